@@ -1,0 +1,251 @@
+"""The contract between rooms: what an episode holds, and how it is written, read, found and verified.
+
+An episode is a folder `<data>/<task>/<seed>/<robot>/`:
+    episode.json   who, how long, success or the reason of failure, versions, hashes (always there)
+    states.npz     the arrays of `States` (accepted episodes only)
+    rgb.mkv        the head camera, lossless (FFV1 in Matroska)
+    robot.mkv      the robot alone, posed by the commanded joints, on a white ground, lossless
+Folders appear under their final name only when complete. A rejected cell keeps its episode.json and nothing else.
+
+Shape letters, here and everywhere: t frames, h w c image, j joints, a action, o objects, k keypoints, n worlds, b batch.
+Quaternions are x y z w; the world frame has its origin under the table's centre, x right, y away from the robot, z up.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+SCHEMA_VERSION = 1
+WIDTH, HEIGHT = 320, 240
+FAILURES = ("plan", "grasp", "slip", "timeout", "overflow")
+"""plan: no joint path. grasp: never held. slip: held and lost. timeout: the plan ended short of success.
+overflow: a physics buffer was too small."""
+
+
+class EpisodeError(Exception):
+    """An episode, or a folder that should hold one, is not as it should be; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class States:
+    """Everything recorded of an episode: the truth of which all pixels are a view."""
+
+    action: np.ndarray
+    """[t 16] float32, commanded joint positions [rad] and grippers [0 closed, 1 open] in force at each frame."""
+    joint_pos: np.ndarray
+    """[t 16] float32, measured, in the same layout."""
+    joint_vel: np.ndarray
+    """[t 16] float32, measured [rad/s; 1/s for the grippers]."""
+    tool_pose: np.ndarray
+    """[t 2 7] float32, measured pose of the left and right tool frame, world."""
+    object_pose: np.ndarray
+    """[t o 7] float32, pose of each object's body, world."""
+    object_joint: np.ndarray
+    """[t o] float32, hinge angle [rad] of objects that have a hinge, else 0."""
+    contact: np.ndarray
+    """[t 2 o] bool, does any finger of the left, right arm touch the object."""
+    keypoints: np.ndarray
+    """[t k 2] float32, origins of the robot's links by forward kinematics of `joint_pos`, pixels (x right, y down,
+    (0, 0) the centre of the upper left pixel)."""
+    keypoint_visible: np.ndarray
+    """[t k] bool, in the image and not hidden by an object or by another link."""
+    robot_mask: np.ndarray
+    """[t h w] bool, pixels in which the robot is what the head camera sees."""
+    intrinsics: np.ndarray
+    """[3 3] float64, the head camera's K [pixels]."""
+    extrinsics: np.ndarray
+    """[4 4] float64, world to camera (x right, y down, z forward)."""
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.action)
+
+
+@dataclass(frozen=True)
+class Record:
+    """episode.json: the header of one (task, seed, robot) cell."""
+
+    task: str
+    seed: int
+    robot: str
+    success: bool
+    failure: str | None = None
+    """One of `FAILURES` where success is false."""
+    instruction: str = ""
+    frame_count: int = 0
+    frame_rate: float = 1000 / 60
+    object_names: tuple[str, ...] = ()
+    keypoint_names: tuple[str, ...] = ()
+    scene_hash: str = ""
+    """SHA-256 of the scene, which is the same for all robots."""
+    hashes: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of states, rgb and robot (decoded bytes, so that a container's padding does not count)."""
+    versions: dict[str, str] = field(default_factory=dict)
+    device: str = ""
+    schema_version: int = SCHEMA_VERSION
+
+
+def episode_folder(data: Path, task: str, seed: int, robot: str) -> Path:
+    return Path(data) / task / f"{seed:07d}" / robot
+
+
+def array_hash(*arrays: np.ndarray) -> str:
+    """SHA-256 over dtype, shape and bytes of arrays, in order."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(f"{array.dtype.str}{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def states_hash(states: States) -> str:
+    return array_hash(*(getattr(states, f.name) for f in fields(States)))
+
+
+def write_episode(
+    data: Path, record: Record, states: States | None = None, rgb: np.ndarray | None = None, robot: np.ndarray | None = None
+) -> Path:
+    """Write one cell atomically and return its folder.
+
+    Args:
+        data: root of the data set.
+        record: the header; hashes are filled in here.
+        states, rgb [t h w 3] uint8, robot [t h w 3] uint8: what an accepted episode holds; leave out what is not stored.
+
+    Raises:
+        EpisodeError: the folder cannot be written or the disk is full; nothing half-written remains.
+    """
+    folder = episode_folder(data, record.task, record.seed, record.robot)
+    temporary = None
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        hashes = {}
+        if states is not None:
+            hashes["states"] = states_hash(states)
+            np.savez_compressed(temporary / "states.npz", **_packed(states))
+        for name, video in (("rgb", rgb), ("robot", robot)):
+            if video is not None:
+                hashes[name] = array_hash(video)
+                write_video(temporary / f"{name}.mkv", video)
+        header = asdict(record) | {"hashes": hashes}
+        (temporary / "episode.json").write_text(json.dumps(header, indent=1) + "\n")
+        if folder.exists():
+            shutil.rmtree(folder)
+        os.rename(temporary, folder)
+    except OSError as error:
+        raise EpisodeError(f"cannot write the episode {folder}: {error}. Free some space or choose another --out.") from error
+    finally:
+        if temporary is not None and temporary.exists():
+            shutil.rmtree(temporary, ignore_errors=True)
+    return folder
+
+
+def _packed(states: States) -> dict[str, np.ndarray]:
+    """Arrays as stored: the mask with eight pixels a byte."""
+    arrays = {f.name: getattr(states, f.name) for f in fields(States)}
+    arrays["robot_mask"] = np.packbits(states.robot_mask, axis=-1)
+    return arrays
+
+
+def read_record(folder: Path) -> Record:
+    """The header of an episode folder. Raises EpisodeError if there is none or it cannot be understood."""
+    path = Path(folder) / "episode.json"
+    try:
+        header = json.loads(path.read_text())
+        version = header["schema_version"]
+        if version != SCHEMA_VERSION:
+            raise EpisodeError(f"{path} has schema version {version}, this xew reads {SCHEMA_VERSION}; generate the data anew.")
+        for name in ("object_names", "keypoint_names"):
+            header[name] = tuple(header[name])
+        return Record(**header)
+    except FileNotFoundError as error:
+        raise EpisodeError(f"{path} does not exist; `python -m xew.sim_warp.generate` makes episodes.") from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise EpisodeError(f"{path} is damaged ({error}); delete its folder and run generate again.") from error
+
+
+def read_states(folder: Path) -> States:
+    """The recorded states of an accepted episode. Raises EpisodeError if they are missing or damaged."""
+    path = Path(folder) / "states.npz"
+    try:
+        with np.load(path) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        arrays["robot_mask"] = np.unpackbits(arrays["robot_mask"], axis=-1).astype(bool)
+        return States(**arrays)
+    except FileNotFoundError as error:
+        raise EpisodeError(f"{path} does not exist: the cell was rejected or its folder is damaged.") from error
+    except Exception as error:  # zipfile, zlib and NumPy each have their own
+        raise EpisodeError(f"{path} is damaged ({error}); delete its folder and run generate again.") from error
+
+
+def write_video(path: Path, video: np.ndarray, frame_rate: float = 1000 / 60) -> None:
+    """Write uint8 RGB [t h w 3] losslessly (FFV1 in Matroska)."""
+    height, width = video.shape[1:3]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), frame_rate, (width, height))
+    if not writer.isOpened():
+        raise OSError(f"OpenCV cannot open {path} for writing FFV1")
+    for frame in video:
+        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+    writer.release()
+    if not path.exists() or path.stat().st_size < 256 + 64 * len(video):
+        raise OSError(f"{path} is shorter than {len(video)} frames can be: the disk may be full")
+
+
+def read_video(path: Path) -> np.ndarray:
+    """Read a video as uint8 RGB [t h w 3]. Raises EpisodeError if it is missing or holds no frame."""
+    capture = cv2.VideoCapture(str(path))
+    frames = []
+    while True:
+        found, frame = capture.read()
+        if not found:
+            break
+        frames.append(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
+    capture.release()
+    if not frames:
+        raise EpisodeError(f"{path} is missing or holds no readable frame; delete its folder and run generate again.")
+    return np.stack(frames)
+
+
+def verify_episode(folder: Path) -> Record:
+    """Read all of an accepted episode and compare with its hashes. Raises EpisodeError at the first difference."""
+    folder = Path(folder)
+    record = read_record(folder)
+    readers = {
+        "states": lambda: states_hash(read_states(folder)),
+        "rgb": lambda: array_hash(read_video(folder / "rgb.mkv")),
+        "robot": lambda: array_hash(read_video(folder / "robot.mkv")),
+    }
+    for name, expected in record.hashes.items():
+        found = readers[name]()
+        if found != expected:
+            raise EpisodeError(f"{folder}: {name} has hash {found[:12]}, expected {expected[:12]}; delete it and run generate again.")
+    return record
+
+
+def find_records(data: Path) -> Iterator[tuple[Path, Record]]:
+    """All cells of a data set, accepted or not, sorted by task, seed, robot. The folders are the index."""
+    for path in sorted(Path(data).glob("*/*/*/episode.json")):
+        if not path.parent.name.startswith("."):
+            yield path.parent, read_record(path.parent)
+
+
+def find_accepted(data: Path) -> list[tuple[Path, Record]]:
+    """Episodes of seeds in which every robot tried has succeeded: the paired data set.
+
+    Raises EpisodeError if there is none, and names the command that makes them.
+    """
+    cells = list(find_records(data))
+    failed = {(record.task, record.seed) for _, record in cells if not record.success}
+    accepted = [(folder, record) for folder, record in cells if (record.task, record.seed) not in failed]
+    if not accepted:
+        raise EpisodeError(f"no accepted episode under {data}; make some: python -m xew.sim_warp.generate --out {data}")
+    return accepted
