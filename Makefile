@@ -1,0 +1,50 @@
+# The ground floor. A newcomer needs python3 (3.11 to 3.13) with venv, and make; everything else is set up here.
+#   make demo    the whole system at debug size, from a seed to a report page
+#   make test    every room's tests
+#   make lint    ruff and mypy
+#   make setup   only the environment (.venv, at the versions of requirements/test.txt)
+
+PYTHON ?= python3
+WORKERS ?= 2
+DEMO ?= demo
+BIN := .venv/bin
+STAMP := .venv/.installed
+
+.PHONY: setup demo test lint clean
+.DELETE_ON_ERROR:
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml requirements/test.txt
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
+	  { echo "xew needs Python 3.11 to 3.13, found `$(PYTHON) --version`; name another: make PYTHON=python3.12 setup"; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --disable-pip-version-check -c requirements/test.txt -e '.[dev]'
+	touch $@
+
+# One thread a worker in the numerical libraries: two workers with a pool each only wait for one another.
+test: $(STAMP)
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+lint: $(STAMP)
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+# Seed -> episodes -> latents -> checkpoint -> rollouts -> scores -> report. Each step skips what is done already.
+TASKS ?= place_empty_cup beat_block_hammer
+DATA := $(DEMO)/data
+RUN := $(DEMO)/run
+ROLLOUTS := $(DEMO)/rollouts
+
+demo: $(STAMP)
+	$(BIN)/python -m xew.sim_warp.generate --tasks $(TASKS) --train-seeds 4 --test-seeds 2 --out $(DATA)
+	$(BIN)/python -m xew.model.latents configs/debug.yaml --data $(DATA)
+	$(BIN)/python -m xew.model.train configs/debug.yaml --data $(DATA) --out $(RUN) --resume
+	$(BIN)/python -m xew.model.rollout $(RUN) --data $(DATA) --split test --out $(ROLLOUTS)
+	$(BIN)/python -m xew.metrics.evaluate $(ROLLOUTS) --data $(DATA) --baselines --out $(DEMO)/scores.parquet
+	$(BIN)/python -m xew.analysis.report $(DEMO)/scores.parquet --data $(DATA) --rollouts $(ROLLOUTS) --out $(DEMO)/report
+	@echo "The report is at $(DEMO)/report/index.html"
+
+clean:
+	rm -rf $(DEMO) .pytest_cache .ruff_cache .mypy_cache
