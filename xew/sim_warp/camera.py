@@ -1,0 +1,75 @@
+"""Pinhole cameras: where a point of the world lands in the image. NumPy only.
+
+Pixels: x right, y down, (0, 0) is the centre of the upper left pixel. Camera frame: x right, y down, z forward.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from xew.episode import HEIGHT, WIDTH
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion or skew."""
+
+    intrinsics: np.ndarray = field(repr=False)
+    """[3 3] float64, K [pixels]; the principal point of a centred camera is ((width - 1) / 2, (height - 1) / 2)."""
+    extrinsics: np.ndarray
+    """[4 4] float64, world to camera [m]."""
+    width: int = WIDTH
+    height: int = HEIGHT
+
+    @property
+    def position(self) -> np.ndarray:
+        """[3] centre of projection, world frame [m]."""
+        return -self.extrinsics[:3, :3].T @ self.extrinsics[:3, 3]
+
+
+def look_at(
+    position: Sequence[float],
+    target: Sequence[float],
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+    vertical_fov: float = 37.0,
+    width: int = WIDTH,
+    height: int = HEIGHT,
+) -> Camera:
+    """A centred camera at `position` [m] that looks at `target` [m], `up` upwards in the image.
+
+    Args:
+        vertical_fov: full vertical angle of view [deg].
+
+    Raises:
+        ValueError: `up` lies along the line of sight, or position and target coincide.
+    """
+    forward = np.subtract(target, position).astype(float)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-9:
+        raise ValueError(f"a camera at {tuple(position)} cannot look at {tuple(target)} with up {tuple(up)}: choose another up.")
+    forward /= np.linalg.norm(forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    extrinsics = np.eye(4)
+    extrinsics[:3, :3] = rotation
+    extrinsics[:3, 3] = -rotation @ np.asarray(position, float)
+    focal = height / 2 / np.tan(np.radians(vertical_fov) / 2)
+    intrinsics = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    return Camera(intrinsics, extrinsics, width, height)
+
+
+def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """World points [... 3] in metres -> (pixels [... 2], depth along the optical axis [...] in metres).
+
+    Points at or behind the camera (depth <= 0) have no image; their pixels are NaN.
+    """
+    in_camera = points @ camera.extrinsics[:3, :3].T + camera.extrinsics[:3, 3]
+    depth = in_camera[..., 2]
+    focal = camera.intrinsics[[0, 1], [0, 1]]
+    front = np.where(depth > 0, depth, np.nan)
+    return focal * in_camera[..., :2] / front[..., None] + camera.intrinsics[:2, 2], depth
+
+
+HEAD_CAMERA = look_at(position=(-0.032, -0.45, 1.35), target=(-0.032, 0.15, 0.55))
+"""RoboTwin's head camera: fixed over the table, 53 degrees down, 37 degrees high; the same for all robots."""

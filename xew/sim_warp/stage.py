@@ -1,0 +1,87 @@
+"""What never moves: table, wall, ground and lights, as plain data. The scene, the physics and the renderer read it here.
+
+Reads nothing, writes nothing. Sizes and lights are RoboTwin 2.0's (`demo_clean`); metres, world frame.
+To change the place where everything happens, change these constants.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from xew.sim_warp.geometry import Color, Mesh, box, merge
+
+TABLE_TOP = 0.74
+"""Height of the table's surface [m]."""
+TABLE_SIZE = (1.2, 0.7, 0.05)
+"""Full size of the table's plate [m]; its centre is over the world's origin."""
+LEG_SIZE = 0.05
+LEG_XY = (0.55, 0.30)
+"""A leg stands at every (+-x, +-y) [m]."""
+WALL_CENTER = (0.0, 1.0, 1.5)
+WALL_SIZE = (6.0, 1.2, 3.0)
+GROUND_SIZE = 12.0
+
+TABLE_COLOR: Color = (255, 255, 255)
+WALL_COLOR: Color = (255, 230, 230)
+GROUND_COLOR: Color = (150, 150, 150)
+
+AMBIENT = 0.5
+"""Light from everywhere, the same on all surfaces that face up; see `SKY_SHARE`."""
+SKY_SHARE = 0.35
+"""Share of the ambient light that comes from above: a surface facing down misses it, so that round links look round."""
+EXPOSURE = 0.5
+"""Factor from light to linear image value: it puts the lit white table at 0.8, below the white of the image."""
+SPECULAR = 0.12
+SHININESS = 24.0
+"""Strength and exponent of the Blinn-Phong highlight that all surfaces of robots and objects share."""
+
+
+@dataclass(frozen=True)
+class Light:
+    """A directional light or, where `position` is given, a point light that falls off with the squared distance."""
+
+    intensity: float
+    direction: tuple[float, float, float]
+    """Where it shines; for a point light the axis of its shadow map."""
+    position: tuple[float, float, float] | None = None
+    """World frame [m]."""
+
+
+LIGHTS = (
+    Light(0.5, (0.0, 0.5, -1.0)),
+    Light(1.0, (-1.0, 0.0, -0.95), (1.0, 0.0, 1.8)),
+    Light(1.0, (1.0, 0.0, -0.95), (-1.0, 0.0, 1.8)),
+)
+SHADOW_CENTER = (0.0, -0.1, 0.85)
+"""Middle of what the directional light's shadow map holds [m]."""
+SHADOW_WIDTH = 1.8
+"""Side of the square that the directional light's shadow map covers [m]."""
+SHADOW_ANGLE = 80.0
+"""Full angle of a point light's shadow map [deg]."""
+
+
+def stage_mesh() -> Mesh:
+    """Table, wall and ground as one mesh in the world frame."""
+    leg_height = TABLE_TOP - TABLE_SIZE[2]
+    legs = [
+        box((LEG_SIZE, LEG_SIZE, leg_height), TABLE_COLOR).transformed((x * LEG_XY[0], y * LEG_XY[1], leg_height / 2))
+        for x in (-1, 1)
+        for y in (-1, 1)
+    ]
+    plate = box(TABLE_SIZE, TABLE_COLOR).transformed((0, 0, TABLE_TOP - TABLE_SIZE[2] / 2))
+    wall = box(WALL_SIZE, WALL_COLOR).transformed(WALL_CENTER)
+    ground = box((GROUND_SIZE, GROUND_SIZE, 0.1), GROUND_COLOR).transformed((0, 0, -0.05))
+    return merge([plate, wall, ground, *legs])
+
+
+def linear_from_srgb(color: np.ndarray) -> np.ndarray:
+    """sRGB values 0 to 255 of any shape -> linear light 0 to 1, float64 (IEC 61966-2-1)."""
+    value = np.asarray(color, np.float64) / 255
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_from_linear(light: np.ndarray) -> np.ndarray:
+    """Linear light, clipped to 0 to 1, of any shape -> sRGB uint8 (IEC 61966-2-1)."""
+    light = np.clip(np.asarray(light, np.float64), 0, 1)
+    value = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.round(value * 255).astype(np.uint8)
