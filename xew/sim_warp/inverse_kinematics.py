@@ -1,0 +1,228 @@
+"""Tool poses to joint positions: batched Levenberg-Marquardt of newton.ik, on the CPU or a GPU.
+
+Every arm is posed as seven joints (six-joint arms get a last one that moves nothing), so that one set of kernels
+serves all robots. Both arms of a robot are alike and share a solver; only their bases differ.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import newton
+import newton.ik
+import numpy as np
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from xew.sim_warp.kinematics import matrix_from_pose, pose_from_matrix, tool_matrix
+from xew.sim_warp.robots.spec import Arm, RobotSpec
+from xew.sim_warp.robots.urdf import load_urdf
+
+JOINT_COUNT = 7
+POSITION_WEIGHT = 4.0
+"""A residual of 1 m counts as much as one of 4 rad: near a pose both then converge at the same pace."""
+LIMIT_WEIGHT = 2.0
+ANCHOR_STRIDE = 8
+"""Frames of a path between two that are solved one after the other; those between are then solved all at once."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Joint positions that bring tools where they should be, and how far from it they end."""
+
+    joint_pos: np.ndarray
+    """[... d] float64, rad, inside the robot's limits."""
+    position_error: np.ndarray
+    """[...] m, distance between the wanted and the reached tool frame."""
+    rotation_error: np.ndarray
+    """[...] rad, angle between them."""
+
+
+class ArmSolver:
+    """Inverse kinematics of one robot's arms; made once, called for every frame or path."""
+
+    def __init__(self, robot: RobotSpec, device: str | None = None, iterations: int = 24) -> None:
+        """Prepare a solver.
+
+        Args:
+            robot: whose arms.
+            device: Warp's name of the device; its default if left out.
+            iterations: Levenberg-Marquardt steps a call.
+        """
+        self.robot = robot
+        self.iterations = iterations
+        self.base = np.stack([_base(robot, arm) for arm in robot.arms])
+        self.model, self.tool = _arm_model(robot, device)
+        self.lower, self.upper = np.array(robot.joint_lower), np.array(robot.joint_upper)
+        self._problems: dict[int, _Problems] = {}
+
+    def solve(self, arm: int | np.ndarray, tool_pose: np.ndarray, seed: np.ndarray) -> Solution:
+        """Joint positions for tool poses, near a seed.
+
+        Args:
+            arm: 0 (left) or 1 (right), one for all or [n].
+            tool_pose: [n 7], wanted pose of the tool frame in the world.
+            seed: [n d], where the search starts [rad].
+
+        Returns:
+            Solution of [n ...]. A pose out of reach gives the nearest found, with the errors that it has.
+        """
+        arm = np.broadcast_to(arm, len(tool_pose))
+        target = pose_from_matrix(np.linalg.inv(self.base[arm]) @ matrix_from_pose(tool_pose))
+        size = 1 << max(0, len(target) - 1).bit_length()
+        if size not in self._problems:
+            self._problems[size] = _Problems(self.model, self.tool, self.robot.arm_joint_count - 1, size, self.iterations)
+        joint_pos = np.clip(self._problems[size].solve(target, seed), self.lower, self.upper)
+        return Solution(joint_pos, *self._errors(arm, tool_pose, joint_pos))
+
+    def solve_path(self, arm: int | np.ndarray, tool_pose: np.ndarray, start: np.ndarray) -> Solution:
+        """Joint positions along paths of the tool, each frame near the one before it.
+
+        Args:
+            arm: 0 (left) or 1 (right), one for all or [n].
+            tool_pose: [t n 7], wanted poses.
+            start: [n d], joint positions before the first frame.
+
+        Returns:
+            Solution of [t n ...].
+        """
+        frames, count = tool_pose.shape[:2]
+        anchors = np.unique(np.append(np.arange(0, frames, ANCHOR_STRIDE), frames - 1))
+        at_anchor = np.empty((len(anchors), *start.shape))
+        for index, frame in enumerate(anchors):
+            start = at_anchor[index] = self.solve(arm, tool_pose[frame], start).joint_pos
+        seed = _interpolated(np.arange(frames), anchors, at_anchor)
+        arms = np.tile(np.broadcast_to(arm, count), frames)
+        flat = self.solve(arms, tool_pose.reshape(-1, 7), seed.reshape(frames * count, -1))
+        return Solution(
+            flat.joint_pos.reshape(seed.shape),
+            flat.position_error.reshape(frames, count),
+            flat.rotation_error.reshape(frames, count),
+        )
+
+    def _errors(self, arm: np.ndarray, tool_pose: np.ndarray, joint_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        reached = np.empty((len(arm), 4, 4))
+        for side in np.unique(arm):
+            reached[arm == side] = tool_matrix(self.robot, side, joint_pos[arm == side])
+        position = np.linalg.norm(reached[:, :3, 3] - tool_pose[:, :3], axis=-1)
+        rotation = (Rotation.from_matrix(reached[:, :3, :3]).inv() * Rotation.from_quat(tool_pose[:, 3:])).magnitude()
+        return position, rotation
+
+
+def inverse_kinematics(
+    robot: RobotSpec, arm: int | np.ndarray, tool_pose: np.ndarray, seed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Joint positions for tool poses: `ArmSolver.solve` with a solver that is kept.
+
+    Args:
+        robot: whose arms.
+        arm: 0 (left) or 1 (right), one for all or [n].
+        tool_pose: [n 7], world.
+        seed: [n d], rad.
+
+    Returns:
+        joint_pos [n d] rad, position_error [n] m, rotation_error [n] rad.
+    """
+    solution = _solver(robot).solve(arm, tool_pose, seed)
+    return solution.joint_pos, solution.position_error, solution.rotation_error
+
+
+@lru_cache(maxsize=16)
+def _solver(robot: RobotSpec) -> ArmSolver:
+    return ArmSolver(robot)
+
+
+def _interpolated(frames: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values [a n d] at anchor frames [a], linearly between them at frames [t]: [t n d]."""
+    after = np.clip(np.searchsorted(anchors, frames), 1, max(1, len(anchors) - 1))
+    if len(anchors) == 1:
+        return np.repeat(values, len(frames), 0)
+    share = (frames - anchors[after - 1]) / (anchors[after] - anchors[after - 1])
+    return values[after - 1] + share[:, None, None] * (values[after] - values[after - 1])
+
+
+def _segments(robot: RobotSpec, arm: Arm) -> list[np.ndarray]:
+    """Transforms [4 4] from the root to the first joint, between joints, and from the last joint to the tool."""
+    segments, frame = [], np.eye(4)
+    for joint in load_urdf(robot.urdf).chain(arm.tool_link):
+        frame = frame @ joint.origin
+        if joint.name in arm.joints:
+            segments.append(frame)
+            frame = np.eye(4)
+    return [*segments, frame @ matrix_from_pose(arm.tool_pose)]
+
+
+def _base(robot: RobotSpec, arm: Arm) -> np.ndarray:
+    """[4 4] world pose of the frame in which the arm's first joint turns."""
+    return matrix_from_pose(arm.root_pose) @ _segments(robot, arm)[0]
+
+
+def _arm_model(robot: RobotSpec, device: str | None) -> tuple[newton.Model, np.ndarray]:
+    """The arm from its first joint on as a Newton model of seven joints, and its tool frame [7] in the last real link."""
+    left, right = (_segments(robot, arm) for arm in robot.arms)
+    if not np.allclose(left[1:], right[1:], atol=1e-6):
+        raise ValueError(f"{robot.key}: the arms differ beyond their bases; inverse kinematics expects two alike.")
+    joints = [load_urdf(robot.urdf).joints[name] for name in robot.arms[0].joints]
+    builder = newton.ModelBuilder()
+    handles = []
+    for index in range(JOINT_COUNT):
+        real = index < len(joints)
+        segment = left[index] if 0 < index < len(joints) else np.eye(4)
+        handles.append(
+            builder.add_joint_revolute(
+                parent=index - 1,
+                child=builder.add_link(mass=1.0, inertia=wp.mat33(*np.eye(3).ravel())),
+                parent_xform=wp.transform(*pose_from_matrix(segment)),
+                axis=wp.vec3(*(joints[index].axis if real else (0.0, 0.0, 1.0))),
+                limit_lower=robot.joint_lower[index] if real else 0.0,
+                limit_upper=robot.joint_upper[index] if real else 0.0,
+            )
+        )
+    builder.add_articulation(handles)
+    return builder.finalize(device=device), pose_from_matrix(left[-1])
+
+
+class _Problems:
+    """A fixed number of problems of one arm model, with their buffers and, on a GPU, their captured graph."""
+
+    def __init__(self, model: newton.Model, tool: np.ndarray, link: int, size: int, iterations: int) -> None:
+        device = model.device
+        self.positions = wp.zeros(size, dtype=wp.vec3, device=device)
+        self.rotations = wp.zeros(size, dtype=wp.vec4, device=device)
+        self.joint_pos = wp.zeros((size, JOINT_COUNT), dtype=wp.float32, device=device)
+        self.iterations = iterations
+        objectives = [
+            newton.ik.IKObjectivePosition(link, wp.vec3(*tool[:3]), self.positions, weight=POSITION_WEIGHT),
+            newton.ik.IKObjectiveRotation(link, wp.quat(*tool[3:]), self.rotations),
+            newton.ik.IKObjectiveJointLimit(model.joint_limit_lower, model.joint_limit_upper, weight=LIMIT_WEIGHT),
+        ]
+        self.solver = newton.ik.IKSolver(
+            model, size, objectives, jacobian_mode=newton.ik.IKJacobianType.ANALYTIC, lambda_initial=1e-3
+        )
+        self.graph: wp.Graph | None = None
+        self.device = device
+
+    def solve(self, target: np.ndarray, seed: np.ndarray) -> np.ndarray:
+        """Joint positions [n d] for tool poses [n 7] in the arm's base frame; n may be less than the size."""
+        count, joints = seed.shape
+        self.positions.assign(_padded(target[:, :3], self.positions.shape[0]))
+        self.rotations.assign(_padded(target[:, 3:], self.positions.shape[0]))
+        start = np.zeros((self.positions.shape[0], JOINT_COUNT), np.float32)
+        start[:count, :joints] = seed
+        self.joint_pos.assign(start)
+        self._step()
+        return self.joint_pos.numpy()[:count, :joints].astype(float)
+
+    def _step(self) -> None:
+        if not self.device.is_cuda:
+            self.solver.step(self.joint_pos, self.joint_pos, iterations=self.iterations)
+            return
+        if self.graph is None:
+            with wp.ScopedCapture(self.device) as capture:
+                self.solver.step(self.joint_pos, self.joint_pos, iterations=self.iterations)
+            self.graph = capture.graph
+        wp.capture_launch(self.graph)
+
+
+def _padded(rows: np.ndarray, size: int) -> np.ndarray:
+    """Rows [n ...] float32, the last one repeated up to `size` rows."""
+    return np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), 0)]).astype(np.float32)
