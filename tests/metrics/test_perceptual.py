@@ -1,0 +1,98 @@
+"""LPIPS: published and measured numbers, the `lpips` package where it is installed, and what a region means."""
+
+import io
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from xew.metrics import lpips, region_lpips
+from xew.metrics.alexnet import read_alexnet, read_arrays
+from xew.metrics.perceptual import SMALLEST_SIDE, union_box
+
+rng = np.random.default_rng(3)
+
+
+def noise(t: int = 1, h: int = 40, w: int = 56) -> np.ndarray:
+    return rng.integers(0, 256, (t, h, w, 3), dtype=np.uint8)
+
+
+def test_black_against_white_has_its_known_value() -> None:
+    black = np.zeros((1, 64, 64, 3), np.uint8)
+    np.testing.assert_allclose(lpips(black, 255 - black), 0.813954, atol=1e-6)
+
+
+def test_the_weights_are_those_of_version_0_1() -> None:
+    """Checksums measured on torchvision's AlexNet and on the heads of the package `lpips` 0.1.4."""
+    weights = read_alexnet()
+    assert sum(array.size for array in weights.values()) == 2_469_696 + 1_152
+    assert weights["conv0_kernel"].astype(np.float64).sum() == pytest.approx(-1.842677, abs=1e-5)
+    heads = [weights[f"head{i}"].astype(np.float64) for i in range(5)]
+    assert [head.sum() for head in heads] == pytest.approx([2.349532, 16.143026, 39.26844, 27.197178, 20.317177], rel=1e-6)
+    assert all((head >= 0).all() for head in heads)
+
+
+def test_a_weight_file_that_asks_for_more_than_arrays_is_refused() -> None:
+    with pytest.raises(pickle.UnpicklingError, match="print"):
+        read_arrays(io.BytesIO(pickle.dumps(print)))
+    with pytest.raises(pickle.UnpicklingError, match="numpy"):
+        read_arrays(io.BytesIO(pickle.dumps(np.random.default_rng)))
+
+
+@pytest.mark.parametrize("size", [(31, 31), (35, 35), (64, 64), (57, 91)])
+def test_it_equals_the_reference_package(size: tuple[int, int], reference_lpips: object) -> None:
+    prediction, target = noise(2, *size), noise(2, *size)
+    np.testing.assert_allclose(lpips(prediction, target), reference_lpips(prediction, target), atol=1e-6)
+
+
+def test_identity_is_zero_and_noise_is_monotone() -> None:
+    target = np.broadcast_to(np.linspace(0, 255, 56).astype(np.uint8)[None, None, :, None], (1, 40, 56, 3))
+    grain = rng.normal(0, 1, target.shape)
+    values = [float(lpips(np.clip(target + s * grain, 0, 255).astype(np.uint8), target)[0]) for s in (0, 8, 32, 96)]
+    assert values[0] == 0 and values == sorted(values) and values[1] > 0
+
+
+def test_frames_do_not_depend_on_the_chunk() -> None:
+    prediction, target = noise(3), noise(3)
+    np.testing.assert_allclose(lpips(prediction, target), lpips(prediction, target, chunk=2), atol=1e-6)
+
+
+def test_small_frames_are_an_error_and_not_nan() -> None:
+    assert np.isfinite(lpips(noise(1, SMALLEST_SIDE, SMALLEST_SIDE), noise(1, SMALLEST_SIDE, SMALLEST_SIDE))).all()
+    with pytest.raises(ValueError, match="31"):
+        lpips(noise(1, 30, 64), noise(1, 30, 64))
+
+
+@pytest.mark.parametrize("box", [(3, 5, 34, 31), (0, 0, 40, 56), (8, 20, 32, 36), (1, 0, 39, 47)])
+def test_the_region_equals_lpips_of_the_crop(box: tuple[int, int, int, int]) -> None:
+    top, left, height, width = box
+    prediction, target, mask = noise(2), noise(2), np.zeros((2, 40, 56), bool)
+    mask[0, top, left] = mask[1, top + height - 1, left + width - 1] = True
+    assert tuple(int(side) for side in union_box(mask)) == box
+    crop = np.s_[:, top : top + height, left : left + width]
+    expected = float(np.mean(lpips(prediction[crop], target[crop])))
+    assert region_lpips(prediction, target, mask) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_region_without_room_for_the_network_is_an_error() -> None:
+    video, mask = noise(), np.zeros((1, 40, 56), bool)
+    for area in (np.s_[:, :0], np.s_[:, 5:25, 5:50]):
+        mask[area] = True
+        with pytest.raises(ValueError, match="at least 31"):
+            region_lpips(video, video, mask)
+
+
+def test_as_a_loss_its_gradient_is_finite() -> None:
+    target = jnp.asarray(noise(), jnp.float32) / 255
+    for start in (jnp.flip(target, 1), target, jnp.zeros_like(target)):
+        gradient = jax.grad(lambda x: jnp.sum(lpips(x, target)))(start)
+        assert np.isfinite(gradient).all()
+
+
+def test_it_works_inside_a_jit_of_the_caller() -> None:
+    prediction, target, mask = noise(), noise(), np.ones((1, 40, 56), bool)
+    inside = jax.jit(lambda p, t, m: (lpips(p, t), region_lpips(p, t, m)))(prediction, target, mask)
+    np.testing.assert_allclose(inside[0], lpips(prediction, target), atol=1e-6)
+    np.testing.assert_allclose(inside[1], region_lpips(prediction, target, mask), atol=1e-6)

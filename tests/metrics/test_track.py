@@ -1,0 +1,131 @@
+"""Point metrics against plain loops over points, frames and warping paths."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from xew.metrics import keypoint_error, ndtw, pck, trajectory_error
+
+rng = np.random.default_rng(2)
+
+
+def tracks(t: int = 9, k: int = 4, spread: float = 6) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    target = rng.uniform(0, 60, (t, k, 2)).astype(np.float32)
+    prediction = (target + rng.normal(0, spread, target.shape)).astype(np.float32)
+    return prediction, target, rng.random((t, k)) < 0.7
+
+
+def brute_diagonal(target: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    boxes = [points[keep] for points, keep in zip(target, valid, strict=True)]
+    return np.array([np.linalg.norm(np.ptp(box, axis=0)) if len(box) else 0.0 for box in boxes])
+
+
+def brute_dtw(a: np.ndarray, b: np.ndarray) -> float:
+    table = np.full((len(a) + 1, len(b) + 1), np.inf)
+    table[0, 0] = 0
+    for i in range(len(a)):
+        for j in range(len(b)):
+            step = min(table[i, j], table[i, j + 1], table[i + 1, j])
+            table[i + 1, j + 1] = np.linalg.norm(a[i] - b[j]) + step
+    return table[-1, -1]
+
+
+def brute_ndtw(prediction: np.ndarray, target: np.ndarray, valid: np.ndarray) -> float:
+    diagonal = brute_diagonal(target, valid)
+    values = []
+    for i in range(target.shape[1]):
+        keep = valid[:, i] & np.isfinite(prediction[:, i]).all(-1)
+        if keep.any() and diagonal[keep].mean() > 0:
+            cost = brute_dtw(prediction[keep, i], target[keep, i])
+            values.append(cost / (2 * keep.sum() * diagonal[keep].mean()))
+    return float(np.mean(values))
+
+
+@pytest.mark.parametrize("t", [1, 2, 9, 30])
+def test_ndtw_equals_the_whole_table(t: int) -> None:
+    prediction, target, valid = tracks(t)
+    valid[0, :2] = True
+    assert ndtw(prediction, target, valid) == pytest.approx(brute_ndtw(prediction, target, valid), rel=1e-5)
+
+
+@pytest.mark.parametrize("alpha", [0.05, 0.1, 0.3])
+def test_pck_equals_counting(alpha: float) -> None:
+    prediction, target, valid = tracks(spread=3)
+    near = np.linalg.norm(prediction - target, axis=-1) < alpha * brute_diagonal(target, valid)[:, None]
+    counts = valid & (brute_diagonal(target, valid) > 0)[:, None]
+    assert pck(prediction, target, valid, alpha=alpha) == pytest.approx(near[counts].mean(), abs=1e-6)
+
+
+def test_errors_equal_their_definitions() -> None:
+    prediction, target, valid = tracks()
+    distance = np.linalg.norm(prediction - target, axis=-1)
+    assert keypoint_error(prediction, target, valid) == pytest.approx(distance[valid].mean(), rel=1e-5)
+    per_object = [distance[valid[:, i], i].mean() for i in range(valid.shape[1])]
+    assert trajectory_error(prediction, target, valid) == pytest.approx(np.mean(per_object), rel=1e-5)
+
+
+def test_objects_never_seen_do_not_count_and_others_count_alike() -> None:
+    prediction, target, valid = tracks(t=10, k=3)
+    valid[:] = True
+    valid[:, 0], valid[2:, 1] = False, False
+    distance = np.linalg.norm(prediction - target, axis=-1)
+    expected = (distance[:2, 1].mean() + distance[:, 2].mean()) / 2
+    assert trajectory_error(prediction, target, valid) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize(("metric", "best"), [(pck, 1), (keypoint_error, 0), (ndtw, 0), (trajectory_error, 0)])
+def test_identity_is_best_and_nothing_is_nan(metric: object, best: float) -> None:
+    _, target, valid = tracks()
+    assert metric(target, target, valid) == best
+    assert np.isnan(metric(target, target, np.zeros_like(valid)))
+
+
+def test_a_lost_point_is_a_miss_and_leaves_the_errors_alone() -> None:
+    _, target, valid = tracks()
+    valid[:] = True
+    lost = target.copy()
+    lost[3, 1] = np.nan
+    assert pck(lost, target, valid) == pytest.approx(1 - 1 / valid.size)
+    assert keypoint_error(lost, target, valid) == trajectory_error(lost, target, valid) == ndtw(lost, target, valid) == 0
+
+
+def test_invalid_points_may_hold_anything() -> None:
+    prediction, target, valid = tracks()
+    wild = np.where(valid[..., None], prediction, np.float32(1e6))
+    for metric in (pck, keypoint_error, ndtw, trajectory_error):
+        assert metric(prediction, target, valid) == metric(wild, target, valid)
+
+
+def test_a_point_exactly_at_the_threshold_is_a_miss() -> None:
+    target = np.array([[[0, 0], [30, 40]]], np.float32)
+    off = target + np.array([5, 0], np.float32)
+    valid = np.ones((1, 2), bool)
+    assert pck(off, target, valid, alpha=0.1) == 0
+    assert pck(off, target, valid, alpha=0.11) == 1
+
+
+def test_ndtw_forgives_a_late_start_that_the_error_does_not() -> None:
+    path = np.stack([np.linspace(0, 50, 30), np.linspace(0, 10, 30)], -1).astype(np.float32)
+    target = np.stack([path, path[:, ::-1]], 1)
+    late = np.concatenate([target[:1], target[:1], target[:1], target[:-3]])
+    valid = np.ones(target.shape[:2], bool)
+    scale = float(np.mean(brute_diagonal(target, valid)))
+    assert ndtw(late, target, valid) < 0.3 * keypoint_error(late, target, valid) / scale
+
+
+@pytest.mark.parametrize("metric", [keypoint_error, ndtw, trajectory_error])
+def test_gradients_are_finite_even_at_the_truth(metric: object) -> None:
+    prediction, target, valid = tracks()
+    for start in (prediction, target):
+        assert np.isfinite(jax.grad(metric)(jnp.asarray(start), target, valid)).all()
+
+
+def test_shapes_and_types_are_checked() -> None:
+    prediction, target, valid = tracks()
+    with pytest.raises(ValueError, match="one shape"):
+        pck(prediction[1:], target, valid)
+    with pytest.raises(ValueError, match="valid is"):
+        ndtw(prediction, target, valid[1:])
+    with pytest.raises(TypeError, match="bool"):
+        keypoint_error(prediction, target, valid.astype(np.float32))

@@ -1,0 +1,71 @@
+"""Metrics, ground: what a metric is, and the checks on arrays that all of them share. Imports nothing of ours."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One entry of the registry `METRICS`: all that a table or a figure needs to know of a metric."""
+
+    function: Callable[..., jax.Array]
+    """Pure and jitted; image metrics give one value a frame, the others a scalar."""
+    dimension: str
+    """visual, morphology, kinematics or objects: reported side by side, never collapsed."""
+    unit: str
+    """'' where the number has none."""
+    range: tuple[float, float]
+    higher_is_better: bool
+    per_frame: bool
+    """Does the function give [t], or one number for the video."""
+    needs: tuple[str, ...]
+    """What is compared: video [t h w 3], mask [t h w], or track [t k 2] with its validity [t k]."""
+    reference: str
+    """Where the definition comes from."""
+
+
+def check_videos(prediction: jax.Array, target: jax.Array, smallest_side: int = 1) -> None:
+    """Raise ValueError or TypeError unless both are [t h w 3], of one shape, uint8 or floating in [0, 1].
+
+    Args:
+        prediction, target: the two videos.
+        smallest_side: the metric is not defined on frames of a side under this.
+    """
+    if np.shape(prediction) != np.shape(target):
+        raise ValueError(
+            f"prediction is {np.shape(prediction)}, target is {np.shape(target)}; they must have one shape [t h w 3]."
+        )
+    if np.ndim(target) != 4 or np.shape(target)[-1] != 3:
+        raise ValueError(f"videos are {np.shape(target)}, expected [t h w 3]; add the time axis, drop alpha.")
+    if min(np.shape(target)[1:3]) < smallest_side:
+        raise ValueError(f"frames are {np.shape(target)[1:3]}, this metric needs sides of at least {smallest_side} pixels.")
+    kinds = {jnp.result_type(video) for video in (prediction, target)}
+    if len(kinds) != 1 or not all(kind == jnp.uint8 or jnp.issubdtype(kind, jnp.floating) for kind in kinds):
+        found = sorted(str(kind) for kind in kinds)
+        raise TypeError(f"videos have dtype {' and '.join(found)}, expected both uint8, or both floating in [0, 1].")
+
+
+def check_masks(prediction: jax.Array, target: jax.Array) -> None:
+    """Raise ValueError or TypeError unless both are bool [t h w] of one shape."""
+    if np.shape(prediction) != np.shape(target) or np.ndim(target) != 3:
+        raise ValueError(f"masks are {np.shape(prediction)} and {np.shape(target)}, expected one shape [t h w].")
+    for name, mask in (("prediction", prediction), ("target", target)):
+        check_bool(name, mask)
+
+
+def check_bool(name: str, array: jax.Array) -> None:
+    if jnp.result_type(array) != jnp.bool_:
+        raise TypeError(f"{name} has dtype {jnp.result_type(array)}, expected bool; compare with a threshold first.")
+
+
+def check_tracks(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> None:
+    """Raise ValueError or TypeError unless tracks are floating [t k 2] of one shape and valid is bool [t k]."""
+    if np.shape(prediction) != np.shape(target) or np.ndim(target) != 3 or np.shape(target)[-1] != 2:
+        raise ValueError(f"tracks are {np.shape(prediction)} and {np.shape(target)}, expected one shape [t k 2].")
+    if np.shape(valid) != np.shape(target)[:2]:
+        raise ValueError(f"valid is {np.shape(valid)}, expected {np.shape(target)[:2]}, a flag for each point and frame.")
+    check_bool("valid", valid)

@@ -1,0 +1,143 @@
+"""Metrics, robot kinematics and object dynamics by tracked points in the image plane.
+
+Tracks are float [t k 2] pixels (x right, y down), validity bool [t k]: the point is visible in the target. A prediction
+that lost a point holds NaN there: a miss for PCK, left out of the errors, so look at coverage beside them.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from xew.metrics.metric import check_tracks
+
+
+@jax.jit
+def pck(prediction: jax.Array, target: jax.Array, valid: jax.Array, alpha: float | jax.Array = 0.1) -> jax.Array:
+    """Percentage of correct keypoints: the share in [0, 1] that lie nearer than alpha x d_t, higher is better.
+
+    d_t is the diagonal of the bounding box of the frame's valid target points (the paper's definition). A frame whose
+    box has no extent sets no scale and is left out.
+
+    Args:
+        prediction, target: [t k 2] pixels. valid: [t k] bool.
+        alpha: the paper's tables use 0.1, its evaluator also 0.05.
+
+    Returns:
+        Scalar float32; NaN where no point counts.
+    """
+    check_tracks(prediction, target, valid)
+    diagonal = box_diagonal(target, valid)
+    counts = valid & (diagonal > 0)[:, None]
+    correct = counts & (_distance(prediction, target) < alpha * diagonal[:, None])
+    return jnp.sum(correct) / jnp.sum(counts)
+
+
+@jax.jit
+def keypoint_error(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Array:
+    """Mean distance [pixels] over the valid points that the prediction has, lower is better.
+
+    Args:
+        prediction, target: [t k 2] pixels. valid: [t k] bool.
+
+    Returns:
+        Scalar float32; NaN where there is no such point.
+    """
+    check_tracks(prediction, target, valid)
+    tracked = valid & _found(prediction)
+    return _masked_mean(_distance(prediction, target), tracked)
+
+
+@jax.jit
+def trajectory_error(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Array:
+    """Distance [pixels] of tracked objects, mean over each object's valid frames, then over objects; lower is better.
+
+    Args:
+        prediction, target: [t o 2] pixels. valid: [t o] bool.
+
+    Returns:
+        Scalar float32; NaN where no object is ever valid.
+    """
+    check_tracks(prediction, target, valid)
+    tracked = valid & _found(prediction)
+    per_object = _masked_mean(_distance(prediction, target), tracked, axis=0)
+    return _masked_mean(per_object, jnp.any(tracked, axis=0))
+
+
+@jax.jit
+def ndtw(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Array:
+    """Normalised dynamic time warping of each keypoint's path, mean over keypoints; lower is better, 0 is best.
+
+    Classic DTW with Euclidean cost, over the frames in which the point is valid and found, divided by the sum of the two
+    lengths and by the mean over those frames of the diagonal d_t of `pck` (the paper's definition).
+
+    Args:
+        prediction, target: [t k 2] pixels. valid: [t k] bool.
+
+    Returns:
+        Scalar float32; NaN where no keypoint has a path with a scale.
+    """
+    check_tracks(prediction, target, valid)
+    tracked = valid & _found(prediction)
+    diagonal = jnp.broadcast_to(box_diagonal(target, valid)[:, None], valid.shape)
+    scale = _masked_mean(diagonal, tracked, axis=0)
+    length = jnp.sum(tracked, axis=0)
+    cost = jax.vmap(_path_cost, in_axes=1)(prediction, target, tracked)
+    counts = (length > 0) & (scale > 0)
+    return _masked_mean(cost / jnp.where(counts, 2 * length.astype(jnp.float32) * scale, 1), counts)
+
+
+def box_diagonal(points: jax.Array, valid: jax.Array) -> jax.Array:
+    """[t] diagonal of the bounding box of each frame's valid points [pixels]; 0 where there is none."""
+    low = jnp.min(jnp.where(valid[..., None], points, jnp.inf), axis=1)
+    high = jnp.max(jnp.where(valid[..., None], points, -jnp.inf), axis=1)
+    extent = jnp.where(jnp.any(valid, axis=1)[:, None], high - low, 0)
+    return _norm(extent)
+
+
+def _path_cost(prediction: jax.Array, target: jax.Array, tracked: jax.Array) -> jax.Array:
+    """DTW cost of two paths [t 2] over the tracked frames.
+
+    Tracked frames come first, in order, so that the cost of the paths is the cell (n - 1, n - 1) of the whole table,
+    which no later frame touches. The table is filled by anti-diagonals, whose cells do not depend on each other.
+    """
+    order = jnp.argsort(~tracked, stable=True)
+    keep = tracked[order][:, None]
+    a, b = jnp.where(keep, prediction[order], 0), jnp.where(keep, target[order], 0)
+    t = len(a)
+    rows = jnp.arange(t)
+
+    def fill(last_two: tuple[jax.Array, jax.Array], d: jax.Array) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+        before, last = last_two
+        columns = d - rows
+        cost = _norm(a - b[jnp.clip(columns, 0, t - 1)])
+        up, diagonal = (jnp.concatenate([jnp.full(1, jnp.inf, jnp.float32), cells[:-1]]) for cells in (last, before))
+        best = jnp.minimum(jnp.minimum(up, last), diagonal)
+        cells = cost + jnp.where(d == 0, 0, best)
+        cells = jnp.where((columns >= 0) & (columns < t), cells, jnp.inf)
+        return (last, cells), cells
+
+    nothing = jnp.full(t, jnp.inf, jnp.float32)
+    _, table = lax.scan(fill, (nothing, nothing), jnp.arange(2 * t - 1))
+    end = jnp.maximum(jnp.sum(tracked) - 1, 0)
+    return table[2 * end, end]
+
+
+def _distance(prediction: jax.Array, target: jax.Array) -> jax.Array:
+    """[t k] Euclidean distance; infinite where the prediction has no point."""
+    found = _found(prediction)
+    return jnp.where(found, _norm(jnp.where(found[..., None], prediction, target) - target), jnp.inf)
+
+
+def _found(points: jax.Array) -> jax.Array:
+    return jnp.all(jnp.isfinite(points), axis=-1)
+
+
+def _norm(vector: jax.Array) -> jax.Array:
+    """Length along the last axis, with gradient 0 instead of NaN at zero."""
+    square = jnp.sum(jnp.square(vector), axis=-1)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0).astype(jnp.float32)
+
+
+def _masked_mean(values: jax.Array, keep: jax.Array, axis: int | None = None) -> jax.Array:
+    """Mean of the kept values; NaN where none is."""
+    return jnp.sum(jnp.where(keep, values, 0), axis=axis) / jnp.sum(keep, axis=axis).astype(jnp.float32)
