@@ -47,7 +47,7 @@ def look_at(
     forward = np.subtract(target, position).astype(float)
     right = np.cross(forward, up)
     if np.linalg.norm(right) < 1e-9:
-        raise ValueError(f"a camera at {tuple(position)} cannot look at {tuple(target)} with up {tuple(up)}: choose another up.")
+        raise ValueError(f"a camera at {tuple(position)} cannot look at {tuple(target)} with up {tuple(up)}: choose another.")
     forward /= np.linalg.norm(forward)
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])

@@ -52,10 +52,14 @@ LIGHTS = (
     Light(1.0, (-1.0, 0.0, -0.95), (1.0, 0.0, 1.8)),
     Light(1.0, (1.0, 0.0, -0.95), (-1.0, 0.0, 1.8)),
 )
+SKY = (1.0, 1.0, 1.0)
+"""Linear colour where there is nothing, and of the ground of a render without the stage."""
 SHADOW_CENTER = (0.0, -0.1, 0.85)
 """Middle of what the directional light's shadow map holds [m]."""
 SHADOW_WIDTH = 1.8
 """Side of the square that the directional light's shadow map covers [m]."""
+SHADOW_DISTANCE = 4.0
+"""How far from that middle the directional light's shadow map begins [m]."""
 SHADOW_ANGLE = 80.0
 """Full angle of a point light's shadow map [deg]."""
 
