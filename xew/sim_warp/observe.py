@@ -1,0 +1,105 @@
+"""From recorded states to what the head camera sees: RGB, robot mask, keypoints. Everything here is a view of states.
+
+Reads joint positions and object poses; writes the images and keypoints of `xew.episode.States`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from xew.sim_warp.camera import HEAD_CAMERA, Camera, project
+from xew.sim_warp.kinematics import link_poses
+from xew.sim_warp.render import Body, Frames, Renderer, World
+from xew.sim_warp.robots.bodies import body_names, keypoint_links, nearby_links, robot_bodies, robot_pose
+from xew.sim_warp.robots.spec import RobotSpec
+from xew.sim_warp.robots.urdf import load_urdf
+
+VISIBILITY_MARGIN = 0.02
+"""How far in front of a link's origin something else may be before it hides the link [m]."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One episode to look at: a robot and things, posed as measured."""
+
+    robot: RobotSpec
+    joint_pos: np.ndarray
+    """[t 16] measured canonical joint positions [rad] and grippers."""
+    things: Sequence[Body] = ()
+    """All bodies that are not the robot; keep the `Mesh` objects of equal things, they are stored once."""
+    thing_pose: np.ndarray | None = None
+    """[t o 7] their measured poses, world frame; None if there are none."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the camera sees of one episode; the fields are those of `xew.episode.States`."""
+
+    rgb: np.ndarray
+    """[t h w 3] uint8."""
+    robot_mask: np.ndarray
+    """[t h w] bool."""
+    keypoints: np.ndarray
+    """[t k 2] float32 [pixels]."""
+    keypoint_visible: np.ndarray
+    """[t k] bool."""
+
+
+def observe(renderer: Renderer, scenes: Sequence[Scene], camera: Camera = HEAD_CAMERA) -> list[Observation]:
+    """Look at many episodes at once; the result of each does not depend on the others."""
+    points = [keypoint_positions(scene.robot, scene.joint_pos) for scene in scenes]
+    worlds = [_world(scene, at) for scene, at in zip(scenes, points, strict=True)]
+    frames = renderer.render_batch(worlds, camera)
+    return [_observation(*seen, camera) for seen in zip(scenes, points, frames, strict=True)]
+
+
+def keypoint_names(robot: RobotSpec) -> tuple[str, ...]:
+    """Names of the keypoints, such as left/link3: the moving links of the left arm, its fingers, then the right's."""
+    return tuple(name for _, _, name in keypoint_links(robot))
+
+
+def keypoint_positions(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
+    """Origins [t k 3] of the moving links at canonical joint positions [t 16], world frame [m]."""
+    poses = link_poses(robot, joint_pos)
+    return np.stack([poses[copy][link][:, :3] for copy, link, _ in keypoint_links(robot)], 1)
+
+
+def keypoint_visibility(robot: RobotSpec, points: np.ndarray, frames: Frames, camera: Camera) -> np.ndarray:
+    """Which keypoints the camera sees, bool [t k].
+
+    A link's origin lies inside the link, so it counts as seen where the pixel that holds it shows the link itself or
+    one that a joint joins to it, or where what the pixel shows is no more than `VISIBILITY_MARGIN` in front of it.
+
+    Args:
+        points: [t k 3] keypoints in the world, as given to the renderer with the frames.
+    """
+    _, depth = project(camera, points)
+    near = frames.point_depth >= depth - VISIBILITY_MARGIN
+    in_image = (frames.point_body != -2) & (depth > 0)
+    return in_image & (near | _own_table(robot)[np.arange(points.shape[1]), np.maximum(frames.point_body, -1)])
+
+
+def _own_table(robot: RobotSpec) -> np.ndarray:
+    """[k b+1] bool: is a body the link of a keypoint, or next to it? The last column, body -1, is False."""
+    urdf = load_urdf(robot.urdf)
+    bodies = body_names(robot)
+    table = np.zeros((len(keypoint_links(robot)), len(bodies) + 1), bool)
+    for row, (copy, link, _) in enumerate(keypoint_links(robot)):
+        near = nearby_links(urdf, link)
+        table[row, :-1] = [body_copy == copy and name in near for body_copy, name in bodies]
+    return table
+
+
+def _world(scene: Scene, points: np.ndarray) -> World:
+    bodies = [*robot_bodies(scene.robot), *scene.things]
+    pose = robot_pose(scene.robot, scene.joint_pos)
+    if scene.thing_pose is not None:
+        pose = np.concatenate([pose, scene.thing_pose], 1)
+    return World(bodies, pose, points)
+
+
+def _observation(scene: Scene, points: np.ndarray, frames: Frames, camera: Camera) -> Observation:
+    pixels, _ = project(camera, points)
+    visible = keypoint_visibility(scene.robot, points, frames, camera)
+    return Observation(frames.rgb, frames.robot_mask, pixels.astype(np.float32), visible)
