@@ -1,0 +1,159 @@
+"""Metrics, default estimator: where is the robot in a predicted video, without any network's weights?
+
+Each predicted frame is read with the help of the true episode, whose masks are known. Three kinds of evidence add up, as
+log-likelihood ratios learnt from the true video itself:
+    colour      how much more often the robot has this colour than everything else has
+    background  how far the pixel is from the empty scene behind it (the camera stands still)
+    shape       the true mask of the same frame, carried along by optical flow onto the predicted frame
+Shape counts only where flow explains the pixel (small residual, flow there and back closes). Without these gates a video
+that stands still would be given the true masks for nothing; with them it is judged by what it shows.
+Its error on true video is published beside every score: the row `ground_truth` of `evaluate --baselines`.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+COLOUR_BINS = 24
+"""Per channel of Lab."""
+LEARNING_FRAMES = 32
+"""The appearance is learnt from at most so many frames, spread evenly."""
+EVIDENCE_LIMIT = 4.0
+"""No single kind of evidence may say more than exp(4) : 1; histograms of one episode know no better."""
+SHAPE_WEIGHT = 6.0
+SHAPE_REACH = 2.0
+"""Pixels from the carried contour at which shape evidence is three quarters of its full weight."""
+RESIDUAL_SCALE = 25.0
+"""Colour difference (levels) between a pixel and the one that flow says it came from, at which the gate is 1/e."""
+CLOSURE_SCALE = 3.0
+"""Distance (pixels) by which flow there and back misses its start, at which the gate is 1/e."""
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """What the true episode teaches of its robot's looks."""
+
+    colour: np.ndarray
+    """[bins bins bins] float32, log-likelihood ratio robot : rest of a Lab colour."""
+    background: np.ndarray
+    """[h w 3] uint8, the scene without the robot; what no frame uncovers is filled in from around."""
+    difference: np.ndarray
+    """[256] float32, log-likelihood ratio robot : rest of the largest channel difference from the background."""
+    uncovered: np.ndarray
+    """[h w] bool, where the background was seen in some frame."""
+
+
+def estimate_masks(prediction: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:
+    """Robot masks of a predicted video.
+
+    Args:
+        prediction, target: [t h w 3] uint8 RGB, predicted and true video of one episode, same frames.
+        target_mask: [t h w] bool, true robot masks.
+
+    Returns:
+        [t h w] bool.
+    """
+    appearance = learn_appearance(target, target_mask)
+    frames = zip(prediction, target, target_mask, strict=True)
+    return np.stack([_estimate_frame(appearance, *frame) for frame in frames])
+
+
+def learn_appearance(video: np.ndarray, mask: np.ndarray) -> Appearance:
+    """Learn the looks of a robot and its background from true video [t h w 3] uint8 and masks [t h w] bool."""
+    picked = np.unique(np.linspace(0, len(video) - 1, LEARNING_FRAMES).round().astype(int))
+    video, mask = video[picked], mask[picked]
+    background, uncovered = _background(video, mask)
+    colour = _colour_bins(video)
+    difference = np.stack([_difference(frame, background) for frame in video])
+    seen = np.broadcast_to(uncovered, mask.shape)
+    return Appearance(
+        colour=_log_ratio(colour, mask, COLOUR_BINS**3, smooth=(COLOUR_BINS,) * 3),
+        background=background,
+        difference=_log_ratio(difference[seen], mask[seen], 256, smooth=(256,)),
+        uncovered=uncovered,
+    )
+
+
+def _estimate_frame(appearance: Appearance, frame: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:
+    colour = appearance.colour.reshape(-1)[_colour_bins(frame)]
+    difference = appearance.difference[_difference(frame, appearance.background)]
+    looks = np.clip(colour, -EVIDENCE_LIMIT, EVIDENCE_LIMIT)
+    looks += np.where(appearance.uncovered, np.clip(difference, -EVIDENCE_LIMIT, EVIDENCE_LIMIT), 0)
+    score = cv2.GaussianBlur(looks.astype(np.float32), (0, 0), 0.8) + _shape_evidence(frame, target, target_mask)
+    return score > 0
+
+
+def _shape_evidence(frame: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:
+    """[h w] float32: the target's mask carried onto the frame by flow, gated by how well flow explains the pixel."""
+    grey, grey_target = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame, target))
+    there, back = _flow(grey, grey_target), _flow(grey_target, grey)
+    source = _grid(grey.shape) + there
+    closure = np.linalg.norm(there + _sample(back, source), axis=-1)
+    residual = np.abs(frame.astype(np.float32) - _sample(target.astype(np.float32), source)).max(axis=-1)
+    gate = np.exp(-((residual / RESIDUAL_SCALE) ** 2) - (closure / CLOSURE_SCALE) ** 2)
+    return SHAPE_WEIGHT * gate * np.tanh(_sample(_signed_distance(target_mask), source) / SHAPE_REACH)
+
+
+def _flow(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """[h w 2] pixels from each pixel of one grey image to its place in the other (DIS)."""
+    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(start, end, None)
+
+
+def _grid(shape: tuple[int, ...]) -> np.ndarray:
+    """[h w 2] float32, x and y of each pixel."""
+    return np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1).astype(np.float32)
+
+
+def _sample(image: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The image read at points [h w 2] between its pixels."""
+    return cv2.remap(image, points[..., 0], points[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _signed_distance(mask: np.ndarray) -> np.ndarray:
+    """[h w] float32, distance to the contour [pixels], positive inside."""
+    inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
+    outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)
+    return np.where(mask, np.minimum(inside, 1e3) - 0.5, 0.5 - np.minimum(outside, 1e3)).astype(np.float32)
+
+
+def _background(video: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Median over time of the frames that show each pixel without the robot; [h w 3] uint8, and where there are any."""
+    hidden = np.broadcast_to(mask[..., None], video.shape)
+    rank = np.sort(np.where(hidden, 256, video.astype(np.int16)), axis=0)
+    shown = np.count_nonzero(~mask, axis=0)
+    middle = np.maximum(shown - 1, 0) // 2
+    median = np.take_along_axis(rank, np.broadcast_to(middle[None, :, :, None], (1, *video.shape[1:])), axis=0)[0]
+    uncovered = shown > 0
+    plate = np.where(uncovered[..., None], median, 0).astype(np.uint8)
+    return cv2.inpaint(plate, (~uncovered).astype(np.uint8), 3, cv2.INPAINT_TELEA), uncovered
+
+
+def _difference(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
+    return cv2.absdiff(frame, background).max(axis=-1)
+
+
+def _colour_bins(video: np.ndarray) -> np.ndarray:
+    """Index of each pixel's Lab colour among the bins."""
+    flat = video.reshape(-1, video.shape[-2], 3)
+    lab = cv2.cvtColor(flat, cv2.COLOR_RGB2LAB).reshape(video.shape).astype(np.int32) * COLOUR_BINS // 256
+    return (lab[..., 0] * COLOUR_BINS + lab[..., 1]) * COLOUR_BINS + lab[..., 2]
+
+
+def _log_ratio(values: np.ndarray, robot: np.ndarray, count: int, smooth: tuple[int, ...]) -> np.ndarray:
+    """log p(value | robot) / p(value | rest) of integers below count, from smoothed histograms of the shape `smooth`."""
+    ratio = []
+    for members in (values[robot], values[~robot]):
+        histogram = np.bincount(members, minlength=count).reshape(smooth).astype(np.float64)
+        ratio.append((_blur(histogram) + 1e-9) / max(len(members), 1))
+    floor = 1e-6
+    return np.log((ratio[0] + floor) / (ratio[1] + floor)).astype(np.float32)
+
+
+def _blur(histogram: np.ndarray) -> np.ndarray:
+    """Each bin shared with its neighbours along every axis, 1 : 2 : 1."""
+    for axis in range(histogram.ndim):
+        padded = np.pad(histogram, [(1, 1) if i == axis else (0, 0) for i in range(histogram.ndim)], mode="edge")
+        before, after = (np.take(padded, range(s, s + histogram.shape[axis]), axis) for s in (0, 2))
+        histogram = 0.25 * before + 0.5 * histogram + 0.25 * after
+    return histogram
