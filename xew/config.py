@@ -1,0 +1,172 @@
+"""Strict configs for all rooms: YAML -> frozen dataclasses, overridden from the command line, saved with the run.
+
+Whatever a user gets wrong (a missing file, an unknown key, a wrong type, an unknown name) raises ConfigError with what
+was found, what was expected and what to do; `user_errors` turns it into that message and exit code 2.
+"""
+
+import dataclasses
+import difflib
+import functools
+import importlib
+import json
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cattrs
+import tyro
+import yaml
+
+from xew.episode import EpisodeError
+
+T = TypeVar("T")
+Parameters = TypeVar("Parameters")
+
+
+class ConfigError(Exception):
+    """A user's setting cannot be used; the message says what to do."""
+
+
+def load(cls: type[T], path: Path | str, overrides: Sequence[str] = ()) -> T:
+    """Read a YAML file into the frozen dataclass `cls`, then apply overrides such as `--train.steps 100`.
+
+    Raises:
+        ConfigError: no such file, not YAML, unknown key, missing key or wrong type.
+        SystemExit: an override is unknown or malformed (tyro has told so; code 2), or asks for --help (code 0).
+    """
+    loaded = parse(cls, read_yaml(path), str(path))
+    if not overrides:
+        return loaded
+    return tyro.cli(cls, args=list(overrides), default=loaded, prog=f"… {path}")
+
+
+def read_yaml(path: Path | str) -> Any:
+    """The content of a YAML file. Raises ConfigError if it is missing or not YAML."""
+    path = Path(path)
+    try:
+        return yaml.safe_load(path.read_text())
+    except OSError as error:
+        beside = sorted(str(p) for p in path.parent.glob("*.yaml"))
+        known = f" There is: {', '.join(beside)}." if beside else ""
+        raise ConfigError(f"cannot read the config {path}: {error.strerror or error}.{known}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not YAML: {error}") from error
+
+
+def parse(cls: type[T], content: Any, source: str) -> T:
+    """Structure plain YAML content as the frozen dataclass `cls`; `source` names it in errors."""
+    if not isinstance(content, Mapping):
+        raise ConfigError(f"{source}: expected keys and values, found {type(content).__name__}.")
+    try:
+        return CONVERTER.structure(content, cls)
+    except (cattrs.BaseValidationError, ValueError, TypeError) as error:
+        reasons = cattrs.transform_error(error, path="", format_exception=_reason)
+        raise ConfigError("\n".join(f"{source}: {_tidy(reason)}" for reason in reasons)) from error
+
+
+def save(config: Any, path: Path) -> None:
+    """Write the resolved config as YAML that `load` reads back to an equal object."""
+    path.write_text(yaml.safe_dump(CONVERTER.unstructure(config), sort_keys=False, allow_unicode=True))
+
+
+def digest(config: Any) -> str:
+    """A canonical text of a config, equal for equal configs."""
+    return json.dumps(CONVERTER.unstructure(config), sort_keys=True)
+
+
+def pick(registry: Mapping[str, T], name: str, kind: str) -> T:
+    """The entry of a registry, or for `module:NAME` an object imported from outside.
+
+    Raises:
+        ConfigError: neither exists; the nearest name is suggested.
+    """
+    if name in registry:
+        return registry[name]
+    if ":" in name:
+        module, _, attribute = name.partition(":")
+        try:
+            return getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError) as error:
+            raise ConfigError(f"cannot import the {kind} {name!r}: {error}.") from error
+    raise ConfigError(f"unknown {kind} {name!r};{suggestion(name, registry)} known: {', '.join(registry)}, or module:NAME.")
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """' did you mean …?' or nothing."""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f" did you mean {close[0]!r}?" if close else ""
+
+
+def user_errors(main: Callable[..., T]) -> Callable[..., T]:
+    """Decorate a command: a user's mistake prints its message on stderr and exits with code 2, without a traceback."""
+
+    @functools.wraps(main)
+    def guarded(*args: Any, **kwargs: Any) -> T:
+        try:
+            return main(*args, **kwargs)
+        except (ConfigError, EpisodeError) as error:
+            print(f"error: {error}", file=sys.stderr)
+            raise SystemExit(2) from None
+
+    return guarded
+
+
+def _exact(kind: type, accepts: tuple[type, ...]) -> Callable[[Any, type], Any]:
+    """A structure hook that converts nothing: YAML's own types are what a config means."""
+
+    def structure(value: Any, _: type) -> Any:
+        if kind is float and isinstance(value, str):
+            value = _yaml_1_2_float(value)
+        if not isinstance(value, accepts) or (isinstance(value, bool) and kind is not bool):
+            raise TypeError(f"expected {kind.__name__}, found {type(value).__name__} {value!r}")
+        return kind(value)
+
+    return structure
+
+
+def _yaml_1_2_float(text: str) -> float | str:
+    """PyYAML reads 5e-5 as text (YAML 1.1 wants 5.0e-5); people mean the number."""
+    try:
+        return float(text) if "e" in text.lower() else text
+    except ValueError:
+        return text
+
+
+def _structure_names(value: Any, kind: type) -> tuple[str, ...]:
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise TypeError(f"expected a list, found {type(value).__name__} {value!r}")
+    return CONVERTER_OF_TUPLES.structure(value, kind)
+
+
+def _reason(error: BaseException, kind: type | None) -> str:
+    """What is wrong, for people: unknown keys with a suggestion, the rest as told."""
+    if isinstance(error, cattrs.ForbiddenExtraKeysError):
+        known = [field.name for field in dataclasses.fields(error.cl)]
+        return " ".join(
+            f"unknown key {key!r};{suggestion(key, known)} known: {', '.join(known)}." for key in error.extra_fields
+        )
+    if isinstance(error, KeyError):
+        return f"missing key {error.args[0]!r}."
+    if dataclasses.is_dataclass(kind) and isinstance(error, TypeError):
+        return "expected keys and values below it."
+    return str(error)
+
+
+def _tidy(reason: str) -> str:
+    """cattrs appends ' @ .path'; put the path first."""
+    message, _, path = reason.rpartition(" @ ")
+    return f"{path.lstrip('.')}: {message}" if path.strip(".") else message or reason
+
+
+def _converter() -> cattrs.Converter:
+    converter = cattrs.Converter(forbid_extra_keys=True)
+    for kind, accepts in ((bool, (bool,)), (int, (int,)), (float, (int, float)), (str, (str,))):
+        converter.register_structure_hook(kind, _exact(kind, accepts))
+    converter.register_unstructure_hook(tuple, list)
+    return converter
+
+
+CONVERTER_OF_TUPLES = _converter()
+CONVERTER = _converter()
+CONVERTER.register_structure_hook_func(lambda kind: getattr(kind, "__origin__", None) is tuple, _structure_names)

@@ -1,0 +1,96 @@
+"""What the model is told of a robot's motion (ACTIONS) and looks (CONDITIONS), made from commands alone.
+
+Reads  a `Command`: which robot, its commanded joints, the camera, and the robot-only render of those commands
+Writes uint8 [t h w 3] pictures for the codec, or float32 [t 16] numbers
+To add one: a function of a Command and one line in ACTIONS or CONDITIONS; from outside the repo, `module:NAME` of a
+`Condition`.
+
+A Command holds nothing that was measured or seen in the scene, so that no condition can show the future.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from xew.episode import Record, States, read_video
+
+if TYPE_CHECKING:
+    from xew.sim_warp.streams import CommandStreams
+
+WHITE = 255
+
+
+@dataclass(frozen=True)
+class Command:
+    """Everything a condition may be made from."""
+
+    robot: str
+    action: np.ndarray
+    """[t 16] float32, commanded joints."""
+    intrinsics: np.ndarray
+    """[3 3] head camera's K."""
+    extrinsics: np.ndarray
+    """[4 4] world to camera."""
+    render_path: Path
+    """The stored robot-only video, posed by `action` on a white ground."""
+
+    @cached_property
+    def render(self) -> np.ndarray:
+        """uint8 [t h w 3], the stored robot-only video."""
+        return read_video(self.render_path)
+
+    @cached_property
+    def streams(self) -> "CommandStreams":
+        """What the simulator makes of the commands. Warp is imported here and not before."""
+        from xew.sim_warp import camera, streams
+
+        return streams.command_streams(self.robot, self.action, camera.Camera(self.intrinsics, self.extrinsics))
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One kind of condition and the stream of the network that it feeds."""
+
+    name: str
+    """Also its name in the latent cache."""
+    stream: Literal["action", "embodiment", "joints"]
+    make: Callable[[Command], np.ndarray]
+    """uint8 [t h w 3], or float32 [t 16] for the stream joints."""
+    aligned: bool = True
+    """One frame for each frame of the episode; else a short description (4 k + 1 frames) that every chunk reuses."""
+
+
+def command_of(folder: Path, record: Record, states: States) -> Command:
+    """The part of an episode that conditions may see."""
+    return Command(record.robot, states.action, states.intrinsics, states.extrinsics, folder / "robot.mkv")
+
+
+def joints(command: Command) -> np.ndarray:
+    """The canonical 16 commanded joint positions and grippers of every frame."""
+    return command.action
+
+
+def robot_render(command: Command) -> np.ndarray:
+    """The robot alone at every frame."""
+    return command.render
+
+
+def robot_mask(command: Command) -> np.ndarray:
+    """The robot's silhouette at every frame, white on black."""
+    silhouette = (command.render < WHITE).any(-1, keepdims=True)
+    return np.broadcast_to(np.where(silhouette, WHITE, 0).astype(np.uint8), command.render.shape)
+
+
+ACTIONS: dict[str, Condition | None] = {
+    "none": None,
+    "mask": Condition("mask", "action", robot_mask),
+    "joints": Condition("joints", "joints", joints),
+}
+CONDITIONS: dict[str, Condition | None] = {
+    "none": None,
+    "robot_render": Condition("robot_render", "embodiment", robot_render),
+}

@@ -1,0 +1,162 @@
+"""The config of a world-model experiment: what configs/*.yaml hold. Fields without a default must be given."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from xew.config import ConfigError, load, pick
+from xew.model.codec import CODECS, TEMPORAL_FACTOR, latent_frames
+from xew.model.conditions import ACTIONS, CONDITIONS, Condition
+from xew.model.dit import MODELS, PATCH, WorldModel
+from xew.model.text import TEXT_ENCODERS
+from xew.protocol import SPLITS, Split
+
+
+@dataclass(frozen=True)
+class Clip:
+    """What the model sees at once."""
+
+    frames: int
+    """4 k + 1; the first is given, the others are predicted."""
+    height: int
+    """Pixels; the camera's 320x240 is padded to this aspect ratio, then resized."""
+    width: int
+
+
+@dataclass(frozen=True)
+class CodecSettings:
+    name: str = "patch_pca"
+    spatial_factor: int = 8
+    channels: int = 48
+    fit_clips: int = 64
+    """Clips of training episodes from which the components are computed."""
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    size: str
+    """One of MODELS."""
+    action: str = "none"
+    """One of ACTIONS: how the commanded motion is shown."""
+    embodiment: str = "none"
+    """One of CONDITIONS: how the robot's looks are shown."""
+    text: str = "hashed_words"
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Of the matrix products."""
+    remat: bool = False
+    attention: Literal["xla", "cudnn"] = "xla"
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    steps: int
+    batch: int
+    seed: int = 0
+    learning_rate: float = 5e-5
+    warmup_steps: int = 0
+    decay_to: float = 1.0
+    """Cosine decay of the learning rate to this part of its peak at the last step; 1 keeps it constant."""
+    weight_decay: float = 0.01
+    clip_norm: float = 1.0
+    ema_decay: float = 0.0
+    """0 keeps no average."""
+    shift: float = 5.0
+    """Of the noise levels, in training and in sampling."""
+    log_every: int = 20
+    save_every: int = 1000
+    sample_every: int = 1000
+    keep_checkpoints: int = 2
+
+
+@dataclass(frozen=True)
+class RolloutSettings:
+    steps: int = 50
+    """Euler steps a chunk."""
+    batch: int = 4
+    max_frames: int = 0
+    """Predict only the first so many frames of an episode; 0 predicts all."""
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Experiment:
+    data: Path
+    """Episodes, made by `python -m xew.sim_warp.generate`."""
+    out: Path
+    """The run: config, checkpoints, TensorBoard, samples."""
+    clip: Clip
+    model: ModelSettings
+    train: TrainSettings
+    split: str = "fixed"
+    """One of protocol.SPLITS: which robots train."""
+    codec: CodecSettings = CodecSettings()
+    rollout: RolloutSettings = RolloutSettings()
+    cache: Path | None = None
+    """Encoded streams; beside the data where left out."""
+
+    @property
+    def cache_folder(self) -> Path:
+        return self.cache or self.data.with_name(f"{self.data.name}-latents")
+
+    @property
+    def robots(self) -> Split:
+        return pick(SPLITS, self.split, "split")
+
+    @property
+    def conditions(self) -> dict[str, Condition]:
+        """The streams beside rgb, by the name of the stream that each feeds; the key of the registry is in `.name`."""
+        chosen = (pick(ACTIONS, self.model.action, "action"), pick(CONDITIONS, self.model.embodiment, "embodiment"))
+        return {condition.stream: condition for condition in chosen if condition is not None}
+
+    @property
+    def latent_shape(self) -> tuple[int, int, int, int]:
+        """Of one RGB clip [t h w c]."""
+        factor = self.codec.spatial_factor
+        return latent_frames(self.clip.frames), self.clip.height // factor, self.clip.width // factor, self.codec.channels
+
+
+def load_experiment(path: Path | str, overrides: list[str] | None = None) -> Experiment:
+    """Read and check a config. Raises ConfigError with every choice that does not exist or does not fit."""
+    experiment = load(Experiment, path, overrides or [])
+    pick(MODELS, experiment.model.size, "model size")
+    pick(CODECS, experiment.codec.name, "codec")
+    pick(TEXT_ENCODERS, experiment.model.text, "text encoder")
+    _ = experiment.robots, experiment.conditions
+    _check_sizes(experiment, str(path))
+    return experiment
+
+
+def _check_sizes(experiment: Experiment, source: str) -> None:
+    clip, factor = experiment.clip, experiment.codec.spatial_factor * PATCH[1]
+    if clip.frames < 5 or clip.frames % TEMPORAL_FACTOR != 1:
+        near = max(5, clip.frames // TEMPORAL_FACTOR * TEMPORAL_FACTOR + 1)
+        raise ConfigError(f"{source}: clip.frames is {clip.frames}; it must be 4 k + 1 and at least 5, for example {near}.")
+    if clip.height % factor or clip.width % factor:
+        found = f"clip is {clip.width}x{clip.height}"
+        raise ConfigError(f"{source}: {found}; both sides must be multiples of {factor} (codec factor x patch).")
+
+
+def create_model(experiment: Experiment) -> WorldModel:
+    """The network of an experiment at its random start; wrap in `nnx.eval_shape` for shapes only."""
+    settings = experiment.model
+    return WorldModel(
+        MODELS[settings.size],
+        experiment.codec.channels,
+        tuple(experiment.conditions),
+        dtype=jnp.dtype(settings.dtype),
+        remat=settings.remat,
+        attention=settings.attention,
+        rngs=nnx.Rngs(experiment.train.seed),
+    )
+
+
+def compile_cache() -> None:
+    """Keep compiled programs between runs in the user's cache folder, unless JAX was told otherwise."""
+    if jax.config.jax_compilation_cache_dir is None:
+        cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "xew" / "jax"
+        jax.config.update("jax_compilation_cache_dir", str(cache))

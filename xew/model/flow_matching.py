@@ -1,0 +1,81 @@
+"""Flow matching: noise levels, the training pair, the RGB loss and the Euler sampler.
+
+x_sigma = (1 - sigma) x_0 + sigma n; the network predicts the velocity n - x_0. Latent frame 0 is the given reference:
+clean in training (up to a small perturbation), put back after every sampling step, and never in the loss.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+TRAIN_LEVELS = 1000
+REFERENCE_NOISE = 0.1
+"""Upper end of the uniform strength of the perturbation that the reference latent gets in training (FlowWAM)."""
+
+
+class TrainingPair(NamedTuple):
+    """What one training example asks of the network."""
+
+    noisy: Array
+    """[b t h w c], latent frame 0 the perturbed reference."""
+    velocity: Array
+    """[b t h w c], the target."""
+    sigma: Array
+    """[b], noise level of latent frames 1 and on."""
+
+
+def shift_sigma(sigma: np.ndarray, shift: float) -> np.ndarray:
+    """Move noise levels towards 1: s u / (1 + (s - 1) u)."""
+    return shift * sigma / (1 + (shift - 1) * sigma)
+
+
+def sampling_sigmas(steps: int, shift: float) -> np.ndarray:
+    """The `steps` + 1 levels from 1 to 0 of the Euler sampler, on the grid of DiffSynth and FlowWAM (float64)."""
+    return np.append(shift_sigma(np.linspace(1, 0, steps + 1)[:-1], shift), 0.0)
+
+
+def training_pair(key: Array, latents: Array, shift: float) -> TrainingPair:
+    """Noise latents [b t h w c]: level uniform over the shifted grid of 1000, perturbed reference in frame 0."""
+    key_level, key_noise, key_strength, key_reference = jax.random.split(key, 4)
+    batch = latents.shape[0]
+    levels = jnp.asarray(sampling_sigmas(TRAIN_LEVELS, shift)[:-1], jnp.float32)
+    sigma = levels[jax.random.randint(key_level, (batch,), 0, TRAIN_LEVELS)]
+    noise = jax.random.normal(key_noise, latents.shape, jnp.float32)
+    strength = jax.random.uniform(key_strength, (batch, 1, 1, 1, 1), maxval=REFERENCE_NOISE)
+    reference = latents[:, :1] + strength * jax.random.normal(key_reference, latents[:, :1].shape, jnp.float32)
+    level = sigma[:, None, None, None, None]
+    noisy = (1 - level) * latents + level * noise
+    return TrainingPair(jnp.concatenate([reference, noisy[:, 1:]], axis=1), noise - latents, sigma)
+
+
+def sample_losses(predicted: Array, pair: TrainingPair) -> Array:
+    """Mean squared velocity error [b] over latent frames 1 and on."""
+    return jnp.square(predicted[:, 1:] - pair.velocity[:, 1:]).mean(axis=(1, 2, 3, 4))
+
+
+def euler_sample(velocity: Callable[[Array, Array], Array], reference: Array, noise: Array, sigmas: np.ndarray) -> Array:
+    """Integrate from noise to latents.
+
+    Args:
+        velocity: (latents [b t h w c], sigma [b]) -> [b t h w c].
+        reference: [b 1 h w c], clean latent frame 0.
+        noise: [b t h w c], unit normal; its frame 0 is not used.
+        sigmas: [k + 1] decreasing levels, as from `sampling_sigmas`.
+
+    Returns:
+        [b t h w c] whose frame 0 is the reference.
+    """
+
+    def clamp(latents: Array) -> Array:
+        return jnp.concatenate([reference, latents[:, 1:]], axis=1)
+
+    def step(latents: Array, levels: Array) -> tuple[Array, None]:
+        sigma = jnp.broadcast_to(levels[0], latents.shape[:1])
+        return clamp(latents + (levels[1] - levels[0]) * velocity(latents, sigma)), None
+
+    pairs = jnp.asarray(np.stack([sigmas[:-1], sigmas[1:]], axis=1), jnp.float32)
+    return jax.lax.scan(step, clamp(noise), pairs)[0]

@@ -1,0 +1,211 @@
+"""The latent cache: every stream of every training episode goes through the codec once, and no video is read in training.
+
+Reads  episodes
+Writes <cache>/codec-KEY.npz, <cache>/<task>/<seed>/<robot>/<stream>-KEY.npy float16 [clips ...], <cache>/header.json
+
+KEY names the codec, the source data and the cut into clips, so that what is stale is not found and never mistaken.
+Command: python -m xew.model.latents CONFIG [--data … and other overrides]
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from xew.config import ConfigError, digest, user_errors
+from xew.episode import Record, episode_folder, find_accepted, read_states, read_video
+from xew.model.codec import CODECS, TEMPORAL_FACTOR, Codec
+from xew.model.conditions import Condition, command_of
+from xew.model.experiment import Experiment, load_experiment
+from xew.model.frames import to_camera_size, to_model_size
+from xew.protocol import seed_split
+
+Episode = tuple[Path, Record]
+CACHE_VERSION = 1
+
+
+@dataclass(frozen=True)
+class LatentCache:
+    """Where the encoded streams of an experiment are, and whether they are still those of its data."""
+
+    experiment: Experiment
+    codec: Codec
+
+    @property
+    def streams(self) -> dict[str, Condition | None]:
+        """The experiment's streams: rgb (no condition) and its conditions."""
+        return {"rgb": None} | dict(self.experiment.conditions)
+
+    def path(self, record: Record, stream: str) -> Path:
+        """The file of one stream of one episode."""
+        condition = self.streams[stream]
+        name = condition.name if condition else stream
+        sources = (record.hashes["rgb"],) if condition is None else (record.hashes["states"], record.hashes["robot"])
+        content = (CACHE_VERSION, self.codec.hash, digest(self.experiment.clip), name, *sources)
+        key = hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]
+        return episode_folder(self.experiment.cache_folder, record.task, record.seed, record.robot) / f"{name}-{key}.npy"
+
+    def read(self, record: Record, stream: str) -> np.ndarray:
+        """One stream of one episode, float16 [clips ...] memory-mapped; conditions that are not aligned have one clip.
+
+        Raises:
+            ConfigError: it was never encoded, or from other data, codec or clips.
+        """
+        path = self.path(record, stream)
+        try:
+            return np.load(path, mmap_mode="r")
+        except FileNotFoundError:
+            stale = list(path.parent.glob(f"{path.stem.rpartition('-')[0]}-*.npy"))
+            found = "was encoded from other data, with another codec or other clips" if stale else "is not in the cache"
+            command = f"python -m xew.model.latents CONFIG --data {self.experiment.data}"
+            raise ConfigError(f"{path.parent}: the stream {stream} {found}; encode it with `{command}`.") from None
+
+    def encode(self, episode: Episode) -> int:
+        """Encode what is missing of one episode; returns the number of bytes written."""
+        folder, record = episode
+        missing = [name for name in self.streams if not self.path(record, name).exists()]
+        if not missing:
+            return 0
+        starts = clip_starts(record.frame_count, self.experiment.clip.frames)
+        videos = stream_videos(self.experiment, folder, record, missing)
+        return sum(_write(self.path(record, name), self._encode_stream(name, video, starts)) for name, video in videos.items())
+
+    def _encode_stream(self, name: str, video: np.ndarray, starts: Sequence[int]) -> np.ndarray:
+        condition = self.streams[name]
+        starts = starts if condition is None or condition.aligned else (0,)
+        return np.stack([encode_clip(self.codec, condition, video, start, self.experiment.clip.frames) for start in starts])
+
+
+def clip_starts(frame_count: int, frames: int) -> tuple[int, ...]:
+    """First frames of an episode's clips: those of the rollout's chunks that fit, and the last that fits."""
+    last = max(frame_count - frames, 0)
+    return tuple(sorted({*range(0, last + 1, frames - 1), last}))
+
+
+def stream_videos(experiment: Experiment, folder: Path, record: Record, streams: Sequence[str]) -> dict[str, np.ndarray]:
+    """Whole-episode input of the named streams: uint8 [t h w 3] at the model's size, or float32 [t 16]."""
+    conditions = {name: condition for name, condition in experiment.conditions.items() if name in streams}
+    videos = {"rgb": read_video(folder / "rgb.mkv")} if "rgb" in streams else {}
+    if conditions:
+        command = command_of(folder, record, read_states(folder))
+        videos |= {name: condition.make(command) for name, condition in conditions.items()}
+    clip = experiment.clip
+    return {name: to_model_size(v, clip.height, clip.width) if v.ndim == 4 else v for name, v in videos.items()}
+
+
+def encode_clip(codec: Codec, condition: Condition | None, video: np.ndarray, start: int, frames: int) -> np.ndarray:
+    """One clip of one stream as the network takes it: latents [t' h' w' c] or joint positions [t' 16].
+
+    Past the end the last frame is repeated. A condition that is not aligned is encoded whole.
+    """
+    if condition is None or condition.aligned:
+        video = video[np.minimum(np.arange(start, start + frames), len(video) - 1)]
+    if video.ndim == 2:
+        return video[::TEMPORAL_FACTOR].astype(np.float32)
+    return codec.encode(video)
+
+
+def training_episodes(experiment: Experiment) -> list[Episode]:
+    """Accepted episodes of training seeds and training robots. Raises ConfigError or EpisodeError if there are none."""
+    robots = experiment.robots.train_robots
+    accepted = find_accepted(experiment.data)
+    chosen = [(f, r) for f, r in accepted if r.robot in robots and seed_split(r.seed) == "train"]
+    if not chosen:
+        command = f"python -m xew.sim_warp.generate --robots {' '.join(robots)} --out {experiment.data}"
+        raise ConfigError(f"{experiment.data} has no training episode of {', '.join(robots)}; make some: {command}")
+    return chosen
+
+
+def test_episodes(data: Path, robots: Sequence[str]) -> list[Episode]:
+    """Accepted episodes of test seeds of the given robots, possibly none."""
+    return [(f, r) for f, r in find_accepted(data) if r.robot in robots and seed_split(r.seed) == "test"]
+
+
+def codec_path(experiment: Experiment, episodes: Sequence[Episode]) -> Path:
+    """Where the codec fitted on these episodes is kept."""
+    hashes = [(record.hashes["rgb"], record.hashes["robot"]) for _, record in episodes]
+    content = (CACHE_VERSION, digest(experiment.codec), digest(experiment.clip), hashes)
+    return experiment.cache_folder / f"codec-{hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]}.npz"
+
+
+def load_codec(experiment: Experiment, episodes: Sequence[Episode]) -> Codec:
+    """The codec that was fitted on these episodes. Raises ConfigError if `latents` has not been run for them."""
+    path = codec_path(experiment, episodes)
+    if not path.exists():
+        command = f"python -m xew.model.latents CONFIG --data {experiment.data}"
+        raise ConfigError(f"no codec fitted on {experiment.data} as it is now under {path.parent}; run `{command}`.")
+    return CODECS[experiment.codec.name].load(path)
+
+
+def fit_codec(experiment: Experiment, episodes: Sequence[Episode]) -> Codec:
+    """Fit the codec on evenly chosen clips, scene and robot-only, of training episodes, and keep it."""
+    settings, clip = experiment.codec, experiment.clip
+    chosen = [episodes[i] for i in np.linspace(0, len(episodes) - 1, min(len(episodes), settings.fit_clips // 2)).astype(int)]
+    clips = []
+    for number, (folder, record) in enumerate(tqdm(chosen, desc="fit codec", disable=not sys.stderr.isatty())):
+        starts = clip_starts(record.frame_count, clip.frames)
+        start = starts[number % len(starts)]
+        for name in ("rgb", "robot"):
+            video = read_video(folder / f"{name}.mkv")[start : start + clip.frames]
+            video = video[np.minimum(np.arange(clip.frames), len(video) - 1)]
+            clips.append(to_model_size(video, clip.height, clip.width))
+    codec = CODECS[settings.name].fit(clips, settings.spatial_factor, settings.channels)
+    path = codec_path(experiment, episodes)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    codec.save(path)
+    return codec
+
+
+def ceiling_psnr(experiment: Experiment, codec: Codec, episodes: Sequence[Episode]) -> float:
+    """Mean PSNR [dB] at the camera's size of encoding and decoding one clip of each episode: no rollout can do better."""
+    clip, values = experiment.clip, []
+    for folder, _ in episodes:
+        video = read_video(folder / "rgb.mkv")[: clip.frames]
+        video = video[np.minimum(np.arange(clip.frames), len(video) - 1)]
+        decoded = to_camera_size(codec.decode(codec.encode(to_model_size(video, clip.height, clip.width))))
+        error = np.square(decoded.astype(np.float32) - video).mean(axis=(1, 2, 3))
+        values.append(10 * np.log10(255**2 / np.maximum(error, 1e-6)).mean())
+    return float(np.mean(values))
+
+
+def _write(path: Path, array: np.ndarray) -> int:
+    """Save atomically as float16; returns the size in bytes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    with temporary.open("wb") as file:
+        np.save(file, array.astype(np.float16))
+    os.replace(temporary, path)
+    return array.size * 2
+
+
+@user_errors
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m xew.model.latents", description=__doc__.splitlines()[0])
+    parser.add_argument("config", type=Path, help="a YAML file such as configs/debug.yaml")
+    args, overrides = parser.parse_known_args(arguments)
+    experiment = load_experiment(args.config, overrides)
+    episodes = training_episodes(experiment)
+    fitted = codec_path(experiment, episodes).exists()
+    codec = load_codec(experiment, episodes) if fitted else fit_codec(experiment, episodes)
+    cache = LatentCache(experiment, codec)
+    written = sum(cache.encode(episode) for episode in tqdm(episodes, desc="encode", unit="episode"))
+    ceiling_on = (test_episodes(experiment.data, experiment.robots.held_out_robots) or episodes)[:8]
+    ceiling = ceiling_psnr(experiment, codec, ceiling_on)
+    header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip), "streams": list(cache.streams)}
+    header |= {"episodes": len(episodes), "ceiling_psnr": ceiling}
+    (experiment.cache_folder / "header.json").write_text(json.dumps(header, indent=1) + "\n")
+    print(
+        f"{experiment.cache_folder}: {len(episodes)} episodes, streams {', '.join(cache.streams)}, {written / 1e6:.1f} MB new"
+    )
+    print(f"codec ceiling: PSNR {ceiling:.2f} dB at camera size over {len(ceiling_on)} episodes")
+
+
+if __name__ == "__main__":
+    main()

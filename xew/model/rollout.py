@@ -1,0 +1,198 @@
+"""Rollouts: a trained model predicts episodes from their first frame and their commands.
+
+Reads  a run, episodes
+Writes <out>/<task>/<seed>/<robot>/rgb.mkv (lossless, 320x240) and rollout.json
+
+Long episodes are predicted in chunks; the last predicted frame of one is the reference of the next.
+Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … --out …]
+"""
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import tempfile
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from tqdm import tqdm
+
+from xew.config import CONVERTER, ConfigError, suggestion, user_errors
+from xew.episode import EpisodeError, episode_folder, find_accepted, write_video
+from xew.model.checkpoint import load_run, restore_params
+from xew.model.codec import Codec
+from xew.model.data import Batch, encode_text
+from xew.model.experiment import Experiment, compile_cache, create_model
+from xew.model.flow_matching import euler_sample, sampling_sigmas
+from xew.model.frames import to_camera_size
+from xew.model.latents import Episode, encode_clip, stream_videos
+from xew.protocol import ROBOT_NAMES, seed_split
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """A trained model that continues videos."""
+
+    experiment: Experiment
+    codec: Codec
+    graph: nnx.GraphDef
+    params: Any
+
+    def predict(self, episodes: Sequence[Episode], frame_count: int) -> np.ndarray:
+        """The first `frame_count` frames of each episode, predicted from its first: uint8 [b t h w 3] at the model's size.
+
+        Frame 0 is the codec's view of the given one. The noise depends on the episode and the chunk, not on the batch.
+        """
+        names = ("rgb", *self.experiment.conditions)
+        streams = [stream_videos(self.experiment, folder, record, names) for folder, record in episodes]
+        reference = np.stack([stream["rgb"][:1] for stream in streams])
+        horizon = self.experiment.clip.frames - 1
+        frames: list[np.ndarray] = []
+        for chunk, start in enumerate(range(0, max(frame_count - 1, 1), horizon)):
+            keys = [self._key(episode, chunk) for episode in episodes]
+            predicted = self._predict_chunk(episodes, streams, reference, start, keys)
+            frames.append(predicted[:, 1:] if frames else predicted)
+            reference = predicted[:, -1:]
+        return np.concatenate(frames, axis=1)[:, :frame_count]
+
+    def _key(self, episode: Episode, chunk: int) -> jax.Array:
+        _, record = episode
+        name = zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode())
+        return jax.random.fold_in(jax.random.fold_in(jax.random.key(self.experiment.rollout.seed), name), chunk)
+
+    def _predict_chunk(
+        self,
+        episodes: Sequence[Episode],
+        streams: Sequence[dict[str, np.ndarray]],
+        reference: np.ndarray,
+        start: int,
+        keys: Sequence[jax.Array],
+    ) -> np.ndarray:
+        """One clip of each episode [b t h w 3] from reference frames [b 1 h w 3]."""
+        frames = self.experiment.clip.frames
+        conditions = {
+            name: np.stack([encode_clip(self.codec, condition, stream[name], start, frames) for stream in streams])
+            for name, condition in self.experiment.conditions.items()
+        }
+        text = np.stack([encode_text(self.experiment, record.instruction) for _, record in episodes])
+        noise = jnp.stack([jax.random.normal(key, self.experiment.latent_shape, jnp.float32) for key in keys])
+        latents = np.stack([self.codec.encode(frame) for frame in reference])
+        sigmas = sampling_sigmas(self.experiment.rollout.steps, self.experiment.train.shift)
+        sampled = sample(self.graph, self.params, Batch(latents, conditions, text), noise, tuple(sigmas))
+        return np.stack([self.codec.decode(clip) for clip in np.asarray(sampled)])
+
+
+@jax.jit(static_argnums=(0, 4))
+def sample(graph: nnx.GraphDef, params: Any, batch: Batch, noise: jax.Array, sigmas: tuple[float, ...]) -> jax.Array:
+    """Latents [b t h w c] sampled from noise; `batch.latents` [b 1 h w c] is the reference."""
+    model = nnx.merge(graph, params)
+
+    def velocity(latents: jax.Array, sigma: jax.Array) -> jax.Array:
+        return model(latents, batch.conditions, sigma, batch.text)
+
+    return euler_sample(velocity, batch.latents, noise, np.asarray(sigmas))
+
+
+def select_episodes(data: Path, split: str, robots: Sequence[str]) -> list[Episode]:
+    """Accepted episodes of a seed family and of the given robots. Raises ConfigError if there is none."""
+    for robot in robots:
+        if robot not in ROBOT_NAMES:
+            raise ConfigError(f"unknown robot {robot!r};{suggestion(robot, ROBOT_NAMES)} known: {', '.join(ROBOT_NAMES)}.")
+    chosen = [(f, r) for f, r in find_accepted(data) if seed_split(r.seed) == split and r.robot in robots]
+    if not chosen:
+        raise EpisodeError(
+            f"{data} has no {split} episode of {', '.join(robots)}; run python -m xew.sim_warp.generate --out {data}"
+        )
+    return chosen
+
+
+def rollout_header(experiment: Experiment, step: int, episode: Episode) -> dict[str, Any]:
+    """rollout.json: what was predicted, from what, with what."""
+    _, record = episode
+    limit = experiment.rollout.max_frames
+    frames = min(record.frame_count, limit) if limit else record.frame_count
+    identity = {"task": record.task, "seed": record.seed, "robot": record.robot}
+    source = {"source_hash": record.hashes["rgb"], "frame_count": frames, "episode_frame_count": record.frame_count}
+    return identity | source | {"checkpoint_step": step, "config": CONVERTER.unstructure(experiment)}
+
+
+def is_done(out: Path, header: dict[str, Any]) -> bool:
+    """Whether this very rollout is there already."""
+    folder = episode_folder(out, header["task"], header["seed"], header["robot"])
+    try:
+        return json.loads((folder / "rollout.json").read_text()) == header and (folder / "rgb.mkv").exists()
+    except (OSError, ValueError):
+        return False
+
+
+def write_rollout(out: Path, header: dict[str, Any], video: np.ndarray) -> None:
+    """Write one rollout atomically; video uint8 [t 240 320 3]."""
+    folder = episode_folder(out, header["task"], header["seed"], header["robot"])
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        write_video(temporary / "rgb.mkv", video)
+        (temporary / "rollout.json").write_text(json.dumps(header, indent=1) + "\n")
+        shutil.rmtree(folder, ignore_errors=True)
+        os.rename(temporary, folder)
+    except OSError as error:
+        raise EpisodeError(f"cannot write the rollout {folder}: {error}; free some space or choose another --out.") from error
+
+
+def batches(pending: list[tuple[Episode, dict[str, Any]]], size: int) -> Iterator[list[tuple[Episode, dict[str, Any]]]]:
+    """Groups of episodes of similar length, so that few chunks are computed for nothing."""
+    ordered = sorted(pending, key=lambda item: item[1]["frame_count"])
+    for start in range(0, len(ordered), size):
+        yield ordered[start : start + size]
+
+
+def predict_and_write(predictor: Predictor, group: list[tuple[Episode, dict[str, Any]]], out: Path) -> None:
+    """Roll out a group of episodes and write each as long as its header says."""
+    size = predictor.experiment.rollout.batch
+    episodes = [episode for episode, _ in group]
+    padded = episodes + [episodes[-1]] * (size - len(episodes))
+    videos = predictor.predict(padded, max(header["frame_count"] for _, header in group))
+    for (_, header), video in zip(group, videos, strict=False):
+        write_rollout(out, header, to_camera_size(video[: header["frame_count"]]))
+
+
+def load_predictor(run: Path) -> tuple[Predictor, int]:
+    """The model of a run at its latest checkpoint, and that checkpoint's step."""
+    experiment, codec = load_run(run)
+    graph, params = nnx.split(create_model(experiment), nnx.Param)
+    params, step = restore_params(run, params)
+    return Predictor(experiment, codec, graph, params), step
+
+
+@user_errors
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m xew.model.rollout", description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, help="folder of a trained run")
+    parser.add_argument("--data", type=Path, help="episodes (default: those of the run's config)")
+    parser.add_argument("--split", choices=("test", "train"), default="test", help="seed family (default: test)")
+    parser.add_argument("--robots", nargs="+", default=ROBOT_NAMES, metavar="ROBOT", help="default: all five")
+    parser.add_argument("--out", type=Path, help="default: rollouts/<name of the run>")
+    args = parser.parse_args(arguments)
+    compile_cache()
+    predictor, step = load_predictor(args.run)
+    out = args.out or Path("rollouts") / args.run.name
+    episodes = select_episodes(args.data or predictor.experiment.data, args.split, args.robots)
+    headers = [(episode, rollout_header(predictor.experiment, step, episode)) for episode in episodes]
+    pending = [item for item in headers if not is_done(out, item[1])]
+    with tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress:
+        for group in batches(pending, predictor.experiment.rollout.batch):
+            predict_and_write(predictor, group, out)
+            progress.update(len(group))
+    print(f"{out}: {len(pending)} rollouts new, {len(headers) - len(pending)} there before, checkpoint {step}")
+
+
+if __name__ == "__main__":
+    main()
