@@ -3,7 +3,8 @@
 A rollout tree mirrors the data set, `<rollouts>/<task>/<seed>/<robot>/`, and holds in each folder
     one video       rgb.mkv as our own model writes it (FFV1, lossless), or any one *.mkv, *.mp4 or *.npz (one array
                     [t h w 3] uint8), or PNG files whose sorted names are the frames; native size, frame 0 the given frame
-    rollout.json    optional: model, condition, frames (how many were asked for), and what else the model wants to say
+    rollout.json    optional: model, condition, frame_count (frames that were asked for), source_hash (of the episode's rgb),
+                    and what else the model wants to say
 Without rollout.json the model is named after the tree's folder and the video must be as long as its episode.
 """
 
@@ -23,7 +24,7 @@ from xew.episode import EpisodeError, episode_folder, read_video, write_video
 VIDEO_SUFFIXES = (".mkv", ".mp4", ".npz")
 
 
-class RolloutError(Exception):
+class RolloutError(EpisodeError):
     """A rollout is missing or is not as it should be; the message says what to do."""
 
 
@@ -37,7 +38,7 @@ class Rollout:
     robot: str
     model: str
     condition: str
-    frames: int | None
+    frame_count: int | None
     """Frames that were asked for, counted from the episode's first; None: all of them."""
     video: tuple[Path, ...]
     """One file of many frames, or the PNG files of one frame each."""
@@ -52,7 +53,7 @@ def write_rollout(root: Path, task: str, seed: int, robot: str, video: np.ndarra
         root: of the rollout tree.
         task, seed, robot: the episode that is predicted.
         video: [t h w 3] uint8 RGB at the camera's size, the given first frame included.
-        header: goes to rollout.json; model and condition belong there, frames is filled in.
+        header: goes to rollout.json; model and condition belong there, frame_count is filled in.
 
     Raises:
         RolloutError: the folder cannot be written or the disk is full; nothing half-written remains.
@@ -63,7 +64,7 @@ def write_rollout(root: Path, task: str, seed: int, robot: str, video: np.ndarra
         folder.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
         write_video(temporary / "rgb.mkv", video)
-        (temporary / "rollout.json").write_text(json.dumps(header | {"frames": len(video)}, indent=1) + "\n")
+        (temporary / "rollout.json").write_text(json.dumps(header | {"frame_count": len(video)}, indent=1) + "\n")
         if folder.exists():
             shutil.rmtree(folder)
         os.rename(temporary, folder)
@@ -85,7 +86,7 @@ def find_rollouts(root: Path) -> list[Rollout]:
     folders = [folder for folder in sorted(root.glob("*/*/*")) if folder.is_dir() and not folder.name.startswith(".")]
     if not folders:
         raise RolloutError(
-            f"no rollout under {root}; expected <task>/<seed>/<robot>/ folders. Make some: python -m xew.model.rollout RUN --out {root}"
+            f"no rollout under {root}, expected <task>/<seed>/<robot>/; make some: python -m xew.model.rollout RUN --out {root}"
         )
     return [read_rollout(folder) for folder in folders]
 
@@ -94,9 +95,9 @@ def read_rollout(folder: Path) -> Rollout:
     """The rollout in a folder `<root>/<task>/<seed>/<robot>`, without its frames. Raises RolloutError as `find_rollouts`."""
     folder = Path(folder)
     header = _read_header(folder / "rollout.json")
-    frames = header.get("frames")
-    if frames is not None and (not isinstance(frames, int) or frames < 1):
-        raise RolloutError(f"{folder / 'rollout.json'}: frames is {frames!r}, expected a positive whole number.")
+    frame_count = header.get("frame_count")
+    if frame_count is not None and (not isinstance(frame_count, int) or frame_count < 1):
+        raise RolloutError(f"{folder / 'rollout.json'}: frame_count is {frame_count!r}, expected a positive whole number.")
     task, seed = folder.parts[-3:-1]
     if not seed.isdecimal():
         raise RolloutError(f"{folder}: the folder above it is {seed!r}, expected a seed; the tree is <task>/<seed>/<robot>/.")
@@ -107,7 +108,7 @@ def read_rollout(folder: Path) -> Rollout:
         robot=folder.name,
         model=str(header.get("model", folder.parents[2].name)),
         condition=str(header.get("condition", "")),
-        frames=frames,
+        frame_count=frame_count,
         video=_find_video(folder),
         header=header,
     )
@@ -138,7 +139,7 @@ def _read_header(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise RolloutError(f"{path} is damaged ({error}); make this rollout again, or delete the file.") from error
     if not isinstance(header, dict):
-        raise RolloutError(f"{path} holds {type(header).__name__}, expected an object with model, condition, frames.")
+        raise RolloutError(f"{path} holds {type(header).__name__}, expected an object with model, condition, frame_count.")
     return header
 
 
@@ -156,7 +157,7 @@ def _find_video(folder: Path) -> tuple[Path, ...]:
 
 
 def _read_pngs(paths: tuple[Path, ...]) -> np.ndarray:
-    frames = []
+    frames: list[np.ndarray] = []
     for path in paths:
         image = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if image is None:

@@ -11,30 +11,37 @@ import math
 from xew.metrics.image import psnr, ssim
 from xew.metrics.mask import boundary_f1, mask_iou
 from xew.metrics.metric import Metric
-from xew.metrics.perceptual import lpips, region_lpips
+from xew.metrics.perceptual import lpips, region_lpips, region_lpips_frames
 from xew.metrics.track import keypoint_error, ndtw, pck, trajectory_error
 
+INF = math.inf
 METRICS = {
-    "psnr": Metric(psnr, "visual", "dB", (0, math.inf), True, True, ("video",), "exact frames capped as in the paper"),
-    "ssim": Metric(ssim, "visual", "", (-1, 1), True, True, ("video",), "Wang et al. 2004, as scikit-image: uniform 7x7"),
-    "lpips": Metric(lpips, "visual", "", (0, math.inf), False, True, ("video",), "Zhang et al. 2018, AlexNet v0.1"),
-    "mask_iou": Metric(mask_iou, "morphology", "", (0, 1), True, True, ("mask",), "intersection over union"),
-    "boundary_f1": Metric(boundary_f1, "morphology", "", (0, 1), True, True, ("mask",), "contours within 2 px"),
+    "psnr": Metric(psnr, psnr, "visual", "dB", (0, INF), True, "video", "of RGB; exact frames capped as in the paper"),
+    "ssim": Metric(ssim, ssim, "visual", "", (-1, 1), True, "video", "Wang et al. 2004, as scikit-image: uniform 7x7 windows"),
+    "lpips": Metric(lpips, lpips, "visual", "", (0, INF), False, "video", "Zhang et al. 2018, AlexNet v0.1"),
+    "mask_iou": Metric(mask_iou, mask_iou, "morphology", "", (0, 1), True, "mask", "intersection over union of robot masks"),
+    "boundary_f1": Metric(boundary_f1, boundary_f1, "morphology", "", (0, 1), True, "mask", "mask contours within 2 px"),
     "region_lpips": Metric(
-        region_lpips,
-        "morphology",
-        "",
-        (0, math.inf),
-        False,
-        False,
-        ("video", "mask"),
-        "LPIPS in the box of all masks",
+        region_lpips, region_lpips_frames, "morphology", "", (0, INF), False, "region", "LPIPS in the box of all robot masks"
     ),
-    "pck": Metric(pck, "kinematics", "", (0, 1), True, False, ("track",), "nearer than 0.1 of the keypoints' box diagonal"),
-    "keypoint_error": Metric(keypoint_error, "kinematics", "px", (0, math.inf), False, False, ("track",), "mean distance"),
-    "ndtw": Metric(ndtw, "kinematics", "", (0, math.inf), False, False, ("track",), "DTW / (both lengths x mean box diagonal)"),
-    "trajectory_error": Metric(trajectory_error, "objects", "px", (0, math.inf), False, False, ("track",), "mean distance"),
+    "pck": Metric(pck, None, "kinematics", "", (0, 1), True, "track", "share within 0.1 of the keypoints' box diagonal"),
+    "keypoint_error": Metric(keypoint_error, None, "kinematics", "px", (0, INF), False, "track", "mean keypoint distance"),
+    "ndtw": Metric(ndtw, None, "kinematics", "", (0, INF), False, "track", "time warping / (lengths x mean box diagonal)"),
+    "trajectory_error": Metric(trajectory_error, None, "objects", "px", (0, INF), False, "track", "mean object distance"),
 }
 """All metrics by name, in the order of the paper's dimensions."""
 
-__all__ = ["METRICS", "Metric", *METRICS]
+__all__ = [
+    "METRICS",
+    "Metric",
+    "boundary_f1",
+    "keypoint_error",
+    "lpips",
+    "mask_iou",
+    "ndtw",
+    "pck",
+    "psnr",
+    "region_lpips",
+    "ssim",
+    "trajectory_error",
+]

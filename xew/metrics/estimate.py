@@ -97,7 +97,7 @@ def _shape_evidence(frame: np.ndarray, target: np.ndarray, target_mask: np.ndarr
 
 def _flow(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """[h w 2] pixels from each pixel of one grey image to its place in the other (DIS)."""
-    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(start, end, None)
+    return cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(start, end, None)
 
 
 def _grid(shape: tuple[int, ...]) -> np.ndarray:

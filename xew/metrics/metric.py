@@ -7,23 +7,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+INPUTS = ("video", "mask", "region", "track")
+"""video: two [t h w 3]. mask: two [t h w]. region: two videos and the target's mask. track: two [t k 2], valid [t k]."""
+
 
 @dataclass(frozen=True)
 class Metric:
     """One entry of the registry `METRICS`: all that a table or a figure needs to know of a metric."""
 
     function: Callable[..., jax.Array]
-    """Pure and jitted; image metrics give one value a frame, the others a scalar."""
+    """Pure and jitted, as users call it."""
+    curve: Callable[..., jax.Array] | None
+    """The same before the mean over frames, [t]; None where a frame has no value of its own."""
     dimension: str
     """visual, morphology, kinematics or objects: reported side by side, never collapsed."""
     unit: str
     """'' where the number has none."""
     range: tuple[float, float]
     higher_is_better: bool
-    per_frame: bool
-    """Does the function give [t], or one number for the video."""
-    needs: tuple[str, ...]
-    """What is compared: video [t h w 3], mask [t h w], or track [t k 2] with its validity [t k]."""
+    inputs: str
+    """What the functions compare, one of `INPUTS`."""
     reference: str
     """Where the definition comes from."""
 

@@ -117,15 +117,17 @@ def _region_distance(
     """
     top, left, height, width = region
 
-    def distance(frames: tuple[jax.Array, jax.Array]) -> jax.Array:
+    def distance(pair: jax.Array) -> jax.Array:
+        layers = _features(weights, pair, height, width)
+        return jnp.sum(jnp.stack([_layer_distance(weights[f"head{i}"], *layer) for i, layer in enumerate(layers)]))
+
+    def of_frames(frames: tuple[jax.Array, jax.Array]) -> jax.Array:
         pair = (_signed(jnp.stack(frames)) - SHIFT.reshape(1, 1, 1, 3)) / SCALE.reshape(1, 1, 1, 3)
         pair = _keep(jnp.roll(pair, -jnp.stack((top, left)), axis=(1, 2)), height, width)
-        layers = _features(weights, pair, height, width)
-        terms = [_layer_distance(weights[f"head{i}"], *layer) for i, layer in enumerate(layers)]
-        # The compiler may round the two halves of a pair differently; equal images are at distance 0 all the same.
-        return jnp.where(jnp.all(pair[0] == pair[1]), 0, jnp.sum(jnp.stack(terms)))
+        # Equal images are at distance 0, though the compiler may round the two halves of a pair differently.
+        return lax.cond(jnp.all(pair[0] == pair[1]), lambda _: jnp.float32(0), distance, pair)
 
-    return lax.map(distance, (prediction, target), batch_size=chunk)
+    return lax.map(of_frames, (prediction, target), batch_size=chunk if chunk > 1 else None)
 
 
 def _signed(frames: jax.Array) -> jax.Array:
