@@ -1,0 +1,110 @@
+"""The things on the table: what they look like and the convex pieces that they collide with.
+
+Each function returns a `Shape` in the object's own frame: z up, origin at the centre of the bottom face, so that an
+object stands on the table when its origin is at table height. Sizes follow RoboTwin 2.0's objects, brought down to
+what a parallel gripper of 80 mm can hold (graspable widths at most 65 mm).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from xew.sim_warp import geometry
+from xew.sim_warp.geometry import Color, Mesh
+
+WALL_SEGMENTS = 6
+"""Convex wedges round the wall of a hollow object: few enough that a finger pad lies on the flat of one."""
+FOOT = 0.0005
+"""How far the wall's wedges end above the floor [m], so that a vessel stands on its floor alone."""
+
+PALETTE: dict[str, Color] = {
+    "red": (200, 45, 40),
+    "green": (60, 150, 70),
+    "blue": (50, 90, 190),
+    "yellow": (225, 185, 50),
+    "orange": (225, 120, 45),
+    "purple": (120, 75, 160),
+    "teal": (40, 140, 145),
+    "pink": (215, 120, 150),
+}
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A rigid piece: looks, and what it collides with."""
+
+    mesh: Mesh
+    hulls: tuple[np.ndarray, ...] = ()
+    """Convex pieces, each [k 3] float32 points in the same frame; none for what is only seen."""
+
+
+def merge(*shapes: Shape) -> Shape:
+    """One rigid piece out of several in the same frame."""
+    return Shape(geometry.merge([s.mesh for s in shapes]), tuple(h for s in shapes for h in s.hulls))
+
+
+def moved(shape: Shape, xyz: tuple[float, float, float]) -> Shape:
+    return Shape(shape.mesh.transformed(xyz), tuple(h + np.float32(xyz) for h in shape.hulls))
+
+
+def block(size: tuple[float, float, float], color: Color) -> Shape:
+    """A box of full edge lengths `size` [m]."""
+    mesh = geometry.box(size, color).transformed((0, 0, size[2] / 2))
+    return Shape(mesh, (mesh.vertices,))
+
+
+def prism(radius: float, length: float, color: Color, end_color: Color | None = None, sides: int = 12) -> Shape:
+    """A rod along x that rests on one of its flat sides; `radius` [m] is that of its inscribed circle."""
+    angle = (np.arange(sides) + 0.5) * 2 * np.pi / sides - np.pi / 2
+    ring = radius / np.cos(np.pi / sides) * np.stack([np.cos(angle), np.sin(angle)], -1)
+    points = np.concatenate([np.column_stack([np.full(sides, x), ring]) for x in (-length / 2, length / 2)])
+    points[:, 2] += radius
+    body = geometry.hull(points, color)
+    caps = [
+        geometry.cylinder(radius * 1.04, 0.02, end_color or color).transformed((x, 0, radius), (0, np.pi / 2, 0))
+        for x in (-length / 2 + 0.005, length / 2 - 0.005)
+    ]
+    return Shape(geometry.merge([body, *caps]) if end_color else body, (points.astype(np.float32),))
+
+
+def disc(radius: float, height: float, color: Color, sides: int = 24) -> Shape:
+    """A flat round plate."""
+    mesh = geometry.cylinder(radius, height, color, sections=sides).transformed((0, 0, height / 2))
+    return Shape(mesh, (mesh.vertices,))
+
+
+def vessel(outline: list[tuple[float, float]], wall: float, color: Color, inside: Color | None = None) -> Shape:
+    """A hollow body of revolution: cup or bowl.
+
+    Args:
+        outline: (outer radius, height) pairs [m] from the bottom to the rim.
+        wall: thickness [m] of wall and floor.
+        color, inside: outer and inner sRGB colour.
+    """
+    outer = np.asarray(outline, float)
+    inner = np.stack([outer[:, 0] - wall, np.maximum(outer[:, 1], wall)], -1)
+    shell = geometry.revolve([(0, 0), *outer, *inner[::-1], (0, wall)], color)
+    centres = shell.vertices[shell.triangles].mean(1)
+    outward = (shell.normals.mean(1)[:, :2] * centres[:, :2]).sum(-1) >= 0
+    colors = np.where(outward[:, None], np.uint8(color), np.uint8(inside or color))
+    mesh = Mesh(shell.vertices, shell.triangles, colors, shell.normals)
+    return Shape(mesh, (*_wall_hulls(outer, inner), _ring(outer[0, 0], 0, wall)))
+
+
+def _wall_hulls(outer: np.ndarray, inner: np.ndarray) -> list[np.ndarray]:
+    """One convex wedge for each band of the outline and each segment round the axis."""
+    hulls = []
+    for angle in np.arange(WALL_SEGMENTS) * 2 * np.pi / WALL_SEGMENTS:
+        half = np.pi / WALL_SEGMENTS
+        turns = [np.array([np.cos(a), np.sin(a)]) for a in (angle - half, angle + half)]
+        for low in range(len(outer) - 1):
+            corners = [outer[low], outer[low + 1], inner[low], inner[low + 1]]
+            # The chord of a wedge lies inside its arc: reach out so that its middle has the outline's radius.
+            hulls.append(np.array([[*(r / np.cos(half) * turn), max(z, FOOT)] for r, z in corners for turn in turns], np.float32))
+    return hulls
+
+
+def _ring(radius: float, low: float, high: float) -> np.ndarray:
+    angle = np.arange(WALL_SEGMENTS) * 2 * np.pi / WALL_SEGMENTS
+    circle = radius * np.stack([np.cos(angle), np.sin(angle)], -1)
+    return np.concatenate([np.column_stack([circle, np.full(WALL_SEGMENTS, z)]) for z in (low, high)]).astype(np.float32)

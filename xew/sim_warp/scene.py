@@ -1,0 +1,126 @@
+"""Stage 1: a scene from (task, seed). It knows no robot.
+
+Reads  nothing but a counter-based random stream
+Writes `Scene`: objects with poses, masses, hinges; the same bytes for every robot
+"""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from xew.episode import array_hash
+from xew.sim_warp.objects import Shape
+
+Pose = tuple[float, float, float, float, float, float, float]
+"""x y z [m], quaternion x y z w; world frame."""
+
+
+@dataclass(frozen=True)
+class Hinge:
+    """A lid on a revolute joint whose other side is the object's own, fixed body."""
+
+    lid: Shape
+    """In the object's frame, as it lies at angle 0."""
+    mass: float
+    """kg."""
+    anchor: tuple[float, float, float]
+    """A point of the axis in the object's frame [m]."""
+    axis: tuple[float, float, float]
+    lower: float
+    """rad."""
+    upper: float
+    start: float
+    """Angle at which the scene begins [rad]."""
+    friction: float
+    """Dry friction [N m]: what keeps the lid where it is left."""
+    damping: float
+    """N m s/rad."""
+
+    def fraction(self, angle: float) -> float:
+        """How far open, 0 to 1."""
+        return (angle - self.lower) / (self.upper - self.lower)
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """One thing in the scene."""
+
+    name: str
+    shape: Shape
+    pose: Pose
+    mass: float = 0.0
+    """kg; 0 means fixed to the table."""
+    hinge: Hinge | None = None
+    friction: float = 0.6
+    """Sliding friction coefficient; a contact has the larger of its two sides'."""
+
+    @property
+    def is_fixed(self) -> bool:
+        return self.mass == 0.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What stands on the table when an episode begins, at rest."""
+
+    task: str
+    seed: int
+    objects: tuple[SceneObject, ...]
+    words: dict[str, str] = field(default_factory=dict)
+    """What the instruction's slots say of this scene (colours, sizes)."""
+    targets: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    """Places drawn with the scene that are no objects, such as where a row of blocks goes [m]."""
+
+    def index(self, name: str) -> int:
+        return self.names.index(name)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(o.name for o in self.objects)
+
+    def object(self, name: str) -> SceneObject:
+        return self.objects[self.index(name)]
+
+
+def scene_rng(task: str, seed: int) -> np.random.Generator:
+    """The random stream of one scene: a function of (task, seed), not of any order in which scenes are made."""
+    key = int.from_bytes(hashlib.sha256(task.encode()).digest()[:8], "little")
+    return np.random.Generator(np.random.Philox(key=np.array([key, seed], np.uint64)))
+
+
+def scene_hash(scene: Scene) -> str:
+    """SHA-256 over everything that the scene is made of."""
+    digest = hashlib.sha256(repr((scene.task, scene.seed, sorted(scene.words.items()), sorted(scene.targets.items()))).encode())
+    for thing in scene.objects:
+        digest.update(repr(_numbers(thing)).encode())
+        for shape in (thing.shape, *((thing.hinge.lid,) if thing.hinge else ())):
+            mesh = shape.mesh
+            digest.update(array_hash(mesh.vertices, mesh.triangles, mesh.colors, mesh.normals, *shape.hulls).encode())
+    return digest.hexdigest()
+
+
+def _numbers(thing: SceneObject) -> tuple[object, ...]:
+    """The numbers of an object without its shapes."""
+    hinge = thing.hinge
+    numbers = replace(hinge, lid=None).__dict__ if hinge else None
+    return (thing.name, thing.pose, thing.mass, thing.friction, numbers)
+
+
+def upright(x: float, y: float, z: float, yaw: float = 0.0) -> Pose:
+    """A pose turned by `yaw` [rad] about the world's z."""
+    return (float(x), float(y), float(z), 0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
+
+
+def draw(
+    rng: np.random.Generator, low: Sequence[float], high: Sequence[float], accept: Callable[[np.ndarray], bool]
+) -> np.ndarray:
+    """A uniform point of a box that `accept` takes, by rejection."""
+    for _ in range(10_000):
+        point = rng.uniform(low, high)
+        if accept(point):
+            return point
+    raise RuntimeError(
+        f"none of 10,000 points of the box {low} to {high} was accepted: the ranges of the task contradict each other"
+    )

@@ -1,0 +1,26 @@
+"""The tasks: one file each, of one shape: sample, plan, success.
+
+To add one, write a file with `TASK = Task(...)` here and add its line to `TASKS`; outside the repository write it
+anywhere importable and name it `module:TASK` wherever a task is asked for.
+"""
+
+from xew.sim_warp.tasks import (
+    beat_block_hammer,
+    blocks_ranking_rgb,
+    grab_roller,
+    open_laptop,
+    place_empty_cup,
+    stack_bowls_two,
+)
+from xew.sim_warp.tasks.task import Moment, Task
+
+__all__ = ["TASKS", "Moment", "Task"]
+
+TASKS: dict[str, Task] = {
+    "beat_block_hammer": beat_block_hammer.TASK,
+    "blocks_ranking_rgb": blocks_ranking_rgb.TASK,
+    "grab_roller": grab_roller.TASK,
+    "open_laptop": open_laptop.TASK,
+    "place_empty_cup": place_empty_cup.TASK,
+    "stack_bowls_two": stack_bowls_two.TASK,
+}

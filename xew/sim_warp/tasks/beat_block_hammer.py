@@ -1,0 +1,74 @@
+"""Task: pick up a hammer and strike a block with its face.
+
+Randomisation: the block (fixed to the table) at |x| in [.05, .25], y in [-.05, .15], yaw within 29 degrees; its colour.
+    The hammer stands on its head at (0, -.06), its handle towards the robot.
+Success: the centre of the hammer's face within 20 mm of the block's top centre in x and y, and on it (6 mm).
+After RoboTwin 2.0's beat_block_hammer.
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from xew.sim_warp import geometry, objects
+from xew.sim_warp.objects import Shape
+from xew.sim_warp.plan import Timeline, tool
+from xew.sim_warp.scene import Scene, SceneObject, draw, upright
+from xew.sim_warp.stage import TABLE_TOP
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, pick
+
+HEAD_SIZE = (0.044, 0.044, 0.075)
+HANDLE_HEIGHT = 0.045
+"""Of the handle's axis above the hammer's face [m]."""
+HANDLE_LENGTH = 0.12
+GRIP_AT = -0.085
+"""y of the grasp in the hammer's frame [m]."""
+BLOCK = 0.05
+
+
+def hammer() -> Shape:
+    """A mallet whose face is its frame's origin; the handle points along -y."""
+    head = objects.block(HEAD_SIZE, (95, 98, 105))
+    face = objects.moved(objects.block((0.036, 0.036, 0.004), (60, 62, 66)), (0, 0, HEAD_SIZE[2]))
+    handle = geometry.box((0.022, HANDLE_LENGTH, 0.026), (165, 105, 55))
+    handle = handle.transformed((0, -HEAD_SIZE[1] / 2 - HANDLE_LENGTH / 2, HANDLE_HEIGHT))
+    return objects.merge(head, Shape(face.mesh), Shape(handle, (handle.vertices,)))
+
+
+def sample(rng: np.random.Generator, seed: int) -> Scene:
+    x, y = draw(rng, [-0.25, -0.05], [0.25, 0.15], lambda p: abs(p[0]) >= 0.05 and np.hypot(*(p - [0, -0.06])) > 0.1)
+    yaw = rng.uniform(-0.5, 0.5)
+    color = rng.choice(sorted(objects.PALETTE))
+    return Scene(
+        "beat_block_hammer",
+        seed,
+        (
+            SceneObject("hammer", hammer(), upright(0, -0.06, TABLE_TOP), mass=0.2),
+            SceneObject("block", objects.block((BLOCK,) * 3, objects.PALETTE[color]), upright(x, y, TABLE_TOP, yaw)),
+        ),
+        words={"color": str(color)},
+    )
+
+
+def plan(scene: Scene) -> Timeline:
+    start, block = np.array(scene.object("hammer").pose[:3]), scene.object("block")
+    arm = arm_for(block.pose[0])
+    grasp = tool(start + [0, GRIP_AT, HANDLE_HEIGHT], 0.0, GRASP_TILT)
+    strike = grasp.moved(*(np.array(block.pose[:3]) - start)).moved(z=BLOCK - 0.002)
+    timeline = Timeline()
+    pick(timeline, {arm: grasp}, lift=0.09)
+    timeline.move({arm: strike.moved(z=0.06)})
+    timeline.move({arm: strike})
+    timeline.wait(0.24)
+    timeline.hold(arm, "hammer", timeline.grips[arm][-1][0])
+    return timeline
+
+
+def success(scene: Scene, now: Moment) -> bool:
+    face = now.object_pose[scene.index("hammer"), :3]
+    top = np.array(scene.object("block").pose[:3]) + [0, 0, BLOCK]
+    tilt = Rotation.from_quat(now.object_pose[scene.index("hammer"), 3:]).apply([0, 0, 1])[2]
+    offset = np.abs(face - top)
+    return bool((offset[:2] < 0.02).all() and offset[2] < 0.006 and tilt > 0.9)
+
+
+TASK = Task("beat_block_hammer", "pick up the hammer and hit the {color} block", sample, plan, success)

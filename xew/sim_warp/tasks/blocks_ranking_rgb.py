@@ -1,0 +1,83 @@
+"""Task: put a red, a green and a blue block in a row, from left to right, one hand at a time.
+
+Randomisation: three cubes of one size (half edge 15 to 25 mm) at |x| in [.05, .28], y in [-.08, .05] (y at most 0 where
+    |x| < .15), any yaw within 43 degrees, at least .10 apart; never in order already. The row's y and its three x.
+Success: red left of green left of blue, neighbours within 130 mm in x and 30 mm in y, both grippers open.
+After RoboTwin 2.0's blocks_ranking_rgb.
+"""
+
+import numpy as np
+
+from xew.sim_warp import objects
+from xew.sim_warp.plan import Timeline, tool
+from xew.sim_warp.scene import Scene, SceneObject, draw, upright
+from xew.sim_warp.stage import TABLE_TOP
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, inward_yaw, pick, place
+
+COLORS = ("red", "green", "blue")
+
+
+def sample(rng: np.random.Generator, seed: int) -> Scene:
+    half = rng.uniform(0.015, 0.025)
+    targets = [(rng.uniform(low, high), 0.0) for low, high in ((-0.09, -0.08), (-0.01, 0.01), (0.08, 0.09))]
+    row = rng.uniform(-0.2, -0.1)
+    places: list[np.ndarray] = []
+    while not places or _ordered(np.array(places)):
+        places = []
+        for _ in COLORS:
+            places.append(draw(rng, [-0.28, -0.08], [0.28, 0.05], lambda p: _free(p, places)))  # noqa: B023
+    yaws = rng.uniform(-0.75, 0.75, 3)
+    blocks = tuple(
+        SceneObject(
+            f"{color}_block",
+            objects.block((2 * half,) * 3, objects.PALETTE[color]),
+            upright(*place_, TABLE_TOP, yaw),
+            mass=float(400 * (2 * half) ** 3),
+        )
+        for color, place_, yaw in zip(COLORS, places, yaws, strict=True)
+    )
+    row_places = {f"{color}_block": (float(x), float(row)) for color, (x, _) in zip(COLORS, targets, strict=True)}
+    return Scene("blocks_ranking_rgb", seed, blocks, targets=row_places)
+
+
+def _free(point: np.ndarray, places: list[np.ndarray]) -> bool:
+    x, y = point
+    if abs(x) < 0.05 or (abs(x) < 0.15 and y > 0) or np.hypot(x, y + 0.1) < 0.1:
+        return False
+    return all(np.hypot(*(point - other)) >= 0.1 for other in places)
+
+
+def _ordered(places: np.ndarray) -> bool:
+    step = np.diff(places, axis=0)
+    return bool((step[:, 0] > 0).all() and (step[:, 0] < 0.13).all() and (np.abs(step[:, 1]) < 0.03).all())
+
+
+def plan(scene: Scene) -> Timeline:
+    timeline = Timeline()
+    last_arm = None
+    for block in scene.objects:
+        arm = arm_for(block.pose[0])
+        if last_arm not in (None, arm):
+            timeline.move({last_arm: None})
+        _move_block(timeline, arm, block, scene.targets[block.name])
+        last_arm = arm
+    return timeline
+
+
+def _move_block(timeline: Timeline, arm: int, block: SceneObject, target: tuple[float, ...]) -> None:
+    yaw = 2 * np.arctan2(block.pose[5], block.pose[6])
+    centre = float(block.shape.mesh.vertices[:, 2].mean())
+    grasp = tool((*block.pose[:2], TABLE_TOP + centre), inward_yaw(arm, yaw, np.pi / 2), GRASP_TILT)
+    goal = tool((*target, TABLE_TOP + centre + 0.002), 0.0, GRASP_TILT)
+    pick(timeline, {arm: grasp}, lift=0.08, opening=0.8)
+    place(timeline, arm, block.name, goal, above=0.07, retreat=0.09, release=0.7)
+
+
+def success(scene: Scene, now: Moment) -> bool:
+    places = now.object_pose[[scene.index(f"{color}_block") for color in COLORS], :2]
+    return _ordered(places) and now.both_open
+
+
+TASK = Task(
+    "blocks_ranking_rgb", "put the red, the green and the blue block in a row from left to right", sample, plan, success
+)

@@ -1,0 +1,52 @@
+"""Task: lift a roller with both hands at once, one at each end.
+
+Randomisation: centre at |x| at most .15, y in [-.25, -.05], yaw within 46 degrees; length, thickness and colour.
+Success: roller higher than .80, both grippers closed on it.
+After RoboTwin 2.0's grab_roller.
+"""
+
+import numpy as np
+
+from xew.sim_warp import objects
+from xew.sim_warp.plan import LEFT, RIGHT, Timeline, tool
+from xew.sim_warp.scene import Scene, SceneObject, upright
+from xew.sim_warp.stage import TABLE_TOP
+from xew.sim_warp.tasks.task import GRASP_TILT, GRIPPER_CLOSED, Moment, Task, pick
+
+GRASP_FROM_END = 0.03
+LIFT = 0.12
+
+
+def sample(rng: np.random.Generator, seed: int) -> Scene:
+    x, y, yaw = rng.uniform([-0.15, -0.25, -0.8], [0.15, -0.05, 0.8])
+    length, radius = rng.uniform([0.23, 0.015], [0.25, 0.018])
+    wood, ends = (205, 160, 105), objects.PALETTE[rng.choice(sorted(objects.PALETTE))]
+    roller = SceneObject("roller", objects.prism(radius, length, wood, ends), upright(x, y, TABLE_TOP, yaw), mass=0.2)
+    return Scene("grab_roller", seed, (roller,))
+
+
+def plan(scene: Scene) -> Timeline:
+    roller = scene.object("roller")
+    x, y = roller.pose[:2]
+    yaw = 2 * np.arctan2(roller.pose[5], roller.pose[6])
+    points = roller.shape.hulls[0]
+    reach, height = points[:, 0].max() - GRASP_FROM_END, points[:, 2].mean()
+    along = np.array([np.cos(yaw), np.sin(yaw)])
+    grasps = {
+        arm: tool((*(np.array([x, y]) + side * reach * along), TABLE_TOP + height), yaw, GRASP_TILT, roll=np.pi / 2)
+        for arm, side in ((LEFT, -1), (RIGHT, 1))
+    }
+    timeline = Timeline()
+    pick(timeline, grasps, lift=LIFT)
+    timeline.wait(0.3)
+    for arm in grasps:
+        timeline.hold(arm, "roller", timeline.grips[arm][-1][0])
+    return timeline
+
+
+def success(scene: Scene, now: Moment) -> bool:
+    index = scene.index("roller")
+    return bool(now.object_pose[index, 2] > 0.80 and (now.gripper < GRIPPER_CLOSED).all())
+
+
+TASK = Task("grab_roller", "use both arms to grab the roller and lift it", sample, plan, success)

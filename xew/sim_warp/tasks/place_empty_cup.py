@@ -1,0 +1,58 @@
+"""Task: put an empty cup on a coaster, with one hand by the rim.
+
+Randomisation: cup at |x| in [.15, .30], y in [-.20, .05]; coaster near the middle on the same side, at least .12 away;
+    size and colour of the cup, colour of the coaster.
+Success: cup within 35 mm of the coaster's centre and standing on it (15 mm), both grippers open.
+After RoboTwin 2.0's place_empty_cup.
+"""
+
+import numpy as np
+
+from xew.sim_warp import objects
+from xew.sim_warp.plan import Timeline
+from xew.sim_warp.scene import Scene, SceneObject, draw, upright
+from xew.sim_warp.stage import TABLE_TOP
+from xew.sim_warp.tasks.task import Moment, Task, arm_for, inward_yaw, pick, place, rim_grasp
+
+COASTER_HEIGHT = 0.008
+WALL = 0.005
+RIM_DEPTH = 0.008
+
+
+def sample(rng: np.random.Generator, seed: int) -> Scene:
+    side = rng.choice([-1.0, 1.0])
+    cup = draw(rng, [0.15, -0.20], [0.30, 0.05], lambda p: True) * [side, 1]
+    coaster = draw(rng, [-0.05, -0.20], [0.10, 0.05], lambda p: np.hypot(*(p * [side, 1] - cup)) >= 0.12) * [side, 1]
+    height, radius = rng.uniform([0.078, 0.038], [0.092, 0.043])
+    colors = rng.permutation(sorted(objects.PALETTE))
+    shape = objects.vessel([(radius - 0.008, 0), (radius, height)], WALL, objects.PALETTE[colors[0]], (235, 232, 225))
+    return Scene(
+        "place_empty_cup",
+        seed,
+        (
+            SceneObject("cup", shape, upright(*cup, TABLE_TOP, inward_yaw(arm_for(side))), mass=0.12),
+            SceneObject(
+                "coaster", objects.disc(0.055, COASTER_HEIGHT, objects.PALETTE[colors[1]]), upright(*coaster, TABLE_TOP)
+            ),
+        ),
+        words={"color": colors[0]},
+    )
+
+
+def plan(scene: Scene) -> Timeline:
+    cup, coaster = scene.object("cup"), scene.object("coaster")
+    arm, grasp = rim_grasp(cup, WALL, RIM_DEPTH)
+    shift = np.subtract(coaster.pose[:3], cup.pose[:3]) + [0, 0, COASTER_HEIGHT + 0.002]
+    timeline = Timeline()
+    pick(timeline, {arm: grasp}, lift=0.08, opening=0.5)
+    place(timeline, arm, "cup", grasp.moved(*shift), above=0.05, retreat=0.08, release=0.4)
+    return timeline
+
+
+def success(scene: Scene, now: Moment) -> bool:
+    goal = np.array(scene.object("coaster").pose[:3]) + [0, 0, COASTER_HEIGHT]
+    offset = now.object_pose[scene.index("cup"), :3] - goal
+    return bool(np.hypot(*offset[:2]) < 0.035 and abs(offset[2]) < 0.015 and now.both_open)
+
+
+TASK = Task("place_empty_cup", "place the empty {color} cup on the coaster", sample, plan, success)

@@ -1,0 +1,72 @@
+"""Task: stack two bowls in the middle, the nearer one first, each hand serving its own side.
+
+Randomisation: two equal bowls at |x| in [.09, .30], y in [-.15, .15] (y at most 0 where |x| < .15), at least .15 apart and
+    .15 from the place of the stack; size and colours.
+Success: centres within 40 mm in x and y, the lower bowl on the table (below .76), the upper inside it (between 10 and
+    45 mm higher), both grippers open. (RoboTwin 2.0 tests only upper bounds of the heights.)
+After RoboTwin 2.0's stack_bowls_two.
+"""
+
+import numpy as np
+
+from xew.sim_warp import objects
+from xew.sim_warp.plan import Timeline
+from xew.sim_warp.scene import Scene, SceneObject, draw, upright
+from xew.sim_warp.stage import TABLE_TOP
+from xew.sim_warp.tasks.task import Moment, Task, arm_for, inward_yaw, pick, place, rim_grasp
+
+STACK = (0.0, -0.1)
+WALL = 0.004
+NESTING = 0.022
+"""Height of the upper bowl above the lower when they are nested [m]."""
+RIM_DEPTH = 0.006
+
+
+def sample(rng: np.random.Generator, seed: int) -> Scene:
+    radius = rng.uniform(0.054, 0.062)
+    first = draw(rng, [-0.30, -0.15], [0.30, 0.15], lambda p: _free(p, []))
+    second = draw(rng, [-0.30, -0.15], [0.30, 0.15], lambda p: _free(p, [first]))
+    nearer, farther = sorted((first, second), key=lambda p: p[1])
+    colors = rng.permutation(sorted(objects.PALETTE))
+    outline = [(radius - 0.026, 0), (radius - 0.006, 0.02), (radius, 0.05)]
+    bowls = tuple(
+        SceneObject(
+            name,
+            objects.vessel(outline, WALL, objects.PALETTE[color], (238, 236, 230)),
+            upright(*at, TABLE_TOP, inward_yaw(arm_for(at[0]))),
+            mass=0.12,
+        )
+        for name, at, color in (("lower_bowl", nearer, colors[0]), ("upper_bowl", farther, colors[1]))
+    )
+    return Scene("stack_bowls_two", seed, bowls, words={"lower": colors[0], "upper": colors[1]})
+
+
+def _free(point: np.ndarray, others: list[np.ndarray]) -> bool:
+    x, y = point
+    if abs(x) < 0.09 or (abs(x) < 0.15 and y > 0) or np.hypot(x - STACK[0], y - STACK[1]) < 0.15:
+        return False
+    return all(np.hypot(*(point - other)) >= 0.15 for other in others)
+
+
+def plan(scene: Scene) -> Timeline:
+    timeline = Timeline()
+    last_arm = None
+    for bowl, height in zip(scene.objects, (0.0, NESTING), strict=True):
+        arm, grasp = rim_grasp(bowl, WALL, RIM_DEPTH)
+        if last_arm not in (None, arm):
+            timeline.move({last_arm: None})
+        pick(timeline, {arm: grasp}, lift=0.10, opening=0.5)
+        goal = grasp.moved(STACK[0] - bowl.pose[0], STACK[1] - bowl.pose[1], height + 0.003)
+        place(timeline, arm, bowl.name, goal, above=0.08, retreat=0.09, release=0.4)
+        last_arm = arm
+    return timeline
+
+
+def success(scene: Scene, now: Moment) -> bool:
+    lower, upper = (now.object_pose[scene.index(name), :3] for name in ("lower_bowl", "upper_bowl"))
+    apart = np.abs(upper - lower)
+    nested = 0.01 < upper[2] - lower[2] < 0.045
+    return bool((apart[:2] < 0.04).all() and lower[2] < 0.76 and nested and now.both_open)
+
+
+TASK = Task("stack_bowls_two", "stack the {upper} bowl on the {lower} bowl", sample, plan, success)

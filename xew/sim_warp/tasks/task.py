@@ -1,0 +1,111 @@
+"""What a task is: a scene to sample, a plan that solves it, and a test of success."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool, tool
+from xew.sim_warp.scene import Scene, SceneObject
+
+GRASP_TILT = np.radians(30)
+"""Lean of the hand in a grasp from above [rad]: all five robots reach the work area with it (docs/robots.md)."""
+INWARD = np.radians(20)
+"""How far that lean turns towards the middle of the table [rad], for the wrists of the small arms."""
+PRE_GRASP = 0.09
+"""Distance before a grasp from which the approach is straight [m]."""
+GRIPPER_OPEN = 0.8
+"""A gripper commanded beyond this counts as open (RoboTwin 2.0)."""
+GRIPPER_CLOSED = 0.2
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One frame of an episode, as success tests see it."""
+
+    object_pose: np.ndarray
+    """[o 7] m and quaternion x y z w, world."""
+    object_joint: np.ndarray
+    """[o] rad."""
+    tool_pose: np.ndarray
+    """[2 7] measured, world."""
+    gripper: np.ndarray
+    """[2] commanded, 0 closed, 1 open."""
+    contact: np.ndarray
+    """[2 o] bool, fingers of each arm against each object."""
+
+    @property
+    def both_open(self) -> bool:
+        return bool((self.gripper > GRIPPER_OPEN).all())
+
+
+@dataclass(frozen=True)
+class Task:
+    """One manipulation task."""
+
+    name: str
+    instruction: str
+    """English, with {slots} that the scene's words fill."""
+    sample: Callable[[np.random.Generator, int], Scene]
+    """(random stream, seed) -> the scene; knows no robot."""
+    plan: Callable[[Scene], Timeline]
+    """Scene -> waypoints of both tools; knows no robot."""
+    success: Callable[[Scene, Moment], bool]
+    """Is the task done at this moment?"""
+
+
+def arm_for(x: float) -> int:
+    """The arm on whose side x [m] lies."""
+    return RIGHT if x > 0 else LEFT
+
+
+def outward(arm: int) -> float:
+    """+1 for the right arm, -1 for the left: the sign of x on its side."""
+    return 1.0 if arm == RIGHT else -1.0
+
+
+def pick(timeline: Timeline, grasps: dict[int, Tool], lift: float, opening: float = 1.0) -> None:
+    """Approach, grasp and lift with one or both arms; `opening` is the gripper's before the grasp."""
+    if opening < 1.0:
+        timeline.grip(dict.fromkeys(grasps, opening), seconds=0.24)
+    timeline.move({arm: grasp.backed(PRE_GRASP) for arm, grasp in grasps.items()})
+    timeline.move(grasps)
+    timeline.grip(dict.fromkeys(grasps, 0.0))
+    timeline.move({arm: grasp.moved(z=lift) for arm, grasp in grasps.items()})
+
+
+def inward_yaw(arm: int, yaw: float = 0.0, symmetry: float = np.inf) -> float:
+    """The hand's yaw [rad] that leans inwards, or, of those at `yaw` plus multiples of `symmetry`, the nearest to it."""
+    wanted = outward(arm) * INWARD
+    return wanted if np.isinf(symmetry) else yaw + symmetry * np.round((wanted - yaw) / symmetry)
+
+
+def rim_grasp(vessel: SceneObject, wall: float, depth: float) -> tuple[int, Tool]:
+    """The arm on whose side a vessel stands, and its grasp from above of the wall on that side.
+
+    Args:
+        vessel: round, standing with its yaw at `inward_yaw` of that arm, so that the hand meets the flat of a wall segment.
+        wall: thickness [m].
+        depth: of the grasp below the rim [m].
+    """
+    position = np.array(vessel.pose[:3])
+    arm = arm_for(position[0])
+    vertices = vessel.shape.mesh.vertices
+    radius = float(np.hypot(*vertices[:, :2].T).max()) - wall / 2
+    yaw = inward_yaw(arm)
+    radial = outward(arm) * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    return arm, tool(position + radius * radial + [0, 0, vertices[:, 2].max() - depth], yaw, GRASP_TILT)
+
+
+def place(timeline: Timeline, arm: int, name: str, goal: Tool, *, above: float, retreat: float, release: float) -> None:
+    """Bring what `arm` has held since its last grip to `goal` from `above` [m], let go, draw back upwards and open.
+
+    `release` is the gripper's opening between letting go and being clear of the object and its neighbours.
+    """
+    held_since = timeline.grips[arm][-1][0]
+    timeline.move({arm: goal.moved(z=above)})
+    timeline.move({arm: goal})
+    timeline.hold(arm, name, held_since)
+    timeline.grip({arm: release})
+    timeline.move({arm: goal.moved(z=retreat)})
+    timeline.grip({arm: 1.0}, seconds=0.24)
