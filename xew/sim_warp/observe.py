@@ -75,9 +75,12 @@ def keypoint_visibility(robot: RobotSpec, points: np.ndarray, frames: Frames, ca
         points: [t k 3] keypoints in the world, as given to the renderer with the frames.
     """
     _, depth = project(camera, points)
-    near = frames.point_depth >= depth - VISIBILITY_MARGIN
-    in_image = (frames.point_body != -2) & (depth > 0)
-    return in_image & (near | _own_table(robot)[np.arange(points.shape[1]), np.maximum(frames.point_body, -1)])
+    shown = frames.point_body
+    own = _own_table(robot)
+    own_body = np.where((shown >= 0) & (shown < own.shape[1] - 1), shown, -1)
+    seen_depth = np.where(frames.point_depth > 0, frames.point_depth, np.inf)
+    near = seen_depth >= depth - VISIBILITY_MARGIN
+    return (shown != -2) & (depth > 0) & (near | own[np.arange(points.shape[1]), own_body])
 
 
 def _own_table(robot: RobotSpec) -> np.ndarray:

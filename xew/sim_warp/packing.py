@@ -62,6 +62,8 @@ def check_world(world: World) -> None:
     shape = np.shape(world.pose)
     if len(shape) != 3 or shape[1:] != (len(world.bodies), 7):
         raise ValueError(f"pose has shape {shape}, expected (frames, {len(world.bodies)}, 7): one pose for each of the bodies.")
+    if shape[0] == 0:
+        raise ValueError("pose has no frames; an episode to render needs at least one.")
     if not np.isfinite(world.pose).all():
         frame, body = np.argwhere(~np.isfinite(world.pose))[0, :2]
         raise ValueError(f"pose of body {body} at frame {frame} is not finite; the simulation before it has diverged.")

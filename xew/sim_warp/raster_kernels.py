@@ -6,7 +6,12 @@ has the same bytes whatever the device's schedule and whatever else is in the ch
 per pixel and triangle. Triangles are counter-clockwise seen from outside, camera frame x right, y down, z forward.
 """
 
+# Warp reads this file in its own way: a variable that a loop changes begins as float(0.0), and any() is unknown.
+# ruff: noqa: UP018, SIM110
+
 import warp as wp
+
+wp.set_module_options({"enable_backward": False})  # nobody differentiates images; halves the time to compile
 
 NEAR = wp.constant(0.1)
 """Near plane of the camera [m]; triangles are cut there."""
@@ -56,6 +61,8 @@ class Shading:
     exposure: float
     specular: float
     shininess: float
+    knee: float
+    ceiling: float
 
 
 @wp.struct
@@ -359,11 +366,12 @@ def lit_share(
     fx = texel[0] - float(x)
     fy = texel[1] - float(y)
     shaded = 0.0
-    for j in range(-1, 3):
-        weight_y = wp.where(j == -1, 1.0 - fy, wp.where(j == 2, fy, 1.0))
-        for i in range(-1, 3):
-            if map_in[frame, light, y + j, x + i] > threshold:
-                shaded += weight_y * wp.where(i == -1, 1.0 - fx, wp.where(i == 2, fx, 1.0))
+    texels = map_in[frame, light]
+    for j in range(4):
+        row = texels[y + j - 1]
+        in_row = wp.where(row[x - 1] > threshold, 1.0 - fx, 0.0) + wp.where(row[x] > threshold, 1.0, 0.0)
+        in_row += wp.where(row[x + 1] > threshold, 1.0, 0.0) + wp.where(row[x + 2] > threshold, fx, 0.0)
+        shaded += in_row * wp.where(j == 0, 1.0 - fy, wp.where(j == 3, fy, 1.0))
     return 1.0 - shaded / 9.0
 
 
@@ -441,6 +449,21 @@ def direct_light(surface: Surface, light: Light, eye: wp.vec3, shading: Shading)
 
 
 @wp.func
+def toned(light: float, shading: Shading) -> float:
+    """Bright light bends towards a ceiling below white, so that a lit white robot keeps its shape on a white ground."""
+    above = light - shading.knee
+    if above <= 0.0:
+        return light
+    room = shading.ceiling - shading.knee
+    return shading.knee + room * (1.0 - wp.exp(-above / room))
+
+
+@wp.func
+def toned_color(light: wp.vec3, shading: Shading) -> wp.vec3:
+    return wp.vec3(toned(light[0], shading), toned(light[1], shading), toned(light[2], shading))
+
+
+@wp.func
 def eye_of(camera: View) -> wp.vec3:
     return -(wp.transpose(camera.rotation) * camera.translation)
 
@@ -514,6 +537,7 @@ def encoded(light: float, srgb: wp.array(dtype=wp.uint8)) -> wp.uint8:
 def stage_light(
     stage: Stage,
     lights: wp.array(dtype=Light),
+    shading: Shading,
     frame: int,
     row: int,
     column: int,
@@ -521,13 +545,15 @@ def stage_light(
     tile_in: wp.array4d(dtype=wp.uint32),
 ) -> wp.vec3:
     total = stage.ambient[row, column]
+    if stage.direct.shape[0] == 0:
+        return total
     for i in range(stage.direct.shape[0]):
         share = 1.0
         if map_in.shape[1] > 0:
             texel = stage.shadow_texel[i, row, column]
             share = lit_share(texel, shadow_reach(texel, lights[i].view.parallel), frame, i, map_in, tile_in)
         total += stage.direct[i, row, column] * share
-    return total
+    return toned_color(total, shading)
 
 
 @wp.func
@@ -548,7 +574,16 @@ def surface_light(
             texel = on_screen(light.view, in_view(light.view, surface.point))
             arriving = arriving * lit_share(texel, shadow_reach(texel, light.view.parallel), frame, i, map_in, tile_in)
         total += arriving
-    return total
+    return toned_color(total, shading)
+
+
+@wp.func
+def shown_before(shown: wp.vec4i, sample: int) -> bool:
+    """Did an earlier sample show the same triangle?"""
+    for earlier in range(sample):
+        if shown[earlier] == shown[sample]:
+            return True
+    return False
 
 
 @wp.kernel
@@ -570,36 +605,35 @@ def shade_pixels(
 ):
     """Colour: each triangle among a pixel's four samples is lit once, at the mean of its samples."""
     frame, row, column = wp.tid()
-    world = frame_world[frame]
+    drawn = key_in[frame, 0, row, column] | key_in[frame, 1, row, column]
+    drawn = drawn | key_in[frame, 2, row, column] | key_in[frame, 3, row, column]
+    if drawn == wp.uint64(0):
+        plain = stage_light(stage, lights, shading, frame, row, column, map_in, tile_in)
+        for channel in range(3):
+            rgb_out[frame, row, column, channel] = encoded(plain[channel], srgb)
+        return
+    first_triangle = geometry.triangle_range[frame_world[frame]][0]
     shown = wp.vec4i(-1, -1, -1, -1)
     for s in range(4):
         shown[s] = owner(key_in[frame, s, row, column], stage.key[s, row, column])
     total = wp.vec3(0.0, 0.0, 0.0)
     for s in range(4):
         triangle = shown[s]
-        first = 1
-        for earlier in range(s):
-            if shown[earlier] == triangle:
-                first = 0
-        if first == 1:
-            count = 0.0
-            x = 0.0
-            y = 0.0
-            nearness = 0.0
-            for other in range(4):
+        if not shown_before(shown, s):
+            place = vec5(0.0, 0.0, 0.0, 0.0, 0.0)
+            for other in range(s, 4):
                 if shown[other] == triangle:
-                    count += 1.0
-                    x += OFFSET_X[other]
-                    y += OFFSET_Y[other]
-                    nearness += nearness_of(key_in[frame, other, row, column])
+                    nearness = nearness_of(key_in[frame, other, row, column])
+                    place += vec5(1.0, OFFSET_X[other], OFFSET_Y[other], nearness, 0.0)
+            count = place[0]
             if triangle < 0:
-                total += stage_light(stage, lights, frame, row, column, map_in, tile_in) * (0.25 * count)
+                total += stage_light(stage, lights, shading, frame, row, column, map_in, tile_in) * (0.25 * count)
             else:
-                packed = geometry.triangle_range[world][0] + triangle
+                packed = first_triangle + triangle
                 # nearness is affine over the screen: its mean belongs to the mean of the samples
-                seen = pixel_ray(camera, float(column) + x / count, float(row) + y / count) * (count / nearness)
+                ray = pixel_ray(camera, float(column) + place[1] / count, float(row) + place[2] / count)
                 body_pose = pose[frame_pose[frame] + geometry.triangle_body[packed]]
-                surface = surface_at(geometry, packed, body_pose, camera, seen, frame, vertex_in)
+                surface = surface_at(geometry, packed, body_pose, camera, ray * (count / place[3]), frame, vertex_in)
                 total += surface_light(surface, camera, lights, shading, frame, map_in, tile_in) * (0.25 * count)
     for channel in range(3):
         rgb_out[frame, row, column, channel] = encoded(total[channel], srgb)
@@ -651,7 +685,7 @@ def measure_pixels(
     if triangle >= 0:
         body = geometry.triangle_body[geometry.triangle_range[world][0] + triangle]
         robot = geometry.body_is_robot[geometry.body_first[world] + body]
-        if flow_out.shape[0] > 0 and robot == 1:
+        if flow_out.shape[0] > 0 and robot == 1 and frame_next_pose[frame] != frame_pose[frame]:
             seen = pixel_ray(camera, float(column), float(row)) / nearness_of(key)
             point = wp.transpose(camera.rotation) * (seen - camera.translation)
             after = moved(pose[frame_pose[frame] + body], pose[frame_next_pose[frame] + body], point)

@@ -349,4 +349,5 @@ def _shading() -> kernels.Shading:
     shading.exposure = stage.EXPOSURE
     shading.specular = stage.SPECULAR
     shading.shininess = stage.SHININESS
+    shading.knee, shading.ceiling = stage.KNEE, stage.CEILING
     return shading
