@@ -3,36 +3,34 @@
 Limits that experts keep: real-stanford/arx5-sdk, configuration X5: the front arms are of that family.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 from xew.sim_warp.robots.spec import Arm, RobotSpec
+
+LEFT = Arm(
+    root_pose=(0, -0.62, 0, 0, 0, 0.7071067812, 0.7071067812),
+    joints=("fl_joint1", "fl_joint2", "fl_joint3", "fl_joint4", "fl_joint5", "fl_joint6"),
+    home=(-1.0928, 0.8282, 0.8178, -1.295, -0.453, -1.0183),
+    tool_link="fl_link6",
+    tool_pose=(0.1406, 0, 0, 0, 0, 0, 1),
+    fingers=("fl_joint7", "fl_joint8"),
+    finger_closed=(0.0, 0.0),
+    finger_open=(0.045, 0.045),
+)
+RIGHT = replace(
+    LEFT,
+    home=(1.0927, 0.8641, 0.8329, -1.2813, 0.4641, 1.0347),
+    joints=("fr_joint1", "fr_joint2", "fr_joint3", "fr_joint4", "fr_joint5", "fr_joint6"),
+    tool_link="fr_link6",
+    fingers=("fr_joint7", "fr_joint8"),
+)
 
 SPEC = RobotSpec(
     key="aloha_agilex",
     title="ALOHA-AgileX",
     urdf=Path(__file__).parent / "descriptions" / "aloha_agilex.urdf",
-    arms=(
-        Arm(
-            root_pose=(0, -0.65, 0, 0, 0, 0.7071067812, 0.7071067812),
-            joints=("fl_joint1", "fl_joint2", "fl_joint3", "fl_joint4", "fl_joint5", "fl_joint6"),
-            home=(0, 1.2, 1.2, -0.6, 0, 0),
-            tool_link="fl_link6",
-            tool_pose=(0.1406, 0, 0, 0, 0, 0, 1),
-            fingers=("fl_joint7", "fl_joint8"),
-            finger_closed=(0.0, 0.0),
-            finger_open=(0.045, 0.045),
-        ),
-        Arm(
-            root_pose=(0, -0.65, 0, 0, 0, 0.7071067812, 0.7071067812),
-            joints=("fr_joint1", "fr_joint2", "fr_joint3", "fr_joint4", "fr_joint5", "fr_joint6"),
-            home=(0, 1.2, 1.2, -0.6, 0, 0),
-            tool_link="fr_link6",
-            tool_pose=(0.1406, 0, 0, 0, 0, 0, 1),
-            fingers=("fr_joint7", "fr_joint8"),
-            finger_closed=(0.0, 0.0),
-            finger_open=(0.045, 0.045),
-        ),
-    ),
+    arms=(LEFT, RIGHT),
     joint_lower=(-3.14, -0.05, -0.1, -1.6, -1.57, -2.0),
     joint_upper=(2.618, 3.5, 3.2, 1.55, 1.57, 2.0),
     joint_velocity=(5.0, 5.0, 5.5, 5.5, 5.0, 5.0),

@@ -3,36 +3,32 @@
 Limits that experts keep: real-stanford/arx5-sdk, configuration X5.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 from xew.sim_warp.robots.spec import Arm, RobotSpec
+
+LEFT = Arm(
+    root_pose=(-0.22, -0.38, 0.84, 0, 0, 0.7071067812, 0.7071067812),
+    joints=("joint1", "joint2", "joint3", "joint4", "joint5", "joint6"),
+    home=(-0.4119, 0.4193, 0.5183, -1.1833, -0.2015, -0.3617),
+    tool_link="link6",
+    tool_pose=(0.142, 0, 0, 0, 0, 0, 1),
+    fingers=("joint7", "joint8"),
+    finger_closed=(0.0, 0.0),
+    finger_open=(0.044, 0.044),
+)
+RIGHT = replace(
+    LEFT,
+    root_pose=(0.22, -0.38, 0.84, 0, 0, 0.7071067812, 0.7071067812),
+    home=(0.4324, 0.4207, 0.5188, -1.1861, 0.2111, 0.3803),
+)
 
 SPEC = RobotSpec(
     key="arx_x5",
     title="ARX X5",
     urdf=Path(__file__).parent / "descriptions" / "arx_x5.urdf",
-    arms=(
-        Arm(
-            root_pose=(-0.3, -0.35, 0.784, 0, 0, 0.7071067812, 0.7071067812),
-            joints=("joint1", "joint2", "joint3", "joint4", "joint5", "joint6"),
-            home=(0, 1.2, 1.2, -0.6, 0, 0),
-            tool_link="link6",
-            tool_pose=(0.142, 0, 0, 0, 0, 0, 1),
-            fingers=("joint7", "joint8"),
-            finger_closed=(0.0, 0.0),
-            finger_open=(0.044, 0.044),
-        ),
-        Arm(
-            root_pose=(0.3, -0.35, 0.784, 0, 0, 0.7071067812, 0.7071067812),
-            joints=("joint1", "joint2", "joint3", "joint4", "joint5", "joint6"),
-            home=(0, 1.2, 1.2, -0.6, 0, 0),
-            tool_link="link6",
-            tool_pose=(0.142, 0, 0, 0, 0, 0, 1),
-            fingers=("joint7", "joint8"),
-            finger_closed=(0.0, 0.0),
-            finger_open=(0.044, 0.044),
-        ),
-    ),
+    arms=(LEFT, RIGHT),
     joint_lower=(-3.14, -0.05, -0.1, -1.6, -1.57, -2.0),
     joint_upper=(2.618, 3.5, 3.2, 1.55, 1.57, 2.0),
     joint_velocity=(5.0, 5.0, 5.5, 5.5, 5.0, 5.0),

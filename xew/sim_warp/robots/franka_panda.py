@@ -3,52 +3,32 @@
 Limits that experts keep: frankaemika/franka_description robots/fer/joint_limits.yaml.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 from xew.sim_warp.robots.spec import Arm, RobotSpec
+
+LEFT = Arm(
+    root_pose=(-0.28, -0.65, 0.6, 0, 0, 0.7071067812, 0.7071067812),
+    joints=("panda_joint1", "panda_joint2", "panda_joint3", "panda_joint4", "panda_joint5", "panda_joint6", "panda_joint7"),
+    home=(-0.0323, -0.632, -0.2089, -2.8873, -0.0189, 2.7776, 0.5674),
+    tool_link="panda_hand",
+    tool_pose=(0, 0, 0.0979, 0.7071067812, 0, 0.7071067812, 0),
+    fingers=("panda_finger_joint1", "panda_finger_joint2"),
+    finger_closed=(0.0, 0.0),
+    finger_open=(0.04, 0.04),
+)
+RIGHT = replace(
+    LEFT,
+    root_pose=(0.28, -0.65, 0.6, 0, 0, 0.7071067812, 0.7071067812),
+    home=(0.0322, -0.632, 0.2091, -2.8873, 0.0191, 2.7776, 1.0032),
+)
 
 SPEC = RobotSpec(
     key="franka_panda",
     title="Franka Emika Panda",
     urdf=Path(__file__).parent / "descriptions" / "franka_panda.urdf",
-    arms=(
-        Arm(
-            root_pose=(-0.4, -0.65, 0.75, 0, 0, 0.7071067812, 0.7071067812),
-            joints=(
-                "panda_joint1",
-                "panda_joint2",
-                "panda_joint3",
-                "panda_joint4",
-                "panda_joint5",
-                "panda_joint6",
-                "panda_joint7",
-            ),
-            home=(0, 0.19634954, 0, -2.61799388, 0, 2.94159265, 0.78539816),
-            tool_link="panda_hand",
-            tool_pose=(0, 0, 0.0979, 0.7071067812, 0.0, 0.7071067812, 0.0),
-            fingers=("panda_finger_joint1", "panda_finger_joint2"),
-            finger_closed=(0.0, 0.0),
-            finger_open=(0.04, 0.04),
-        ),
-        Arm(
-            root_pose=(0.4, -0.65, 0.75, 0, 0, 0.7071067812, 0.7071067812),
-            joints=(
-                "panda_joint1",
-                "panda_joint2",
-                "panda_joint3",
-                "panda_joint4",
-                "panda_joint5",
-                "panda_joint6",
-                "panda_joint7",
-            ),
-            home=(0, 0.19634954, 0, -2.61799388, 0, 2.94159265, 0.78539816),
-            tool_link="panda_hand",
-            tool_pose=(0, 0, 0.0979, 0.7071067812, 0.0, 0.7071067812, 0.0),
-            fingers=("panda_finger_joint1", "panda_finger_joint2"),
-            finger_closed=(0.0, 0.0),
-            finger_open=(0.04, 0.04),
-        ),
-    ),
+    arms=(LEFT, RIGHT),
     joint_lower=(-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973),
     joint_upper=(2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973),
     joint_velocity=(2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61),

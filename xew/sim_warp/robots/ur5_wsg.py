@@ -4,50 +4,32 @@ Limits that experts keep: the URDF's, inside those of the UR5 manual (ur_descrip
 90 keeps clear of neighbouring objects.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 from xew.sim_warp.robots.spec import Arm, RobotSpec
+
+LEFT = Arm(
+    root_pose=(-0.35, -0.65, 0.75, 0, 0, 0, 1),
+    joints=("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"),
+    home=(-1.7074, -1.2788, -2.3451, -0.5689, 1.639, -0.1185),
+    tool_link="ee_link",
+    tool_pose=(0.1385, 0, 0, 0, 0, 0, 1),
+    fingers=("base_joint_gripper_left", "base_joint_gripper_right"),
+    finger_closed=(-0.0027, 0.0027),
+    finger_open=(-0.0477, 0.0477),
+)
+RIGHT = replace(
+    LEFT,
+    root_pose=(0.35, -0.65, 0.75, 0, 0, 0, 1),
+    home=(-0.7516, -1.2438, -2.3323, -0.7607, 1.1969, 0.7473),
+)
 
 SPEC = RobotSpec(
     key="ur5_wsg",
     title="UR5 with WSG-50",
     urdf=Path(__file__).parent / "descriptions" / "ur5_wsg.urdf",
-    arms=(
-        Arm(
-            root_pose=(-0.4, -0.65, 0.75, 0, 0, 0, 1),
-            joints=(
-                "shoulder_pan_joint",
-                "shoulder_lift_joint",
-                "elbow_joint",
-                "wrist_1_joint",
-                "wrist_2_joint",
-                "wrist_3_joint",
-            ),
-            home=(-1.5447, -1.5447, -1.5447, -1.5794, 1.5794, 0),
-            tool_link="ee_link",
-            tool_pose=(0.1385, 0, 0, 0, 0, 0, 1),
-            fingers=("base_joint_gripper_left", "base_joint_gripper_right"),
-            finger_closed=(-0.0027, 0.0027),
-            finger_open=(-0.0477, 0.0477),
-        ),
-        Arm(
-            root_pose=(0.4, -0.65, 0.75, 0, 0, 0, 1),
-            joints=(
-                "shoulder_pan_joint",
-                "shoulder_lift_joint",
-                "elbow_joint",
-                "wrist_1_joint",
-                "wrist_2_joint",
-                "wrist_3_joint",
-            ),
-            home=(-1.5447, -1.5447, -1.5447, -1.5794, 1.5794, 0),
-            tool_link="ee_link",
-            tool_pose=(0.1385, 0, 0, 0, 0, 0, 1),
-            fingers=("base_joint_gripper_left", "base_joint_gripper_right"),
-            finger_closed=(-0.0027, 0.0027),
-            finger_open=(-0.0477, 0.0477),
-        ),
-    ),
+    arms=(LEFT, RIGHT),
     joint_lower=(-3.1415, -3.1415, -3.1415, -1.75, -3.1415, -3.1415),
     joint_upper=(3.1415, 0.0, 3.1415, 1.75, 3.1415, 3.1415),
     joint_velocity=(3.1415, 3.1415, 3.1415, 3.1415, 3.1415, 3.1415),
