@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from xew.sim_warp import geometry
 from xew.sim_warp.camera import HEAD_CAMERA, project
 from xew.sim_warp.kinematics import forward_kinematics, joint_positions, tool_pose
-from xew.sim_warp.observe import Scene, keypoint_names, keypoint_positions, observe
+from xew.sim_warp.observe import Recording, keypoint_names, keypoint_positions, observe
 from xew.sim_warp.render import Body, Renderer
 from xew.sim_warp.robots import ROBOTS, UnknownRobotError, load_urdf
 from xew.sim_warp.robots.bodies import body_names, keypoint_links, robot_bodies, robot_pose
@@ -110,7 +110,7 @@ def test_streams_do_not_see_later_commands(robot_key: str) -> None:
 def test_a_measured_state_that_differs_changes_the_view_but_no_stream() -> None:
     robot, action = ROBOTS["ur5_wsg"], in_view("ur5_wsg")
     before = command_streams("ur5_wsg", action)
-    seen = observe(default_renderer(), [Scene(robot, action), Scene(robot, action - 0.1)])
+    seen = observe(default_renderer(), [Recording(robot, action), Recording(robot, action - 0.1)])
     after = command_streams("ur5_wsg", action)
     assert not np.array_equal(seen[0].rgb, seen[1].rgb)
     assert np.array_equal(before.render, after.render)
@@ -131,7 +131,7 @@ def test_a_scene_without_its_robot_is_the_same_beside_any_robot() -> None:
     renderer = Renderer("cpu")
     alone = renderer.render([thing], pose).rgb
     for key in ROBOTS:
-        scene = Scene(ROBOTS[key], in_view(key)[:1], [thing], pose)
+        scene = Recording(ROBOTS[key], in_view(key)[:1], [thing], pose)
         seen = observe(renderer, [scene])[0]
         assert (seen.rgb != alone).any()
         assert np.array_equal(renderer.render([thing], pose).rgb, alone)
@@ -139,7 +139,7 @@ def test_a_scene_without_its_robot_is_the_same_beside_any_robot() -> None:
 
 def test_keypoints_are_the_projected_links(robot_key: str) -> None:
     robot, action = ROBOTS[robot_key], in_view(robot_key)
-    seen = observe(default_renderer(), [Scene(robot, action)])[0]
+    seen = observe(default_renderer(), [Recording(robot, action)])[0]
     names = keypoint_names(robot)
     assert len(set(names)) == len(names) == 2 * (robot.arm_joint_count + 2)
     assert seen.keypoints.shape == (FRAMES, len(names), 2)
@@ -156,7 +156,7 @@ def test_a_board_in_front_of_the_robot_hides_its_keypoints(robot_key: str) -> No
     toward = HEAD_CAMERA.position + 0.15 * HEAD_CAMERA.extrinsics[2, :3]
     turned = Rotation.from_matrix(HEAD_CAMERA.extrinsics[:3, :3].T).as_quat()
     pose = np.tile([*toward, *turned], (FRAMES, 1, 1))
-    hidden = observe(default_renderer(), [Scene(robot, action, [board], pose)])[0]
+    hidden = observe(default_renderer(), [Recording(robot, action, [board], pose)])[0]
     points = keypoint_positions(robot, action)
     _, depth = project(HEAD_CAMERA, points)
     assert not hidden.keypoint_visible[depth > 0.2].any()

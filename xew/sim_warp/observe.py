@@ -7,20 +7,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from xew.sim_warp.camera import HEAD_CAMERA, Camera, project
-from xew.sim_warp.kinematics import link_poses
+from xew.sim_warp.kinematics import link_poses, matrix_from_pose, pose_from_matrix
 from xew.sim_warp.render import Body, Frames, Renderer, World
 from xew.sim_warp.robots.bodies import body_names, keypoint_links, nearby_links, robot_bodies, robot_pose
 from xew.sim_warp.robots.spec import RobotSpec
 from xew.sim_warp.robots.urdf import load_urdf
+from xew.sim_warp.scene import Hinge, Scene
 
 VISIBILITY_MARGIN = 0.02
 """How far in front of a link's origin something else may be before it hides the link [m]."""
 
 
 @dataclass(frozen=True)
-class Scene:
+class Recording:
     """One episode to look at: a robot and things, posed as measured."""
 
     robot: RobotSpec
@@ -46,12 +48,41 @@ class Observation:
     """[t k] bool."""
 
 
-def observe(renderer: Renderer, scenes: Sequence[Scene], camera: Camera = HEAD_CAMERA) -> list[Observation]:
+def observe(renderer: Renderer, recordings: Sequence[Recording], camera: Camera = HEAD_CAMERA) -> list[Observation]:
     """Look at many episodes at once; the result of each does not depend on the others."""
-    points = [keypoint_positions(scene.robot, scene.joint_pos) for scene in scenes]
-    worlds = [_world(scene, at) for scene, at in zip(scenes, points, strict=True)]
+    points = [keypoint_positions(recording.robot, recording.joint_pos) for recording in recordings]
+    worlds = [_world(recording, at) for recording, at in zip(recordings, points, strict=True)]
     frames = renderer.render_batch(worlds, camera)
-    return [_observation(*seen, camera) for seen in zip(scenes, points, frames, strict=True)]
+    return [_observation(*seen, camera) for seen in zip(recordings, points, frames, strict=True)]
+
+
+def scene_things(scene: Scene, object_pose: np.ndarray, object_joint: np.ndarray) -> tuple[list[Body], np.ndarray]:
+    """The objects of a scene as bodies with poses, lids as bodies of their own.
+
+    Args:
+        object_pose: [t o 7] recorded poses of the objects, world frame.
+        object_joint: [t o] recorded hinge angles [rad].
+
+    Returns:
+        The bodies, and their poses [t b 7].
+    """
+    bodies = [Body(thing.shape.mesh, is_robot=False) for thing in scene.objects]
+    poses = [object_pose]
+    for index, thing in enumerate(scene.objects):
+        if thing.hinge is not None:
+            bodies.append(Body(thing.hinge.lid.mesh, is_robot=False))
+            swing = _swing(thing.hinge, object_joint[:, index])
+            poses.append(pose_from_matrix(matrix_from_pose(object_pose[:, index]) @ swing)[:, None])
+    return bodies, np.concatenate(poses, 1)
+
+
+def _swing(hinge: Hinge, angle: np.ndarray) -> np.ndarray:
+    """[t 4 4] motion of a lid in its object's frame at angles [t]."""
+    motion = np.tile(np.eye(4), (len(angle), 1, 1))
+    axis = np.array(hinge.axis) / np.linalg.norm(hinge.axis)
+    motion[:, :3, :3] = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
+    motion[:, :3, 3] = np.array(hinge.anchor) - motion[:, :3, :3] @ np.array(hinge.anchor)
+    return motion
 
 
 def keypoint_names(robot: RobotSpec) -> tuple[str, ...]:
@@ -94,15 +125,15 @@ def _own_table(robot: RobotSpec) -> np.ndarray:
     return table
 
 
-def _world(scene: Scene, points: np.ndarray) -> World:
-    bodies = [*robot_bodies(scene.robot), *scene.things]
-    pose = robot_pose(scene.robot, scene.joint_pos)
-    if scene.thing_pose is not None:
-        pose = np.concatenate([pose, scene.thing_pose], 1)
+def _world(recording: Recording, points: np.ndarray) -> World:
+    bodies = [*robot_bodies(recording.robot), *recording.things]
+    pose = robot_pose(recording.robot, recording.joint_pos)
+    if recording.thing_pose is not None:
+        pose = np.concatenate([pose, recording.thing_pose], 1)
     return World(bodies, pose, points)
 
 
-def _observation(scene: Scene, points: np.ndarray, frames: Frames, camera: Camera) -> Observation:
+def _observation(recording: Recording, points: np.ndarray, frames: Frames, camera: Camera) -> Observation:
     pixels, _ = project(camera, points)
-    visible = keypoint_visibility(scene.robot, points, frames, camera)
+    visible = keypoint_visibility(recording.robot, points, frames, camera)
     return Observation(frames.rgb, frames.robot_mask, pixels.astype(np.float32), visible)

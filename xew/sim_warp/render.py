@@ -2,7 +2,8 @@
 
 Two kinds of frame are made. With the stage (table, wall, ground, shadows) it is what the head camera sees of an
 episode. Without it, it is the bodies alone on white, from which the conditions of a model come. The kernels
-(raster_kernels.py) are the same on CPU and GPU, and a frame's bytes do not depend on what else is rendered with it.
+(raster_kernels.py, then shading_kernels.py) are the same on CPU and GPU, and a frame's bytes do not depend on what
+else is rendered with it.
 """
 
 from collections.abc import Sequence
@@ -11,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from xew.sim_warp import raster_kernels as kernels
+from xew.sim_warp import raster_kernels as raster
+from xew.sim_warp import shading_kernels as shading
 from xew.sim_warp import stage
 from xew.sim_warp.camera import HEAD_CAMERA, Camera, look_at, project
 from xew.sim_warp.packing import (
@@ -74,11 +76,11 @@ class Renderer:
         kind = "cuda" if self.device.is_cuda else "cpu"
         self._frames_per_chunk = frames_per_chunk or FRAMES_PER_CHUNK[kind]
         self._stripes = STRIPES[kind]
-        self._lights = wp.array([_light(light) for light in stage.LIGHTS], dtype=kernels.Light, device=self.device)
+        self._lights = wp.array([_light(light) for light in stage.LIGHTS], dtype=raster.Light, device=self.device)
         self._shading = _shading()
-        ramp = stage.srgb_from_linear(np.linspace(0, 1, kernels.COLORS))
+        ramp = stage.srgb_from_linear(np.linspace(0, 1, shading.COLORS))
         self._srgb = wp.array(ramp, dtype=wp.uint8, device=self.device)
-        self._stages: dict[tuple[bytes, int, int], kernels.Stage] = {}
+        self._stages: dict[tuple[bytes, int, int], shading.Stage] = {}
 
     def render(
         self,
@@ -151,24 +153,24 @@ class Renderer:
         drawn = _Drawn(
             vertex=self._zeros((count, chunk.vertex_count), wp.vec3),
             shadow_vertex=self._zeros((count, lights, chunk.vertex_count), wp.vec3),
-            key=self._zeros((count, kernels.SAMPLES, job.camera.height, job.camera.width), wp.uint64),
+            key=self._zeros((count, raster.SAMPLES, job.camera.height, job.camera.width), wp.uint64),
             shadow_map=self._zeros((count, lights, SHADOW_SIZE, SHADOW_SIZE), wp.uint32),
-            shadow_tile=self._zeros((count, lights, SHADOW_SIZE // kernels.TILE, SHADOW_SIZE // kernels.TILE), wp.uint32),
+            shadow_tile=self._zeros((count, lights, SHADOW_SIZE // raster.TILE, SHADOW_SIZE // raster.TILE), wp.uint32),
         )
         self._launch(
-            kernels.place_vertices,
+            raster.place_vertices,
             (count, chunk.vertex_count),
             [job.geometry.arrays, chunk.world, chunk.pose, job.pose, job.view, self._lights],
             [drawn.vertex, drawn.shadow_vertex],
         )
         self._launch(
-            kernels.draw_triangles,
+            raster.draw_triangles,
             (count, chunk.triangle_count, self._stripes),
             [job.geometry.arrays, chunk.world, job.view, drawn.vertex, self._stripes],
             [drawn.key],
         )
         self._launch(
-            kernels.draw_shadows,
+            raster.draw_shadows,
             (count, lights, chunk.triangle_count),
             [job.geometry.arrays, chunk.world, drawn.shadow_vertex],
             [drawn.shadow_map, drawn.shadow_tile],
@@ -181,7 +183,7 @@ class Renderer:
         seen = [drawn.vertex, drawn.key, drawn.shadow_map, drawn.shadow_tile]
         rgb = self._empty((chunk.count, height, width, 3), wp.uint8)
         self._launch(
-            kernels.shade_pixels,
+            shading.shade_pixels,
             (chunk.count, height, width),
             [*posed, self._lights, self._shading, job.stage, self._srgb, *seen],
             [rgb],
@@ -195,7 +197,7 @@ class Renderer:
         for name, dtype in (("body", wp.int16), ("depth", wp.float32), ("optical_flow", wp.vec2)):
             images[name] = self._empty(shape if name in job.wanted else (0, 0, 0), dtype)
         self._launch(
-            kernels.measure_pixels,
+            shading.measure_pixels,
             shape,
             [*posed, job.stage, FLOW_LIMIT, drawn.key],
             list(images.values()),
@@ -206,14 +208,14 @@ class Renderer:
         shape = pixel.shape[:2]
         images = {"point_body": self._empty(shape, int), "point_depth": self._empty(shape, float)}
         self._launch(
-            kernels.probe_pixels,
+            shading.probe_pixels,
             shape,
             [job.geometry.arrays, chunk.world, job.stage, wp.array(pixel, dtype=wp.vec2i, device=self.device), drawn.key],
             list(images.values()),
         )
         return images
 
-    def _stage(self, camera: Camera, ground: bool) -> kernels.Stage:
+    def _stage(self, camera: Camera, ground: bool) -> shading.Stage:
         """What never moves as this camera sees it; drawn and lit at first use."""
         name = b"".join([camera.intrinsics.tobytes(), camera.extrinsics.tobytes(), bytes([ground])])
         key = (name, camera.width, camera.height)
@@ -221,7 +223,7 @@ class Renderer:
             self._stages[key] = self._lit_stage(camera, ground)
         return self._stages[key]
 
-    def _lit_stage(self, camera: Camera, ground: bool) -> kernels.Stage:
+    def _lit_stage(self, camera: Camera, ground: bool) -> shading.Stage:
         bodies = [Body(stage.stage_mesh(), False)] if ground else []
         rows, pose = pack_frames([World(bodies, np.tile(IDENTITY, (1, len(bodies), 1)))], [0])
         job = _Job(
@@ -229,18 +231,18 @@ class Renderer:
             pose=wp.array(pose, dtype=wp.transform, device=self.device),
             camera=camera,
             view=_camera_view(camera),
-            stage=kernels.Stage(),
+            stage=shading.Stage(),
         )
         chunk = _Chunk(self.device, job.geometry, rows)
         drawn = self._draw(job, chunk)
         height, width, lights = camera.height, camera.width, len(stage.LIGHTS) if ground else 0
-        lit = kernels.Stage()
+        lit = shading.Stage()
         lit.key = drawn.key[0]
         lit.ambient = self._zeros((height, width), wp.vec3)
         lit.direct = self._zeros((lights, height, width), wp.vec3)
         lit.shadow_texel = self._zeros((lights, height, width), wp.vec3)
         self._launch(
-            kernels.light_stage,
+            shading.light_stage,
             (height, width),
             [job.geometry.arrays, job.view, self._lights, self._shading, drawn.vertex, drawn.key, wp.vec3(*stage.SKY)],
             [lit.ambient, lit.direct, lit.shadow_texel],
@@ -264,8 +266,8 @@ class _Job:
     geometry: PackedGeometry
     pose: wp.array
     camera: Camera
-    view: kernels.View
-    stage: kernels.Stage
+    view: raster.View
+    stage: shading.Stage
     shadows: int = 0
     wanted: frozenset[str] = frozenset()
 
@@ -314,8 +316,8 @@ def _nearest_pixel(camera: Camera, points: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(pixel), np.clip(np.round(pixel), -1, 1 << 20), -1).astype(np.int32)
 
 
-def _camera_view(camera: Camera) -> kernels.View:
-    view = kernels.View()
+def _camera_view(camera: Camera) -> raster.View:
+    view = raster.View()
     view.rotation = wp.mat33(*camera.extrinsics[:3, :3].ravel())
     view.translation = wp.vec3(*camera.extrinsics[:3, 3])
     view.focal = wp.vec2(camera.intrinsics[0, 0], camera.intrinsics[1, 1])
@@ -323,9 +325,9 @@ def _camera_view(camera: Camera) -> kernels.View:
     return view
 
 
-def _light(source: stage.Light) -> kernels.Light:
+def _light(source: stage.Light) -> raster.Light:
     """A light with the view of its shadow map."""
-    light = kernels.Light()
+    light = raster.Light()
     light.intensity = source.intensity
     direction = np.array(source.direction) / np.linalg.norm(source.direction)
     light.to_light = wp.vec3(*-direction)
@@ -342,12 +344,12 @@ def _light(source: stage.Light) -> kernels.Light:
     return light
 
 
-def _shading() -> kernels.Shading:
-    shading = kernels.Shading()
-    shading.ambient = stage.AMBIENT
-    shading.sky_share = stage.SKY_SHARE
-    shading.exposure = stage.EXPOSURE
-    shading.specular = stage.SPECULAR
-    shading.shininess = stage.SHININESS
-    shading.knee, shading.ceiling = stage.KNEE, stage.CEILING
-    return shading
+def _shading() -> shading.Shading:
+    values = shading.Shading()
+    values.ambient = stage.AMBIENT
+    values.sky_share = stage.SKY_SHARE
+    values.exposure = stage.EXPOSURE
+    values.specular = stage.SPECULAR
+    values.shininess = stage.SHININESS
+    values.knee, shading.ceiling = stage.KNEE, stage.CEILING
+    return values
