@@ -1,0 +1,119 @@
+"""Stage 11 of 11: pictures of the report. Strips and sheets are uint8 RGB arrays, curves a matplotlib figure."""
+
+import base64
+import io
+from collections.abc import Sequence
+
+import cv2
+import matplotlib
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from xew.analysis.scores import COPY, TRUTH, MetricInfo
+from xew.analysis.summary import METRIC_TITLES, ROBOT_TITLES
+
+GAP = 4
+"""White pixels between the pictures of a sheet."""
+DIFFERENCE_FULL = 96
+"""Levels of 255 at which the difference picture is darkest."""
+COLOURS = ("#1f6feb", "#c2410c", "#15803d", "#7e22ce", "#a16207", "#0e7490")
+"""Of models, in order; baselines are grey."""
+
+
+def difference_picture(predicted: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    """Largest channel difference of two uint8 frames [h w 3] as colour: white is none, black DIFFERENCE_FULL or more."""
+    difference = cv2.absdiff(predicted, observed).max(axis=-1) / DIFFERENCE_FULL
+    return (matplotlib.colormaps["gist_heat_r"](np.minimum(difference, 1))[..., :3] * 255).astype(np.uint8)
+
+
+def strip_times(frame_count: int, count: int = 5) -> list[int]:
+    """Frames shown of a video: the given one, the last, and some between."""
+    return np.unique(np.linspace(0, frame_count - 1, count).round().astype(int)).tolist()
+
+
+def strip(observed: np.ndarray, predicted: np.ndarray, times: Sequence[int]) -> np.ndarray:
+    """Three rows observed, predicted, difference; one column for each time. Videos [t h w 3] uint8 of the same length."""
+    rows = [
+        [observed[t] for t in times],
+        [predicted[t] for t in times],
+        [difference_picture(predicted[t], observed[t]) for t in times],
+    ]
+    return sheet(rows)
+
+
+def sheet(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
+    """Pictures [h w 3] of one size as a grid on white."""
+    height, width = rows[0][0].shape[:2]
+    columns = max(len(row) for row in rows)
+    page = np.full((len(rows) * (height + GAP) - GAP, columns * (width + GAP) - GAP, 3), 255, np.uint8)
+    for i, row in enumerate(rows):
+        for j, picture in enumerate(row):
+            top, left = i * (height + GAP), j * (width + GAP)
+            page[top : top + height, left : left + width] = picture
+    return page
+
+
+def png(image: np.ndarray) -> bytes:
+    """An RGB image [h w 3] uint8 as PNG."""
+    done, encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    if not done:
+        raise OSError("OpenCV cannot encode a PNG")
+    return encoded.tobytes()
+
+
+def data_uri(image: bytes) -> str:
+    """PNG bytes for the src of an <img> that must open without a network."""
+    return "data:image/png;base64," + base64.b64encode(image).decode()
+
+
+def figure_png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=200)
+    return buffer.getvalue()
+
+
+def error_curves(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Sequence[str]) -> Figure:
+    """Mean over episodes by frame, a row of panels for each metric and a column for each robot; bands are quartiles."""
+    robots = [robot for robot in robots if (curves["robot"] == robot).any()]
+    figure = Figure(figsize=(10, 0.5 + 2.1 * len(metrics)), layout="constrained")
+    panels = figure.subplots(len(metrics), len(robots), sharex=True, sharey="row", squeeze=False)
+    for line, metric in zip(panels, metrics, strict=True):
+        for panel, robot in zip(line, robots, strict=True):
+            chosen = curves[(curves["robot"] == robot) & (curves["metric"] == metric.name)]
+            _draw_models(panel, chosen, metric)
+            _dress(panel)
+        arrow = "higher is better" if metric.higher_is_better else "lower is better"
+        unit = f" [{metric.unit}]" if metric.unit else ""
+        line[0].set_ylabel(f"{METRIC_TITLES.get(metric.name, metric.name)}{unit}\n{arrow}", fontsize=9)
+    for panel, robot in zip(panels[0], robots, strict=True):
+        panel.set_title(ROBOT_TITLES.get(robot, robot), fontsize=11, loc="left", fontweight="bold")
+    for panel in panels[-1]:
+        panel.set_xlabel("frame", fontsize=9)
+    named = {label: handle for panel in panels.flat for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)}
+    figure.legend(named.values(), named, loc="outside upper right", ncols=len(named), frameon=False, fontsize=9)
+    return figure
+
+
+def _draw_models(panel: matplotlib.axes.Axes, curves: pd.DataFrame, metric: MetricInfo) -> None:
+    models = list(dict.fromkeys(zip(curves["model"], curves["condition"], strict=True)))
+    own = [key for key in models if key[0] not in (COPY, TRUTH)]
+    # The truth's PSNR is a cap, not a measurement, and would squeeze everything else flat.
+    baselines = [key for key in models if key[0] == COPY or (key[0] == TRUTH and metric.name != "psnr")]
+    for key in own + baselines:
+        group = curves[(curves["model"] == key[0]) & (curves["condition"] == key[1])].groupby("frame")["value"]
+        mean, low, high = group.mean(), group.quantile(0.25), group.quantile(0.75)
+        if key in own:
+            colour = COLOURS[own.index(key) % len(COLOURS)]
+            panel.fill_between(mean.index, low, high, color=colour, alpha=0.15, linewidth=0)
+            panel.plot(mean.index, mean, color=colour, linewidth=2, label=" · ".join(filter(None, key)))
+        else:
+            dash, label = ("--", "frozen first frame") if key[0] == COPY else (":", "ground truth")
+            panel.plot(mean.index, mean, color="#57606a", linewidth=1.3, linestyle=dash, label=label)
+
+
+def _dress(panel: matplotlib.axes.Axes) -> None:
+    panel.spines[["top", "right"]].set_visible(False)
+    panel.spines[["left", "bottom"]].set_color("#8c959f")
+    panel.tick_params(labelsize=8, color="#8c959f")
+    panel.grid(axis="y", color="#d0d7de", linewidth=0.6)

@@ -1,0 +1,273 @@
+"""Stage 11 of 11: report. A score table to one page that opens without a network.
+
+Reads  scores.parquet and its curves; the data set and the rollouts for pictures
+Writes <out>/index.html (self-contained), report.md with figures/, summary.csv
+
+    python -m xew.analysis.report demo/scores.parquet --data demo/data --rollouts demo/rollouts --out demo/report
+"""
+
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import pandas as pd
+import tyro
+from tqdm import tqdm
+
+from xew.analysis import page, pictures
+from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, read_scores
+from xew.analysis.summary import METRIC_TITLES, ROBOT_TITLES, RobotTable, finding, flat_summary, robot_table
+from xew.config import ConfigError, user_errors
+from xew.episode import Record, episode_folder, find_records, read_video
+from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
+from xew.rollout import Rollout, find_rollouts, read_rollout_video
+
+TITLE = "Can the model render a robot that it has never seen?"
+STRIP_METRIC = "lpips"
+"""By which episodes are ranked, so that strips show the best, the median and the worst."""
+CURVE_METRICS = ("lpips", "psnr", "mask_iou")
+SHEET_TASKS = 8
+
+
+@dataclass(frozen=True)
+class Args:
+    """Turn a score table into one HTML page, with Markdown and CSV beside it."""
+
+    scores: Annotated[Path, tyro.conf.Positional]
+    """Made by python -m xew.metrics.evaluate."""
+    data: Path | None = None
+    """The data set, for pictures and for the number of episodes that a complete table has."""
+    rollouts: tuple[Path, ...] = ()
+    """The graded rollouts, for pictures."""
+    out: Path = Path("report")
+    """Folder to write."""
+    held_out: tuple[str, ...] = HELD_OUT_ROBOTS
+    """Robots that the models have not seen; each has a table of its own."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of the page."""
+
+    name: str
+    image: bytes
+    """PNG."""
+    html: str
+
+
+@user_errors
+def main(args: Args) -> None:
+    """Read everything, then write the page."""
+    scores = read_scores(args.scores)
+    for robot in args.held_out:
+        if robot not in ROBOT_NAMES:
+            raise ConfigError(f"--held-out names {robot!r}; known: {', '.join(ROBOT_NAMES)}.")
+    records = [record for _, record in find_records(args.data)] if args.data else []
+    if args.data and not records:
+        raise ConfigError(f"{args.data} holds no episode; make some: python -m xew.sim_warp.generate --out {args.data}")
+    held_out, seen = _tables(scores, records, args.held_out)
+    strips = _strips(scores, args) if args.data and args.rollouts else []
+    curves = _curves(scores, args.held_out)
+    sheets = [_contact_sheet(args.data, records)] if args.data else []
+    sections = [
+        _held_out_section(held_out, scores.metrics),
+        _strip_section(strips),
+        page.section("How the error grows with time", curves.html),
+        _seen_section(seen, scores.metrics),
+        _data_section(sheets, records),
+        _method_section(scores, args),
+    ]
+    sentences = finding(held_out, scores.metrics)
+    html = page.page(TITLE, sentences, [text for text in sections if text], _footer(scores))
+    _write(args.out, html, _markdown(sentences, held_out, seen, scores, [*strips, curves, *sheets]), held_out + seen)
+    print(f"report: {args.out / 'index.html'}")
+
+
+def _tables(scores: Scores, records: Sequence[Record], held_out: Sequence[str]) -> tuple[list[RobotTable], list[RobotTable]]:
+    """A table for each held-out robot, never averaged over them; one for the seen robots pooled, as in the paper."""
+    present = set(scores.rows["robot"])
+
+    def build(title: str, robots: Sequence[str]) -> RobotTable:
+        return robot_table(scores, title, robots, _expected(records, robots) if records else None)
+
+    apart = [build(ROBOT_TITLES[robot], [robot]) for robot in held_out if robot in present]
+    rest = [robot for robot in ROBOT_NAMES if robot in present and robot not in held_out]
+    pooled = [build("Pooled: " + ", ".join(ROBOT_TITLES[robot] for robot in rest), rest)] if rest else []
+    return apart, pooled
+
+
+def _expected(records: Sequence[Record], robots: Sequence[str]) -> int:
+    """Test episodes of these robots in seeds that all robots have mastered: what a complete table has."""
+    failed = {(record.task, record.seed) for record in records if not record.success}
+    tests = [record for record in records if seed_split(record.seed) == "test" and (record.task, record.seed) not in failed]
+    return sum(record.robot in robots for record in tests)
+
+
+def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> str:
+    if not tables:
+        return page.section("Robots never seen in training", page.note("No held-out robot has been graded yet."))
+    few = min(table.count for table in tables) < 10
+    caution = page.note("Fewer than ten episodes a robot: intervals and verdicts are rough.") if few else ""
+    return page.section(
+        "Robots never seen in training",
+        page.paragraph(
+            "Means over episodes with 95 % bootstrap intervals. Against the frozen first frame, paired by episode: "
+            "▲ better, ▼ worse, ≈ not resolved. The ceiling is the true video graded in the model's place, so its "
+            "distance from perfect is the error of the mask estimator."
+        ),
+        caution,
+        *(page.score_table(table, metrics) for table in tables),
+    )
+
+
+def _seen_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> str:
+    if not tables:
+        return ""
+    text = "The same model on robots that it was trained on, at test seeds: what is missing here is not embodiment."
+    return page.section("Robots seen in training", page.paragraph(text), *(page.score_table(t, metrics) for t in tables))
+
+
+def _strip_section(strips: Sequence[Picture]) -> str:
+    if not strips:
+        return page.section(
+            "What it looks like", page.note("No pictures: name the data and the rollouts (--data, --rollouts).")
+        )
+    text = (
+        "Best, median and worst episode of each held-out robot by LPIPS. The difference is the largest of the three "
+        f"channels, white for none, black for {pictures.DIFFERENCE_FULL} of 255 levels or more. Frame 0 is given."
+    )
+    return page.section("What it looks like", page.paragraph(text), *(strip.html for strip in strips))
+
+
+def _data_section(sheets: Sequence[Picture], records: Sequence[Record]) -> str:
+    if not sheets:
+        return ""
+    accepted = sum(record.success for record in records)
+    text = f"{len(records)} cells were tried, {accepted} succeeded. A seed counts when every robot has mastered it."
+    return page.section("The paired data", page.paragraph(text), *(sheet.html for sheet in sheets))
+
+
+def _method_section(scores: Scores, args: Args) -> str:
+    definitions = {METRIC_TITLES.get(metric.name, metric.name): metric.reference for metric in scores.metrics}
+    notes = (
+        "Every metric is a mean over the predicted frames; frame 0 is given to the model and never scored. Masks in "
+        "predicted video are estimated with the help of the true episode, by the same estimator for every row."
+    )
+    made = {"scores": str(args.scores), "data": str(args.data or "not given"), "protocol": str(scores.protocol)}
+    made["rollouts"] = ", ".join(map(str, args.rollouts)) or "not given"
+    return page.section("How it was measured", page.paragraph(notes), page.definitions(definitions), page.definitions(made))
+
+
+def _strips(scores: Scores, args: Args) -> list[Picture]:
+    """Up to three strips for each held-out robot and model."""
+    assert args.data is not None
+    rollouts = {(r.model, r.condition, r.task, r.seed, r.robot): r for root in args.rollouts for r in find_rollouts(root)}
+    rows = scores.rows[(scores.rows["metric"] == STRIP_METRIC) & scores.rows["robot"].isin(args.held_out)]
+    rows = rows[~rows["model"].isin([COPY, TRUTH])]
+    chosen = [pair for _, group in rows.groupby(["robot", "model", "condition"]) for pair in _ranked(group)]
+    return [_strip(row, word, rollouts, args.data) for word, row in tqdm(chosen, desc="strips", unit="strip", disable=None)]
+
+
+def _ranked(group: pd.DataFrame) -> list[tuple[str, pd.Series]]:
+    """Best, median and worst row by the ranking metric (lower is better); fewer where there are fewer."""
+    ordered = group.sort_values(["value", "task", "seed"])
+    places = {0: "best", len(ordered) // 2: "median", len(ordered) - 1: "worst"}
+    return [(word, ordered.iloc[place]) for place, word in sorted(places.items())]
+
+
+def _strip(row: pd.Series, word: str, rollouts: dict[tuple[str, str, str, int, str], Rollout], data: Path) -> Picture:
+    key = (row["model"], row["condition"], row["task"], int(row["seed"]), row["robot"])
+    if key not in rollouts:
+        raise ConfigError(f"the rollout {' '.join(map(str, key))} is graded but not under --rollouts; name its tree too.")
+    predicted = read_rollout_video(rollouts[key])
+    observed = read_video(episode_folder(data, *key[2:]) / "rgb.mkv")
+    times = pictures.strip_times(int(row["frames"]))
+    image = pictures.png(pictures.strip(observed, predicted, times))
+    caption = (
+        f"<b>{ROBOT_TITLES[row['robot']]}, {page.escape(row['task'])}</b>, seed {row['seed']} · "
+        f"{page.escape(' · '.join(filter(None, key[:2])))} · {word}, LPIPS {row['value']:.3f}"
+    )
+    columns = [f"frame {t}" for t in times]
+    html = page.labelled_picture(pictures.data_uri(image), caption, columns, ["observed", "predicted", "difference"])
+    return Picture("_".join((*map(str, key[:5]), word)).replace("/", "-") + ".png", image, html)
+
+
+def _curves(scores: Scores, held_out: Sequence[str]) -> Picture:
+    metrics = [metric for metric in scores.metrics if metric.name in CURVE_METRICS] or list(scores.metrics[:3])
+    robots = [robot for robot in held_out if robot in set(scores.rows["robot"])] or sorted(set(scores.rows["robot"]))
+    image = pictures.figure_png(pictures.error_curves(scores.curves, metrics, robots))
+    caption = "Mean over episodes frame by frame; bands hold the middle half of the episodes."
+    return Picture("curves.png", image, page.picture(pictures.data_uri(image), caption, "error curves"))
+
+
+def _contact_sheet(data: Path, records: Sequence[Record]) -> Picture:
+    """One seed of each task, middle frame, all robots side by side."""
+    accepted = [record for record in records if record.success]
+    tasks = sorted({record.task for record in accepted})[:SHEET_TASKS]
+    robots = [robot for robot in ROBOT_NAMES if any(record.robot == robot for record in accepted)]
+    rows = [_task_row(data, [record for record in accepted if record.task == task], robots) for task in tasks]
+    image = pictures.png(pictures.sheet(rows))
+    caption = "One seed of each task half-way through: the scene is the same for every robot."
+    titles = [ROBOT_TITLES[robot] for robot in robots]
+    names = [task.replace("_", " ") for task in tasks]
+    return Picture("data.png", image, page.labelled_picture(pictures.data_uri(image), caption, titles, names))
+
+
+def _task_row(data: Path, records: Sequence[Record], robots: Sequence[str]) -> list[np.ndarray]:
+    """Middle frames of the seed that most robots have, a white picture for those that have not."""
+    by_seed: dict[int, dict[str, Record]] = {}
+    for record in records:
+        by_seed.setdefault(record.seed, {})[record.robot] = record
+    seed = max(sorted(by_seed), key=lambda seed: len(by_seed[seed]))
+    found = {}
+    for robot, record in by_seed[seed].items():
+        video = read_video(episode_folder(data, record.task, seed, robot) / "rgb.mkv")
+        found[robot] = video[len(video) // 2]
+    blank = np.full_like(next(iter(found.values())), 255)
+    return [found.get(robot, blank) for robot in robots]
+
+
+def _footer(scores: Scores) -> str:
+    packages = ("xew", "numpy", "scipy", "pandas", "opencv-python-headless")
+    versions = {name: metadata.version(name) for name in packages} | scores.versions
+    text = " · ".join(f"{name} {version}" for name, version in versions.items())
+    return page.escape(f"{text} · Python {platform.python_version()}")
+
+
+def _markdown(
+    sentences: Sequence[str],
+    held_out: Sequence[RobotTable],
+    seen: Sequence[RobotTable],
+    scores: Scores,
+    figures: Sequence[Picture],
+) -> tuple[str, dict[str, bytes]]:
+    """report.md and the files that it shows."""
+    lines = [f"# {TITLE}", "", *(f"- {sentence}" for sentence in sentences)]
+    for heading, tables in (("Robots never seen in training", held_out), ("Robots seen in training", seen)):
+        lines += ["", f"## {heading}"]
+        for table in tables:
+            state = "" if table.complete else f" (incomplete: {table.count} of {table.expected} test episodes)"
+            lines += ["", f"### {table.title}{state}", "", page.markdown_table(table, scores.metrics)]
+    lines += ["", "## Figures", "", *(f"![{figure.name}](figures/{figure.name})" for figure in figures)]
+    return "\n".join(lines) + "\n", {figure.name: figure.image for figure in figures}
+
+
+def _write(out: Path, html: str, markdown: tuple[str, dict[str, bytes]], tables: Sequence[RobotTable]) -> None:
+    try:
+        (out / "figures").mkdir(parents=True, exist_ok=True)
+        text, figures = markdown
+        for name, image in figures.items():
+            (out / "figures" / name).write_bytes(image)
+        (out / "report.md").write_text(text)
+        flat_summary(tables).to_csv(out / "summary.csv", index=False)
+        (out / "index.html").write_text(html)
+    except OSError as error:
+        raise ConfigError(f"cannot write the report to {out}: {error}. Choose another --out.") from error
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, prog="python -m xew.analysis.report"))

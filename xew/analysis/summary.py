@@ -1,0 +1,175 @@
+"""Stage 11 of 11: scores to means, intervals and verdicts, robot by robot."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores
+
+RESAMPLES = 9999
+LEVEL = 0.95
+
+ROBOT_TITLES = {
+    "aloha_agilex": "Aloha-AgileX",
+    "arx_x5": "ARX-X5",
+    "ur5_wsg": "UR5 with WSG-50",
+    "franka_panda": "Franka Panda",
+    "piper": "Piper",
+}
+METRIC_TITLES = {
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "mask_iou": "Mask IoU",
+    "boundary_f1": "Boundary F1",
+    "region_lpips": "Region LPIPS",
+    "pck": "PCK",
+    "keypoint_error": "Keypoint error",
+    "ndtw": "nDTW",
+    "trajectory_error": "Object error",
+}
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean over episodes and its bootstrap interval; the ends are NaN where there is one episode only."""
+
+    mean: float
+    low: float
+    high: float
+    count: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a robot's table."""
+
+    model: str
+    condition: str
+    scores: dict[str, Interval]
+    """By metric."""
+    verdicts: dict[str, str]
+    """By metric, against the frozen first frame, paired by episode: better, worse or unresolved; empty for baselines."""
+
+    @property
+    def title(self) -> str:
+        baseline = {COPY: "frozen first frame", TRUTH: "ground truth (ceiling)"}.get(self.model)
+        return baseline or (f"{self.model} · {self.condition}" if self.condition else self.model)
+
+
+@dataclass(frozen=True)
+class RobotTable:
+    """The scores of one robot, or of several that are pooled on purpose."""
+
+    title: str
+    robots: tuple[str, ...]
+    rows: tuple[Row, ...]
+    expected: int | None
+    """Episodes that the protocol's data hold for a model; None where the data set was not given."""
+
+    @property
+    def count(self) -> int:
+        """Episodes of the model that has fewest."""
+        return min((score.count for row in self.rows for score in row.scores.values()), default=0)
+
+    @property
+    def complete(self) -> bool:
+        return self.expected is None or all(score.count == self.expected for row in self.rows for score in row.scores.values())
+
+
+def mean_interval(values: np.ndarray) -> Interval:
+    """Mean of episodes' scores [n] and its percentile bootstrap interval at LEVEL; the same at every call."""
+    values = np.asarray(values, np.float64)
+    mean = float(values.mean())
+    if len(values) < 2:
+        return Interval(mean, np.nan, np.nan, len(values))
+    if np.ptp(values) == 0:
+        return Interval(mean, mean, mean, len(values))
+    result = stats.bootstrap(
+        (values,), np.mean, n_resamples=RESAMPLES, confidence_level=LEVEL, method="percentile", rng=np.random.default_rng(0)
+    )
+    return Interval(mean, float(result.confidence_interval.low), float(result.confidence_interval.high), len(values))
+
+
+def verdict(model: pd.Series, copy: pd.Series, higher_is_better: bool) -> str:
+    """Is a model better than the frozen first frame on the episodes that both have? Series are indexed by episode.
+
+    'unresolved' where the interval of the mean paired difference holds 0, or where there are fewer than two episodes.
+    """
+    difference = (model - copy).dropna().to_numpy() * (1 if higher_is_better else -1)
+    if len(difference) < 2:
+        return "unresolved"
+    interval = mean_interval(difference)
+    if interval.low > 0:
+        return "better"
+    return "worse" if interval.high < 0 else "unresolved"
+
+
+def robot_table(scores: Scores, title: str, robots: Sequence[str], expected: int | None) -> RobotTable:
+    """Rows for all models, then the frozen first frame, then the truth."""
+    rows = scores.rows[scores.rows["robot"].isin(robots)]
+    groups = rows.groupby(["model", "condition"], sort=False)
+    by_model = {(str(model), str(condition)): group for (model, condition), group in groups}
+    ends = [key for name in (COPY, TRUTH) for key in by_model if key[0] == name]
+    order = [key for key in by_model if key[0] not in (COPY, TRUTH)] + ends
+    copy = next((by_model[key] for key in ends if key[0] == COPY), None)
+    built = tuple(_row(key, by_model[key], copy, scores.metrics) for key in order)
+    return RobotTable(title, tuple(robots), built, expected)
+
+
+def _row(key: tuple[str, str], group: pd.DataFrame, copy: pd.DataFrame | None, metrics: Sequence[MetricInfo]) -> Row:
+    values = {metric.name: _by_episode(group, metric.name) for metric in metrics}
+    verdicts = {}
+    if copy is not None and key[0] not in (COPY, TRUTH):
+        for metric in metrics:
+            verdicts[metric.name] = verdict(values[metric.name], _by_episode(copy, metric.name), metric.higher_is_better)
+    intervals = {name: mean_interval(series.to_numpy()) for name, series in values.items() if len(series)}
+    return Row(*key, intervals, verdicts)
+
+
+def _by_episode(rows: pd.DataFrame, metric: str) -> pd.Series:
+    return rows[rows["metric"] == metric].set_index(["task", "seed", "robot"])["value"]
+
+
+def finding(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> list[str]:
+    """The result in sentences, one for each robot and model: against the frozen first frame, metric by metric."""
+    compared = [(table, row) for table in tables for row in table.rows if row.verdicts]
+    sentences = [f"{table.title}: {row.title} {_compare(row, metrics)}." for table, row in compared]
+    return sentences or ["No model has been compared with the frozen first frame yet: grade with --baselines."]
+
+
+def _compare(row: Row, metrics: Sequence[MetricInfo]) -> str:
+    parts = []
+    for word, phrase in (("better", "beats"), ("worse", "falls behind"), ("unresolved", "cannot be told from")):
+        names = [METRIC_TITLES.get(m.name, m.name) for m in metrics if row.verdicts.get(m.name) == word]
+        if names:
+            parts.append(f"{phrase} a frozen first frame on {_join(names)}")
+    return "; it ".join(parts)
+
+
+def _join(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def flat_summary(tables: Sequence[RobotTable]) -> pd.DataFrame:
+    """All tables as one tidy frame: robots model condition metric mean low high episodes expected versus_frozen."""
+    return pd.DataFrame(
+        {
+            "robots": " ".join(table.robots),
+            "model": row.model,
+            "condition": row.condition,
+            "metric": name,
+            "mean": score.mean,
+            "low": score.low,
+            "high": score.high,
+            "episodes": score.count,
+            "expected": table.expected,
+            "versus_frozen": row.verdicts.get(name, ""),
+        }
+        for table in tables
+        for row in table.rows
+        for name, score in row.scores.items()
+    )
