@@ -350,6 +350,5 @@ def _shading() -> shading.Shading:
     values.sky_share = stage.SKY_SHARE
     values.exposure = stage.EXPOSURE
     values.specular = stage.SPECULAR
-    values.shininess = stage.SHININESS
     values.knee, shading.ceiling = stage.KNEE, stage.CEILING
     return values

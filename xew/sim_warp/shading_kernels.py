@@ -40,7 +40,6 @@ class Shading:
     sky_share: float
     exposure: float
     specular: float
-    shininess: float
     knee: float
     ceiling: float
 
@@ -105,6 +104,7 @@ class Surface:
 
     point: wp.vec3
     normal: wp.vec3
+    to_eye: wp.vec3
     albedo: wp.vec3
 
 
@@ -142,6 +142,7 @@ def surface_at(
     surface = Surface()
     surface.point = wp.transpose(camera.rotation) * (seen - camera.translation)
     surface.normal = wp.normalize(wp.transform_vector(body_pose, normal))
+    surface.to_eye = wp.transpose(camera.rotation) * (-wp.normalize(seen))
     surface.albedo = geometry.albedo[packed]
     return surface
 
@@ -153,19 +154,24 @@ def ambient_light(surface: Surface, shading: Shading) -> wp.vec3:
 
 
 @wp.func
-def direct_light(surface: Surface, light: Light, eye: wp.vec3, shading: Shading) -> wp.vec3:
-    """Lambert's diffuse and Blinn-Phong's highlight of one light, without shadow."""
+def direct_light(surface: Surface, light: Light, shading: Shading) -> wp.vec3:
+    """Lambert's diffuse and Blinn-Phong's highlight (to the power of 32) of one light, without shadow."""
     to_light = light.to_light
     intensity = light.intensity
     if light.view.parallel == 0:
         offset = light.position - surface.point
-        intensity /= wp.length_sq(offset)
-        to_light = wp.normalize(offset)
+        squared = wp.length_sq(offset)
+        to_light = offset / wp.sqrt(squared)
+        intensity = light.intensity / squared
     facing = wp.dot(surface.normal, to_light)
     if facing <= 0.0:
         return wp.vec3(0.0, 0.0, 0.0)
-    halfway = wp.normalize(to_light + wp.normalize(eye - surface.point))
-    gloss = shading.specular * wp.pow(wp.max(wp.dot(surface.normal, halfway), 0.0), shading.shininess)
+    shine = wp.max(wp.dot(surface.normal, wp.normalize(to_light + surface.to_eye)), 0.0)
+    shine = shine * shine
+    shine = shine * shine
+    shine = shine * shine
+    shine = shine * shine
+    gloss = shading.specular * shine * shine
     return (surface.albedo * facing + wp.vec3(gloss, gloss, gloss)) * (intensity * shading.exposure)
 
 
@@ -182,11 +188,6 @@ def toned(light: float, shading: Shading) -> float:
 @wp.func
 def toned_color(light: wp.vec3, shading: Shading) -> wp.vec3:
     return wp.vec3(toned(light[0], shading), toned(light[1], shading), toned(light[2], shading))
-
-
-@wp.func
-def eye_of(camera: View) -> wp.vec3:
-    return -(wp.transpose(camera.rotation) * camera.translation)
 
 
 @wp.func
@@ -225,7 +226,6 @@ def light_stage(
 ):
     """Light on the stage, once per camera: by source, so that a frame only has to multiply with its shadows."""
     row, column = wp.tid()
-    eye = eye_of(camera)
     ambient = wp.vec3(0.0, 0.0, 0.0)
     for sample in range(SAMPLES):
         triangle = owner(key_in[0, sample, row, column], wp.uint64(0))
@@ -242,7 +242,7 @@ def light_stage(
                 if sample == CENTER:
                     shadow_texel_out[i, row, column] = on_screen(lights[i].view, in_view(lights[i].view, surface.point))
                 else:
-                    direct_out[i, row, column] += direct_light(surface, lights[i], eye, shading) * 0.25
+                    direct_out[i, row, column] += direct_light(surface, lights[i], shading) * 0.25
     ambient_out[row, column] = ambient
 
 
@@ -280,7 +280,6 @@ def stage_light(
 @wp.func
 def surface_light(
     surface: Surface,
-    camera: View,
     lights: wp.array(dtype=Light),
     shading: Shading,
     frame: int,
@@ -290,7 +289,7 @@ def surface_light(
     total = ambient_light(surface, shading)
     for i in range(lights.shape[0]):
         light = lights[i]
-        arriving = direct_light(surface, light, eye_of(camera), shading)
+        arriving = direct_light(surface, light, shading)
         if map_in.shape[1] > 0 and arriving[0] + arriving[1] + arriving[2] > 0.0:
             texel = on_screen(light.view, in_view(light.view, surface.point))
             arriving = arriving * lit_share(texel, shadow_reach(texel, light.view.parallel), frame, i, map_in, tile_in)
@@ -355,7 +354,7 @@ def shade_pixels(
                 ray = pixel_ray(camera, float(column) + place[1] / count, float(row) + place[2] / count)
                 body_pose = pose[frame_pose[frame] + geometry.triangle_body[packed]]
                 surface = surface_at(geometry, packed, body_pose, camera, ray * (count / place[3]), frame, vertex_in)
-                total += surface_light(surface, camera, lights, shading, frame, map_in, tile_in) * (0.25 * count)
+                total += surface_light(surface, lights, shading, frame, map_in, tile_in) * (0.25 * count)
     for channel in range(3):
         rgb_out[frame, row, column, channel] = encoded(total[channel], srgb)
 

@@ -34,8 +34,7 @@ EXPOSURE = 0.5
 KNEE, CEILING = 0.6, 0.95
 """Linear image values above the knee bend towards the ceiling, so that what is lit never reaches white."""
 SPECULAR = 0.12
-SHININESS = 24.0
-"""Strength and exponent of the Blinn-Phong highlight that all surfaces of robots and objects share."""
+"""Strength of the highlight that all surfaces share."""
 
 
 @dataclass(frozen=True)
