@@ -24,7 +24,7 @@ from xew.sim_warp.raster_kernels import (
     vec5,
 )
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})  # why: see raster_kernels.py
 
 SHADOW_BIAS = wp.constant(0.0015)
 """How far behind a surface a point is still lit [m]."""
@@ -182,7 +182,7 @@ def toned(light: float, shading: Shading) -> float:
     if above <= 0.0:
         return light
     room = shading.ceiling - shading.knee
-    return shading.knee + room * (1.0 - wp.exp(-above / room))
+    return shading.knee + room * (above / (above + room))
 
 
 @wp.func

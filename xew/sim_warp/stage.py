@@ -31,7 +31,7 @@ SKY_SHARE = 0.35
 """Share of the ambient light that comes from above: a surface facing down misses it, so that round links look round."""
 EXPOSURE = 0.5
 """Factor from light to linear image value: it puts the lit white table at 0.8, below the white of the image."""
-KNEE, CEILING = 0.6, 0.95
+KNEE, CEILING = 0.7, 0.95
 """Linear image values above the knee bend towards the ceiling, so that what is lit never reaches white."""
 SPECULAR = 0.12
 """Strength of the highlight that all surfaces share."""
