@@ -17,6 +17,7 @@ GAP = 4
 """White pixels between the pictures of a sheet."""
 DIFFERENCE_FULL = 96
 """Levels of 255 at which the difference picture is darkest."""
+FRAME = (208, 215, 222)
 COLOURS = ("#1f6feb", "#c2410c", "#15803d", "#7e22ce", "#a16207", "#0e7490")
 """Of models, in order; baselines are grey."""
 
@@ -24,7 +25,9 @@ COLOURS = ("#1f6feb", "#c2410c", "#15803d", "#7e22ce", "#a16207", "#0e7490")
 def difference_picture(predicted: np.ndarray, observed: np.ndarray) -> np.ndarray:
     """Largest channel difference of two uint8 frames [h w 3] as colour: white is none, black DIFFERENCE_FULL or more."""
     difference = cv2.absdiff(predicted, observed).max(axis=-1) / DIFFERENCE_FULL
-    return (matplotlib.colormaps["gist_heat_r"](np.minimum(difference, 1))[..., :3] * 255).astype(np.uint8)
+    picture = (matplotlib.colormaps["gist_heat_r"](np.minimum(difference, 1))[..., :3] * 255).astype(np.uint8)
+    height, width = picture.shape[:2]
+    return cv2.rectangle(picture, (0, 0), (width - 1, height - 1), FRAME, 1)  # else white on white has no edge
 
 
 def strip_times(frame_count: int, count: int = 5) -> list[int]:

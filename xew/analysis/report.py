@@ -81,7 +81,7 @@ def main(args: Args) -> None:
         _data_section(sheets, records),
         _method_section(scores, args),
     ]
-    sentences = finding(held_out, scores.metrics)
+    sentences = finding(held_out, seen, scores.metrics)
     html = page.page(TITLE, sentences, [text for text in sections if text], _footer(scores))
     _write(args.out, html, _markdown(sentences, held_out, seen, scores, [*strips, curves, *sheets]), held_out + seen)
     print(f"report: {args.out / 'index.html'}")

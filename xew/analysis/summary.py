@@ -134,11 +134,35 @@ def _by_episode(rows: pd.DataFrame, metric: str) -> pd.Series:
     return rows[rows["metric"] == metric].set_index(["task", "seed", "robot"])["value"]
 
 
-def finding(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> list[str]:
-    """The result in sentences, one for each robot and model: against the frozen first frame, metric by metric."""
-    compared = [(table, row) for table in tables for row in table.rows if row.verdicts]
-    sentences = [f"{table.title}: {row.title} {_compare(row, metrics)}." for table, row in compared]
+def finding(held_out: Sequence[RobotTable], seen: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> list[str]:
+    """The result in sentences, one for each held-out robot and model: how far from a frozen frame towards the truth."""
+    compared = [(table, row) for table in held_out for row in table.rows if row.verdicts]
+    sentences = []
+    for table, row in compared:
+        twins = [(other, twin) for other in seen for twin in other.rows if _same_model(twin, row)]
+        sentences.append(f"{table.title}: {row.title} {_compare(row, metrics)}.{_distance_covered((table, row), twins)}")
     return sentences or ["No model has been compared with the frozen first frame yet: grade with --baselines."]
+
+
+def _same_model(a: Row, b: Row) -> bool:
+    return (a.model, a.condition) == (b.model, b.condition)
+
+
+def _distance_covered(own: tuple[RobotTable, Row], seen: Sequence[tuple[RobotTable, Row]], metric: str = "lpips") -> str:
+    shares = [progress(table, row, metric) for table, row in (own, *seen)]
+    if shares[0] is None:
+        return ""
+    beside = f" (on seen robots {shares[1]:.0%})" if len(shares) > 1 and shares[1] is not None else ""
+    return f" In {METRIC_TITLES[metric]} it covers {shares[0]:.0%} of the way from there to the truth{beside}."
+
+
+def progress(table: RobotTable, row: Row, metric: str) -> float | None:
+    """0 where the model's mean is the frozen first frame's, 1 where it is the truth's; None where these are not graded."""
+    ends = [other.scores.get(metric) for name in (COPY, TRUTH) for other in table.rows if other.model == name]
+    own = row.scores.get(metric)
+    if own is None or len(ends) < 2 or ends[0] is None or ends[1] is None or ends[0].mean == ends[1].mean:
+        return None
+    return (own.mean - ends[0].mean) / (ends[1].mean - ends[0].mean)
 
 
 def _compare(row: Row, metrics: Sequence[MetricInfo]) -> str:
