@@ -197,9 +197,10 @@ def _find_record(rollout: Rollout, folder: Path, data: Path) -> Record:
         )
     record = read_record(folder)
     if not record.success:
-        raise RolloutError(
-            f"{folder} is a rejected cell ({record.failure}); there is nothing to compare {rollout.folder} with."
-        )
+        raise RolloutError(f"{rollout.folder} predicts an episode that was rejected ({record.failure}); delete this rollout.")
+    source = rollout.header.get("source_hash")
+    if source is not None and source != record.hashes.get("rgb"):
+        raise RolloutError(f"{rollout.folder} was made from another video than {folder} now holds; make this rollout again.")
     return record
 
 

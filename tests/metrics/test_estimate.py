@@ -1,0 +1,73 @@
+"""The default mask estimator: near the truth on true video, and not to be won by standing still."""
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.synthetic import write_cell
+from xew.episode import read_states, read_video
+from xew.metrics import boundary_f1, mask_iou
+from xew.metrics.estimate import estimate_masks, learn_appearance
+
+FRAMES = 13
+ROBOTS = ("franka_panda", "piper")
+
+
+@pytest.fixture(scope="module", params=ROBOTS)
+def episode(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[np.ndarray, np.ndarray]:
+    """True video [t h w 3] and masks [t h w]."""
+    folder = write_cell(tmp_path_factory.mktemp("data"), "place_empty_cup", 1_000_000, request.param, FRAMES)
+    return read_video(folder / "rgb.mkv"), read_states(folder).robot_mask
+
+
+def mean(metric: object, a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.mean(metric(a, b)[1:]))
+
+
+def test_on_true_video_it_is_near_perfect(episode: tuple[np.ndarray, np.ndarray]) -> None:
+    video, mask = episode
+    estimate = estimate_masks(video, video, mask)
+    assert mean(mask_iou, estimate, mask) > 0.95
+    assert mean(boundary_f1, estimate, mask) > 0.95
+
+
+def test_a_soft_but_right_video_loses_little(episode: tuple[np.ndarray, np.ndarray]) -> None:
+    video, mask = episode
+    soft = np.stack([cv2.GaussianBlur(frame, (0, 0), 0.8) for frame in video])
+    assert mean(mask_iou, estimate_masks(soft, video, mask), mask) > 0.93
+
+
+WRONG_MOTIONS = {
+    "frozen": np.zeros(FRAMES, int),
+    "three frames late": np.maximum(np.arange(FRAMES) - 3, 0),
+    "half as fast": np.arange(FRAMES) // 2,
+}
+
+
+@pytest.mark.parametrize("name", WRONG_MOTIONS)
+def test_a_wrong_motion_is_scored_as_wrong_as_it_is(name: str, episode: tuple[np.ndarray, np.ndarray]) -> None:
+    """The shown mask is known here, so that estimate and truth can be held side by side."""
+    video, mask = episode
+    shown = WRONG_MOTIONS[name]
+    estimate = estimate_masks(video[shown], video, mask)
+    for metric in (mask_iou, boundary_f1):
+        assert mean(metric, estimate, mask) == pytest.approx(mean(metric, mask[shown], mask), abs=0.03)
+
+
+def test_standing_still_does_not_win(episode: tuple[np.ndarray, np.ndarray]) -> None:
+    video, mask = episode
+    frozen = np.repeat(video[:1], FRAMES, axis=0)
+    assert mean(mask_iou, estimate_masks(frozen, video, mask), mask) < 0.6
+
+
+def test_without_a_robot_in_sight_nothing_is_found(episode: tuple[np.ndarray, np.ndarray]) -> None:
+    video, mask = episode
+    empty = np.repeat(learn_appearance(video, mask).background[None], FRAMES, axis=0)
+    estimate = estimate_masks(empty, video, mask)
+    assert mean(mask_iou, estimate, mask) < 0.3
+
+
+def test_it_is_the_same_every_time(episode: tuple[np.ndarray, np.ndarray]) -> None:
+    video, mask = episode
+    late = video[WRONG_MOTIONS["three frames late"]]
+    np.testing.assert_array_equal(estimate_masks(late, video, mask), estimate_masks(late, video, mask))
