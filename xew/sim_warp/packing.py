@@ -76,7 +76,8 @@ def check_world(world: World) -> None:
 def distinct_worlds(worlds: Sequence[World]) -> tuple[list[Sequence[Body]], list[int]]:
     """The different lists of bodies among the worlds, and which of them each world shows."""
     found: dict[tuple[tuple[int, bool], ...], int] = {}
-    kinds, index = [], []
+    kinds: list[Sequence[Body]] = []
+    index = []
     for world in worlds:
         key = tuple((id(body.mesh), body.is_robot) for body in world.bodies)
         if key not in found:

@@ -6,6 +6,9 @@ has the same bytes whatever the device's schedule and whatever else is in the ch
 (shading_kernels.py). Triangles are counter-clockwise seen from outside, camera frame x right, y down, z forward.
 """
 
+# Annotations of kernels are types of Warp, which mypy does not know.
+# mypy: ignore-errors
+
 import warp as wp
 
 # Nobody differentiates images, and half the code compiles in half the time. Without fused multiply-adds, and with no

@@ -7,7 +7,7 @@ else is rendered with it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import warp as wp
@@ -41,24 +41,28 @@ STRIPES = {"cpu": 1, "cuda": 8}
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
+def _nothing() -> np.ndarray:
+    return np.empty(0)
+
+
 @dataclass(frozen=True)
 class Frames:
-    """Images of one world. What was not asked for is None."""
+    """Images of one world. What was not asked for has no elements."""
 
     rgb: np.ndarray
     """[t h w 3] uint8, sRGB, anti-aliased."""
     robot_mask: np.ndarray
     """[t h w] bool, the first thing that the ray through the pixel's centre meets is the robot."""
-    depth: np.ndarray | None = None
+    depth: np.ndarray = field(default_factory=_nothing)
     """[t h w] float32, along the optical axis at the pixel's centre [m], 0 where nothing is."""
-    body: np.ndarray | None = None
+    body: np.ndarray = field(default_factory=_nothing)
     """[t h w] int16, index of the body at the pixel's centre, -1 where there is none."""
-    optical_flow: np.ndarray | None = None
+    optical_flow: np.ndarray = field(default_factory=_nothing)
     """[t h w 2] float32, motion (x right, y down) [pixels] from this frame to the next of the robot's surface point
     under the pixel's centre, no longer than `FLOW_LIMIT`; zero off the robot and in the last frame."""
-    point_body: np.ndarray | None = None
+    point_body: np.ndarray = field(default_factory=_nothing)
     """[t k] int32, index of the body seen in the pixel of each of the world's points, -1 none, -2 outside the image."""
-    point_depth: np.ndarray | None = None
+    point_depth: np.ndarray = field(default_factory=_nothing)
     """[t k] float32, depth of what is seen there [m], 0 where nothing is."""
 
 
@@ -350,5 +354,5 @@ def _shading() -> shading.Shading:
     values.sky_share = stage.SKY_SHARE
     values.exposure = stage.EXPOSURE
     values.specular = stage.SPECULAR
-    values.knee, shading.ceiling = stage.KNEE, stage.CEILING
+    values.knee, values.ceiling = stage.KNEE, stage.CEILING
     return values

@@ -4,7 +4,11 @@ A pixel's colour is made once per triangle that it shows, at the mean of that tr
 light on what never moves is kept per camera and source; a frame only multiplies it with its shadows.
 """
 
-# ruff: noqa: SIM110 (Warp does not know any())
+# Warp does not know any().
+# ruff: noqa: SIM110
+
+# Annotations of kernels are types of Warp, which mypy does not know.
+# mypy: ignore-errors
 
 import warp as wp
 

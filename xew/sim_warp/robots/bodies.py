@@ -17,7 +17,9 @@ SIDES = ("left", "right")
 
 def robot_bodies(spec: RobotSpec) -> list[Body]:
     """The robot's visible links, as many and in the order of `robot_pose`. The meshes are shared between calls."""
-    return [Body(load_urdf(spec.urdf).links[link].visual, is_robot=True) for _, link in _shown_links(spec)]
+    links = load_urdf(spec.urdf).links
+    meshes = [links[name].visual for _, name in _shown_links(spec)]
+    return [Body(mesh, is_robot=True) for mesh in meshes if mesh is not None]
 
 
 def robot_pose(spec: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
