@@ -11,7 +11,7 @@ from xew.sim_warp.robots.spec import Arm, RobotSpec
 LEFT = Arm(
     root_pose=(-0.22, -0.38, 0.84, 0, 0, 0.7071067812, 0.7071067812),
     joints=("joint1", "joint2", "joint3", "joint4", "joint5", "joint6"),
-    home=(-0.4119, 0.4193, 0.5183, -1.1833, -0.2015, -0.3617),
+    home=(-0.7354, 0.559, 0.3734, -0.9806, -0.3421, -0.6646),
     tool_link="link6",
     tool_pose=(0.142, 0, 0, 0, 0, 0, 1),
     fingers=("joint7", "joint8"),
@@ -21,7 +21,7 @@ LEFT = Arm(
 RIGHT = replace(
     LEFT,
     root_pose=(0.22, -0.38, 0.84, 0, 0, 0.7071067812, 0.7071067812),
-    home=(0.4324, 0.4207, 0.5188, -1.1861, 0.2111, 0.3803),
+    home=(0.7489, 0.5609, 0.374, -0.9839, 0.3474, 0.6778),
 )
 
 SPEC = RobotSpec(

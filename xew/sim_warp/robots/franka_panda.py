@@ -11,7 +11,7 @@ from xew.sim_warp.robots.spec import Arm, RobotSpec
 LEFT = Arm(
     root_pose=(-0.28, -0.65, 0.6, 0, 0, 0.7071067812, 0.7071067812),
     joints=("panda_joint1", "panda_joint2", "panda_joint3", "panda_joint4", "panda_joint5", "panda_joint6", "panda_joint7"),
-    home=(-0.0323, -0.632, -0.2089, -2.8873, -0.0189, 2.7776, 0.5674),
+    home=(0.0287, -0.4803, -0.3468, -2.8834, 0.0048, 2.9288, 0.4591),
     tool_link="panda_hand",
     tool_pose=(0, 0, 0.0979, 0.7071067812, 0, 0.7071067812, 0),
     fingers=("panda_finger_joint1", "panda_finger_joint2"),
@@ -21,7 +21,7 @@ LEFT = Arm(
 RIGHT = replace(
     LEFT,
     root_pose=(0.28, -0.65, 0.6, 0, 0, 0.7071067812, 0.7071067812),
-    home=(0.0322, -0.632, 0.2091, -2.8873, 0.0191, 2.7776, 1.0032),
+    home=(-0.0288, -0.4804, 0.347, -2.8834, -0.0046, 2.9288, 1.1115),
 )
 
 SPEC = RobotSpec(

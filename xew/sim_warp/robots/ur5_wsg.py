@@ -12,7 +12,7 @@ from xew.sim_warp.robots.spec import Arm, RobotSpec
 LEFT = Arm(
     root_pose=(-0.35, -0.65, 0.75, 0, 0, 0, 1),
     joints=("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"),
-    home=(-1.7074, -1.2788, -2.3451, -0.5689, 1.639, -0.1185),
+    home=(-1.7942, -1.4173, -2.3647, -0.4176, 1.6818, -0.1943),
     tool_link="ee_link",
     tool_pose=(0.1385, 0, 0, 0, 0, 0, 1),
     fingers=("base_joint_gripper_left", "base_joint_gripper_right"),
@@ -22,7 +22,7 @@ LEFT = Arm(
 RIGHT = replace(
     LEFT,
     root_pose=(0.35, -0.65, 0.75, 0, 0, 0, 1),
-    home=(-0.7516, -1.2438, -2.3323, -0.7607, 1.1969, 0.7473),
+    home=(-0.7122, -1.3756, -2.3561, -0.6199, 1.1827, 0.787),
 )
 
 SPEC = RobotSpec(

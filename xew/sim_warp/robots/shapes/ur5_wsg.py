@@ -1,9 +1,29 @@
 """Shapes of the UR5 with WSG-50: light grey tubes, blue caps, a silver gripper, after the link sizes of the vendors' meshes."""
 
-from xew.sim_warp.robots.shapes.solids import PAD_HALF_WIDTH, PAD_THICKNESS, Box, Part, box_solid
+from xew.sim_warp.robots.shapes.solids import (
+    PAD_HALF_WIDTH,
+    PAD_THICKNESS,
+    Box,
+    Part,
+    Vector,
+    box_solid,
+    camera,
+    cylinder,
+    dome,
+    hull,
+    rounded_box,
+)
 
-MATERIALS = {"grey": (198, 202, 206), "silver": (150, 152, 156)}
-MESH_NAMES: dict[str, str] = {}
+MATERIALS = {
+    "grey": (206, 209, 212),
+    "blue": (112, 168, 208),
+    "dark": (78, 80, 84),
+    "silver": (158, 161, 166),
+    "rubber": (30, 30, 32),
+    "case": (150, 152, 156),
+    "lens": (24, 24, 28),
+}
+MESH_NAMES = {"finger_right": "finger_left", "gripper_right": "gripper_left"}
 
 FINGER = (
     Box((0.0027 - PAD_THICKNESS, -PAD_HALF_WIDTH, 0.0955), (0.0027, PAD_HALF_WIDTH, 0.1305), name="pad"),
@@ -20,8 +40,91 @@ COLLISIONS = {
     "finger_left": FINGER,
     "finger_right": FINGER,
 }
+
+
+def housing(start: Vector, end: Vector, radius: float) -> list[Part]:
+    """A joint's housing along its axis: grey, with a blue cap over its end."""
+    seam = tuple(a + 0.78 * (b - a) for a, b in zip(start, end, strict=True))
+    return [("grey", cylinder(start, seam, radius)), ("blue", dome(seam, end, 0.985 * radius))]
+
+
+def ring(start: Vector, end: Vector, radius: float) -> Part:
+    """The dark gap between two links."""
+    return ("dark", cylinder(start, end, radius))
+
+
+def tee(axis: int) -> list[Part]:
+    """A wrist: a stub along `axis` (1 for y, 2 for z) and a capped housing across it."""
+    swap = (lambda x, y, z: (x, y, z)) if axis == 1 else (lambda x, y, z: (x, z, y))
+    return [
+        ring(swap(0, 0.0475, 0), swap(0, 0.052, 0), 0.036),
+        ("grey", cylinder(swap(0, 0.052, 0), swap(0, 0.093, 0), 0.0375)),
+        *housing(swap(0, 0.093, 0.0435), swap(0, 0.093, -0.057), 0.0385),
+        ring(swap(0, 0.093, 0.0435), swap(0, 0.093, 0.0475), 0.036),
+    ]
+
+
+def upper_arm_parts() -> list[Part]:
+    ends = [part for z in (0, 0.425) for part in housing((0, -0.061, z), (0, 0.0686, z), 0.0585)]
+    return [
+        *ends,
+        ring((0, -0.0652, 0), (0, -0.061, 0), 0.056),
+        ring((0, -0.0652, 0.425), (0, -0.061, 0.425), 0.056),
+        ("grey", cylinder((0, 0, 0.04), (0, 0, 0.385), 0.05)),
+        ("grey", hull(cylinder((0, 0, 0.03), (0, 0, 0.085), 0.0545, 0.05), cylinder((0, -0.05, 0), (0, 0.045, 0), 0.0565))),
+        (
+            "grey",
+            hull(cylinder((0, 0, 0.34), (0, 0, 0.395), 0.05, 0.0545), cylinder((0, -0.05, 0.425), (0, 0.045, 0.425), 0.0565)),
+        ),
+    ]
+
+
+def forearm_parts() -> list[Part]:
+    return [
+        *housing((0, 0.0545, 0), (0, -0.034, 0), 0.0575),
+        ("grey", hull(cylinder((0, 0, 0.03), (0, 0, 0.1), 0.05, 0.039), cylinder((0, -0.02, 0), (0, 0.045, 0), 0.055))),
+        ("grey", cylinder((0, 0, 0.1), (0, 0, 0.365), 0.039)),
+        *housing((0, 0.0475, 0.39225), (0, -0.0572, 0.39225), 0.0388),
+    ]
+
+
+def gripper_body_parts() -> list[Part]:
+    return [
+        ("silver", rounded_box((-0.073, -0.025, 0.004), (0.073, 0.025, 0.06), 0.004)),
+        ("dark", rounded_box((-0.071, -0.022, 0.06), (0.071, 0.022, 0.0725), 0.003)),
+        ("dark", cylinder((0, 0, -0.002), (0, 0, 0.004), 0.032)),
+    ]
+
+
+def finger_parts() -> list[Part]:
+    """Bar and pad; the fingertip of the FMF kind is slim."""
+    bar = hull(
+        rounded_box((-0.02, -0.015, 0.0575), (-0.002, 0.015, 0.073), 0.002),
+        box_solid(Box((-0.0155, -0.011, 0.09), (-0.0023, 0.011, 0.12))),
+    )
+    return [("silver", bar), ("rubber", box_solid(FINGER[0]))]
+
+
 PARTS: dict[str, list[Part]] = {
-    link: [("silver" if "wsg" in link or "finger" in link else "grey", box_solid(box)) for box in boxes]
-    for link, boxes in COLLISIONS.items()
+    "base_link": [
+        ("grey", cylinder((0, 0, 0), (0, 0, 0.02), 0.0745, bevel=0.004, sections=20)),
+        ("dark", cylinder((0, 0, 0.02), (0, 0, 0.0265), 0.058)),
+    ],
+    "shoulder_link": [
+        ("grey", cylinder((0, 0, -0.062), (0, 0, 0.03), 0.0585)),
+        ("blue", dome((0, 0, 0.03), (0, 0, 0.0685), 0.0578)),
+        ("grey", cylinder((0, 0, 0), (0, 0.066, 0), 0.057)),
+        ring((0, 0.066, 0), (0, 0.0705, 0), 0.055),
+    ],
+    "upper_arm_link": upper_arm_parts(),
+    "forearm_link": forearm_parts(),
+    "wrist_1_link": tee(1),
+    "wrist_2_link": tee(2),
+    "wrist_3_link": [("dark", cylinder((0, 0.0473, 0), (0, 0.0818, 0), 0.0375, bevel=0.003))],
+    "wsg_50_base_link": gripper_body_parts(),
+    "gripper_left": [("dark", rounded_box((-0.018, -0.013, 0.06), (-0.001, 0.013, 0.084), 0.002))],
+    "gripper_right": [("dark", rounded_box((-0.018, -0.013, 0.06), (-0.001, 0.013, 0.084), 0.002))],
+    "finger_left": finger_parts(),
+    "finger_right": finger_parts(),
+    "camera": camera((-0.0125, -0.045, -0.0125), (0.0125, 0.045, 0.0125), ((-0.008, -0.02, -0.032), (0.006, 0.02, -0.01))),
 }
-PARTS["base_link"] = [("grey", box_solid(Box((-0.075, -0.075, 0), (0.075, 0.075, 0.03))))]
