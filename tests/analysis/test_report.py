@@ -1,0 +1,176 @@
+"""The page holds what a reader needs, opens offline, and says what is missing."""
+
+import base64
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.analysis.conftest import FRAMES, Study
+from xew.analysis.report import Args, main
+from xew.analysis.scores import read_scores
+
+VOID = {"meta", "img", "br", "hr", "link", "input"}
+
+
+class Page(HTMLParser):
+    """Tags, and whether they close in order."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.images: list[dict[str, str | None]] = []
+        self.headings: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        if tag == "img":
+            self.images.append(dict(attributes))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] in ("h1", "h2", "h3"):
+            self.headings.append(data)
+
+
+@pytest.fixture(scope="module")
+def report(study: Study, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("report")
+    main(Args(study.scores, study.data, (study.rollouts,), out))
+    return out
+
+
+def test_the_page_is_well_formed_and_needs_no_network(report: Path) -> None:
+    text = (report / "index.html").read_text()
+    page = Page(text)
+    assert not page.open
+    assert not re.search(r"(src|href)\s*=\s*[\"'](?!data:)", text) and "url(" not in text and "<script" not in text
+    for image in page.images:
+        kind, _, encoded = str(image["src"]).partition(",")
+        assert kind == "data:image/png;base64"
+        picture = cv2.imdecode(np.frombuffer(base64.b64decode(encoded), np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None and picture.std() > 0
+        assert image["alt"]
+    # Three strips for each of two held-out robots, the curves, the data.
+    assert len(page.images) == 3 * 2 + 2
+
+
+def test_each_held_out_robot_has_its_own_table_and_the_seen_are_pooled(report: Path) -> None:
+    headings = Page((report / "index.html").read_text()).headings
+    assert headings[0].startswith("Can the model")
+    assert [h for h in headings if h in ("Franka Panda", "Piper")] == ["Franka Panda", "Piper"]
+    assert "Pooled: Aloha-AgileX" in headings
+    assert not any("Franka" in h and "Piper" in h for h in headings)
+
+
+def test_the_finding_comes_first_and_names_both_robots(report: Path) -> None:
+    text = (report / "index.html").read_text()
+    finding = re.search(r'<ul class="finding">(.*?)</ul>', text, re.DOTALL)
+    assert finding and finding.start() < text.index("<table")
+    for robot in ("Franka Panda", "Piper"):
+        assert f"{robot}: late · by one &lt;frame&gt; beats a frozen first frame on" in finding[1]
+    assert "of the way from there to the truth (on seen robots" in finding[1]
+
+
+def test_the_numbers_are_those_of_the_scores(report: Path, study: Study) -> None:
+    summary = pd.read_csv(report / "summary.csv")
+    rows = pd.read_parquet(study.scores)
+    text = (report / "index.html").read_text()
+    for robot in ("franka_panda", "piper"):
+        mean = rows[(rows["robot"] == robot) & (rows["metric"] == "lpips") & (rows["model"] == "late")]["value"].mean()
+        line = summary[(summary["robots"] == robot) & (summary["metric"] == "lpips") & (summary["model"] == "late")]
+        assert line["mean"].item() == pytest.approx(mean, rel=1e-9)
+        assert line["low"].item() <= mean <= line["high"].item()
+        assert line["episodes"].item() == line["expected"].item() == 4
+        assert f">{mean:.3f}<" in text
+    assert "4 of 4 test episodes" in text and "Incomplete" not in text
+
+
+def test_markdown_and_figures_stand_beside_the_page(report: Path) -> None:
+    text = (report / "report.md").read_text()
+    assert "### Franka Panda" in text and "| late · by one <frame> |" in text
+    figures = re.findall(r"\]\((figures/[^)]+)\)", text)
+    assert len(figures) == 8
+    for figure in figures:
+        assert cv2.imread(str(report / figure)) is not None
+
+
+def test_a_strip_shows_the_first_and_the_last_frame(report: Path) -> None:
+    page = Page((report / "index.html").read_text())
+    assert f"frame {FRAMES - 1}" in str(page.images[0]["alt"]) and "frame 0" in str(page.images[0]["alt"])
+
+
+def edit(study: Study, out: Path, change: object) -> Path:
+    """A copy of the scores with some change."""
+    rows, curves = pd.read_parquet(study.scores), pd.read_parquet(study.scores.with_suffix(".curves.parquet"))
+    changed = change(rows)
+    changed.attrs = rows.attrs
+    changed.to_parquet(out / "scores.parquet", index=False)
+    curves.to_parquet(out / "scores.curves.parquet", index=False)
+    return out / "scores.parquet"
+
+
+def test_an_incomplete_table_says_so(study: Study, tmp_path: Path) -> None:
+    piper = lambda rows: rows[~((rows["robot"] == "piper") & (rows["seed"] == 1_000_001))]  # noqa: E731
+    main(Args(edit(study, tmp_path, piper), study.data, (study.rollouts,), tmp_path / "report"))
+    text = (tmp_path / "report" / "index.html").read_text()
+    assert text.count("Incomplete: 2 of 4 test episodes are scored.") == 1
+    assert "incomplete: 2 of 4" in (tmp_path / "report" / "report.md").read_text()
+
+
+def test_without_data_there_are_numbers_and_a_word_on_the_missing_pictures(study: Study, tmp_path: Path) -> None:
+    main(Args(study.scores, out=tmp_path))
+    text = (tmp_path / "index.html").read_text()
+    assert "No pictures" in text and "Franka Panda" in text and len(Page(text).images) == 1
+
+
+SPOILERS = {
+    "more than once": lambda rows: pd.concat([rows, rows.iloc[:1]]),
+    "NaN": lambda rows: rows.assign(value=rows["value"].where(rows.index > 0)),
+    "unknown": lambda rows: rows.assign(robot=rows["robot"].replace("piper", "pipper")),
+    "holds no row": lambda rows: rows.iloc[:0],
+    "no score table": lambda rows: rows.drop(columns="metric"),
+}
+
+
+@pytest.mark.parametrize("word", SPOILERS)
+def test_scores_that_cannot_be_trusted_are_named(
+    word: str, study: Study, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(Args(edit(study, tmp_path, SPOILERS[word]), out=tmp_path / "report"))
+    message = capsys.readouterr().err
+    assert exit_.value.code == 2 and word in message and "xew.metrics.evaluate" in message
+    assert not (tmp_path / "report").exists()
+
+
+def test_missing_inputs_name_the_command_that_makes_them(study: Study, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "void").mkdir()
+    for args, command in (
+        (Args(tmp_path / "none.parquet"), "xew.metrics.evaluate"),
+        (Args(study.scores, tmp_path / "void"), "xew.sim_warp.generate"),
+        (Args(study.scores, study.data, (tmp_path / "void",)), "xew.model.rollout"),
+        (Args(study.scores, held_out=("panda",)), "franka_panda"),
+    ):
+        with pytest.raises(SystemExit):
+            main(args)
+        assert command in capsys.readouterr().err
+
+
+def test_reading_gives_the_metrics_with_unit_and_direction(study: Study) -> None:
+    scores = read_scores(study.scores)
+    assert [(m.name, m.unit, m.higher_is_better) for m in scores.metrics] == [
+        ("psnr", "dB", True),
+        ("lpips", "", False),
+        ("mask_iou", "", True),
+    ]
+    assert scores.models == [("late", "by one <frame>")]

@@ -1,0 +1,75 @@
+"""Means, intervals and verdicts on numbers whose answer is known."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from xew.analysis.page import number
+from xew.analysis.scores import MetricInfo
+from xew.analysis.summary import Interval, RobotTable, Row, finding, mean_interval, progress, verdict
+
+rng = np.random.default_rng(0)
+
+
+def info(name: str, unit: str = "", higher: bool = False) -> MetricInfo:
+    return MetricInfo(name, "visual", unit, higher, None, None, "")
+
+
+def test_the_interval_is_close_to_the_normal_one_for_many_values() -> None:
+    values = rng.normal(3, 2, 400)
+    interval = mean_interval(values)
+    half = 1.96 * values.std() / np.sqrt(len(values))
+    assert interval.mean == pytest.approx(values.mean())
+    assert (interval.low, interval.high) == pytest.approx((values.mean() - half, values.mean() + half), abs=0.1 * half)
+    assert interval == mean_interval(values)
+
+
+def test_one_value_has_no_interval_and_equal_values_a_point() -> None:
+    assert np.isnan(mean_interval(np.array([2.0])).low)
+    assert mean_interval(np.array([2.0, 2.0])) == Interval(2, 2, 2, 2)
+
+
+@pytest.mark.parametrize(("shift", "higher", "expected"), [(1, True, "better"), (1, False, "worse"), (0, True, "unresolved")])
+def test_verdicts_are_paired(shift: float, higher: bool, expected: str) -> None:
+    """Episodes differ by far more than the models do, so that only pairing can tell them apart."""
+    copy = pd.Series(rng.normal(0, 50, 20))
+    model = copy + shift + np.tile([-0.5, 0.5], 10)
+    assert verdict(model.sample(frac=1, random_state=1), copy, higher) == expected
+
+
+def test_a_single_episode_resolves_nothing() -> None:
+    assert verdict(pd.Series([9.0]), pd.Series([1.0]), True) == "unresolved"
+    assert verdict(pd.Series([9.0, 8.0], index=[0, 1]), pd.Series([1.0, 2.0], index=[1, 2]), True) == "unresolved"
+
+
+def table(title: str, model: float, copy: float = 0.4) -> RobotTable:
+    point = lambda value: {"lpips": Interval(value, value, value, 4)}  # noqa: E731
+    rows = (
+        Row("m", "c", point(model), {"lpips": "better" if model < copy else "worse"}),
+        Row("copy_first_frame", "", point(copy), {}),
+        Row("ground_truth", "", point(0.0), {}),
+    )
+    return RobotTable(title, (title,), rows, 4)
+
+
+def test_progress_is_the_share_of_the_way_from_frozen_to_true() -> None:
+    for model, share in ((0.4, 0), (0.1, 0.75), (0, 1), (0.5, -0.25)):
+        made = table("x", model)
+        assert progress(made, made.rows[0], "lpips") == pytest.approx(share)
+
+
+def test_the_finding_says_better_worse_and_how_far() -> None:
+    said = finding([table("Panda", 0.1), table("Piper", 0.5)], [table("Seen", 0.2)], [info("lpips")])
+    assert said == [
+        "Panda: m · c beats a frozen first frame on LPIPS. "
+        "In LPIPS it covers 75% of the way from there to the truth (on seen robots 50%).",
+        "Piper: m · c falls behind a frozen first frame on LPIPS. "
+        "In LPIPS it covers -25% of the way from there to the truth (on seen robots 50%).",
+    ]
+    assert "--baselines" in finding([], [], [info("lpips")])[0]
+
+
+def test_numbers_have_the_digits_that_mean_something() -> None:
+    assert number(21.23456, info("psnr", "dB")) == "21.23"
+    assert number(3.14159, info("keypoint_error", "px")) == "3.1"
+    assert number(0.123456, info("lpips")) == "0.123"
