@@ -93,7 +93,7 @@ def mast_parts() -> list[Part]:
 
 
 def wheel_parts() -> list[Part]:
-    return [("rubber", cylinder((0, -0.02, 0), (0, 0.02, 0), 0.068, bevel=0.006))]
+    return [("rubber", cylinder((0, -0.02, 0), (0, 0.02, 0), 0.068))]
 
 
 PARTS: dict[str, list[Part]] = {f"{arm}_{link}": parts for arm in ARMS for link, parts in ARM_PARTS.items()}
@@ -102,7 +102,8 @@ PARTS |= {f"{arm}_link8": arx_x5.finger_parts(-1, ARM_BOXES["link8"]) for arm in
 PARTS |= {f"{arm}_link7": handle_parts() for arm in ("lr", "rr")}
 PARTS |= {f"{side}_wheel_link": wheel_parts() for side in ("left", "right")}
 PARTS |= {
-    f"{side}_wheel_link": [("rubber", cylinder((0, 0, -0.014), (0, 0, 0.014), 0.035))] for side in ("fl", "fr", "rl", "rr")
+    f"{side}_wheel_link": [("rubber", cylinder((0, 0, -0.014), (0, 0, 0.014), 0.035, sections=10))]
+    for side in ("fl", "fr", "rl", "rr")
 }
 PARTS |= {
     f"{side}_castor_link": [("black", rounded_box((-0.035, 0.0, -0.02), (0.012, 0.06, 0.02), 0.004))]
