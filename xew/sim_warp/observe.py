@@ -1,6 +1,7 @@
-"""From recorded states to what the head camera sees: RGB, robot mask, keypoints. Everything here is a view of states.
+"""Stage 4a: recorded states to what the head camera sees. Everything here is a view of states.
 
-Reads joint positions and object poses; writes the images and keypoints of `xew.episode.States`.
+Reads  `Recording`s: a robot, its measured joints, and things with their measured poses
+Writes `Observation`s: RGB, robot mask, keypoints and their visibility, as `xew.episode.States` keeps them
 """
 
 from collections.abc import Sequence

@@ -1,9 +1,11 @@
-"""Rendering: posed bodies to images. Reads meshes, poses and a camera; writes RGB, masks, depth and optical flow.
+"""Stage 4: posed bodies to images, for observe.py (what the camera sees) and streams.py (what commands tell).
+
+Reads  `World`s: meshes and their poses; a camera; the stage
+Writes `Frames`: RGB, robot mask, depth, bodies, optical flow
 
 Two kinds of frame are made. With the stage (table, wall, ground, shadows) it is what the head camera sees of an
-episode. Without it, it is the bodies alone on white, from which the conditions of a model come. The kernels
-(raster_kernels.py, then shading_kernels.py) are the same on CPU and GPU, and a frame's bytes do not depend on what
-else is rendered with it.
+episode. Without it, it is the bodies alone on white. The kernels (raster_kernels.py, then shading_kernels.py) are the
+same on CPU and GPU, and a frame's bytes do not depend on what else is rendered with it.
 """
 
 from collections.abc import Sequence

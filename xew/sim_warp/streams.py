@@ -1,6 +1,7 @@
-"""What a model may know in advance: images that follow from a robot and its recorded commands alone.
+"""Stage 4b: what a model may know in advance: images that follow from a robot and its commands alone.
 
-Reads a robot's key and canonical commands [t 16]; never a recorded state, so that no condition sees the future.
+Reads  a robot's key and canonical commands [t 16]; never a recorded state, so that no condition sees the future
+Writes the robot-only render with mask and exact optical flow, ray map, and task-independent views of the robot
 To add one, write a pure function of (robot_key, action, camera) here.
 """
 
