@@ -152,7 +152,9 @@ def _distance_covered(own: tuple[RobotTable, Row], seen: Sequence[tuple[RobotTab
     shares = [progress(table, row, metric) for table, row in (own, *seen)]
     if shares[0] is None:
         return ""
-    beside = f" (on seen robots {shares[1]:.0%})" if len(shares) > 1 and shares[1] is not None else ""
+    beside = f" (on seen robots it covers {shares[1]:.0%})" if len(shares) > 1 and shares[1] is not None else ""
+    if shares[0] < 0:
+        return f" In {METRIC_TITLES[metric]} it ends {-shares[0]:.0%} farther from the truth than that frame{beside}."
     return f" In {METRIC_TITLES[metric]} it covers {shares[0]:.0%} of the way from there to the truth{beside}."
 
 
