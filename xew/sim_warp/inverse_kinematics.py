@@ -22,7 +22,9 @@ POSITION_WEIGHT = 4.0
 """A residual of 1 m counts as much as one of 4 rad: near a pose both then converge at the same pace."""
 LIMIT_WEIGHT = 2.0
 POSTURE_WEIGHT = 0.01
-"""Pull of a seven-joint arm towards the mean of its two homes, so that its elbow does not drift: moves the tool by < 0.1 mm."""
+"""Pull of a seven-joint arm towards the mean of its two homes, so that its elbow does not drift."""
+POLISH_STEPS = 4
+"""Last steps, without that pull, so that it does not move the tool."""
 ANCHOR_STRIDE = 8
 """Frames of a path between two that are solved one after the other; those between are then solved all at once."""
 
@@ -195,17 +197,18 @@ class _Problems:
         self.rotations = wp.zeros(size, dtype=wp.vec4, device=device)
         self.joint_pos = wp.zeros((size, JOINT_COUNT), dtype=wp.float32, device=device)
         self.iterations = iterations
+        self.posture = newton.ik.IKObjectiveJointLimit(posture, posture)
+        self.posture_weight = POSTURE_WEIGHT if robot.arm_joint_count == JOINT_COUNT else 0.0
         objectives = [
             newton.ik.IKObjectivePosition(link, wp.vec3(*tool[:3]), self.positions, weight=POSITION_WEIGHT),
             newton.ik.IKObjectiveRotation(link, wp.quat(*tool[3:]), self.rotations),
             newton.ik.IKObjectiveJointLimit(model.joint_limit_lower, model.joint_limit_upper, weight=LIMIT_WEIGHT),
-            newton.ik.IKObjectiveJointLimit(
-                posture, posture, weight=POSTURE_WEIGHT if robot.arm_joint_count == JOINT_COUNT else 0.0
-            ),
+            self.posture,
         ]
         self.solver = newton.ik.IKSolver(
             model, size, objectives, jacobian_mode=newton.ik.IKJacobianType.ANALYTIC, lambda_initial=1e-3
         )
+        self.has_run = False
         self.graph: wp.Graph | None = None
         self.device = device
 
@@ -217,18 +220,25 @@ class _Problems:
         start = np.zeros((self.positions.shape[0], JOINT_COUNT), np.float32)
         start[:count, :joints] = seed
         self.joint_pos.assign(start)
-        self._step()
+        self._run()
         return self.joint_pos.numpy()[:count, :joints].astype(float)
 
-    def _step(self) -> None:
-        if not self.device.is_cuda:
-            self.solver.step(self.joint_pos, self.joint_pos, iterations=self.iterations)
+    def _run(self) -> None:
+        """All steps; on a GPU the first run loads the kernels, the second records them, later ones replay."""
+        if not self.device.is_cuda or not self.has_run:
+            self._step()
+            self.has_run = True
             return
         if self.graph is None:
             with wp.ScopedCapture(self.device) as capture:
-                self.solver.step(self.joint_pos, self.joint_pos, iterations=self.iterations)
+                self._step()
             self.graph = capture.graph
         wp.capture_launch(self.graph)
+
+    def _step(self) -> None:
+        for weight, iterations in ((self.posture_weight, self.iterations - POLISH_STEPS), (0.0, POLISH_STEPS)):
+            self.posture.weight = weight
+            self.solver.step(self.joint_pos, self.joint_pos, iterations=iterations)
 
 
 def _padded(rows: np.ndarray, size: int) -> np.ndarray:

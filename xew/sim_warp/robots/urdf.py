@@ -136,21 +136,25 @@ def _load(path: Path, modified: int) -> Urdf:
     colors = {material.name: material.color for material in robot.materials if material.color is not None}
     links = {link.name: _link(link, path, colors) for link in robot.links}
     joints = {joint.name: _joint(joint, path) for joint in robot.joints}
-    return Urdf(robot.name, path, _root(links, joints, path), links, joints)
+    children = {joint.child for joint in joints.values()}
+    root = next((name for name in links if name not in children), "")
+    if not root:
+        raise UrdfError(f"{path}: there is no link without a parent; links must form one tree.")
+    urdf = Urdf(robot.name, path, root, links, joints)
+    _check_tree(urdf)
+    return urdf
 
 
-def _root(links: dict[str, Link], joints: dict[str, Joint], path: Path) -> str:
-    """The one link without a parent. Every other link must have exactly one."""
-    named = {name for joint in joints.values() for name in (joint.parent, joint.child)}
-    if unknown := sorted(named - set(links)):
+def _check_tree(urdf: Urdf) -> None:
+    """All links hang together from one root, each by one joint."""
+    path, links, joints = urdf.path, set(urdf.links), urdf.joints.values()
+    if unknown := sorted({name for joint in joints for name in (joint.parent, joint.child)} - links):
         raise UrdfError(f"{path}: joints name links that do not exist: {', '.join(unknown)}; add or rename them.")
-    children = [joint.child for joint in joints.values()]
-    roots = [name for name in links if name not in children]
-    if len(roots) != 1 or len(set(children)) != len(children):
-        raise UrdfError(
-            f"{path}: links must form one tree; found roots {roots} and {len(children)} joints for {len(links)} links."
-        )
-    return roots[0]
+    children = [joint.child for joint in joints]
+    if twice := sorted({name for name in children if children.count(name) > 1}):
+        raise UrdfError(f"{path}: links must form one tree; more than one joint leads to {', '.join(twice)}.")
+    if loose := sorted(links - {urdf.root, *(joint.child for joint in urdf.tree)}):
+        raise UrdfError(f"{path}: links must form one tree; no way leads from {urdf.root} to {', '.join(loose)}.")
 
 
 def _joint(joint: yourdfpy.Joint, path: Path) -> Joint:

@@ -33,10 +33,9 @@ ARM_BOXES = {
     "link4": arx_x5.LINK4,
     "link5": arx_x5.LINK5,
     "link6": arx_x5.PALM,
-    "link7": arx_x5.finger(1, 0.0705, 0.024493, 0.00010349),
-    "link8": arx_x5.finger(-1, 0.0705, 0.024496, 0.00010354),
+    "link7": arx_x5.finger(1, 0.1556 - 0.08457, 0.024493, 0.00010349),
+    "link8": arx_x5.finger(-1, 0.1556 - 0.08457, 0.024496, 0.00010354),
 }
-"""Fingertips: 0.1556 m from link6, of which the finger's origin takes 0.08457; rounded down so that both sides agree."""
 COLLISIONS = {f"{arm}_{link}": boxes for arm in ("fl", "fr") for link, boxes in ARM_BOXES.items()}
 
 ARM_PARTS: dict[str, list[Part]] = {
