@@ -1,11 +1,15 @@
 """The rasteriser against ray casting in NumPy, and what its images promise."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
+import warp as wp
 from scipy.ndimage import binary_dilation, binary_erosion, map_coordinates
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp import geometry
+from xew.sim_warp import geometry, raster_kernels, shading_kernels
 from xew.sim_warp.camera import HEAD_CAMERA, Camera, look_at, project
 from xew.sim_warp.geometry import Mesh
 from xew.sim_warp.render import FLOW_LIMIT, Body, Renderer, World
@@ -271,6 +275,27 @@ def test_other_cameras_see_other_images(renderer: Renderer) -> None:
     rows, columns = np.nonzero(frames.robot_mask[0])
     assert frames.rgb.shape == (1, 48, 64, 3)
     assert np.allclose([columns.mean(), rows.mean()], [31.5, 23.5], atol=0.5)
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="Warp compiles for CUDA on Linux and Windows")
+def test_kernels_compile_for_cuda_without_fused_or_approximate_arithmetic(tmp_path: Path) -> None:
+    """Fused multiply-adds and approximate roots or divisions would give a GPU other bytes than a CPU."""
+    for module in (raster_kernels, shading_kernels):
+        wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
+    programs = [path.read_bytes() for path in tmp_path.glob("*.ptx")]
+    assert len(programs) == 2
+    for program in programs:
+        assert b"div.rn.f32" in program
+        assert not any(word in program for word in (b"fma.rn.f32", b"div.approx", b"div.full", b"sqrt.approx", b"rcp.approx"))
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a GPU")
+@pytest.mark.parametrize("ground", [True, False])
+def test_a_gpu_makes_the_same_bytes(renderer: Renderer, ground: bool) -> None:
+    bodies, pose = [Body(CUBE, True), Body(BALL, False)], tumbling(5, 2)
+    here, there = (r.render(bodies, pose, ground=ground, depth=True, optical_flow=True) for r in (renderer, Renderer("cuda:0")))
+    for name in ("rgb", "robot_mask", "depth", "optical_flow"):
+        assert np.array_equal(getattr(here, name), getattr(there, name)), name
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from xew.sim_warp.streams import (
     CLIP_FRAMES,
     RAY_MAP_GROUND,
     articulation_clip,
+    command_renders,
     command_streams,
     command_streams_batch,
     default_renderer,
@@ -125,6 +126,8 @@ def test_a_batch_of_robots_equals_each_alone() -> None:
         alone = command_streams(key, action)
         assert np.array_equal(alone.render, batched.render)
         assert np.array_equal(alone.optical_flow, batched.optical_flow)
+    for batched, render in zip(command_streams_batch(commands), command_renders(commands), strict=True):
+        assert np.array_equal(batched.render, render)
 
 
 def test_a_scene_without_its_robot_is_the_same_beside_any_robot() -> None:

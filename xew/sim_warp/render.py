@@ -40,6 +40,8 @@ FRAMES_PER_CHUNK = {"cpu": 4, "cuda": 512}
 """Frames in flight; one takes about 6 MB."""
 STRIPES = {"cpu": 1, "cuda": 8}
 """Threads that share a triangle's rows, so that one large triangle does not hold up a GPU."""
+STAGES_KEPT = 16
+"""Cameras whose lit stage is kept, about 10 MB each."""
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -222,10 +224,12 @@ class Renderer:
         return images
 
     def _stage(self, camera: Camera, ground: bool) -> shading.Stage:
-        """What never moves as this camera sees it; drawn and lit at first use."""
-        name = b"".join([camera.intrinsics.tobytes(), camera.extrinsics.tobytes(), bytes([ground])])
-        key = (name, camera.width, camera.height)
+        """What never moves as this camera sees it; drawn and lit at first use. Nothing looks the same from anywhere."""
+        view = camera.intrinsics.tobytes() + camera.extrinsics.tobytes() if ground else b""
+        key = (view, camera.width, camera.height)
         if key not in self._stages:
+            if len(self._stages) >= STAGES_KEPT:
+                self._stages.clear()
             self._stages[key] = self._lit_stage(camera, ground)
         return self._stages[key]
 

@@ -72,12 +72,24 @@ def command_streams_batch(
     commands: Sequence[tuple[str, np.ndarray]], camera: Camera = HEAD_CAMERA, renderer: Renderer | None = None
 ) -> list[CommandStreams]:
     """`command_streams` of many (robot_key, action [t 16]) at once; each does not depend on the others."""
-    worlds = []
-    for robot_key, action in commands:
-        robot = get_robot(robot_key)
-        worlds.append(World(robot_bodies(robot), robot_pose(robot, _checked(action))))
-    batch = (renderer or default_renderer()).render_batch(worlds, camera, ground=False, optical_flow=True)
+    batch = (renderer or default_renderer()).render_batch(_worlds(commands), camera, ground=False, optical_flow=True)
     return [CommandStreams(frames.rgb, frames.robot_mask, frames.optical_flow) for frames in batch]
+
+
+def command_renders(
+    commands: Sequence[tuple[str, np.ndarray]], camera: Camera = HEAD_CAMERA, renderer: Renderer | None = None
+) -> list[np.ndarray]:
+    """Only the renders [t h w 3] uint8 of `command_streams_batch`, of which an episode keeps a video."""
+    batch = (renderer or default_renderer()).render_batch(_worlds(commands), camera, ground=False)
+    return [frames.rgb for frames in batch]
+
+
+def _worlds(commands: Sequence[tuple[str, np.ndarray]]) -> list[World]:
+    robots = [get_robot(robot_key) for robot_key, _ in commands]
+    return [
+        World(robot_bodies(robot), robot_pose(robot, _checked(action)))
+        for robot, (_, action) in zip(robots, commands, strict=True)
+    ]
 
 
 def flow_to_rgb(flow: np.ndarray, clip: float = FLOW_LIMIT) -> np.ndarray:
