@@ -8,6 +8,7 @@ import importlib
 import io
 import xml.etree.ElementTree as ElementTree
 from collections import defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 
 import trimesh
@@ -79,7 +80,7 @@ def _collision(box: Box) -> ElementTree.Element:
     return collision
 
 
-def _numbers(values: list[float]) -> str:
+def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{round(float(value), 6) + 0.0:g}" for value in values)
 
 

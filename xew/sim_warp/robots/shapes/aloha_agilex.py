@@ -1,7 +1,7 @@
 """Shapes of the ALOHA-AgileX: black arms of the X5 family on an aluminium frame over a mobile base."""
 
 from xew.sim_warp.robots.shapes import arx_x5
-from xew.sim_warp.robots.shapes.solids import Box, Part, box_solid, camera, cylinder, hull, rounded_box
+from xew.sim_warp.robots.shapes.solids import Box, Part, Vector, box_solid, camera, cylinder, hull, rounded_box
 
 MATERIALS = {
     "black": (46, 46, 50),
@@ -57,23 +57,24 @@ def handle_parts() -> list[Part]:
 
 def base_parts() -> list[Part]:
     """The mobile base's hull, about the frame of base_link, 0.15 m over the ground."""
-    hull_ = rounded_box((-0.32, -0.245, -0.075), (0.26, 0.245, 0.0), 0.02)
+    chassis = rounded_box((-0.32, -0.245, -0.075), (0.26, 0.245, 0.0), 0.02)
     bumpers = [rounded_box((x, -0.24, -0.1), (x + 0.03, 0.24, -0.045), 0.01) for x in (-0.34, 0.25)]
-    return [("panel", hull_), *[("black", solid) for solid in bumpers]]
+    return [("panel", chassis), *[("black", solid) for solid in bumpers]]
 
 
 def deck_parts() -> list[Part]:
     return [("black", rounded_box((-0.31, -0.24, 0.0), (0.25, 0.24, 0.012), 0.004))]
 
 
-def profile(low: tuple[float, float, float], high: tuple[float, float, float]) -> Part:
-    """A length of aluminium profile, corners given in the frame of `footprint`."""
-    shift = (0.158, -0.385, 0.015)
-    return ("aluminium", box_solid(Box(*(tuple(a - b for a, b in zip(corner, shift, strict=True)) for corner in (low, high)))))
+def profile(low: Vector, high: Vector) -> Part:
+    """A length of aluminium profile on box2_Link, its corners given in the frame of `footprint`."""
+    solid = box_solid(Box(low, high))
+    solid.apply_translation((-0.158, 0.385, -0.015))
+    return ("aluminium", solid)
 
 
 def frame_parts() -> list[Part]:
-    """Column, front beam under the working arms, rear beam under the teaching arms. Sizes after photographs, not drawings."""
+    """Column, front beam under the working arms, rear beam under the teaching arms. Its proportions are ours."""
     posts = [profile((x, y, 0.162), (x + 0.04, y + 0.04, 0.742)) for x in (-0.2, 0.06) for y in (-0.16, 0.12)]
     rails = [profile((-0.33, y, 0.702), (0.25, y + 0.04, 0.742)) for y in (-0.16, 0.12)]
     front = profile((0.19, -0.36, 0.742), (0.27, 0.36, 0.781))

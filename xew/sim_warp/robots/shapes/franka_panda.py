@@ -6,6 +6,7 @@ from xew.sim_warp.robots.shapes.solids import (
     Box,
     Part,
     Vector,
+    between,
     box_solid,
     camera,
     cylinder,
@@ -68,7 +69,7 @@ COLLISIONS = {
 
 def drum(start: Vector, end: Vector, radius: float = 0.0545) -> list[Part]:
     """Half of a joint: dark at the seam where it starts, a white dome where it ends."""
-    seam = tuple(a + 0.06 * (b - a) for a, b in zip(start, end, strict=True))
+    seam = between(start, end, 0.06)
     return [("grey", cylinder(start, seam, 0.96 * radius)), ("white", dome(seam, end, radius))]
 
 

@@ -34,7 +34,13 @@ class Box:
         return Rotation.from_euler("xyz", self.rpy).apply(np.add(self.low, self.high) / 2)
 
 
-def transform(xyz: Sequence[float] = (0, 0, 0), rpy: Sequence[float] = (0, 0, 0)) -> np.ndarray:
+def between(start: Vector, end: Vector, share: float) -> Vector:
+    """The point that lies `share` of the way from start to end."""
+    x, y, z = (a + share * (b - a) for a, b in zip(start, end, strict=True))
+    return x, y, z
+
+
+def transform(xyz: Sequence[float] | np.ndarray = (0, 0, 0), rpy: Sequence[float] = (0, 0, 0)) -> np.ndarray:
     """[4 4], URDF's order: turn by roll, pitch, yaw, then move."""
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_euler("xyz", rpy).as_matrix()
@@ -72,12 +78,11 @@ def dome(start: Vector, end: Vector, radius: float, sections: int = 16) -> trime
 
 def rounded_box(low: Vector, high: Vector, chamfer: float = 0.004, rpy: Vector = (0, 0, 0)) -> trimesh.Trimesh:
     """A box between two corners, its edges cut, in a frame turned by roll, pitch, yaw [rad]."""
-    low, high = np.array(low, float), np.array(high, float)
     corners = []
     for axis in range(3):
         inset = np.full(3, chamfer)
         inset[axis] = 0
-        corners.append(trimesh.creation.box(bounds=[low + inset, high - inset]).vertices)
+        corners.append(trimesh.creation.box(bounds=[np.add(low, inset), np.subtract(high, inset)]).vertices)
     return _placed(trimesh.convex.convex_hull(np.vstack(corners)), transform(rpy=rpy), (0, 0, 0))
 
 

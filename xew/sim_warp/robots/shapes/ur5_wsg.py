@@ -6,6 +6,7 @@ from xew.sim_warp.robots.shapes.solids import (
     Box,
     Part,
     Vector,
+    between,
     box_solid,
     camera,
     cylinder,
@@ -44,7 +45,7 @@ COLLISIONS = {
 
 def housing(start: Vector, end: Vector, radius: float) -> list[Part]:
     """A joint's housing along its axis: grey, with a blue cap over its end."""
-    seam = tuple(a + 0.78 * (b - a) for a, b in zip(start, end, strict=True))
+    seam = between(start, end, 0.78)
     return [("grey", cylinder(start, seam, radius)), ("blue", dome(seam, end, 0.985 * radius))]
 
 
