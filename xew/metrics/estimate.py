@@ -19,11 +19,18 @@ COLOUR_BINS = 24
 """Per channel of Lab."""
 LEARNING_FRAMES = 32
 """The appearance is learnt from at most so many frames, spread evenly."""
+SOFTNESS = (1.0, 2.0)
+"""Standard deviations of the blur [pixels] of the softened copies that are learnt from too."""
+RESIDUAL_SOFTNESS = 1.5
+"""Both frames are blurred so before they are compared, so that sharpness and grain do not count as motion."""
 EVIDENCE_LIMIT = 4.0
 """No single kind of evidence may say more than exp(4) : 1; histograms of one episode know no better."""
-SHAPE_WEIGHT = 6.0
+SHAPE_WEIGHT = 9.0
+"""More than both other kinds together: where flow explains a pixel fully, an object in the robot's colours stays out."""
 SHAPE_REACH = 2.0
 """Pixels from the carried contour at which shape evidence is three quarters of its full weight."""
+SMALLEST_PIECE = 24
+"""Pixels; what is smaller is the rim of some object, not a robot."""
 RESIDUAL_SCALE = 25.0
 """Colour difference (levels) between a pixel and the one that flow says it came from, at which the gate is 1/e."""
 CLOSURE_SCALE = 3.0
@@ -60,10 +67,15 @@ def estimate_masks(prediction: np.ndarray, target: np.ndarray, target_mask: np.n
 
 
 def learn_appearance(video: np.ndarray, mask: np.ndarray) -> Appearance:
-    """Learn the looks of a robot and its background from true video [t h w 3] uint8 and masks [t h w] bool."""
+    """Learn the looks of a robot and its background from true video [t h w 3] uint8 and masks [t h w] bool.
+
+    Colours and differences are learnt from the frames as they are and softened, as predicted video is: else every soft
+    edge of an object would differ from the background as only a robot does.
+    """
     picked = np.unique(np.linspace(0, len(video) - 1, LEARNING_FRAMES).round().astype(int))
-    video, mask = video[picked], mask[picked]
-    background, uncovered = _background(video, mask)
+    background, uncovered = _background(video[picked], mask[picked])
+    video = np.concatenate([video[picked], *([_soften(frame, s) for frame in video[picked]] for s in SOFTNESS)])
+    mask = np.tile(mask[picked], (1 + len(SOFTNESS), 1, 1))
     colour = _colour_bins(video)
     difference = np.stack([_difference(frame, background) for frame in video])
     seen = np.broadcast_to(uncovered, mask.shape)
@@ -81,7 +93,15 @@ def _estimate_frame(appearance: Appearance, frame: np.ndarray, target: np.ndarra
     looks = np.clip(colour, -EVIDENCE_LIMIT, EVIDENCE_LIMIT)
     looks += np.where(appearance.uncovered, np.clip(difference, -EVIDENCE_LIMIT, EVIDENCE_LIMIT), 0)
     score = cv2.GaussianBlur(looks.astype(np.float32), (0, 0), 0.8) + _shape_evidence(frame, target, target_mask)
-    return score > 0
+    return _drop_specks(cv2.medianBlur((score > 0).astype(np.uint8), 3))
+
+
+def _drop_specks(mask: np.ndarray) -> np.ndarray:
+    """Without pieces of fewer than SMALLEST_PIECE pixels; uint8 [h w] to bool."""
+    _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] >= SMALLEST_PIECE
+    large[0] = False  # the ground
+    return large[pieces]
 
 
 def _shape_evidence(frame: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:
@@ -90,9 +110,14 @@ def _shape_evidence(frame: np.ndarray, target: np.ndarray, target_mask: np.ndarr
     there, back = _flow(grey, grey_target), _flow(grey_target, grey)
     source = _grid(grey.shape) + there
     closure = np.linalg.norm(there + _sample(back, source), axis=-1)
-    residual = np.abs(frame.astype(np.float32) - _sample(target.astype(np.float32), source)).max(axis=-1)
+    soft_frame, soft_target = (_soften(image, RESIDUAL_SOFTNESS).astype(np.float32) for image in (frame, target))
+    residual = np.abs(soft_frame - _sample(soft_target, source)).max(axis=-1)
     gate = np.exp(-((residual / RESIDUAL_SCALE) ** 2) - (closure / CLOSURE_SCALE) ** 2)
     return SHAPE_WEIGHT * gate * np.tanh(_sample(_signed_distance(target_mask), source) / SHAPE_REACH)
+
+
+def _soften(image: np.ndarray, sigma: float) -> np.ndarray:
+    return cv2.GaussianBlur(image, (0, 0), sigma)
 
 
 def _flow(start: np.ndarray, end: np.ndarray) -> np.ndarray:
