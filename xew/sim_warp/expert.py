@@ -10,8 +10,8 @@ from functools import lru_cache
 import numpy as np
 
 from xew.protocol import ACTION_DIM, ARMS, FRAME_RATE
-from xew.sim_warp.inverse_kinematics import ArmSolver, Solution
-from xew.sim_warp.plan import ToolPath
+from xew.sim_warp.inverse_kinematics import ArmSolver
+from xew.sim_warp.plan import LEFT, RIGHT, ToolPath
 from xew.sim_warp.robots import RobotSpec
 
 POSITION_TOLERANCE = 0.003
@@ -30,36 +30,19 @@ class Commands:
     """Why this robot cannot follow the plan, in words; None if it can."""
 
 
-@dataclass(frozen=True)
-class _Run:
-    """Frames of one arm between leaving its rest posture and coming back."""
-
-    path: int
-    arm: int
-    frames: np.ndarray
-
-
 def joint_commands(robot: RobotSpec, paths: list[ToolPath]) -> list[Commands]:
-    """Joint commands of one robot for many plans, solved together.
-
-    Where an arm goes from or to its rest posture it moves in joint space, elsewhere along the planned tool path.
-    """
-    runs = [run for index, path in enumerate(paths) for arm in (0, 1) for run in _runs(index, arm, path)]
-    actions = [_resting(robot, path) for path in paths]
-    problems: list[str | None] = [None] * len(paths)
-    if runs:
-        solution = _solve(robot, paths, runs)
-        for column, run in enumerate(runs):
-            count = len(run.frames)
-            joints = solution.joint_pos[:count, column]
-            errors = solution.position_error[:count, column], solution.rotation_error[:count, column]
-            home_share = paths[run.path].home_share[run.frames, run.arm]
-            home = np.array(robot.arms[run.arm].home)
-            columns = ARMS[run.arm][0].start + np.arange(robot.arm_joint_count)
-            actions[run.path][np.ix_(run.frames, columns)] = home_share[:, None] * home + (1 - home_share[:, None]) * joints
-            problems[run.path] = problems[run.path] or _out_of_reach(run, home_share, *errors)
-    problems = [problem or _too_fast(robot, action) for problem, action in zip(problems, actions, strict=True)]
-    return [Commands(action.astype(np.float32), problem) for action, problem in zip(actions, problems, strict=True)]
+    """Joint commands of one robot for many plans, solved together: each frame near the one before it, from home on."""
+    longest = max(path.frame_count for path in paths)
+    targets = np.stack([_lengthened(path.pose, longest) for path in paths], 1).reshape(longest, -1, 7)
+    arms = np.tile([LEFT, RIGHT], len(paths))
+    solution = _solver(robot).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
+    commands = []
+    for index, path in enumerate(paths):
+        columns, frames = slice(2 * index, 2 * index + 2), slice(path.frame_count)
+        action = _action(solution.joint_pos[frames, columns], path.gripper)
+        problem = _out_of_reach(solution.position_error[frames, columns], solution.rotation_error[frames, columns])
+        commands.append(Commands(action.astype(np.float32), problem or _too_fast(robot, action)))
+    return commands
 
 
 @lru_cache(maxsize=16)
@@ -67,41 +50,27 @@ def _solver(robot: RobotSpec) -> ArmSolver:
     return ArmSolver(robot)
 
 
-def _runs(index: int, arm: int, path: ToolPath) -> list[_Run]:
-    away = path.home_share[:, arm] < 1
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], away, [False]]).astype(int)))
-    return [_Run(index, arm, np.arange(start, end)) for start, end in edges.reshape(-1, 2)]
+def _lengthened(pose: np.ndarray, frames: int) -> np.ndarray:
+    """A path [t 2 7] that stands at its last pose until it has `frames` frames."""
+    return np.concatenate([pose, np.repeat(pose[-1:], frames - len(pose), 0)])
 
 
-def _resting(robot: RobotSpec, path: ToolPath) -> np.ndarray:
-    """[t 16] both arms at rest, grippers as planned."""
-    action = np.zeros((path.frame_count, ACTION_DIM))
-    for arm, (joints, gripper) in enumerate(ARMS):
-        action[:, joints.start : joints.start + robot.arm_joint_count] = robot.arms[arm].home
-        action[:, gripper] = path.gripper[:, arm]
+def _action(joint_pos: np.ndarray, gripper: np.ndarray) -> np.ndarray:
+    """[t 2 d] joints and [t 2] grippers -> [t 16] canonical."""
+    action = np.zeros((len(gripper), ACTION_DIM))
+    for arm, (joints, column) in enumerate(ARMS):
+        action[:, joints.start : joints.start + joint_pos.shape[-1]] = joint_pos[:, arm]
+        action[:, column] = gripper[:, arm]
     return action
 
 
-def _solve(robot: RobotSpec, paths: list[ToolPath], runs: list[_Run]) -> Solution:
-    """All runs as one batch; shorter ones stand at their last pose until the longest ends."""
-    longest = max(len(run.frames) for run in runs)
-    targets = np.empty((longest, len(runs), 7))
-    for column, run in enumerate(runs):
-        path, count = paths[run.path], len(run.frames)
-        pose = np.concatenate([path.position[run.frames, run.arm], path.quaternion[run.frames, run.arm]], -1)
-        targets[:count, column], targets[count:, column] = pose, pose[-1]
-    arms = np.array([run.arm for run in runs])
-    start = np.array([robot.arms[run.arm].home for run in runs])
-    return _solver(robot).solve_path(arms, targets, start)
-
-
-def _out_of_reach(run: _Run, home_share: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> str | None:
-    on_path = home_share == 0
-    far, turned = position[on_path].max(initial=0), rotation[on_path].max(initial=0)
-    if far <= POSITION_TOLERANCE and turned <= ROTATION_TOLERANCE:
-        return None
-    side = ("left", "right")[run.arm]
-    return f"{side} arm cannot reach: off by {1000 * far:.0f} mm, {np.degrees(turned):.0f} deg"
+def _out_of_reach(position: np.ndarray, rotation: np.ndarray) -> str | None:
+    """Words for tool errors [t 2] m and rad beyond the tolerance."""
+    for arm, side in enumerate(("left", "right")):
+        far, turned = position[:, arm].max(), rotation[:, arm].max()
+        if far > POSITION_TOLERANCE or turned > ROTATION_TOLERANCE:
+            return f"{side} arm cannot reach: off by {1000 * far:.0f} mm, {np.degrees(turned):.0f} deg"
+    return None
 
 
 def _too_fast(robot: RobotSpec, action: np.ndarray) -> str | None:

@@ -14,16 +14,14 @@ from scipy.spatial.transform import Rotation, Slerp
 from xew.protocol import FRAME_RATE
 
 LEFT, RIGHT = 0, 1
-TOOL_SPEED = 0.20
+TOOL_SPEED = 0.16
 """Mean speed of a tool between two waypoints [m/s]; a minimum-jerk move peaks at 1.875 times its mean."""
-TURN_SPEED = 0.6
-"""Mean turning speed of a tool [rad/s]."""
-SHORTEST_MOVE = 0.36
+TURN_SPEED = 0.45
+"""Mean turning speed of a tool [rad/s]; a move takes the time of its way and of its turn together."""
+SHORTEST_MOVE = 0.42
 """s."""
 GRIP_TIME = 0.48
 """Time for a gripper to close or open [s]: 8 frames."""
-HOME_TIME = 1.8
-"""Time from or to a robot's rest posture [s]; how far that is depends on the robot, so the clock must not."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +40,11 @@ class Tool:
         """Drawn back against the approach direction [m]."""
         return Tool(self.position - distance * self.rotation.apply([1, 0, 0]), self.rotation)
 
+    def carried(self, start: np.ndarray, goal: np.ndarray, turn: float = 0.0) -> "Tool":
+        """The hand after what it holds has moved from `start` to `goal` [3] m and turned about the world's z [rad]."""
+        turned = Rotation.from_euler("z", turn)
+        return Tool(np.asarray(goal) + turned.apply(self.position - np.asarray(start)), turned * self.rotation)
+
 
 def tool(position: np.ndarray | tuple[float, float, float], yaw: float = 0.0, tilt: float = 0.0, roll: float = 0.0) -> Tool:
     """A tool frame that points down at `position`.
@@ -57,6 +60,10 @@ def tool(position: np.ndarray | tuple[float, float, float], yaw: float = 0.0, ti
     return Tool(np.asarray(position, float), turned)
 
 
+HOME = (tool((-0.17, -0.24, 0.88), tilt=np.radians(30)), tool((0.17, -0.24, 0.88), tilt=np.radians(30)))
+"""Where both tools are when an episode begins: every robot's home posture puts them there."""
+
+
 @dataclass(frozen=True)
 class Hold:
     """A stretch of time in which an arm should be touching an object."""
@@ -70,24 +77,19 @@ class Hold:
 
 @dataclass(frozen=True)
 class _Segment:
-    """One arm along waypoints, evenly spaced in progress; None stands for the robot's rest posture."""
+    """One arm along waypoints, evenly spaced in progress."""
 
     start_time: float
     end_time: float
-    waypoints: tuple[Tool | None, ...]
+    waypoints: tuple[Tool, ...]
 
 
 @dataclass(frozen=True)
 class ToolPath:
     """Both tools at every stored frame."""
 
-    position: np.ndarray
-    """[t 2 3] float64, m, world; the nearest stated waypoint on the way from or to
-    home, NaN while nothing is stated."""
-    quaternion: np.ndarray
-    """[t 2 4] float64, x y z w; NaN likewise."""
-    home_share: np.ndarray
-    """[t 2] float64, 1 at the rest posture, 0 on the tool path, between them on the way (minimum jerk)."""
+    pose: np.ndarray
+    """[t 2 7] float64, x y z [m] and quaternion x y z w, world."""
     gripper: np.ndarray
     """[t 2] float64, 0 closed, 1 open."""
     holds: tuple[Hold, ...]
@@ -103,8 +105,8 @@ class Timeline:
 
     time: float = 0.0
     """s, now."""
-    at: list[Tool | None] = field(default_factory=lambda: [None, None])
-    """Where each tool is now; None is home."""
+    at: list[Tool] = field(default_factory=lambda: list(HOME))
+    """Where each tool is now."""
     segments: tuple[list[_Segment], list[_Segment]] = field(default_factory=lambda: ([], []))
     grips: tuple[list[tuple[float, float]], list[tuple[float, float]]] = field(
         default_factory=lambda: ([(0.0, 1.0)], [(0.0, 1.0)])
@@ -112,10 +114,9 @@ class Timeline:
     """(time, value) knots of each gripper, linear between."""
     holds: list[Hold] = field(default_factory=list)
 
-    def move(self, goals: dict[int, Tool | None], seconds: float | None = None) -> None:
-        """Move one or both tools, starting and arriving together; a goal of None is the robot's rest posture."""
-        seconds = seconds or max(_duration(self.at[arm], goal) for arm, goal in goals.items())
-        end = self.time + seconds
+    def move(self, goals: dict[int, Tool]) -> None:
+        """Move one or both tools straight, starting and arriving together."""
+        end = self.time + max(_duration(self.at[arm], goal) for arm, goal in goals.items())
         for arm, goal in goals.items():
             self.segments[arm].append(_Segment(self.time, end, (self.at[arm], goal)))
             self.at[arm] = goal
@@ -137,22 +138,19 @@ class Timeline:
     def wait(self, seconds: float) -> None:
         self.time += seconds
 
-    def hold(self, arm: int, name: str, since: float) -> None:
-        """Say that `arm` should have touched the object `name` from time `since` until now."""
-        self.holds.append(Hold(arm, name, since, self.time))
+    def hold(self, arm: int, name: str) -> None:
+        """Say that `arm` should have touched the object `name` from its last grip until now."""
+        self.holds.append(Hold(arm, name, self.grips[arm][-1][0], self.time))
 
     def path(self) -> ToolPath:
         """Both tools at each stored frame, 60 ms apart, from time 0 until the last move has ended."""
         times = np.arange(int(np.ceil(self.time * FRAME_RATE)) + 1) / FRAME_RATE
-        sampled = [_sample(self.segments[arm], times) for arm in (LEFT, RIGHT)]
+        poses = [_sample(HOME[arm], self.segments[arm], times) for arm in (LEFT, RIGHT)]
         grippers = [np.interp(times, *np.array(self.grips[arm]).T) for arm in (LEFT, RIGHT)]
-        position, quaternion, home_share = (np.stack(parts, 1) for parts in zip(*sampled, strict=True))
-        return ToolPath(position, quaternion, home_share, np.stack(grippers, 1), tuple(self.holds))
+        return ToolPath(np.stack(poses, 1), np.stack(grippers, 1), tuple(self.holds))
 
 
-def _duration(start: Tool | None, end: Tool | None) -> float:
-    if start is None or end is None:
-        return HOME_TIME
+def _duration(start: Tool, end: Tool) -> float:
     distance = np.linalg.norm(end.position - start.position)
     angle = (start.rotation.inv() * end.rotation).magnitude()
     return max(SHORTEST_MOVE, float(distance / TOOL_SPEED + angle / TURN_SPEED))
@@ -164,32 +162,19 @@ def minimum_jerk(share: np.ndarray) -> np.ndarray:
     return np.clip(share**3 * (10 - 15 * share + 6 * share**2), 0, 1)
 
 
-def _sample(segments: list[_Segment], times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Position [t 3], quaternion [t 4] and home share [t] of one tool; it stands still between segments."""
-    position, quaternion = np.full((len(times), 3), np.nan), np.full((len(times), 4), np.nan)
-    home_share = np.ones(len(times))
+def _sample(home: Tool, segments: list[_Segment], times: np.ndarray) -> np.ndarray:
+    """[t 7] pose of one tool; it stands still between segments."""
+    pose = np.tile(np.concatenate([home.position, home.rotation.as_quat()]), (len(times), 1))
     for segment in segments:
         now = times >= segment.start_time
         progress = minimum_jerk((times[now] - segment.start_time) / (segment.end_time - segment.start_time))
-        position[now], quaternion[now], home_share[now] = _sample_segment(segment, progress)
-    return position, quaternion, home_share
+        pose[now] = _along(segment.waypoints, progress)
+    return pose
 
 
-def _sample_segment(segment: _Segment, progress: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    start, end = segment.waypoints[0], segment.waypoints[-1]
-    if start is not None and end is not None:
-        return *_along(segment.waypoints, progress), np.zeros(len(progress))
-    # The tool's own pose on the way is the robot's business: only the end of the tool path is stated.
-    known = start if end is None else end
-    home_share = progress if end is None else 1 - progress
-    if known is None:
-        return np.full((len(progress), 3), np.nan), np.full((len(progress), 4), np.nan), np.ones(len(progress))
-    return *_along((known, known), progress), home_share
-
-
-def _along(waypoints: tuple[Tool, ...], progress: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _along(waypoints: tuple[Tool, ...], progress: np.ndarray) -> np.ndarray:
     knots = np.linspace(0, 1, len(waypoints))
     positions = np.stack([waypoint.position for waypoint in waypoints])
     position = np.stack([np.interp(progress, knots, positions[:, axis]) for axis in range(3)], -1)
     turns = Slerp(knots, Rotation.concatenate([waypoint.rotation for waypoint in waypoints]))
-    return position, turns(progress).as_quat()
+    return np.concatenate([position, turns(progress).as_quat()], -1)

@@ -9,9 +9,9 @@ from pathlib import Path
 from xew.sim_warp.robots.spec import Arm, RobotSpec
 
 LEFT = Arm(
-    root_pose=(-0.28, -0.65, 0.6, 0, 0, 0.7071067812, 0.7071067812),
+    root_pose=(-0.28, -0.7, 0.5, 0, 0, 0.7071067812, 0.7071067812),
     joints=("panda_joint1", "panda_joint2", "panda_joint3", "panda_joint4", "panda_joint5", "panda_joint6", "panda_joint7"),
-    home=(0.0287, -0.4803, -0.3468, -2.8834, 0.0048, 2.9288, 0.4591),
+    home=(-0.0131, -0.4912, -0.2391, -2.6131, 0.0293, 2.6428, 0.5093),
     tool_link="panda_hand",
     tool_pose=(0, 0, 0.0979, 0.7071067812, 0, 0.7071067812, 0),
     fingers=("panda_finger_joint1", "panda_finger_joint2"),
@@ -20,8 +20,8 @@ LEFT = Arm(
 )
 RIGHT = replace(
     LEFT,
-    root_pose=(0.28, -0.65, 0.6, 0, 0, 0.7071067812, 0.7071067812),
-    home=(-0.0288, -0.4804, 0.347, -2.8834, -0.0046, 2.9288, 1.1115),
+    root_pose=(0.28, -0.7, 0.5, 0, 0, 0.7071067812, 0.7071067812),
+    home=(0.0129, -0.4912, 0.2393, -2.6131, -0.0291, 2.6428, 1.0614),
 )
 
 SPEC = RobotSpec(

@@ -16,20 +16,20 @@ from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, pick
 
-HEAD_SIZE = (0.044, 0.044, 0.075)
+HEAD_SIZE = (0.05, 0.05, 0.07)
 HANDLE_HEIGHT = 0.045
 """Of the handle's axis above the hammer's face [m]."""
-HANDLE_LENGTH = 0.12
-GRIP_AT = -0.085
+HANDLE_LENGTH = 0.11
+GRIP_AT = -0.075
 """y of the grasp in the hammer's frame [m]."""
 BLOCK = 0.05
 
 
 def hammer() -> Shape:
-    """A mallet whose face is its frame's origin; the handle points along -y."""
+    """A mallet whose face is its frame's origin; the handle points along -y, light enough that it stands on its head."""
     head = objects.block(HEAD_SIZE, (95, 98, 105))
     face = objects.moved(objects.block((0.036, 0.036, 0.004), (60, 62, 66)), (0, 0, HEAD_SIZE[2]))
-    handle = geometry.box((0.022, HANDLE_LENGTH, 0.026), (165, 105, 55))
+    handle = geometry.box((0.02, HANDLE_LENGTH, 0.022), (165, 105, 55))
     handle = handle.transformed((0, -HEAD_SIZE[1] / 2 - HANDLE_LENGTH / 2, HANDLE_HEIGHT))
     return objects.merge(head, Shape(face.mesh), Shape(handle, (handle.vertices,)))
 
@@ -42,7 +42,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         "beat_block_hammer",
         seed,
         (
-            SceneObject("hammer", hammer(), upright(0, -0.06, TABLE_TOP), mass=0.2),
+            SceneObject("hammer", hammer(), upright(0, -0.06, TABLE_TOP), mass=0.15),
             SceneObject("block", objects.block((BLOCK,) * 3, objects.PALETTE[color]), upright(x, y, TABLE_TOP, yaw)),
         ),
         words={"color": str(color)},
@@ -59,7 +59,7 @@ def plan(scene: Scene) -> Timeline:
     timeline.move({arm: strike.moved(z=0.06)})
     timeline.move({arm: strike})
     timeline.wait(0.24)
-    timeline.hold(arm, "hammer", timeline.grips[arm][-1][0])
+    timeline.hold(arm, "hammer")
     return timeline
 
 

@@ -9,10 +9,10 @@ After RoboTwin 2.0's blocks_ranking_rgb.
 import numpy as np
 
 from xew.sim_warp import objects
-from xew.sim_warp.plan import Timeline, tool
+from xew.sim_warp.plan import HOME, Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, inward_yaw, pick, place
+from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, arm_for, pick, place, symmetric_yaw
 
 COLORS = ("red", "green", "blue")
 
@@ -58,7 +58,7 @@ def plan(scene: Scene) -> Timeline:
     for block in scene.objects:
         arm = arm_for(block.pose[0])
         if last_arm not in (None, arm):
-            timeline.move({last_arm: None})
+            timeline.move({last_arm: HOME[last_arm]})
         _move_block(timeline, arm, block, scene.targets[block.name])
         last_arm = arm
     return timeline
@@ -67,8 +67,8 @@ def plan(scene: Scene) -> Timeline:
 def _move_block(timeline: Timeline, arm: int, block: SceneObject, target: tuple[float, ...]) -> None:
     yaw = 2 * np.arctan2(block.pose[5], block.pose[6])
     centre = float(block.shape.mesh.vertices[:, 2].mean())
-    grasp = tool((*block.pose[:2], TABLE_TOP + centre), inward_yaw(arm, yaw, np.pi / 2), GRASP_TILT)
-    goal = tool((*target, TABLE_TOP + centre + 0.002), 0.0, GRASP_TILT)
+    grasp = tool((*block.pose[:2], TABLE_TOP + centre), symmetric_yaw(arm, block.pose, yaw, np.pi / 2), STEEP_TILT)
+    goal = tool((*target, TABLE_TOP + centre + 0.002), symmetric_yaw(arm, target, 0.0, np.pi / 2), STEEP_TILT)
     pick(timeline, {arm: grasp}, lift=0.08, opening=0.8)
     place(timeline, arm, block.name, goal, above=0.07, retreat=0.09, release=0.7)
 

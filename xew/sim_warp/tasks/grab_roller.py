@@ -8,10 +8,10 @@ After RoboTwin 2.0's grab_roller.
 import numpy as np
 
 from xew.sim_warp import objects
-from xew.sim_warp.plan import LEFT, RIGHT, Timeline, tool
+from xew.sim_warp.plan import LEFT, RIGHT, Timeline
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, GRIPPER_CLOSED, Moment, Task, pick
+from xew.sim_warp.tasks.task import GRIPPER_CLOSED, Moment, Task, across, pick
 
 GRASP_FROM_END = 0.03
 LIFT = 0.12
@@ -33,14 +33,14 @@ def plan(scene: Scene) -> Timeline:
     reach, height = points[:, 0].max() - GRASP_FROM_END, points[:, 2].mean()
     along = np.array([np.cos(yaw), np.sin(yaw)])
     grasps = {
-        arm: tool((*(np.array([x, y]) + side * reach * along), TABLE_TOP + height), yaw, GRASP_TILT, roll=np.pi / 2)
+        arm: across((*(np.array([x, y]) + side * reach * along), TABLE_TOP + height), yaw, arm)
         for arm, side in ((LEFT, -1), (RIGHT, 1))
     }
     timeline = Timeline()
     pick(timeline, grasps, lift=LIFT)
     timeline.wait(0.3)
     for arm in grasps:
-        timeline.hold(arm, "roller", timeline.grips[arm][-1][0])
+        timeline.hold(arm, "roller")
     return timeline
 
 

@@ -1,9 +1,9 @@
-"""Task: open a laptop by its lid with one hand.
+"""Task: open a laptop with one hand, a finger under the edge of its lid.
 
 Randomisation: centre at |x| at most .05, y in [-.08, .03]; its front turned up to 45 degrees to the left or right (the arm
     on that side works); size of the lid, colour. The lid begins at 20 % of its range, the base is fixed.
 Success: lid open beyond 40 % of its range, the tool within 10 cm of the lid's free edge.
-After RoboTwin 2.0's open_laptop, whose front turns up to 60 degrees.
+After RoboTwin 2.0's open_laptop, whose front turns up to 60 degrees and whose expert grasps the lid.
 """
 
 import numpy as np
@@ -14,16 +14,22 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool, tool
 from xew.sim_warp.scene import Hinge, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import PRE_GRASP, Moment, Task
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, radial_yaw
 
 BASE_HEIGHT = 0.016
 LID_THICKNESS = 0.009
-RANGE = 2.3
-"""rad, of the hinge."""
-START, GOAL, DONE = 0.2, 0.52, 0.4
+RANGE = 3.1
+"""rad, of the hinge: the widest of the original's laptops, so that 20 % of it leaves room for a hand."""
+START, GOAL, DONE = 0.2, 0.47, 0.4
 """Shares of the range at which the lid begins, to which the expert opens it, and from which it counts as open."""
-GRASP_FROM_EDGE = 0.012
-OPENING = 0.45
+FINGER_HALF_WIDTH = 0.011
+"""Of every robot's pads, along the tool's z [m]: how far the pushing face is from the tool's axis."""
+PRESS = 0.004
+"""How far the commanded tool is beyond touching [m]: the lid's hinge is stiffer than nothing."""
+RUN_UP = 0.06
+"""Distance before the lid at which the finger comes down [m]."""
+WIDEST_TURN = np.radians(30)
+"""Of the hand from its radial yaw towards the laptop's own [rad]."""
 
 
 def laptop(width: float, depth: float, color: objects.Color) -> tuple[Shape, Hinge]:
@@ -55,28 +61,36 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     return Scene("open_laptop", seed, (SceneObject("laptop", base, upright(x, y, TABLE_TOP, yaw), hinge=hinge),))
 
 
-def lid_grasp(scene: Scene, fraction: float) -> Tool:
-    """The grasp of the lid's free edge, fingers on both of its faces, when it is open by a fraction of its range."""
+def lid_edge(scene: Scene, fraction: float) -> np.ndarray:
+    """[3] world position of the middle of the lid's free edge, inner side, at a fraction of the hinge's range."""
     thing = scene.object("laptop")
-    hinge, yaw = thing.hinge, _yaw(thing)
+    hinge = thing.hinge
     angle = hinge.lower + fraction * (hinge.upper - hinge.lower)
-    reach = -hinge.lid.hulls[0][:, 1].min() + hinge.anchor[1] - GRASP_FROM_EDGE
-    local = np.array(hinge.anchor) + reach * np.array([0, -np.cos(angle), np.sin(angle)])
-    position = np.array(thing.pose[:3]) + Rotation.from_euler("z", yaw).apply(local)
-    return tool(position, yaw, tilt=np.pi / 2 - angle, roll=np.pi / 2)
+    reach = hinge.anchor[1] - hinge.lid.hulls[0][:, 1].min()
+    local = np.array(hinge.anchor) + Rotation.from_euler("x", -angle).apply([0, -reach, -LID_THICKNESS / 2])
+    return np.array(thing.pose[:3]) + Rotation.from_euler("z", _yaw(thing)).apply(local)
+
+
+def _pushing(scene: Scene, arm: int, fraction: float, short_by: float) -> Tool:
+    """The closed hand whose far side touches the lid's edge, drawn back towards the laptop's front by `short_by` [m]."""
+    edge, yaw = lid_edge(scene, fraction), _yaw(scene.object("laptop"))
+    radial = radial_yaw(arm, edge)
+    hand = tool(edge, radial + np.clip(yaw - radial, -WIDEST_TURN, WIDEST_TURN), GRASP_TILT)
+    ahead = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    return Tool(edge - FINGER_HALF_WIDTH * hand.rotation.apply([0, 0, 1]) - short_by * ahead, hand.rotation)
 
 
 def plan(scene: Scene) -> Timeline:
     arm = RIGHT if _yaw(scene.object("laptop")) > 0 else LEFT
-    grasp = lid_grasp(scene, START)
     timeline = Timeline()
-    timeline.grip({arm: OPENING}, seconds=0.3)
-    timeline.move({arm: grasp.backed(PRE_GRASP)})
-    timeline.move({arm: grasp})
     timeline.grip({arm: 0.0})
-    timeline.follow(arm, [lid_grasp(scene, fraction) for fraction in np.linspace(START, GOAL, 12)[1:]], seconds=1.8)
+    before = _pushing(scene, arm, START, RUN_UP)
+    timeline.move({arm: before.moved(z=0.05)})
+    timeline.move({arm: before})
+    timeline.move({arm: _pushing(scene, arm, START, 0.0)})
+    timeline.follow(arm, [_pushing(scene, arm, fraction, -PRESS) for fraction in np.linspace(START, GOAL, 16)[1:]], seconds=2.4)
     timeline.wait(0.2)
-    timeline.hold(arm, "laptop", timeline.grips[arm][-1][0])
+    timeline.hold(arm, "laptop")
     return timeline
 
 
@@ -87,8 +101,7 @@ def _yaw(thing: SceneObject) -> float:
 def success(scene: Scene, now: Moment) -> bool:
     index = scene.index("laptop")
     fraction = scene.objects[index].hinge.fraction(now.object_joint[index])
-    edge = lid_grasp(scene, fraction).position
-    near = np.linalg.norm(now.tool_pose[:, :3] - edge, axis=-1).min() < 0.1
+    near = np.linalg.norm(now.tool_pose[:, :3] - lid_edge(scene, fraction), axis=-1).min() < 0.1
     return bool(fraction > DONE and near)
 
 

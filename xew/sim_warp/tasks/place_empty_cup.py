@@ -12,7 +12,7 @@ from xew.sim_warp import objects
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, arm_for, inward_yaw, pick, place, rim_grasp
+from xew.sim_warp.tasks.task import Moment, Task, pick, place, radial_yaw, rim_grasp, vessel_pose
 
 COASTER_HEIGHT = 0.008
 WALL = 0.005
@@ -30,7 +30,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         "place_empty_cup",
         seed,
         (
-            SceneObject("cup", shape, upright(*cup, TABLE_TOP, inward_yaw(arm_for(side))), mass=0.12),
+            SceneObject("cup", shape, vessel_pose(cup), mass=0.12),
             SceneObject(
                 "coaster", objects.disc(0.055, COASTER_HEIGHT, objects.PALETTE[colors[1]]), upright(*coaster, TABLE_TOP)
             ),
@@ -42,10 +42,11 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 def plan(scene: Scene) -> Timeline:
     cup, coaster = scene.object("cup"), scene.object("coaster")
     arm, grasp = rim_grasp(cup, WALL, RIM_DEPTH)
-    shift = np.subtract(coaster.pose[:3], cup.pose[:3]) + [0, 0, COASTER_HEIGHT + 0.002]
+    start, goal = cup.pose[:3], np.array(coaster.pose[:3]) + [0, 0, COASTER_HEIGHT + 0.002]
+    turn = radial_yaw(arm, goal) - radial_yaw(arm, start)
     timeline = Timeline()
     pick(timeline, {arm: grasp}, lift=0.08, opening=0.5)
-    place(timeline, arm, "cup", grasp.moved(*shift), above=0.05, retreat=0.08, release=0.4)
+    place(timeline, arm, "cup", grasp.carried(start, goal, turn), above=0.05, retreat=0.08, release=0.4)
     return timeline
 
 

@@ -10,10 +10,10 @@ After RoboTwin 2.0's stack_bowls_two.
 import numpy as np
 
 from xew.sim_warp import objects
-from xew.sim_warp.plan import Timeline
-from xew.sim_warp.scene import Scene, SceneObject, draw, upright
+from xew.sim_warp.plan import HOME, Timeline
+from xew.sim_warp.scene import Scene, SceneObject, draw
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, arm_for, inward_yaw, pick, place, rim_grasp
+from xew.sim_warp.tasks.task import Moment, Task, pick, place, radial_yaw, rim_grasp, vessel_pose
 
 STACK = (0.0, -0.1)
 WALL = 0.004
@@ -33,7 +33,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         SceneObject(
             name,
             objects.vessel(outline, WALL, objects.PALETTE[color], (238, 236, 230)),
-            upright(*at, TABLE_TOP, inward_yaw(arm_for(at[0]))),
+            vessel_pose(at),
             mass=0.12,
         )
         for name, at, color in (("lower_bowl", nearer, colors[0]), ("upper_bowl", farther, colors[1]))
@@ -54,10 +54,11 @@ def plan(scene: Scene) -> Timeline:
     for bowl, height in zip(scene.objects, (0.0, NESTING), strict=True):
         arm, grasp = rim_grasp(bowl, WALL, RIM_DEPTH)
         if last_arm not in (None, arm):
-            timeline.move({last_arm: None})
+            timeline.move({last_arm: HOME[last_arm]})
         pick(timeline, {arm: grasp}, lift=0.10, opening=0.5)
-        goal = grasp.moved(STACK[0] - bowl.pose[0], STACK[1] - bowl.pose[1], height + 0.003)
-        place(timeline, arm, bowl.name, goal, above=0.08, retreat=0.09, release=0.4)
+        start, goal = bowl.pose[:3], np.array([*STACK, TABLE_TOP + height + 0.003])
+        turn = radial_yaw(arm, goal) - radial_yaw(arm, start)
+        place(timeline, arm, bowl.name, grasp.carried(start, goal, turn), above=0.08, retreat=0.09, release=0.4)
         last_arm = arm
     return timeline
 

@@ -1,17 +1,18 @@
 """What a task is: a scene to sample, a plan that solves it, and a test of success."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool, tool
-from xew.sim_warp.scene import Scene, SceneObject
+from xew.sim_warp.scene import Pose, Scene, SceneObject, upright
+from xew.sim_warp.stage import TABLE_TOP
 
 GRASP_TILT = np.radians(30)
 """Lean of the hand in a grasp from above [rad]: all five robots reach the work area with it (docs/robots.md)."""
-INWARD = np.radians(20)
-"""How far that lean turns towards the middle of the table [rad], for the wrists of the small arms."""
+STEEP_TILT = np.radians(14)
+"""Lean for grasps low over the near part of the table, where a wrist of small range has it easier [rad]."""
 PRE_GRASP = 0.09
 """Distance before a grasp from which the approach is straight [m]."""
 GRIPPER_OPEN = 0.8
@@ -74,17 +75,37 @@ def pick(timeline: Timeline, grasps: dict[int, Tool], lift: float, opening: floa
     timeline.move({arm: grasp.moved(z=lift) for arm, grasp in grasps.items()})
 
 
-def inward_yaw(arm: int, yaw: float = 0.0, symmetry: float = np.inf) -> float:
-    """The hand's yaw [rad] that leans inwards, or, of those at `yaw` plus multiples of `symmetry`, the nearest to it."""
-    wanted = outward(arm) * INWARD
-    return wanted if np.isinf(symmetry) else yaw + symmetry * np.round((wanted - yaw) / symmetry)
+def radial_yaw(arm: int, position: np.ndarray | Sequence[float]) -> float:
+    """The hand's yaw [rad] at which its lean points away from the arm's shoulder: the one that all robots reach best."""
+    x, y = position[:2]
+    return outward(arm) * float(np.arctan2(0.25 - outward(arm) * x, y + 0.45))
+
+
+def symmetric_yaw(arm: int, position: np.ndarray | Sequence[float], yaw: float, symmetry: float) -> float:
+    """Of the yaws `yaw` plus multiples of `symmetry` [rad] the one nearest to the radial yaw."""
+    return float(yaw + symmetry * np.round((radial_yaw(arm, position) - yaw) / symmetry))
+
+
+def across(position: tuple[float, float, float], direction: float, arm: int) -> Tool:
+    """A grasp from above across a rod that lies along the horizontal `direction` [rad], leaning inwards."""
+    yaw = radial_yaw(arm, position)
+    approach, opening = tool(position, yaw, STEEP_TILT).rotation.apply([[1.0, 0, 0], [0, 1.0, 0]])
+    wanted = np.cross(approach, [np.cos(direction), np.sin(direction), 0.0])
+    roll = np.arctan2(np.dot(np.cross(opening, wanted), approach), np.dot(opening, wanted))
+    roll -= np.pi * np.round(roll / np.pi)  # fingers have no front
+    return tool(position, yaw, STEEP_TILT, roll)
+
+
+def vessel_pose(position: Sequence[float]) -> Pose:
+    """Upright on the table at (x, y), turned so that a wall segment faces the hand that will take it."""
+    return upright(*position[:2], TABLE_TOP, radial_yaw(arm_for(position[0]), position))
 
 
 def rim_grasp(vessel: SceneObject, wall: float, depth: float) -> tuple[int, Tool]:
     """The arm on whose side a vessel stands, and its grasp from above of the wall on that side.
 
     Args:
-        vessel: round, standing with its yaw at `inward_yaw` of that arm, so that the hand meets the flat of a wall segment.
+        vessel: round, standing at `vessel_pose`, so that the hand meets the flat of a wall segment.
         wall: thickness [m].
         depth: of the grasp below the rim [m].
     """
@@ -92,7 +113,7 @@ def rim_grasp(vessel: SceneObject, wall: float, depth: float) -> tuple[int, Tool
     arm = arm_for(position[0])
     vertices = vessel.shape.mesh.vertices
     radius = float(np.hypot(*vertices[:, :2].T).max()) - wall / 2
-    yaw = inward_yaw(arm)
+    yaw = radial_yaw(arm, position)
     radial = outward(arm) * np.array([np.cos(yaw), np.sin(yaw), 0.0])
     return arm, tool(position + radius * radial + [0, 0, vertices[:, 2].max() - depth], yaw, GRASP_TILT)
 
@@ -102,10 +123,9 @@ def place(timeline: Timeline, arm: int, name: str, goal: Tool, *, above: float, 
 
     `release` is the gripper's opening between letting go and being clear of the object and its neighbours.
     """
-    held_since = timeline.grips[arm][-1][0]
     timeline.move({arm: goal.moved(z=above)})
     timeline.move({arm: goal})
-    timeline.hold(arm, name, held_since)
+    timeline.hold(arm, name)
     timeline.grip({arm: release})
     timeline.move({arm: goal.moved(z=retreat)})
     timeline.grip({arm: 1.0}, seconds=0.24)
