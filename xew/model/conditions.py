@@ -19,9 +19,8 @@ import numpy as np
 from xew.episode import Record, States, read_video
 
 if TYPE_CHECKING:
+    from xew.sim_warp.camera import Camera
     from xew.sim_warp.streams import CommandStreams
-
-WHITE = 255
 
 
 @dataclass(frozen=True)
@@ -45,10 +44,17 @@ class Command:
 
     @cached_property
     def streams(self) -> "CommandStreams":
-        """What the simulator makes of the commands. Warp is imported here and not before."""
-        from xew.sim_warp import camera, streams
+        """Render, mask and optical flow of the commands; Warp is imported when first asked for."""
+        from xew.sim_warp.streams import command_streams
 
-        return streams.command_streams(self.robot, self.action, camera.Camera(self.intrinsics, self.extrinsics))
+        return command_streams(self.robot, self.action, self.camera)
+
+    @property
+    def camera(self) -> "Camera":
+        """The simulator's own camera object."""
+        from xew.sim_warp.camera import Camera
+
+        return Camera(self.intrinsics, self.extrinsics)
 
 
 @dataclass(frozen=True)
@@ -81,16 +87,55 @@ def robot_render(command: Command) -> np.ndarray:
 
 def robot_mask(command: Command) -> np.ndarray:
     """The robot's silhouette at every frame, white on black."""
-    silhouette = (command.render < WHITE).any(-1, keepdims=True)
-    return np.broadcast_to(np.where(silhouette, WHITE, 0).astype(np.uint8), command.render.shape)
+    return np.repeat(command.streams.mask[..., None], 3, axis=-1).astype(np.uint8) * 255
+
+
+def optical_flow(command: Command) -> np.ndarray:
+    """The robot's exact motion as a colour wheel; white where nothing moves."""
+    from xew.sim_warp.streams import flow_to_rgb
+
+    return flow_to_rgb(command.streams.optical_flow)
+
+
+def ray_map(command: Command) -> np.ndarray:
+    """The commanded tool frames drawn into the image."""
+    from xew.sim_warp import streams
+
+    return streams.ray_map(command.robot, command.action, command.camera)
+
+
+def reference_image(command: Command) -> np.ndarray:
+    """One front view of the robot at home."""
+    from xew.sim_warp import streams
+
+    return streams.reference_image(command.robot)[None]
+
+
+def nine_views(command: Command) -> np.ndarray:
+    """The robot at home from nine sides."""
+    from xew.sim_warp import streams
+
+    return streams.nine_views(command.robot)
+
+
+def articulation_clip(command: Command) -> np.ndarray:
+    """A clip of the robot that moves all its joints."""
+    from xew.sim_warp import streams
+
+    return streams.articulation_clip(command.robot)
 
 
 ACTIONS: dict[str, Condition | None] = {
     "none": None,
+    "optical_flow": Condition("optical_flow", "action", optical_flow),
     "mask": Condition("mask", "action", robot_mask),
+    "ray_map": Condition("ray_map", "action", ray_map),
     "joints": Condition("joints", "joints", joints),
 }
 CONDITIONS: dict[str, Condition | None] = {
     "none": None,
+    "reference_image": Condition("reference_image", "embodiment", reference_image, aligned=False),
+    "nine_views": Condition("nine_views", "embodiment", nine_views, aligned=False),
+    "articulation_clip": Condition("articulation_clip", "embodiment", articulation_clip, aligned=False),
     "robot_render": Condition("robot_render", "embodiment", robot_render),
 }

@@ -9,10 +9,7 @@ Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … 
 
 import argparse
 import json
-import os
-import shutil
 import sys
-import tempfile
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -26,7 +23,7 @@ from flax import nnx
 from tqdm import tqdm
 
 from xew.config import CONVERTER, ConfigError, suggestion, user_errors
-from xew.episode import EpisodeError, episode_folder, find_accepted, write_video
+from xew.episode import EpisodeError, episode_folder, find_accepted
 from xew.model.checkpoint import load_run, restore_params
 from xew.model.codec import Codec
 from xew.model.data import Batch, encode_text
@@ -35,6 +32,7 @@ from xew.model.flow_matching import euler_sample, sampling_sigmas
 from xew.model.frames import to_camera_size
 from xew.model.latents import Episode, encode_clip, stream_videos
 from xew.protocol import ROBOT_NAMES, seed_split
+from xew.rollout import write_rollout
 
 
 @dataclass(frozen=True)
@@ -119,32 +117,25 @@ def rollout_header(experiment: Experiment, step: int, episode: Episode) -> dict[
     _, record = episode
     limit = experiment.rollout.max_frames
     frames = min(record.frame_count, limit) if limit else record.frame_count
-    identity = {"task": record.task, "seed": record.seed, "robot": record.robot}
-    source = {"source_hash": record.hashes["rgb"], "frame_count": frames, "episode_frame_count": record.frame_count}
-    return identity | source | {"checkpoint_step": step, "config": CONVERTER.unstructure(experiment)}
+    action, embodiment = experiment.model.action, experiment.model.embodiment
+    return {
+        "model": experiment.out.name,
+        "condition": "+".join(name for name in (action, embodiment) if name != "none") or "none",
+        "source_hash": record.hashes["rgb"],
+        "frame_count": frames,
+        "checkpoint_step": step,
+        "config": CONVERTER.unstructure(experiment),
+    }
 
 
-def is_done(out: Path, header: dict[str, Any]) -> bool:
+def is_done(out: Path, episode: Episode, header: dict[str, Any]) -> bool:
     """Whether this very rollout is there already."""
-    folder = episode_folder(out, header["task"], header["seed"], header["robot"])
+    _, record = episode
+    folder = episode_folder(out, record.task, record.seed, record.robot)
     try:
         return json.loads((folder / "rollout.json").read_text()) == header and (folder / "rgb.mkv").exists()
     except (OSError, ValueError):
         return False
-
-
-def write_rollout(out: Path, header: dict[str, Any], video: np.ndarray) -> None:
-    """Write one rollout atomically; video uint8 [t 240 320 3]."""
-    folder = episode_folder(out, header["task"], header["seed"], header["robot"])
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-        write_video(temporary / "rgb.mkv", video)
-        (temporary / "rollout.json").write_text(json.dumps(header, indent=1) + "\n")
-        shutil.rmtree(folder, ignore_errors=True)
-        os.rename(temporary, folder)
-    except OSError as error:
-        raise EpisodeError(f"cannot write the rollout {folder}: {error}; free some space or choose another --out.") from error
 
 
 def batches(pending: list[tuple[Episode, dict[str, Any]]], size: int) -> Iterator[list[tuple[Episode, dict[str, Any]]]]:
@@ -160,8 +151,8 @@ def predict_and_write(predictor: Predictor, group: list[tuple[Episode, dict[str,
     episodes = [episode for episode, _ in group]
     padded = episodes + [episodes[-1]] * (size - len(episodes))
     videos = predictor.predict(padded, max(header["frame_count"] for _, header in group))
-    for (_, header), video in zip(group, videos, strict=False):
-        write_rollout(out, header, to_camera_size(video[: header["frame_count"]]))
+    for ((_, record), header), video in zip(group, videos, strict=False):
+        write_rollout(out, record.task, record.seed, record.robot, to_camera_size(video[: header["frame_count"]]), header)
 
 
 def load_predictor(run: Path) -> tuple[Predictor, int]:
@@ -186,7 +177,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     out = args.out or Path("rollouts") / args.run.name
     episodes = select_episodes(args.data or predictor.experiment.data, args.split, args.robots)
     headers = [(episode, rollout_header(predictor.experiment, step, episode)) for episode in episodes]
-    pending = [item for item in headers if not is_done(out, item[1])]
+    pending = [item for item in headers if not is_done(out, *item)]
     with tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress:
         for group in batches(pending, predictor.experiment.rollout.batch):
             predict_and_write(predictor, group, out)

@@ -90,7 +90,7 @@ def make_train_step(
         updates, optimizer_state = optimizer.update(gradients, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)
         ema = None if state.ema is None else optax.incremental_update(params, state.ema, 1 - settings.ema_decay)
-        result = StepResult(losses, pair.sigma, optax.global_norm(gradients))
+        result = StepResult(losses, pair.sigma, optax.tree.norm(gradients))
         return TrainState(state.step + 1, params, optimizer_state, ema), result
 
     return train_step

@@ -1,0 +1,31 @@
+"""Strict session for the model room: no silent type promotion, no silent broadcasting over missing axes."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+
+@pytest.fixture(autouse=True)
+def strict_shapes() -> Iterator[None]:
+    """Arrays of different rank never broadcast silently."""
+    with jax.numpy_rank_promotion("raise"):
+        yield
+
+
+@pytest.fixture
+def strict_types() -> Iterator[None]:
+    """No implicit conversion between types; not for tests that train, since Optax itself relies on some."""
+    with jax.numpy_dtype_promotion("strict"):
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_compile_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The session compiles equal programs once and leaves the user's cache alone."""
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("jax")))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

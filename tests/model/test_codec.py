@@ -1,0 +1,100 @@
+"""The linear codec and the way between the camera's frames and the model's."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from xew.model.codec import PatchCodec, cut_patches, join_patches, latent_frames, reconstruction_psnr
+from xew.model.frames import to_camera_size, to_model_size
+
+
+def smooth_clip(seed: int, frames: int = 9) -> np.ndarray:
+    """A few moving plane waves, uint8 [t 32 48 3]."""
+    rng = np.random.default_rng(seed)
+    t, y, x = np.meshgrid(np.arange(frames), np.arange(32), np.arange(48), indexing="ij")
+    waves = [np.sin(rng.uniform(-0.2, 0.2) * x + rng.uniform(-0.2, 0.2) * y + rng.uniform(-0.3, 0.3) * t) for _ in range(3)]
+    return (127 + 100 * np.stack(waves, -1)).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def codec() -> PatchCodec:
+    return PatchCodec.fit([smooth_clip(seed) for seed in range(8)], spatial_factor=8, channels=24)
+
+
+def test_shapes(codec: PatchCodec) -> None:
+    latents = codec.encode(smooth_clip(9, frames=13))
+    assert latents.shape == (latent_frames(13), 4, 6, 24) and latents.dtype == np.float32
+    assert codec.decode(latents).shape == (13, 32, 48, 3)
+
+
+def test_round_trip_of_unseen_video(codec: PatchCodec) -> None:
+    assert reconstruction_psnr(codec, [smooth_clip(9), smooth_clip(10)]) > 35
+
+
+def test_causal(codec: PatchCodec) -> None:
+    """The first frame stands alone; each latent depends on frames up to its own group only."""
+    video, changed = smooth_clip(9), smooth_clip(9)
+    changed[5:] = 255 - changed[5:]
+    before, after = codec.encode(video), codec.encode(changed)
+    np.testing.assert_array_equal(before[:2], after[:2])
+    assert not np.allclose(before[2], after[2])
+    np.testing.assert_array_equal(codec.encode(video[:1])[0], before[0])
+
+
+def test_stillness_is_zero(codec: PatchCodec) -> None:
+    still = np.repeat(smooth_clip(9)[:1], 9, 0)
+    latents = codec.encode(still)
+    np.testing.assert_array_equal(latents[1:], np.zeros_like(latents[1:]))
+    decoded = codec.decode(latents)
+    np.testing.assert_array_equal(decoded, np.repeat(decoded[:1], 9, 0))
+
+
+def test_latents_are_of_unit_size(codec: PatchCodec) -> None:
+    latents = np.stack([codec.encode(smooth_clip(seed)) for seed in range(8)])
+    assert latents[:, :1].std() == pytest.approx(1, abs=0.1)
+    assert np.sqrt(np.square(latents[:, 1:]).mean()) == pytest.approx(1, abs=0.1)
+
+
+def test_patches_are_lossless() -> None:
+    video = np.random.default_rng(0).integers(0, 256, (9, 16, 24, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(join_patches(*cut_patches(video, 8), 8), video)
+
+
+def test_refuses_clips_that_do_not_fit(codec: PatchCodec) -> None:
+    with pytest.raises(ValueError, match="needs 4 k"):
+        codec.encode(smooth_clip(0)[:8])
+    with pytest.raises(ValueError, match="sides in 8s"):
+        codec.encode(smooth_clip(0)[:, :30])
+
+
+def test_saved_codec_is_the_same(codec: PatchCodec, tmp_path: Path) -> None:
+    codec.save(tmp_path / "codec.npz")
+    loaded = PatchCodec.load(tmp_path / "codec.npz")
+    assert loaded.hash == codec.hash
+    np.testing.assert_array_equal(loaded.encode(smooth_clip(9)), codec.encode(smooth_clip(9)))
+
+
+def test_fit_is_deterministic_and_hash_tells_codecs_apart(codec: PatchCodec) -> None:
+    clips = [smooth_clip(seed) for seed in range(8)]
+    assert PatchCodec.fit(clips, 8, 24).hash == codec.hash
+    assert PatchCodec.fit(clips, 8, 23).hash != codec.hash
+
+
+def test_padding_to_the_paper_s_size_is_lossless() -> None:
+    video = np.random.default_rng(0).integers(0, 256, (2, 240, 320, 3), dtype=np.uint8)
+    padded = to_model_size(video, 256, 320)
+    assert padded.shape == (2, 256, 320, 3)
+    np.testing.assert_array_equal(padded[:, 8:248], video)
+    np.testing.assert_array_equal(to_camera_size(padded), video)
+
+
+@pytest.mark.parametrize(("height", "width"), [(128, 160), (64, 80), (120, 160), (96, 160)])
+def test_resizing_keeps_the_geometry(height: int, width: int) -> None:
+    """A bright square comes back where it was."""
+    video = np.zeros((1, 240, 320, 3), np.uint8)
+    video[:, 80:120, 200:280] = 255
+    back = to_camera_size(to_model_size(video, height, width))
+    rows, columns = np.nonzero(back[0, ..., 0] > 127)
+    assert (rows.mean(), columns.mean()) == pytest.approx((99.5, 239.5), abs=0.5)
+    assert np.abs(back.astype(int) - video).mean() < 8

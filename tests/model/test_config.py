@@ -1,0 +1,123 @@
+"""Configs: strict, with errors that say what to do."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from xew import config
+from xew.config import ConfigError
+from xew.model.experiment import load_experiment
+
+REPOSITORY = Path(__file__).parents[2]
+CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
+MODEL_CONFIGS = [REPOSITORY / "configs" / name for name in ("debug.yaml", "fixed.yaml")]
+
+
+@dataclass(frozen=True)
+class Inner:
+    depth: int = 3
+    rate: float = 1e-3
+    names: tuple[str, ...] = ("a",)
+
+
+@dataclass(frozen=True)
+class Outer:
+    name: str
+    inner: Inner = Inner()
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "config.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_reads_and_converts(tmp_path: Path) -> None:
+    path = write(tmp_path, "name: x\ninner: {depth: 4, rate: 5e-5, names: [b, c]}")
+    assert config.load(Outer, path) == Outer("x", Inner(4, 5e-5, ("b", "c")))
+
+
+def test_overrides_win(tmp_path: Path) -> None:
+    path = write(tmp_path, "name: x\ninner: {depth: 4, rate: 2}")
+    assert config.load(Outer, path, ["--inner.depth", "5"]) == Outer("x", Inner(5, 2.0))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("name: x\ninner: {dpeth: 4}", "inner: unknown key 'dpeth'; did you mean 'depth'?"),
+        ("inner: {depth: 4}", "missing key 'name'"),
+        ("name: x\ninner: {depth: 4.5}", "inner.depth: expected int, found float 4.5"),
+        ("name: x\ninner: {depth: true}", "inner.depth: expected int, found bool True"),
+        ("name: x\ninner: {rate: fast}", "inner.rate: expected float, found str 'fast'"),
+        ("name: x\ninner: {names: b}", "inner.names: expected a list, found str 'b'"),
+        ("name: x\ninner: 3", "inner: expected keys and values"),
+        ("- 3", "expected keys and values, found list"),
+        ("name: [", "is not YAML"),
+    ],
+)
+def test_mistakes_are_named(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        config.load(Outer, write(tmp_path, text))
+    assert said in str(error.value)
+
+
+def test_all_mistakes_at_once(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as error:
+        config.load(Outer, write(tmp_path, "inner: {depth: x, rate: y}"))
+    assert len(str(error.value).splitlines()) == 3
+
+
+def test_missing_file_lists_what_there_is(tmp_path: Path) -> None:
+    write(tmp_path, "name: x")
+    with pytest.raises(ConfigError, match=r"cannot read the config .*There is: .*config\.yaml"):
+        config.load(Outer, tmp_path / "other.yaml")
+
+
+def test_unknown_override_exits_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        config.load(Outer, write(tmp_path, "name: x"), ["--inner.dpeth", "5"])
+    assert stop.value.code == 2
+    assert "--inner.depth" in capsys.readouterr().err
+
+
+def test_user_errors_exit_2_without_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+    @config.user_errors
+    def command() -> None:
+        raise ConfigError("found this, do that")
+
+    with pytest.raises(SystemExit) as stop:
+        command()
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == "error: found this, do that\n"
+
+
+def test_pick_suggests_and_imports() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'mask'"):
+        config.pick({"mask": 1, "none": 2}, "maks", "action")
+    assert config.pick({}, "math:tau", "action") > 6
+    with pytest.raises(ConfigError, match="cannot import the action 'math:taau'"):
+        config.pick({}, "math:taau", "action")
+
+
+@pytest.mark.parametrize("path", MODEL_CONFIGS, ids=lambda path: path.stem)
+def test_shipped_configs_load_and_survive_saving(path: Path, tmp_path: Path) -> None:
+    experiment = load_experiment(path)
+    config.save(experiment, tmp_path / "saved.yaml")
+    assert load_experiment(tmp_path / "saved.yaml") == experiment
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["--clip.frames", "16"], r"clip.frames is 16; it must be 4 k \+ 1 .* for example 17"),
+        (["--clip.width", "100"], "both sides must be multiples of"),
+        (["--model.size", "debgu"], "unknown model size 'debgu'; did you mean 'debug'"),
+        (["--model.embodiment", "render"], "unknown embodiment 'render'; did you mean 'robot_render'"),
+        (["--split", "fixd"], "unknown split 'fixd'; did you mean 'fixed'"),
+    ],
+)
+def test_experiment_mistakes(overrides: list[str], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        load_experiment(MODEL_CONFIGS[0], overrides)

@@ -1,0 +1,186 @@
+"""The block stack against what is known of Wan2.2-TI2V-5B and against naive forms of itself."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from xew.model import dit
+from xew.model.dit import MODELS, STREAMS, WorldModel
+
+pytestmark = pytest.mark.usefixtures("strict_types")
+CHANNELS = 3
+SHAPE = (2, 3, 4, 6, CHANNELS)
+TOLERANCE = 2e-5
+
+
+def tiny(streams: tuple[str, ...] = (), **options: object) -> WorldModel:
+    """A model whose every parameter is drawn anew, so that nothing hides behind a zero start."""
+    model = WorldModel(MODELS["tiny"], CHANNELS, streams, rngs=nnx.Rngs(0), **options)
+    graph, params = nnx.split(model)
+    leaves, tree = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    drawn = [0.2 * jax.random.normal(key, leaf.shape, jnp.float32) for key, leaf in zip(keys, leaves, strict=True)]
+    return nnx.merge(graph, jax.tree.unflatten(tree, drawn))
+
+
+def normal(seed: int, *shape: int) -> jax.Array:
+    return jax.random.normal(jax.random.key(seed), shape, jnp.float32)
+
+
+@pytest.fixture(scope="module")
+def inputs() -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Latents, noise levels and text."""
+    return normal(2, *SHAPE), jnp.array([0.3, 0.9], jnp.float32), normal(3, 2, 8, 16)
+
+
+def test_parameters_of_the_published_model() -> None:
+    model = nnx.eval_shape(lambda: WorldModel(MODELS["wan5b"], 48, rngs=nnx.Rngs(0)))
+    paths = jax.tree_util.tree_leaves_with_path(nnx.state(model, nnx.Param))
+    tensors = sum(MODELS["wan5b"].depth if "blocks" in jax.tree_util.keystr(path) else 1 for path, _ in paths)
+    assert dit.parameter_count(model) == 4_999_787_712
+    assert tensors == 825
+
+
+def test_extra_stream_costs_what_flowwam_says() -> None:
+    """592,896 for the patch embedding; the stream embedding is one width more."""
+    plain, flow = (nnx.eval_shape(lambda s=s: WorldModel(MODELS["wan5b"], 48, s, rngs=nnx.Rngs(0))) for s in ((), ("action",)))
+    assert dit.parameter_count(flow) - dit.parameter_count(plain) == 592_896 + 3072
+
+
+def test_stream_embedding_copies_the_patch_embedding() -> None:
+    model = WorldModel(MODELS["tiny"], CHANNELS, ("action",), rngs=nnx.Rngs(0))
+    copied = model.stream_inputs["action"]
+    np.testing.assert_array_equal(copied.kernel[...], model.patch_embedding.kernel[...])
+    assert copied.kernel is not model.patch_embedding.kernel
+
+
+def test_zero_velocity_at_the_start(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+    latents, sigma, text = inputs
+    model = WorldModel(MODELS["tiny"], CHANNELS, rngs=nnx.Rngs(0))
+    assert not np.any(model(latents, {}, sigma, text))
+
+
+def test_one_stream_is_the_plain_block_stack(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+    """Scan over stacked layers = calling each layer's block in turn."""
+    latents, sigma, text = inputs
+    model = tiny()
+    tokens, rows, rotary = model.embed_streams(latents, {})
+    time = model.time_embedding(dit.sinusoid(jnp.stack([jnp.zeros(2), 1000 * sigma], 1)))
+    modulation, context = model.modulation(time), model.text_embedding(text)
+    graph, layers = nnx.split(model.blocks)
+    for layer in range(MODELS["tiny"].depth):
+        block = nnx.merge(graph, jax.tree.map(lambda leaf, layer=layer: leaf[layer], layers))
+        tokens = block(tokens, modulation, rows, rotary, context)
+    expected = dit.unpatchify(model.head(tokens, time, rows), latents.shape)
+    np.testing.assert_allclose(model(latents, {}, sigma, text), expected, atol=TOLERANCE)
+
+
+def test_remat_changes_nothing(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+    latents, sigma, text = inputs
+    values = [tiny(remat=remat)(latents, {}, sigma, text) for remat in (False, True)]
+    np.testing.assert_allclose(*values, atol=TOLERANCE)
+
+
+def test_streams_are_one_sequence(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+    """A stream equals the same tokens appended to RGB's, with their own positions."""
+    latents, *_ = inputs
+    model, condition = tiny(("embodiment",)), normal(4, 2, 1, 4, 6, CHANNELS)
+    tokens, rows, (cos, _) = model.embed_streams(latents, {"embodiment": condition})
+    rgb_tokens, _, (rgb_cos, _) = tiny().embed_streams(latents, {})
+    np.testing.assert_allclose(tokens[:, :18], model.patch_embedding(dit.patchify(latents)), atol=TOLERANCE)
+    assert rgb_tokens.shape == tokens[:, :18].shape
+    np.testing.assert_array_equal(cos[:18], rgb_cos)
+    np.testing.assert_array_equal(cos[18:], cos[:6])
+    assert tokens.shape[1] == 3 * 2 * 3 + 1 * 2 * 3
+    own = model.stream_inputs["embodiment"](dit.patchify(condition)) + model.stream_embeddings["embodiment"][None, None]
+    np.testing.assert_allclose(tokens[:, 18:], own, atol=TOLERANCE)
+    np.testing.assert_array_equal(rows, [0] * 6 + [1] * 12 + [0] * 6)
+
+
+def test_conditions_matter_and_rgb_alone_is_predicted(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+    latents, sigma, text = inputs
+    model = tiny(("embodiment", "joints"))
+    conditions = {"embodiment": normal(4, *SHAPE), "joints": normal(5, 2, 3, 16)}
+    velocity = model(latents, conditions, sigma, text)
+    assert velocity.shape == SHAPE
+    for name, values in conditions.items():
+        moved = model(latents, conditions | {name: values + 1}, sigma, text)
+        assert np.abs(moved - velocity).max() > 1e-3, name
+
+
+def test_two_rows_equal_a_timestep_for_every_token(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+    latents, sigma, text = inputs
+    model, conditions = tiny(("action",)), {"action": normal(4, *SHAPE)}
+    tokens, rows, rotary = model.embed_streams(latents, conditions)
+    timesteps = jnp.where(rows[None] == 0, 0.0, 1000 * sigma[:, None])
+    time = model.time_embedding(dit.sinusoid(timesteps))
+    every = np.arange(tokens.shape[1])
+    tokens = model.apply_blocks(tokens, model.modulation(time), every, rotary, model.text_embedding(text))
+    rgb = every[: tokens.shape[1] // 2]
+    expected = dit.unpatchify(model.head(tokens[:, rgb], time, rgb), latents.shape)
+    np.testing.assert_allclose(model(latents, conditions, sigma, text), expected, atol=TOLERANCE)
+
+
+def test_noise_levels_told_to_streams() -> None:
+    grid = (3, 1, 2)
+    assert dit.token_rows(STREAMS["rgb"], grid).tolist() == [0, 0, 1, 1, 1, 1]
+    assert dit.token_rows(STREAMS["action"], grid).tolist() == [0, 0, 1, 1, 1, 1]
+    assert dit.token_rows(STREAMS["embodiment"], grid).tolist() == [0] * 6
+
+
+@pytest.mark.parametrize(("head_dim", "parts"), [(128, (44, 42, 42)), (64, (24, 20, 20)), (16, (8, 4, 4))])
+def test_rotary_split(head_dim: int, parts: tuple[int, int, int]) -> None:
+    """Each axis has its own frequencies 10000^(-2i/width), in the order time, height, width."""
+    angles = dit.rotary_angles((3, 2, 2), head_dim)
+    assert angles.shape == (12, head_dim // 2)
+    last = angles[-1]
+    series = [
+        position * 10_000.0 ** (-np.arange(0, width, 2) / width) for position, width in zip((2, 1, 1), parts, strict=True)
+    ]
+    np.testing.assert_allclose(last, np.concatenate(series), rtol=1e-12)
+
+
+def test_rotation_is_a_complex_product_of_neighbouring_pairs() -> None:
+    values, angles = np.asarray(normal(6, 1, 12, 2, 16)), dit.rotary_angles((3, 2, 2), 16)
+    pairs = values[..., 0::2] + 1j * values[..., 1::2]
+    expected = pairs * np.exp(1j * angles)[None, :, None]
+    rotated = dit.rotate(jnp.asarray(values), (jnp.asarray(np.cos(angles), "float32"), jnp.asarray(np.sin(angles), "float32")))
+    rotated = np.asarray(rotated)
+    np.testing.assert_allclose(rotated[..., 0::2] + 1j * rotated[..., 1::2], expected, atol=1e-5)
+
+
+def test_sinusoid_is_cosine_first() -> None:
+    features = dit.sinusoid(jnp.array([0.0, 1.0], jnp.float32))
+    assert features.shape == (2, 256)
+    np.testing.assert_allclose(features[0], [1.0] * 128 + [0.0] * 128)
+    np.testing.assert_allclose(features[1, [0, 64, 128]], [np.cos(1), np.cos(0.01), np.sin(1)], atol=1e-6)
+
+
+def test_patchify_orders_features_as_wan() -> None:
+    """In: channel slowest, then row and column of the patch. Out: row, column, channel fastest."""
+    latents = np.arange(4 * CHANNELS, dtype=np.float32).reshape(1, 1, 2, 2, CHANNELS)
+    np.testing.assert_array_equal(dit.patchify(jnp.asarray(latents))[0, 0], latents[0, 0].transpose(2, 0, 1).ravel())
+    np.testing.assert_array_equal(dit.unpatchify(jnp.asarray(latents.reshape(1, 1, -1)), latents.shape), latents)
+
+
+def test_query_norm_spans_all_heads() -> None:
+    """Wan normalises before the split: scaling one head's queries changes the others' logits."""
+    attention = tiny().blocks.self_attn
+    assert attention.norm_q.scale.shape == (MODELS["tiny"].depth, MODELS["tiny"].dim)
+
+
+def test_bfloat16_keeps_parameters_and_result_float32(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+    latents, sigma, text = inputs
+    with jax.numpy_dtype_promotion("standard"):  # JAX's own attention mixes bfloat16 and float32
+        exact, rounded = (tiny(dtype=dtype)(latents, {}, sigma, text) for dtype in (jnp.float32, jnp.bfloat16))
+    assert rounded.dtype == jnp.float32
+    assert 0 < np.abs(rounded - exact).max() < 0.1 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_sizes_are_consistent(name: str) -> None:
+    size = MODELS[name]
+    assert size.dim == size.heads * size.head_dim
+    assert size.head_dim % 2 == 0

@@ -1,0 +1,181 @@
+"""Latents, training, resuming and rollouts on synthetic data, end to end and tiny."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+
+from xew.episode import HEIGHT, WIDTH, find_records, read_video
+from xew.model import latents, rollout, train
+from xew.model.data import ClipSource, fake_batch, make_dataset
+from xew.model.experiment import Experiment, load_experiment
+from xew.model.latents import LatentCache, clip_starts, load_codec, training_episodes
+from xew.protocol import SEEN_ROBOTS
+from xew.rollout import find_rollouts, read_rollout_video
+
+FRAMES = 12
+CONFIG = """
+clip: {frames: 5, height: 64, width: 80}
+codec: {spatial_factor: 8, channels: 4}
+model: {size: tiny, action: joints, embodiment: robot_render}
+train: {steps: 4, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, ema_decay: 0.5}
+rollout: {steps: 2, batch: 3}
+"""
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with data and config.yaml; latents are encoded."""
+    root = tmp_path_factory.mktemp("world")
+    synthetic.write_synthetic_data(root / "data", seeds=(0, 1_000_000), frames=FRAMES)
+    (root / "config.yaml").write_text(f"data: {root / 'data'}\nout: {root / 'run'}\n{CONFIG}")
+    latents.main([str(root / "config.yaml")])
+    return root
+
+
+@pytest.fixture(scope="module")
+def run(world: Path) -> Path:
+    """A run of four straight steps."""
+    train.main([str(world / "config.yaml")])
+    return world / "run"
+
+
+@pytest.fixture
+def experiment(world: Path) -> Experiment:
+    return load_experiment(world / "config.yaml")
+
+
+def lines(run: Path, name: str) -> list[float]:
+    logged = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return [line[name] for line in logged if name in line]
+
+
+def fails(command: Callable[[list[str]], None], arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """What a command says when it exits with code 2."""
+    with pytest.raises(SystemExit) as stop:
+        command(arguments)
+    assert stop.value.code == 2
+    return capsys.readouterr().err
+
+
+def test_resumed_run_repeats_the_straight_one(world: Path, run: Path) -> None:
+    config, out = str(world / "config.yaml"), world / "resumed"
+    train.main([config, "--out", str(out), "--train.steps", "2"])
+    train.main([config, "--out", str(out), "--resume"])
+    assert lines(out, "train/loss") == lines(run, "train/loss")
+    assert lines(out, "train/gradient_norm") == lines(run, "train/gradient_norm")
+    assert len(lines(run, "train/loss")) == 4
+
+
+def test_run_folder_holds_what_a_rerun_needs(run: Path, experiment: Experiment) -> None:
+    assert load_experiment(run / "config.yaml") == experiment
+    assert sorted(path.name for path in (run / "checkpoints").iterdir() if path.is_dir()) == ["2", "4"]
+    assert {path.name for path in (run / "checkpoints" / "4").iterdir()} >= {"params", "optimizer", "ema", "data"}
+    assert list(run.glob("events.out.tfevents.*"))
+    assert lines(run, "sample/psnr/unseen/piper")
+
+
+def test_existing_run_is_not_touched_unasked(world: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = fails(train.main, [str(world / "config.yaml")], capsys)
+    assert "--resume" in said and "--overwrite" in said
+    said = fails(train.main, [str(world / "config.yaml"), "--resume", "--train.learning-rate", "0.5"], capsys)
+    assert "train.learning_rate was 0.001, is 0.5" in said
+    assert len(lines(run, "train/loss")) == 4
+
+
+def test_missing_data_and_latents_name_the_command(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = str(world / "config.yaml")
+    assert "python -m xew.sim_warp.generate" in fails(train.main, [config, "--data", str(tmp_path / "none")], capsys)
+    said = fails(train.main, [config, "--cache", str(tmp_path / "none"), "--out", str(tmp_path / "run")], capsys)
+    assert "python -m xew.model.latents" in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_other_data_makes_the_cache_stale(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The same cells, recorded differently: nothing of the old cache is taken for them."""
+    synthetic.write_synthetic_data(tmp_path / "data", seeds=(0, 1_000_000), frames=FRAMES + 1)
+    shutil.copytree(world / "data-latents", tmp_path / "data-latents")
+    said = fails(
+        train.main, [str(world / "config.yaml"), "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")], capsys
+    )
+    assert "no codec fitted on" in said and "python -m xew.model.latents" in said
+
+
+def test_stale_stream_is_an_error(
+    experiment: Experiment, world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A stream encoded from an older recording has another key."""
+    shutil.copytree(world / "data-latents", tmp_path / "cache")
+    victim = next((tmp_path / "cache").glob("*/*/arx_x5/rgb-*.npy"))
+    victim.rename(victim.with_name("rgb-000000000000.npy"))
+    config = [str(world / "config.yaml"), "--cache", str(tmp_path / "cache"), "--out", str(tmp_path / "run")]
+    assert "was encoded from other data" in fails(train.main, config, capsys)
+
+
+def test_training_sees_training_robots_and_seeds_only(experiment: Experiment) -> None:
+    episodes = training_episodes(experiment)
+    assert {record.robot for _, record in episodes} == set(SEEN_ROBOTS)
+    assert {record.seed for _, record in episodes} == {0}
+
+
+def test_encoding_again_writes_nothing(world: Path, experiment: Experiment) -> None:
+    before = {path: path.stat().st_mtime_ns for path in (world / "data-latents").rglob("*.npy")}
+    latents.main([str(world / "config.yaml")])
+    assert {path: path.stat().st_mtime_ns for path in (world / "data-latents").rglob("*.npy")} == before
+    assert len(before) == len(SEEN_ROBOTS) * 3
+
+
+def test_batches_have_the_declared_shapes_and_resume(experiment: Experiment) -> None:
+    episodes = training_episodes(experiment)
+    source = ClipSource(LatentCache(experiment, load_codec(experiment, episodes)), episodes)
+    assert len(source) == len(episodes) * len(clip_starts(FRAMES, 5))
+    batches = iter(make_dataset(source, 2, seed=0))
+    first, position = next(batches), batches.get_state()
+    second = next(batches)
+    fake = fake_batch(experiment, 2)
+    assert first.latents.shape == fake.latents.shape == (2, *experiment.latent_shape)
+    assert {k: v.shape for k, v in first.conditions.items()} == {k: v.shape for k, v in fake.conditions.items()}
+    assert first.text.shape == fake.text.shape
+    continued = iter(make_dataset(source, 2, seed=0))
+    continued.set_state(position)
+    np.testing.assert_array_equal(next(continued).latents, second.latents)
+
+
+@pytest.mark.parametrize(
+    ("frame_count", "starts"), [(5, (0,)), (9, (0, 4)), (12, (0, 4, 7)), (3, (0,))], ids=["one", "two", "rest", "short"]
+)
+def test_clips_cover_an_episode(frame_count: int, starts: tuple[int, ...]) -> None:
+    assert clip_starts(frame_count, 5) == starts
+
+
+def test_rollouts_cover_the_test_episodes(run: Path, world: Path) -> None:
+    out = world / "rollouts"
+    rollout.main([str(run), "--out", str(out)])
+    found = {(r.task, r.seed, r.robot): r for r in find_rollouts(out)}
+    tested = {(r.task, r.seed, r.robot): r for _, r in find_records(world / "data") if r.seed >= 1_000_000}
+    assert set(found) == set(tested)
+    for key, made in found.items():
+        assert read_rollout_video(made).shape == (FRAMES, HEIGHT, WIDTH, 3)
+        assert made.header["source_hash"] == tested[key].hashes["rgb"]
+        assert made.condition == "joints+robot_render"
+
+
+def test_rollouts_resume_and_do_not_depend_on_the_batch(run: Path, world: Path, tmp_path: Path) -> None:
+    rollout.main([str(run), "--out", str(tmp_path), "--robots", "piper", "ur5_wsg"])
+    piper, ur5 = (next(tmp_path.glob(f"*/*/{robot}/rgb.mkv")) for robot in ("piper", "ur5_wsg"))
+    before, untouched = read_video(piper), ur5.stat().st_mtime_ns
+    shutil.rmtree(piper.parent)
+    rollout.main([str(run), "--out", str(tmp_path), "--robots", "piper", "ur5_wsg"])
+    assert ur5.stat().st_mtime_ns == untouched
+    again = read_video(piper)
+    assert np.abs(again.astype(int) - before).max() <= 1
+
+
+def test_rollout_mistakes(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "did you mean 'piper'" in fails(rollout.main, [str(run), "--robots", "pipr"], capsys)
+    assert "holds no run" in fails(rollout.main, [str(tmp_path)], capsys)
+    assert "xew.sim_warp.generate" in fails(rollout.main, [str(run), "--data", str(tmp_path)], capsys)
