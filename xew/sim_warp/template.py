@@ -41,6 +41,8 @@ give way under more lets the pads sink into a wall of 5 mm and throw it out."""
 PAD_FRICTION = 1.2
 """Rubber pads on plastic or wood."""
 LINK_FRICTION = 0.5
+HINGE_SOLIMP = (0.999, 0.999, 0.001, 0.5, 2.0)
+"""Impedance of a hinge's dry friction: with MuJoCo's default a light lid creeps shut at 4 degrees a second."""
 FARTHEST_MASS = 0.3
 """A radius of gyration [m] beyond which a link's inertia is taken for a placeholder (RoboTwin's UR5 gripper states
 1 kg m2 for fingers of 100 g) and that of its collision shapes is used."""
@@ -320,7 +322,14 @@ def _add_hinge_slot(builder: newton.ModelBuilder, thing: SceneObject | None, sce
         for points in thing.hinge.lid.hulls:
             _add_hull(builder, body, points - thing.hinge.anchor, thing.friction, OBJECT_GROUP, object_label(scene, thing))
     joint = builder.add_joint_revolute(
-        -1, body, parent_xform=frame, axis=wp.vec3(*axis), armature=1e-4, label="lid_hinge", **settings
+        -1,
+        body,
+        parent_xform=frame,
+        axis=wp.vec3(*axis),
+        armature=1e-3,
+        label="lid_hinge",
+        custom_attributes={"mujoco:solimpfriction": [HINGE_SOLIMP]},
+        **settings,
     )
     builder.add_articulation([joint], label="lid")
 

@@ -15,6 +15,8 @@ from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, arm_for, pick, place, symmetric_yaw
 
 COLORS = ("red", "green", "blue")
+GRASP_BELOW_TOP = 0.014
+"""High enough that a wide hand passes over the blocks beside [m]."""
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
@@ -66,9 +68,9 @@ def plan(scene: Scene) -> Timeline:
 
 def _move_block(timeline: Timeline, arm: int, block: SceneObject, target: tuple[float, ...]) -> None:
     yaw = 2 * np.arctan2(block.pose[5], block.pose[6])
-    centre = float(block.shape.mesh.vertices[:, 2].mean())
-    grasp = tool((*block.pose[:2], TABLE_TOP + centre), symmetric_yaw(arm, block.pose, yaw, np.pi / 2), STEEP_TILT)
-    goal = tool((*target, TABLE_TOP + centre + 0.002), symmetric_yaw(arm, target, 0.0, np.pi / 2), STEEP_TILT)
+    height = TABLE_TOP + float(block.shape.mesh.vertices[:, 2].max()) - GRASP_BELOW_TOP
+    grasp = tool((*block.pose[:2], height), symmetric_yaw(arm, block.pose, yaw, np.pi / 2), STEEP_TILT)
+    goal = tool((*target, height + 0.002), symmetric_yaw(arm, target, 0.0, np.pi / 2), STEEP_TILT)
     pick(timeline, {arm: grasp}, lift=0.08, opening=0.8)
     place(timeline, arm, block.name, goal, above=0.07, retreat=0.09, release=0.7)
 

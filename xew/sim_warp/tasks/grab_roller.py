@@ -14,12 +14,14 @@ from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks.task import GRIPPER_CLOSED, Moment, Task, across, pick
 
 GRASP_FROM_END = 0.03
+GRASP_ABOVE_AXIS = 0.006
+"""Keeps the lower finger of a leaning hand off the table [m]."""
 LIFT = 0.12
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
     x, y, yaw = rng.uniform([-0.15, -0.25, -0.8], [0.15, -0.05, 0.8])
-    length, radius = rng.uniform([0.23, 0.015], [0.25, 0.018])
+    length, radius = rng.uniform([0.23, 0.017], [0.25, 0.019])
     wood, ends = (205, 160, 105), objects.PALETTE[rng.choice(sorted(objects.PALETTE))]
     roller = SceneObject("roller", objects.prism(radius, length, wood, ends), upright(x, y, TABLE_TOP, yaw), mass=0.2)
     return Scene("grab_roller", seed, (roller,))
@@ -33,11 +35,11 @@ def plan(scene: Scene) -> Timeline:
     reach, height = points[:, 0].max() - GRASP_FROM_END, points[:, 2].mean()
     along = np.array([np.cos(yaw), np.sin(yaw)])
     grasps = {
-        arm: across((*(np.array([x, y]) + side * reach * along), TABLE_TOP + height), yaw, arm)
+        arm: across((*(np.array([x, y]) + side * reach * along), TABLE_TOP + height + GRASP_ABOVE_AXIS), yaw, arm)
         for arm, side in ((LEFT, -1), (RIGHT, 1))
     }
     timeline = Timeline()
-    pick(timeline, grasps, lift=LIFT)
+    pick(timeline, grasps, lift=LIFT, opening=0.6)
     timeline.wait(0.3)
     for arm in grasps:
         timeline.hold(arm, "roller")

@@ -11,7 +11,7 @@ from xew.sim_warp.stage import TABLE_TOP
 
 GRASP_TILT = np.radians(30)
 """Lean of the hand in a grasp from above [rad]: all five robots reach the work area with it (docs/robots.md)."""
-STEEP_TILT = np.radians(14)
+STEEP_TILT = np.radians(10)
 """Lean for grasps low over the near part of the table, where a wrist of small range has it easier [rad]."""
 PRE_GRASP = 0.09
 """Distance before a grasp from which the approach is straight [m]."""
@@ -86,7 +86,7 @@ def symmetric_yaw(arm: int, position: np.ndarray | Sequence[float], yaw: float, 
     return float(yaw + symmetry * np.round((radial_yaw(arm, position) - yaw) / symmetry))
 
 
-def across(position: tuple[float, float, float], direction: float, arm: int) -> Tool:
+def across(position: np.ndarray, direction: float, arm: int) -> Tool:
     """A grasp from above across a rod that lies along the horizontal `direction` [rad], leaning inwards."""
     yaw = radial_yaw(arm, position)
     approach, opening = tool(position, yaw, STEEP_TILT).rotation.apply([[1.0, 0, 0], [0, 1.0, 0]])
