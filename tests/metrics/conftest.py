@@ -1,5 +1,8 @@
 """Reference implementations, where the extra `reference` is installed."""
 
+import importlib.util
+import sys
+import types
 from collections.abc import Callable
 
 import numpy as np
@@ -11,8 +14,10 @@ from xew.metrics.alexnet import read_alexnet
 @pytest.fixture(scope="session")
 def reference_lpips() -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """The real `lpips` network on uint8 videos [t h w 3], its trunk filled from our file (no download)."""
-    torch = pytest.importorskip("torch", reason="parity with lpips needs the extra: pip install -e '.[reference]'")
-    pytest.importorskip("lpips", reason="parity with lpips needs the extra: pip install -e '.[reference]'")
+    # Looked for and not imported: `import lpips` needs torchvision, for which there is a stand-in below.
+    if not all(importlib.util.find_spec(name) for name in ("torch", "lpips")):
+        pytest.skip("parity with lpips needs the extra: pip install -e '.[reference]'")
+    torch = importlib.import_module("torch")
     network = _lpips_without_torchvision(torch)
     _fill(torch, network, read_alexnet())
 
@@ -26,9 +31,6 @@ def reference_lpips() -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
 
 def _lpips_without_torchvision(torch: object) -> object:
     """`lpips` imports torchvision for the trunk's layers alone; a stand-in with AlexNet's layers serves where it is absent."""
-    import sys
-    import types
-
     nn = torch.nn
 
     def alexnet(pretrained: bool = False, **_: object) -> object:
