@@ -61,7 +61,9 @@ def tool(position: np.ndarray | tuple[float, float, float], yaw: float = 0.0, ti
 
 
 HOME = (tool((-0.17, -0.24, 0.88), tilt=np.radians(30)), tool((0.17, -0.24, 0.88), tilt=np.radians(30)))
-"""Where both tools are when an episode begins: every robot's home posture puts them there."""
+"""Where both tools are when an episode begins: every robot's home posture puts them there, in the head camera's view."""
+ASIDE = (tool((-0.28, -0.24, 0.93), tilt=np.radians(30)), tool((0.28, -0.24, 0.93), tilt=np.radians(30)))
+"""Where a tool waits while the other arm works alone: wide hands would meet over the middle of the table."""
 
 
 @dataclass(frozen=True)

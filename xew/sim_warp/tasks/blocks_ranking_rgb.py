@@ -9,7 +9,7 @@ After RoboTwin 2.0's blocks_ranking_rgb.
 import numpy as np
 
 from xew.sim_warp import objects
-from xew.sim_warp.plan import HOME, Timeline, tool
+from xew.sim_warp.plan import Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, arm_for, pick, place, symmetric_yaw
@@ -56,13 +56,9 @@ def _ordered(places: np.ndarray) -> bool:
 
 def plan(scene: Scene) -> Timeline:
     timeline = Timeline()
-    last_arm = None
     for block in scene.objects:
         arm = arm_for(block.pose[0])
-        if last_arm not in (None, arm):
-            timeline.move({last_arm: HOME[last_arm]})
         _move_block(timeline, arm, block, scene.targets[block.name])
-        last_arm = arm
     return timeline
 
 

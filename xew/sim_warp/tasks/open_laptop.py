@@ -14,7 +14,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool, tool
 from xew.sim_warp.scene import Hinge, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, radial_yaw
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, aside, radial_yaw
 
 BASE_HEIGHT = 0.016
 LID_THICKNESS = 0.009
@@ -85,7 +85,7 @@ def plan(scene: Scene) -> Timeline:
     timeline = Timeline()
     timeline.grip({arm: 0.0})
     before = _pushing(scene, arm, START, RUN_UP)
-    timeline.move({arm: before.moved(z=0.05)})
+    timeline.move(aside([arm]) | {arm: before.moved(z=0.05)})
     timeline.move({arm: before})
     timeline.move({arm: _pushing(scene, arm, START, 0.0)})
     timeline.follow(arm, [_pushing(scene, arm, fraction, -PRESS) for fraction in np.linspace(START, GOAL, 16)[1:]], seconds=2.4)

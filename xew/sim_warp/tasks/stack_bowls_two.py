@@ -10,7 +10,7 @@ After RoboTwin 2.0's stack_bowls_two.
 import numpy as np
 
 from xew.sim_warp import objects
-from xew.sim_warp.plan import HOME, Timeline
+from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw
 from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks.task import Moment, Task, pick, place, radial_yaw, rim_grasp, vessel_pose
@@ -50,16 +50,12 @@ def _free(point: np.ndarray, others: list[np.ndarray]) -> bool:
 
 def plan(scene: Scene) -> Timeline:
     timeline = Timeline()
-    last_arm = None
     for bowl, height in zip(scene.objects, (0.0, NESTING), strict=True):
         arm, grasp = rim_grasp(bowl, WALL, RIM_DEPTH)
-        if last_arm not in (None, arm):
-            timeline.move({last_arm: HOME[last_arm]})
         pick(timeline, {arm: grasp}, lift=0.10, opening=0.5)
         start, goal = bowl.pose[:3], np.array([*STACK, TABLE_TOP + height + 0.003])
         turn = radial_yaw(arm, goal) - radial_yaw(arm, start)
         place(timeline, arm, bowl.name, grasp.carried(start, goal, turn), above=0.08, retreat=0.09, release=0.4)
-        last_arm = arm
     return timeline
 
 

@@ -1,11 +1,11 @@
 """What a task is: a scene to sample, a plan that solves it, and a test of success."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool, tool
+from xew.sim_warp.plan import ASIDE, LEFT, RIGHT, Timeline, Tool, tool
 from xew.sim_warp.scene import Pose, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
 
@@ -66,10 +66,13 @@ def outward(arm: int) -> float:
 
 
 def pick(timeline: Timeline, grasps: dict[int, Tool], lift: float, opening: float = 1.0) -> None:
-    """Approach, grasp and lift with one or both arms; `opening` is the gripper's before the grasp."""
+    """Approach, grasp and lift with one or both arms; `opening` is the gripper's before the grasp.
+
+    An arm that has no part in it goes aside during the approach.
+    """
     if opening < 1.0:
         timeline.grip(dict.fromkeys(grasps, opening), seconds=0.24)
-    timeline.move({arm: grasp.backed(PRE_GRASP) for arm, grasp in grasps.items()})
+    timeline.move(aside(grasps) | {arm: grasp.backed(PRE_GRASP) for arm, grasp in grasps.items()})
     timeline.move(grasps)
     timeline.grip(dict.fromkeys(grasps, 0.0))
     timeline.move({arm: grasp.moved(z=lift) for arm, grasp in grasps.items()})
@@ -116,6 +119,11 @@ def rim_grasp(vessel: SceneObject, wall: float, depth: float) -> tuple[int, Tool
     yaw = radial_yaw(arm, position)
     radial = outward(arm) * np.array([np.cos(yaw), np.sin(yaw), 0.0])
     return arm, tool(position + radius * radial + [0, 0, vertices[:, 2].max() - depth], yaw, GRASP_TILT)
+
+
+def aside(working: Collection[int]) -> dict[int, Tool]:
+    """Where the arms that are not working wait."""
+    return {arm: ASIDE[arm] for arm in (LEFT, RIGHT) if arm not in working}
 
 
 def place(timeline: Timeline, arm: int, name: str, goal: Tool, *, above: float, retreat: float, release: float) -> None:
