@@ -77,7 +77,7 @@ def test_the_finding_comes_first_and_names_both_robots(report: Path) -> None:
     finding = re.search(r'<ul class="finding">(.*?)</ul>', text, re.DOTALL)
     assert finding and finding.start() < text.index("<table")
     for robot in ("Franka Panda", "Piper"):
-        assert f"{robot}: late · by one &lt;frame&gt; beats a frozen first frame on" in finding[1]
+        assert f"{robot} (4 episodes): late · by one &lt;frame&gt; beats a frozen first frame on" in finding[1]
     assert "of the way from there to the truth (on seen robots" in finding[1]
 
 

@@ -61,9 +61,9 @@ def test_progress_is_the_share_of_the_way_from_frozen_to_true() -> None:
 def test_the_finding_says_better_worse_and_how_far() -> None:
     said = finding([table("Panda", 0.1), table("Piper", 0.5)], [table("Seen", 0.2)], [info("lpips")])
     assert said == [
-        "Panda: m · c beats a frozen first frame on LPIPS. "
+        "Panda (4 episodes): m · c beats a frozen first frame on LPIPS. "
         "In LPIPS it covers 75% of the way from there to the truth (on seen robots it covers 50%).",
-        "Piper: m · c falls behind a frozen first frame on LPIPS. "
+        "Piper (4 episodes): m · c falls behind a frozen first frame on LPIPS. "
         "In LPIPS it ends 25% farther from the truth than that frame (on seen robots it covers 50%).",
     ]
     assert "--baselines" in finding([], [], [info("lpips")])[0]

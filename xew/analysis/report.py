@@ -174,6 +174,8 @@ def _strips(scores: Scores, args: Args) -> list[Picture]:
 
 def _ranked(group: pd.DataFrame) -> list[tuple[str, pd.Series]]:
     """Best, median and worst row by the ranking metric (lower is better); fewer where there are fewer."""
+    if len(group) == 1:
+        return [("the only episode", group.iloc[0])]
     ordered = group.sort_values(["value", "task", "seed"])
     places = {0: "best", len(ordered) // 2: "median", len(ordered) - 1: "worst"}
     return [(word, ordered.iloc[place]) for place, word in sorted(places.items())]

@@ -140,7 +140,10 @@ def finding(held_out: Sequence[RobotTable], seen: Sequence[RobotTable], metrics:
     sentences = []
     for table, row in compared:
         twins = [(other, twin) for other in seen for twin in other.rows if _same_model(twin, row)]
-        sentences.append(f"{table.title}: {row.title} {_compare(row, metrics)}.{_distance_covered((table, row), twins)}")
+        episodes = f"{table.count} episode{'s' if table.count != 1 else ''}"
+        sentences.append(
+            f"{table.title} ({episodes}): {row.title} {_compare(row, metrics)}.{_distance_covered((table, row), twins)}"
+        )
     return sentences or ["No model has been compared with the frozen first frame yet: grade with --baselines."]
 
 

@@ -10,6 +10,7 @@ that stands still would be given the true masks for nothing; with them it is jud
 Its error on true video is published beside every score: the row `ground_truth` of `evaluate --baselines`.
 """
 
+import functools
 from dataclasses import dataclass
 
 import cv2
@@ -51,17 +52,20 @@ class Appearance:
     """[h w] bool, where the background was seen in some frame."""
 
 
-def estimate_masks(prediction: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:
+def estimate_masks(
+    prediction: np.ndarray, target: np.ndarray, target_mask: np.ndarray, appearance: Appearance | None = None
+) -> np.ndarray:
     """Robot masks of a predicted video.
 
     Args:
         prediction, target: [t h w 3] uint8 RGB, predicted and true video of one episode, same frames.
         target_mask: [t h w] bool, true robot masks.
+        appearance: `learn_appearance(target, target_mask)`, where several predictions of one episode share it.
 
     Returns:
         [t h w] bool.
     """
-    appearance = learn_appearance(target, target_mask)
+    appearance = appearance or learn_appearance(target, target_mask)
     frames = zip(prediction, target, target_mask, strict=True)
     return np.stack([_estimate_frame(appearance, *frame) for frame in frames])
 
@@ -109,9 +113,9 @@ def _shape_evidence(frame: np.ndarray, target: np.ndarray, target_mask: np.ndarr
     grey, grey_target = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame, target))
     there, back = _flow(grey, grey_target), _flow(grey_target, grey)
     source = _grid(grey.shape) + there
-    closure = np.linalg.norm(there + _sample(back, source), axis=-1)
+    closure = np.hypot(*cv2.split(there + _sample(back, source)))
     soft_frame, soft_target = (_soften(image, RESIDUAL_SOFTNESS).astype(np.float32) for image in (frame, target))
-    residual = np.abs(soft_frame - _sample(soft_target, source)).max(axis=-1)
+    residual = _difference(soft_frame, _sample(soft_target, source))
     gate = np.exp(-((residual / RESIDUAL_SCALE) ** 2) - (closure / CLOSURE_SCALE) ** 2)
     return SHAPE_WEIGHT * gate * np.tanh(_sample(_signed_distance(target_mask), source) / SHAPE_REACH)
 
@@ -154,8 +158,9 @@ def _background(video: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.nda
     return cv2.inpaint(plate, (~uncovered).astype(np.uint8), 3, cv2.INPAINT_TELEA), uncovered
 
 
-def _difference(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
-    return cv2.absdiff(frame, background).max(axis=-1)
+def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[h w], the largest of the three channels' differences; three times as fast as a maximum over the last axis."""
+    return functools.reduce(np.maximum, cv2.split(cv2.absdiff(a, b)))
 
 
 def _colour_bins(video: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ Writes scores.parquet, one row per model, condition, task, seed, robot and metri
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
@@ -18,7 +19,7 @@ from tqdm import tqdm
 from xew.config import ConfigError, pick, user_errors
 from xew.episode import EpisodeError, Record, States, episode_folder, find_records, read_record, read_states, read_video
 from xew.metrics import METRICS
-from xew.metrics.estimate import estimate_masks
+from xew.metrics.estimate import Appearance, estimate_masks, learn_appearance
 from xew.metrics.scores import Cell, ScoreTable, file_digest
 from xew.protocol import HELD_OUT_ROBOTS
 from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video
@@ -62,6 +63,11 @@ class Episode:
     mask: np.ndarray
     """[t h w] bool."""
 
+    @cached_property
+    def appearance(self) -> Appearance:
+        """What the mask estimator learns of it, once for all models."""
+        return learn_appearance(self.rgb, self.mask)
+
 
 BASELINES: dict[str, Callable[[Episode], np.ndarray]] = {
     "copy_first_frame": lambda episode: np.repeat(episode.rgb[:1], len(episode.rgb), axis=0),
@@ -83,7 +89,7 @@ def grade(prediction: np.ndarray, episode: Episode, metrics: tuple[str, ...]) ->
     """
     masks = np.zeros_like(episode.mask)
     if any(METRICS[name].inputs == "mask" for name in metrics):
-        masks = estimate_masks(prediction, episode.rgb, episode.mask)
+        masks = estimate_masks(prediction, episode.rgb, episode.mask, episode.appearance)
     count = len(prediction) - GIVEN_FRAMES
     arrays = (prediction, episode.rgb, masks, episode.mask)
     p, t, predicted_mask, mask = (_whole_blocks(array[GIVEN_FRAMES:]) for array in arrays)
