@@ -34,7 +34,7 @@ lint: $(STAMP)
 # Seed -> episodes -> latents -> checkpoint -> rollouts -> scores -> report. Each step skips what is done already.
 TASKS ?= place_empty_cup beat_block_hammer
 DATA := $(DEMO)/data
-RUN := $(DEMO)/run
+RUN := $(DEMO)/runs/debug
 ROLLOUTS := $(DEMO)/rollouts
 
 demo: $(STAMP)
