@@ -78,7 +78,7 @@ def test_the_finding_comes_first_and_names_both_robots(report: Path) -> None:
     assert finding and finding.start() < text.index("<table")
     for robot in ("Franka Panda", "Piper"):
         assert f"{robot} (4 episodes): late · by one &lt;frame&gt; beats a frozen first frame on" in finding[1]
-    assert "of the way from there to the truth (on seen robots" in finding[1]
+    assert "distance from the truth (on seen robots" in finding[1]
 
 
 def test_the_numbers_are_those_of_the_scores(report: Path, study: Study) -> None:

@@ -62,9 +62,9 @@ def test_the_finding_says_better_worse_and_how_far() -> None:
     said = finding([table("Panda", 0.1), table("Piper", 0.5)], [table("Seen", 0.2)], [info("lpips")])
     assert said == [
         "Panda (4 episodes): m · c beats a frozen first frame on LPIPS. "
-        "In LPIPS it covers 75% of the way from there to the truth (on seen robots it covers 50%).",
+        "In LPIPS it is at 25% of that frame's distance from the truth (on seen robots 50%).",
         "Piper (4 episodes): m · c falls behind a frozen first frame on LPIPS. "
-        "In LPIPS it ends 25% farther from the truth than that frame (on seen robots it covers 50%).",
+        "In LPIPS it is at 125% of that frame's distance from the truth (on seen robots 50%).",
     ]
     assert "--baselines" in finding([], [], [info("lpips")])[0]
 

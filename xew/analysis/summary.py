@@ -135,14 +135,14 @@ def _by_episode(rows: pd.DataFrame, metric: str) -> pd.Series:
 
 
 def finding(held_out: Sequence[RobotTable], seen: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> list[str]:
-    """The result in sentences, one for each held-out robot and model: how far from a frozen frame towards the truth."""
+    """The result in sentences, one for each held-out robot and model: against a frozen frame, and how far from the truth."""
     compared = [(table, row) for table in held_out for row in table.rows if row.verdicts]
     sentences = []
     for table, row in compared:
         twins = [(other, twin) for other in seen for twin in other.rows if _same_model(twin, row)]
         episodes = f"{table.count} episode{'s' if table.count != 1 else ''}"
         sentences.append(
-            f"{table.title} ({episodes}): {row.title} {_compare(row, metrics)}.{_distance_covered((table, row), twins)}"
+            f"{table.title} ({episodes}): {row.title} {_compare(row, metrics)}.{_distance_left((table, row), twins)}"
         )
     return sentences or ["No model has been compared with the frozen first frame yet: grade with --baselines."]
 
@@ -151,14 +151,12 @@ def _same_model(a: Row, b: Row) -> bool:
     return (a.model, a.condition) == (b.model, b.condition)
 
 
-def _distance_covered(own: tuple[RobotTable, Row], seen: Sequence[tuple[RobotTable, Row]], metric: str = "lpips") -> str:
+def _distance_left(own: tuple[RobotTable, Row], seen: Sequence[tuple[RobotTable, Row]], metric: str = "lpips") -> str:
     shares = [progress(table, row, metric) for table, row in (own, *seen)]
     if shares[0] is None:
         return ""
-    beside = f" (on seen robots it covers {shares[1]:.0%})" if len(shares) > 1 and shares[1] is not None else ""
-    if shares[0] < 0:
-        return f" In {METRIC_TITLES[metric]} it ends {-shares[0]:.0%} farther from the truth than that frame{beside}."
-    return f" In {METRIC_TITLES[metric]} it covers {shares[0]:.0%} of the way from there to the truth{beside}."
+    beside = f" (on seen robots {1 - shares[1]:.0%})" if len(shares) > 1 and shares[1] is not None else ""
+    return f" In {METRIC_TITLES[metric]} it is at {1 - shares[0]:.0%} of that frame's distance from the truth{beside}."
 
 
 def progress(table: RobotTable, row: Row, metric: str) -> float | None:
