@@ -3,13 +3,13 @@
 Reads  `World`s: robot, scene and commanded joints at every stored frame
 Writes `Motion`s: what the joints, objects and contacts did
 
-Both engines step the model that Newton compiles from the common template. The C engine steps one world after another and
-repeats bit for bit; MuJoCo Warp steps all worlds of a batch together and, its contact order being free, does not.
+Both engines step the model that Newton compiles from the common template (template.py). physics_cpu.py steps one world
+after another and repeats bit for bit; physics_gpu.py steps all worlds of a batch together and, the order in which a GPU
+adds up contacts being free, does not.
 """
 
 from dataclasses import dataclass
 
-import mujoco
 import newton
 import numpy as np
 import warp as wp
@@ -17,7 +17,7 @@ import warp as wp
 from xew.protocol import ARMS, FRAME_RATE
 from xew.sim_warp.robots import RobotSpec
 from xew.sim_warp.scene import Scene
-from xew.sim_warp.template import ARM_JOINTS, FREE_SLOTS, add_world, new_builder
+from xew.sim_warp.template import ARM_JOINTS, FREE_SLOTS, PARKED, add_world, new_builder
 
 TIME_STEP = 0.004
 """s."""
@@ -63,8 +63,10 @@ class Motion:
     """[t o] float32, hinge angles [rad], 0 without a hinge."""
     contact: np.ndarray
     """[t 2 o] bool, fingers of the left, right arm on each object."""
+    arm_overlap: float
+    """How deep an arm pressed into the table or into the other arm at any stored frame [m]."""
     overflow: bool
-    """A contact or constraint buffer was too small at some step: the motion must not be used."""
+    """A contact or constraint buffer was too small, or a number was not finite: the motion must not be used."""
 
 
 def simulate(worlds: list[World], device: str | None = None) -> list[Motion]:
@@ -75,10 +77,12 @@ def simulate(worlds: list[World], device: str | None = None) -> list[Motion]:
         device: "cpu" for MuJoCo's C engine, "cuda:0" for MuJoCo Warp; by default what Warp prefers.
     """
     if wp.get_device(device).is_cuda:
-        from xew.sim_warp.physics_gpu import simulate_batch  # heavy, and of no use without a GPU
+        from xew.sim_warp.physics_gpu import simulate_batch  # MuJoCo Warp is heavy, and of no use without a GPU
 
         return simulate_batch(worlds, device)
-    return [_simulate_one(world) for world in worlds]
+    from xew.sim_warp.physics_cpu import simulate_one
+
+    return [simulate_one(world) for world in worlds]
 
 
 def finger_strokes(robot: RobotSpec, side: int) -> np.ndarray:
@@ -131,58 +135,48 @@ def build_solver(worlds: list[World], device: str, **options: object) -> newton.
     return solver
 
 
-def shape_owners(labels: list[str]) -> np.ndarray:
-    """What a collision shape belongs to: 0, 1 the fingers of the left, right arm, 2 + i object i, -1 anything else."""
-    owners = np.full(len(labels), -1, np.int32)
-    for shape, label in enumerate(labels):
-        name = label.rsplit("/", 1)[-1]
-        if "finger" in name:
-            owners[shape] = 0 if name.startswith("left") else 1
-        elif name.startswith("object"):
-            owners[shape] = 2 + int(name.removeprefix("object"))
-    return owners
-
-
-def _simulate_one(world: World) -> Motion:
-    solver = build_solver([world], "cpu", use_mujoco_cpu=True)
-    model, data = solver.mj_model, solver.mj_data
-    labels = solver.model.shape_label
-    owners = shape_owners([labels[shape] for shape in solver.mjc_geom_to_newton_shape.numpy()[0]])
-    data.qpos[:] = initial_joints(world, data.qpos)
-    mujoco.mj_forward(model, data)
-    frames = [_frame(data, owners, len(world.scene.objects))]
-    for targets in control_targets(world.robot, world.action):
-        for target in targets:
-            data.ctrl[:] = target
-            mujoco.mj_step(model, data)
-        frames.append(_frame(data, owners, len(world.scene.objects)))
-    qpos, qvel, contact = (np.stack(parts) for parts in zip(*frames, strict=True))
-    overflow = bool(any(warning.number for warning in data.warning))
-    return motion(world, qpos, qvel, contact, overflow)
-
-
-def initial_joints(world: World, qpos: np.ndarray) -> np.ndarray:
-    """The template's joint coordinates [40] when the world begins: `qpos` with the robot and the lid in their places."""
-    qpos = qpos.copy()
+def initial_joints(world: World) -> np.ndarray:
+    """The template's joint coordinates [40] when a world begins."""
+    qpos = np.zeros(HINGE_INDEX + 1)
     qpos[:ROBOT_DOFS] = template_joints(world.robot, world.action[:1])[0]
+    poses = [thing.pose for thing in world.scene.objects if not thing.is_fixed]
+    poses += [PARKED[slot] for slot in range(len(poses), FREE_SLOTS)]
+    for slot, pose in enumerate(poses):
+        start = FREE_START + 7 * slot
+        qpos[start : start + 7] = np.array(pose)[[0, 1, 2, 6, 3, 4, 5]]
     for thing in world.scene.objects:
         if thing.hinge:
             qpos[HINGE_INDEX] = thing.hinge.start
     return qpos
 
 
-def _frame(data: mujoco.MjData, owners: np.ndarray, object_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Joint coordinates, velocities, and [2 o] which fingers touch which objects."""
-    contact = np.zeros((2, object_count), bool)
-    touching = data.contact.geom[data.contact.dist < 0.001] if data.ncon else np.zeros((0, 2), int)
-    pairs = np.sort(owners[touching], axis=-1)
-    pairs = pairs[(pairs[:, 0] >= 0) & (pairs[:, 0] < 2) & (pairs[:, 1] >= 2)]
-    contact[pairs[:, 0], pairs[:, 1] - 2] = True
-    return data.qpos.copy(), data.qvel.copy(), contact
+LEFT_FINGERS, RIGHT_FINGERS, FIRST_OBJECT, TABLE, LEFT_ARM_LINKS, RIGHT_ARM_LINKS = 0, 1, 2, -1, -2, -3
+"""What a collision shape belongs to; object i of a scene is `FIRST_OBJECT` + i."""
 
 
-def motion(world: World, qpos: np.ndarray, qvel: np.ndarray, contact: np.ndarray, overflow: bool) -> Motion:
-    """The template's joint coordinates [t 40] and velocities [t 37] as a `Motion` of the world's own objects."""
+def shape_owners(labels: list[str]) -> np.ndarray:
+    """[s] int32 owners of collision shapes, by the labels that the template gives them."""
+    return np.array([_owner(label.rsplit("/", 1)[-1]) for label in labels], np.int32)
+
+
+def _owner(label: str) -> int:
+    if label.startswith("object"):
+        return FIRST_OBJECT + int(label.removeprefix("object"))
+    if label.startswith("left"):
+        return LEFT_FINGERS if "finger" in label else LEFT_ARM_LINKS
+    if label.startswith("right"):
+        return RIGHT_FINGERS if "finger" in label else RIGHT_ARM_LINKS
+    return TABLE
+
+
+def motion(world: World, qpos: np.ndarray, qvel: np.ndarray, contact: np.ndarray, arm_overlap: float, overflow: bool) -> Motion:
+    """A `Motion` of the world's own joints and objects.
+
+    Args:
+        qpos, qvel: [t 40], [t 37] the template's joint coordinates and velocities.
+        contact: [t 2 o] bool.
+        arm_overlap: m.
+    """
     objects = world.scene.objects
     pose = np.tile(np.array([thing.pose for thing in objects], np.float32), (len(qpos), 1, 1))
     angle = np.zeros((len(qpos), len(objects)), np.float32)
@@ -200,5 +194,6 @@ def motion(world: World, qpos: np.ndarray, qvel: np.ndarray, contact: np.ndarray
         pose,
         angle,
         contact,
+        arm_overlap,
         overflow or not np.isfinite(qpos).all(),
     )

@@ -26,6 +26,8 @@ from xew.sim_warp.stage import TABLE_SIZE, TABLE_TOP
 
 ARM_JOINTS = 7
 FREE_SLOTS = 3
+PARKED = tuple((0.3 * slot, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0) for slot in range(FREE_SLOTS))
+"""Where free bodies float that a scene has no object for: under the table, out of sight."""
 SIDES = ("left", "right")
 
 ARM_STIFFNESS, ARM_DAMPING, ARM_ARMATURE = 6000.0, 400.0, 0.3
@@ -41,7 +43,9 @@ give way under more lets the pads sink into a wall of 5 mm and throw it out."""
 PAD_FRICTION = 1.2
 """Rubber pads on plastic or wood."""
 LINK_FRICTION = 0.5
-HINGE_SOLIMP = (0.999, 0.999, 0.001, 0.5, 2.0)
+HINGE_ARMATURE = 0.02
+"""kg m2: gives a light lid a share in the solver's cost beside the arms, without which its friction is not solved for."""
+HINGE_SOLIMP = (0.99, 0.99, 0.001, 0.5, 2.0)
 """Impedance of a hinge's dry friction: with MuJoCo's default a light lid creeps shut at 4 degrees a second."""
 FARTHEST_MASS = 0.3
 """A radius of gyration [m] beyond which a link's inertia is taken for a placeholder (RoboTwin's UR5 gripper states
@@ -272,7 +276,7 @@ def _add_free_slot(builder: newton.ModelBuilder, slot: int, thing: SceneObject |
         body = builder.add_link(
             mass=0.1,
             inertia=wp.mat33(*(np.eye(3) * 1e-4).flatten()),
-            xform=wp.transform((0.3 * slot, 0, 0.3), wp.quat_identity()),
+            xform=wp.transform(*PARKED[slot]),
             lock_inertia=True,
             label=label,
             custom_attributes={"mujoco:gravcomp": 1.0},
@@ -326,7 +330,7 @@ def _add_hinge_slot(builder: newton.ModelBuilder, thing: SceneObject | None, sce
         body,
         parent_xform=frame,
         axis=wp.vec3(*axis),
-        armature=1e-3,
+        armature=HINGE_ARMATURE,
         label="lid_hinge",
         custom_attributes={"mujoco:solimpfriction": [HINGE_SOLIMP]},
         **settings,

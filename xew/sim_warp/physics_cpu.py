@@ -1,0 +1,55 @@
+"""Physics on a CPU: MuJoCo's C engine, one world at a time, the same bits every time."""
+
+import mujoco
+import numpy as np
+
+from xew.sim_warp.physics import (
+    FIRST_OBJECT,
+    LEFT_ARM_LINKS,
+    LEFT_FINGERS,
+    RIGHT_ARM_LINKS,
+    RIGHT_FINGERS,
+    TABLE,
+    Motion,
+    World,
+    build_solver,
+    control_targets,
+    initial_joints,
+    motion,
+    shape_owners,
+)
+
+_ARMS = ((LEFT_FINGERS, LEFT_ARM_LINKS), (RIGHT_FINGERS, RIGHT_ARM_LINKS))
+
+
+def simulate_one(world: World) -> Motion:
+    """Step one world through its commands."""
+    solver = build_solver([world], "cpu", use_mujoco_cpu=True)
+    model, data = solver.mj_model, solver.mj_data
+    labels = solver.model.shape_label
+    owners = shape_owners([labels[shape] for shape in solver.mjc_geom_to_newton_shape.numpy()[0]])
+    data.qpos[:] = initial_joints(world)
+    mujoco.mj_forward(model, data)
+    count = len(world.scene.objects)
+    frames = [_frame(data, owners, count)]
+    for targets in control_targets(world.robot, world.action):
+        for target in targets:
+            data.ctrl[:] = target
+            mujoco.mj_step(model, data)
+        frames.append(_frame(data, owners, count))
+    qpos, qvel, contact, overlap = (np.stack(parts) for parts in zip(*frames, strict=True))
+    overflow = any(warning.number for warning in data.warning)
+    return motion(world, qpos, qvel, contact, float(overlap.max()), overflow)
+
+
+def _frame(data: mujoco.MjData, owners: np.ndarray, objects: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Joint coordinates, velocities, [2 o] which fingers touch which objects, and how deep an arm overlaps [m]."""
+    distance = np.array(data.contact.dist) if data.ncon else np.zeros(0)
+    pairs = np.sort(owners[data.contact.geom], axis=-1) if data.ncon else np.zeros((0, 2), int)
+    touching = pairs[distance < 0]
+    contact = np.zeros((2, objects), bool)
+    held = touching[np.isin(touching[:, 0], (LEFT_FINGERS, RIGHT_FINGERS)) & (touching[:, 1] >= FIRST_OBJECT)]
+    contact[held[:, 0], held[:, 1] - FIRST_OBJECT] = True
+    left, right = (np.isin(pairs, arm) for arm in _ARMS)
+    wrong = (left | right).any(1) & ((pairs == TABLE).any(1) | (left.any(1) & right.any(1)))
+    return data.qpos.copy(), data.qvel.copy(), contact, max(0.0, float(-distance[wrong].min(initial=0.0)))

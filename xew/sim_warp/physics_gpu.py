@@ -1,0 +1,205 @@
+"""Physics on a GPU: MuJoCo Warp, all worlds of a batch together, a CUDA graph a stored frame.
+
+The same code runs on Warp's CPU device, slowly: that is how it is tested where there is no GPU.
+"""
+
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+
+from xew.protocol import FRAME_RATE
+from xew.sim_warp.physics import (
+    FIRST_OBJECT,
+    LEFT_ARM_LINKS,
+    LEFT_FINGERS,
+    RIGHT_ARM_LINKS,
+    RIGHT_FINGERS,
+    ROBOT_DOFS,
+    STEPS_PER_FRAME,
+    TABLE,
+    TIME_STEP,
+    Motion,
+    World,
+    build_solver,
+    initial_joints,
+    motion,
+    shape_owners,
+    template_joints,
+)
+
+CONTACTS_PER_WORLD = 160
+CONSTRAINTS_PER_WORLD = 768
+"""First sizes of MuJoCo Warp's buffers; worlds that overflow them are stepped again with twice as much."""
+ATTEMPTS = 3
+
+
+@wp.kernel
+def set_targets(
+    # In:
+    joints: wp.array3d[wp.float32],  # [n t 18] commanded robot joints at stored frames
+    frame: wp.array[wp.int32],  # [1]
+    share: wp.float32,
+    frame_rate: wp.float32,
+    # Out:
+    ctrl_out: wp.array2d[wp.float32],  # [n 36]
+):
+    """Targets of one step: position and velocity of each joint, commands being linear between frames."""
+    world, joint = wp.tid()
+    before = joints[world, frame[0], joint]
+    after = joints[world, frame[0] + 1, joint]
+    ctrl_out[world, 2 * joint] = before + share * (after - before)
+    ctrl_out[world, 2 * joint + 1] = (after - before) * frame_rate
+
+
+@wp.kernel
+def record_joints(
+    # In:
+    qpos: wp.array2d[wp.float32],
+    qvel: wp.array2d[wp.float32],
+    frame: wp.array[wp.int32],
+    # Out:
+    qpos_out: wp.array3d[wp.float32],  # [n t q]
+    qvel_out: wp.array3d[wp.float32],  # [n t v]
+):
+    world, index = wp.tid()
+    if index < qpos.shape[1]:
+        qpos_out[world, frame[0], index] = qpos[world, index]
+    if index < qvel.shape[1]:
+        qvel_out[world, frame[0], index] = qvel[world, index]
+
+
+@wp.func
+def side_of(owner: int) -> int:
+    """0 for any part of the left arm, 1 for the right, -1 for what is no robot."""
+    if owner == wp.static(LEFT_FINGERS) or owner == wp.static(LEFT_ARM_LINKS):
+        return 0
+    if owner == wp.static(RIGHT_FINGERS) or owner == wp.static(RIGHT_ARM_LINKS):
+        return 1
+    return -1
+
+
+@wp.kernel
+def record_contacts(
+    # In:
+    count: wp.array[wp.int32],  # [1] contacts of all worlds
+    geom: wp.array[wp.vec2i],
+    world_of: wp.array[wp.int32],
+    distance: wp.array[wp.float32],
+    owners: wp.array2d[wp.int32],  # [n g]
+    frame: wp.array[wp.int32],
+    # Out:
+    contact_out: wp.array3d[wp.int32],  # [n t 2] bit i: fingers on object i
+    overlap_out: wp.array[wp.float32],  # [n] m
+):
+    """Which fingers touch which objects, and how deep an arm presses into the table or the other arm."""
+    index = wp.tid()
+    if index >= wp.min(count[0], geom.shape[0]) or distance[index] >= 0.0:
+        return
+    world = world_of[index]
+    low = wp.min(owners[world, geom[index][0]], owners[world, geom[index][1]])
+    high = wp.max(owners[world, geom[index][0]], owners[world, geom[index][1]])
+    if low >= 0 and low < wp.static(FIRST_OBJECT) and high >= wp.static(FIRST_OBJECT):
+        wp.atomic_or(contact_out, world, frame[0], low, 1 << (high - wp.static(FIRST_OBJECT)))
+    first = side_of(low)
+    second = side_of(high)
+    on_table = (low == wp.static(TABLE) and second >= 0) or (high == wp.static(TABLE) and first >= 0)
+    if on_table or (first >= 0 and second >= 0 and first != second):
+        wp.atomic_max(overlap_out, world, -distance[index])
+
+
+@wp.kernel
+def advance(frame: wp.array[wp.int32]):
+    frame[0] = frame[0] + 1
+
+
+def simulate_batch(worlds: list[World], device: str | None = None) -> list[Motion]:
+    """Step all worlds together; those whose buffers overflow once more, with larger ones."""
+    motions: dict[int, Motion] = {}
+    for attempt in range(ATTEMPTS):
+        open_worlds = [index for index in range(len(worlds)) if index not in motions or motions[index].overflow]
+        if not open_worlds:
+            break
+        batch = _Batch([worlds[index] for index in open_worlds], wp.get_device(device), 2**attempt)
+        motions |= dict(zip(open_worlds, batch.run(), strict=True))
+    return [motions[index] for index in range(len(worlds))]
+
+
+class _Batch:
+    """Worlds on the device, and what they have done so far."""
+
+    def __init__(self, worlds: list[World], device: wp.Device, scale: int) -> None:
+        self.worlds, self.device = worlds, device
+        self.solver = build_solver(worlds, device, nconmax=scale * CONTACTS_PER_WORLD, njmax=scale * CONSTRAINTS_PER_WORLD)
+        self.model, self.data = self.solver.mjw_model, self.solver.mjw_data
+        self.model.opt.timestep.fill_(TIME_STEP)
+        self.frame_count = max(len(world.action) for world in worlds)
+        self.joints = self._array(np.stack([self._joints(world) for world in worlds]))
+        self.owners = self._array(self._geom_owners(), wp.int32)
+        self.frame = self._array(np.zeros(1), wp.int32)
+        self.data.qpos.assign(np.stack([initial_joints(world) for world in worlds]).astype(np.float32))
+        self.data.qvel.zero_()
+        self.data.overflow.zero_()
+        shape = (len(worlds), self.frame_count)
+        self.qpos = self._array(np.zeros((*shape, self.data.qpos.shape[1])))
+        self.qvel = self._array(np.zeros((*shape, self.data.qvel.shape[1])))
+        self.contact = self._array(np.zeros((*shape, 2)), wp.int32)
+        self.overlap = self._array(np.zeros(len(worlds)))
+
+    def run(self) -> list[Motion]:
+        with wp.ScopedDevice(self.device):
+            mjw.forward(self.model, self.data)
+            self._record()
+            graph = None
+            if self.device.is_cuda:
+                with wp.ScopedCapture(self.device) as capture:
+                    self._step_frame()
+                graph = capture.graph
+            for _ in range(self.frame_count - 1):
+                wp.capture_launch(graph) if graph else self._step_frame()
+        return self._motions()
+
+    def _step_frame(self) -> None:
+        for step in range(STEPS_PER_FRAME):
+            wp.launch(
+                set_targets,
+                (len(self.worlds), ROBOT_DOFS),
+                [self.joints, self.frame, (step + 1) / STEPS_PER_FRAME, FRAME_RATE],
+                [self.data.ctrl],
+            )
+            mjw.step(self.model, self.data)
+        wp.launch(advance, 1, [self.frame])
+        self._record()
+
+    def _record(self) -> None:
+        data, contacts = self.data, self.data.contact
+        width = max(data.qpos.shape[1], data.qvel.shape[1])
+        wp.launch(record_joints, (len(self.worlds), width), [data.qpos, data.qvel, self.frame], [self.qpos, self.qvel])
+        wp.launch(
+            record_contacts,
+            data.naconmax,
+            [data.nacon, contacts.geom, contacts.worldid, contacts.dist, self.owners, self.frame],
+            [self.contact, self.overlap],
+        )
+
+    def _motions(self) -> list[Motion]:
+        qpos, qvel, contact = self.qpos.numpy(), self.qvel.numpy(), self.contact.numpy()
+        overlap, overflow = self.overlap.numpy(), self.data.overflow.numpy()
+        motions = []
+        for index, world in enumerate(self.worlds):
+            frames = slice(len(world.action))
+            touched = (contact[index, frames, :, None] >> np.arange(len(world.scene.objects))) & 1
+            parts = (qpos[index, frames], qvel[index, frames], touched.astype(bool))
+            motions.append(motion(world, *parts, float(overlap[index]), bool(overflow[index])))
+        return motions
+
+    def _joints(self, world: World) -> np.ndarray:
+        """[t 18] commanded joints; a world that ends early stands at its last command."""
+        joints = template_joints(world.robot, world.action)
+        return np.concatenate([joints, np.repeat(joints[-1:], self.frame_count - len(joints), 0)])
+
+    def _geom_owners(self) -> np.ndarray:
+        labels = np.array([*shape_owners(self.solver.model.shape_label), TABLE])
+        return labels[self.solver.mjc_geom_to_newton_shape.numpy()]
+
+    def _array(self, values: np.ndarray, dtype: type = wp.float32) -> wp.array:
+        return wp.array(values, dtype=dtype, device=self.device)
