@@ -79,16 +79,20 @@ def pick(registry: Mapping[str, T], name: str, kind: str) -> T:
     """The entry of a registry, or for `module:NAME` an object imported from outside.
 
     Raises:
-        ConfigError: neither exists; the nearest name is suggested.
+        ConfigError: neither exists (the nearest name is suggested), or what was imported is of another type.
     """
     if name in registry:
         return registry[name]
     if ":" in name:
         module, _, attribute = name.partition(":")
         try:
-            return getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError) as error:
-            raise ConfigError(f"cannot import the {kind} {name!r}: {error}.") from error
+            found = getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise ConfigError(f"cannot import the {kind} {name!r}: {error}; expected module:NAME.") from error
+        expected = type(next(iter(registry.values())))
+        if not isinstance(found, expected):
+            raise ConfigError(f"the {kind} {name!r} is a {type(found).__name__}; expected a {expected.__name__}.")
+        return found
     raise ConfigError(f"unknown {kind} {name!r};{suggestion(name, registry)} known: {', '.join(registry)}, or module:NAME.")
 
 

@@ -79,6 +79,8 @@ class Record:
     success: bool
     failure: str | None = None
     """One of `FAILURES` where success is false."""
+    failure_detail: str = ""
+    """The same in words."""
     instruction: str = ""
     frame_count: int = 0
     frame_rate: float = 1000 / 60

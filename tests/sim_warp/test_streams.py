@@ -13,7 +13,8 @@ from xew.sim_warp.camera import HEAD_CAMERA, project
 from xew.sim_warp.kinematics import forward_kinematics, joint_positions, matrix_from_pose, tool_pose
 from xew.sim_warp.observe import Recording, keypoint_names, keypoint_positions, observe, scene_things
 from xew.sim_warp.render import Body, Renderer
-from xew.sim_warp.robots import ROBOTS, UnknownRobotError, load_urdf
+from xew.config import ConfigError
+from xew.sim_warp.robots import ROBOTS, load_urdf
 from xew.sim_warp.robots.bodies import body_names, keypoint_links, robot_bodies, robot_pose
 from xew.sim_warp.scene import scene_rng
 from xew.sim_warp.streams import (
@@ -245,7 +246,7 @@ def test_articulation_clip_moves_and_returns(robot_key: str) -> None:
 
 
 def test_unknown_robots_and_odd_commands_are_refused() -> None:
-    with pytest.raises(UnknownRobotError, match="piper"):
+    with pytest.raises(ConfigError, match="piper"):
         command_streams("piperr", np.zeros((1, 16)))
     with pytest.raises(ValueError, match=r"expected \(frames, 16\)"):
         ray_map("piper", np.zeros((3, 14)))

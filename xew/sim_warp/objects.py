@@ -100,7 +100,8 @@ def _wall_hulls(outer: np.ndarray, inner: np.ndarray) -> list[np.ndarray]:
         for low in range(len(outer) - 1):
             corners = [outer[low], outer[low + 1], inner[low], inner[low + 1]]
             # The chord of a wedge lies inside its arc: reach out so that its middle has the outline's radius.
-            hulls.append(np.array([[*(r / np.cos(half) * turn), max(z, FOOT)] for r, z in corners for turn in turns], np.float32))
+            points = [[*(radius / np.cos(half) * turn), max(z, FOOT)] for radius, z in corners for turn in turns]
+            hulls.append(np.array(points, np.float32))
     return hulls
 
 

@@ -95,6 +95,8 @@ class ToolPath:
     gripper: np.ndarray
     """[t 2] float64, 0 closed, 1 open."""
     holds: tuple[Hold, ...]
+    frame_rate: float = FRAME_RATE
+    """Hz."""
 
     @property
     def frame_count(self) -> int:

@@ -62,7 +62,7 @@ def command_streams(robot_key: str, action: np.ndarray, camera: Camera = HEAD_CA
     """Render, mask and exact optical flow of commands [t 16].
 
     Raises:
-        UnknownRobotError: there is no such robot.
+        ConfigError: there is no such robot.
         ValueError: the action does not have 16 columns.
     """
     return command_streams_batch([(robot_key, action)], camera)[0]

@@ -4,6 +4,7 @@ To add one, write a file with `TASK = Task(...)` here and add its line to `TASKS
 anywhere importable and name it `module:TASK` wherever a task is asked for.
 """
 
+from xew.config import pick
 from xew.sim_warp.tasks import (
     beat_block_hammer,
     blocks_ranking_rgb,
@@ -14,7 +15,7 @@ from xew.sim_warp.tasks import (
 )
 from xew.sim_warp.tasks.task import Moment, Task
 
-__all__ = ["TASKS", "Moment", "Task"]
+__all__ = ["TASKS", "Moment", "Task", "get_task"]
 
 TASKS: dict[str, Task] = {
     "beat_block_hammer": beat_block_hammer.TASK,
@@ -24,3 +25,8 @@ TASKS: dict[str, Task] = {
     "place_empty_cup": place_empty_cup.TASK,
     "stack_bowls_two": stack_bowls_two.TASK,
 }
+
+
+def get_task(name: str) -> Task:
+    """The task of a registry key, or of an import path `module:NAME`. Raises ConfigError if there is none."""
+    return pick(TASKS, name, "task")

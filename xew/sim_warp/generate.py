@@ -1,0 +1,249 @@
+"""Make the paired data set: episodes of every task, seed and robot.
+
+Reads  the registries of tasks and robots
+Writes <out>/<task>/<seed>/<robot>/, see xew/episode.py; one line per task and robot at the end
+
+Seeds are tried in order until enough of them are accepted, that is, until all robots have succeeded on them. What is on
+disk is not made again: stop the command at any time, give it again, and the result is the same.
+
+Command: python -m xew.sim_warp.generate --batch 256 [--tasks … --robots … --train-seeds 50 --test-seeds 20 --out data]
+"""
+
+import multiprocessing
+import os
+import shutil
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+import warp as wp
+from tqdm import tqdm
+
+from xew.config import user_errors
+from xew.episode import EpisodeError, Record, episode_folder, find_records
+from xew.protocol import TEST_SEED_START, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK
+from xew.sim_warp.produce import Job, produce
+from xew.sim_warp.render import Renderer
+from xew.sim_warp.robots import ROBOTS, get_robot
+from xew.sim_warp.tasks import TASKS, get_task
+
+TRIES_PER_SEED = 3
+SPARE_TRIES = 20
+"""A task gives up when 3 n + 20 seeds have been tried and fewer than n accepted."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """What to generate."""
+
+    tasks: tuple[str, ...] = tuple(TASKS)
+    """Keys of the registry, or module:NAME."""
+    robots: tuple[str, ...] = tuple(ROBOTS)
+    """Keys of the registry, or module:NAME."""
+    train_seeds: int = TRAIN_SEEDS_PER_TASK
+    """Accepted training seeds a task."""
+    test_seeds: int = TEST_SEEDS_PER_TASK
+    """Accepted test seeds a task; their numbers begin where no training seed comes."""
+    out: Path = Path("data")
+    batch: int = 256
+    """Worlds that a GPU steps together. On a CPU each is stepped by itself, as many at a time as there are workers."""
+    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
+    """Processes on a CPU."""
+    device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
+    """Default: a GPU if Warp finds one."""
+
+
+@dataclass
+class Family:
+    """The seeds of one task, training or test, and how far they are."""
+
+    task: str
+    first_seed: int
+    wanted: int
+    robots: tuple[str, ...]
+    done: dict[int, dict[str, Record]] = field(default_factory=lambda: defaultdict(dict))
+
+    def add(self, record: Record) -> None:
+        self.done[record.seed][record.robot] = record
+
+    @property
+    def accepted(self) -> int:
+        """Complete seeds on which nobody failed, counted as long as they are wanted."""
+        return min(self.wanted, sum(self._complete(seed) and self._succeeded(seed) for seed in self.done))
+
+    def next_jobs(self) -> list[Job]:
+        """The first seeds that are not complete, as many as are still to be accepted."""
+        jobs, seed = [], self.first_seed
+        while len(jobs) < self.wanted - self.accepted:
+            if seed - self.first_seed >= TRIES_PER_SEED * self.wanted + SPARE_TRIES:
+                raise EpisodeError(
+                    f"{self.task}: only {self.accepted} of {self.wanted} seeds were accepted in {seed - self.first_seed} "
+                    "tries. See the reasons with python -m xew.sim_warp.inspect; make the task easier or leave out a robot."
+                )
+            missing = tuple(robot for robot in self.robots if robot not in self.done[seed])
+            if missing and self._succeeded(seed):
+                jobs.append(Job(self.task, seed, missing))
+            seed += 1
+        return jobs
+
+    def _complete(self, seed: int) -> bool:
+        return all(robot in self.done[seed] for robot in self.robots)
+
+    def _succeeded(self, seed: int) -> bool:
+        """Has nobody failed so far?"""
+        return all(record.success for record in self.done[seed].values())
+
+
+class Maker:
+    """Runs jobs on the device at hand: worker processes on a CPU, large batches on a GPU."""
+
+    def __init__(self, args: Args) -> None:
+        self.args = args
+        self.device = wp.get_device(args.device)
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[list[Record], float]]:
+        """Records of each job, as they come, with the seconds spent on it."""
+        if self.device.is_cuda:
+            yield from self._in_batches(jobs)
+        else:
+            yield from self._in_processes(jobs)
+
+    def _in_batches(self, jobs: Sequence[Job]) -> Iterator[tuple[list[Record], float]]:
+        renderer = Renderer(self.device.alias)
+        size = max(1, self.args.batch // len(self.args.robots))
+        for start in range(0, len(jobs), size):
+            begin = time.perf_counter()
+            batch = produce(jobs[start : start + size], self.args.out, renderer, self.device.alias)
+            seconds = (time.perf_counter() - begin) / len(batch)
+            yield from ((records, seconds) for records in batch)
+
+    def _in_processes(self, jobs: Sequence[Job]) -> Iterator[tuple[list[Record], float]]:
+        os.environ.setdefault("OMP_NUM_THREADS", "1")  # a worker is a core; more threads would wait for one another
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(max(1, self.args.workers), context) as pool:
+            try:
+                # Alone, so that Warp compiles its kernels once and not in every worker.
+                yield pool.submit(_one, jobs[0], self.args.out).result()
+                yield from _as_completed([pool.submit(_one, job, self.args.out) for job in jobs[1:]])
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+
+
+def _as_completed(futures: list[Future[tuple[list[Record], float]]]) -> Iterator[tuple[list[Record], float]]:
+    waiting = set(futures)
+    while waiting:
+        finished, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+        yield from (future.result() for future in finished)
+
+
+_worker_renderer: list[Renderer] = []
+
+
+def _one(job: Job, out: Path) -> tuple[list[Record], float]:
+    """One job in a worker process, which keeps its renderer."""
+    if not _worker_renderer:
+        _worker_renderer.append(Renderer("cpu"))
+    begin = time.perf_counter()
+    records = produce([job], out, _worker_renderer[0], "cpu")[0]
+    return records, time.perf_counter() - begin
+
+
+def generate(args: Args) -> list[Family]:
+    """Make what is missing; returns all families with their records."""
+    _check(args)
+    robots = tuple(dict.fromkeys(args.robots))
+    families = [
+        Family(task, first, wanted, robots)
+        for task in dict.fromkeys(args.tasks)
+        for first, wanted in ((0, args.train_seeds), (TEST_SEED_START, args.test_seeds))
+    ]
+    _read_existing(families, args.out)
+    spent: Counter[str] = Counter()
+    frames: Counter[str] = Counter()
+    maker = Maker(args)
+    total = sum(family.wanted for family in families)
+    with tqdm(total=total, initial=sum(f.accepted for f in families), desc="accepted seeds", unit="seed") as bar:
+        while jobs := [job for family in families for job in family.next_jobs()]:
+            by_seed = {(family.task, job.seed): family for family in families for job in family.next_jobs()}
+            for records, seconds in maker.run(jobs):
+                family = by_seed[records[0].task, records[0].seed]
+                for record in records:
+                    family.add(record)
+                spent[family.task] += seconds
+                frames[family.task] += sum(record.frame_count for record in records if record.success)
+                bar.n = sum(f.accepted for f in families)
+                bar.set_postfix_str(f"{records[0].task} {records[0].seed}", refresh=True)
+    _print_speed(frames, spent)
+    return families
+
+
+def _check(args: Args) -> None:
+    """Names, numbers and the folder, before any work."""
+    for task in args.tasks:
+        get_task(task)
+    for robot in args.robots:
+        get_robot(robot)
+    if not args.tasks or not args.robots or min(args.train_seeds, args.test_seeds) < 0 or args.batch < 1:
+        raise EpisodeError(f"nothing to make: {args}. Name tasks and robots, seeds of at least 0, a batch of at least 1.")
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+        for left_over in args.out.glob("*/*/.*-*"):  # from a run that was killed while it wrote
+            shutil.rmtree(left_over, ignore_errors=True)
+        (args.out / ".writable").touch()
+        (args.out / ".writable").unlink()
+    except OSError as error:
+        raise EpisodeError(f"cannot write to {args.out}: {error.strerror}. Choose another folder with --out.") from error
+
+
+def _read_existing(families: list[Family], out: Path) -> None:
+    """Take in what is on disk. Raises EpisodeError at a damaged header."""
+    for folder, record in find_records(out):
+        for family in families:
+            same_side = (record.seed >= TEST_SEED_START) == (family.first_seed >= TEST_SEED_START)
+            if record.task == family.task and same_side:
+                if folder != episode_folder(out, record.task, record.seed, record.robot):
+                    raise EpisodeError(f"{folder} holds {record.task}/{record.seed}/{record.robot}; move or delete it.")
+                family.add(record)
+
+
+def _print_speed(frames: Counter[str], spent: Counter[str]) -> None:
+    for task, seconds in spent.items():
+        print(
+            f"{task}: {frames[task]} frames in {seconds:.1f} process-seconds, {frames[task] / seconds:.1f} frames/s a process"
+        )
+
+
+def yield_table(records: Sequence[Record]) -> str:
+    """A line per task and robot: cells tried, succeeded, why not, and frames; then a line per task of accepted seeds."""
+    lines = [f"{'task':<24}{'robot':<16}{'tried':>6}{'succeeded':>11}{'frames':>8}  reasons"]
+    cells: dict[tuple[str, str], list[Record]] = defaultdict(list)
+    seeds: dict[str, dict[int, bool]] = defaultdict(dict)
+    for record in records:
+        cells[record.task, record.robot].append(record)
+        seeds[record.task][record.seed] = seeds[record.task].get(record.seed, True) and record.success
+    for (task, robot), tried in sorted(cells.items()):
+        good = [record for record in tried if record.success]
+        frames = sum(record.frame_count for record in good) // max(1, len(good))
+        reasons = Counter(record.failure for record in tried if not record.success)
+        told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
+        share = f"{len(good)} ({100 * len(good) / len(tried):.0f} %)"
+        lines.append(f"{task:<24}{robot:<16}{len(tried):>6}{share:>11}{frames:>8}  {told}")
+    for task, accepted in sorted(seeds.items()):
+        lines.append(f"{task:<24}all robots together: {sum(accepted.values())} of {len(accepted)} seeds accepted")
+    return "\n".join(lines)
+
+
+@user_errors
+def main() -> None:
+    families = generate(tyro.cli(Args, description=__doc__))
+    print(yield_table([record for family in families for seed in family.done.values() for record in seed.values()]))
+
+
+if __name__ == "__main__":
+    main()

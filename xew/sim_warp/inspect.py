@@ -1,0 +1,139 @@
+"""Look into a data set: yields, hashes, contact sheets and strips.
+
+Reads  <data>/<task>/<seed>/<robot>/
+Writes a table to the terminal and, where asked, pictures: a sheet a task (start, middle and end of every robot) and a strip
+       an episode (eight frames of the scene over eight of the robot alone)
+
+Command: python -m xew.sim_warp.inspect data [--verify] [--rerender 5] [--pictures sheets]
+"""
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from xew.config import user_errors
+from xew.episode import EpisodeError, Record, find_records, read_states, read_video, verify_episode
+from xew.sim_warp.generate import yield_table
+from xew.sim_warp.produce import render_again
+from xew.sim_warp.render import Renderer
+
+STRIP_FRAMES = 8
+SHEET_TIMES = (0.0, 0.5, 1.0)
+GAP = 4
+"""White pixels between pictures."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """What to look at."""
+
+    data: Annotated[Path, tyro.conf.Positional]
+    verify: bool = False
+    """Read everything and compare with the recorded hashes."""
+    rerender: int = 0
+    """Render this many episodes again from their states and compare with the recorded hashes."""
+    pictures: Path | None = None
+    """Folder for contact sheets and strips; none are drawn without it."""
+    seeds: int = 2
+    """Seeds of each task that are drawn."""
+
+
+@user_errors
+def main() -> None:
+    args = tyro.cli(Args, description=__doc__)
+    cells = list(find_records(args.data))
+    if not cells:
+        raise EpisodeError(f"no episode under {args.data}; make some: python -m xew.sim_warp.generate --out {args.data}")
+    print(yield_table([record for _, record in cells]))
+    for folder, record in cells:
+        if not record.success:
+            print(f"{folder}: {record.failure}: {record.failure_detail}")
+    pictured = [(folder, record) for folder, record in cells if record.hashes]
+    if args.verify:
+        verify([folder for folder, _ in pictured])
+    if args.rerender:
+        rerender([folder for folder, _ in pictured], args.rerender)
+    if args.pictures:
+        draw(pictured, args.pictures, args.seeds)
+
+
+def verify(folders: list[Path]) -> None:
+    """Compare all files with their hashes; names every damaged episode, then fails if there was one."""
+    damaged = []
+    for folder in tqdm(folders, desc="verifying", unit="episode"):
+        try:
+            verify_episode(folder)
+        except EpisodeError as error:
+            damaged.append(str(error))
+    if damaged:
+        raise EpisodeError("\n".join([*damaged, f"{len(damaged)} of {len(folders)} episodes are damaged."]))
+    print(f"{len(folders)} episodes agree with their hashes")
+
+
+def rerender(folders: list[Path], count: int) -> None:
+    """Render some episodes again, spread over the data set."""
+    renderer = Renderer()
+    chosen = [folders[index] for index in np.unique(np.linspace(0, len(folders) - 1, count).astype(int))]
+    for folder in tqdm(chosen, desc="rendering again", unit="episode"):
+        render_again(folder, renderer)
+    print(f"{len(chosen)} episodes rendered again from their states agree with their hashes")
+
+
+def draw(cells: list[tuple[Path, Record]], out: Path, seeds: int) -> None:
+    """Sheets and strips of the first seeds of each task, as PNG."""
+    by_task: dict[str, dict[int, list[tuple[Path, Record]]]] = defaultdict(lambda: defaultdict(list))
+    for folder, record in cells:
+        by_task[record.task][record.seed].append((folder, record))
+    out.mkdir(parents=True, exist_ok=True)
+    for task, of_task in tqdm(by_task.items(), desc="drawing", unit="task"):
+        for seed in sorted(of_task)[:seeds]:
+            save_png(out / f"{task}_{seed}.png", contact_sheet([folder for folder, _ in of_task[seed]]))
+            for folder, record in of_task[seed]:
+                save_png(out / f"{task}_{seed}_{record.robot}.png", strip(folder))
+
+
+def contact_sheet(folders: list[Path]) -> np.ndarray:
+    """Episodes one under the other, each at its start, middle and end: uint8 [h w 3]."""
+    rows = []
+    for folder in folders:
+        video = read_video(folder / "rgb.mkv")
+        rows.append([video[round(time * (len(video) - 1))] for time in SHEET_TIMES])
+    return tiled(rows)
+
+
+def strip(folder: Path) -> np.ndarray:
+    """Eight evenly spaced frames of an episode, with keypoints, over the robot alone: uint8 [h w 3]."""
+    rgb, robot, states = read_video(folder / "rgb.mkv"), read_video(folder / "robot.mkv"), read_states(folder)
+    frames = np.linspace(0, len(rgb) - 1, STRIP_FRAMES).round().astype(int)
+    marked = [_marked(rgb[t], states.keypoints[t][states.keypoint_visible[t]], states.robot_mask[t]) for t in frames]
+    return tiled([marked, [robot[t] for t in frames]])
+
+
+def _marked(image: np.ndarray, keypoints: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The image with the robot's outline and its visible keypoints."""
+    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    image = cv2.drawContours(image.copy(), outlines, -1, (255, 120, 0), 1)
+    for x, y in keypoints:
+        cv2.circle(image, (round(float(x)), round(float(y))), 2, (0, 160, 255), -1, cv2.LINE_AA)
+    return image
+
+
+def tiled(rows: list[list[np.ndarray]]) -> np.ndarray:
+    """Rows of equal pictures as one, white between them."""
+    padded = [[np.pad(image, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for image in row] for row in rows]
+    return np.concatenate([np.concatenate(row, 1) for row in padded])
+
+
+def save_png(path: Path, image: np.ndarray) -> None:
+    if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
+        raise EpisodeError(f"cannot write {path}; choose another folder with --pictures.")
+
+
+if __name__ == "__main__":
+    main()

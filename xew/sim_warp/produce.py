@@ -1,0 +1,225 @@
+"""Stages 1 to 5 for a batch of seeds: scene, expert, physics, rendering, episodes.
+
+Reads  `Job`s: (task, seed) and the robots that still lack it
+Writes episodes and, for what did not succeed, their headers with the reason
+
+The robots of a seed are made together, because a seed counts only when all of them succeed; only then it is rendered.
+"""
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+import xew
+from xew.episode import (
+    EpisodeError,
+    Record,
+    States,
+    array_hash,
+    read_record,
+    read_states,
+    states_hash,
+    write_episode,
+)
+from xew.protocol import ARMS
+from xew.sim_warp.camera import HEAD_CAMERA
+from xew.sim_warp.expert import Commands, joint_commands
+from xew.sim_warp.kinematics import tool_pose
+from xew.sim_warp.observe import Observation, Recording, keypoint_names, observe, scene_things
+from xew.sim_warp.physics import Motion, World, simulate
+from xew.sim_warp.plan import ToolPath
+from xew.sim_warp.render import Renderer
+from xew.sim_warp.robots import RobotSpec, get_robot
+from xew.sim_warp.scene import Scene, scene_hash, scene_rng
+from xew.sim_warp.streams import command_renders
+from xew.sim_warp.tasks import Moment, Task, get_task
+
+DEEPEST_OVERLAP = 0.005
+"""How deep an arm may press into the table or the other arm before its episode is refused [m]."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One scene, to be done by the robots that do not have it yet."""
+
+    task: str
+    seed: int
+    robots: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One (task, seed, robot) on its way."""
+
+    task: Task
+    scene: Scene
+    path: ToolPath
+    robot: RobotSpec
+    commands: Commands
+    motion: Motion | None = None
+    """None where the robot cannot follow the plan."""
+
+    @property
+    def tool_pose(self) -> np.ndarray:
+        """[t 2 7] measured tool poses, world."""
+        return measured_tools(self.robot, self.motion.joint_pos)
+
+
+def produce(jobs: Sequence[Job], out: Path, renderer: Renderer, device: str | None = None) -> list[list[Record]]:
+    """Make all episodes of some seeds and write them under `out`; the headers of each job in the order of its robots."""
+    seeds = _with_motion(_commanded(jobs), device)
+    accepted = [cell for cells in seeds if all(failure(cell) is None for cell in cells) for cell in cells]
+    views = observe(renderer, [_recording(cell) for cell in accepted])
+    renders = command_renders([(cell.robot.key, cell.commands.action) for cell in accepted], renderer=renderer)
+    pixels = {id(cell): pair for cell, *pair in zip(accepted, views, renders, strict=True)}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # OpenCV and zlib let go of the interpreter's lock
+        return [list(pool.map(lambda cell: _write(cell, pixels.get(id(cell)), out, renderer), cells)) for cells in seeds]
+
+
+def _commanded(jobs: Sequence[Job]) -> list[list[Cell]]:
+    """Scene, plan and commands of every cell; the commands of all cells of a robot are solved together."""
+    tasks = [get_task(job.task) for job in jobs]
+    scenes = [task.sample(scene_rng(job.task, job.seed), job.seed) for job, task in zip(jobs, tasks, strict=True)]
+    paths = [task.plan(scene).path() for task, scene in zip(tasks, scenes, strict=True)]
+    seeds: list[list[Cell]] = [[] for _ in jobs]
+    for name in dict.fromkeys(robot for job in jobs for robot in job.robots):
+        mine = [index for index, job in enumerate(jobs) if name in job.robots]
+        robot = get_robot(name)
+        for index, commands in zip(mine, joint_commands(robot, [paths[index] for index in mine]), strict=True):
+            seeds[index].append(Cell(tasks[index], scenes[index], paths[index], robot, commands))
+    return seeds
+
+
+def _with_motion(seeds: list[list[Cell]], device: str | None) -> list[list[Cell]]:
+    cells = [cell for cells in seeds for cell in cells if cell.commands.problem is None]
+    worlds = [World(cell.robot, cell.scene, cell.commands.action) for cell in cells]
+    motions = {id(cell): motion for cell, motion in zip(cells, simulate(worlds, device), strict=True)}
+    return [[dataclasses.replace(cell, motion=motions.get(id(cell))) for cell in cells] for cells in seeds]
+
+
+def measured_tools(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
+    """[t 2 7] tool poses at canonical joint positions [t 16], world."""
+    arms = [joint_pos[:, joints][:, : robot.arm_joint_count] for joints, _ in ARMS]
+    return np.stack([tool_pose(robot, side, arm) for side, arm in enumerate(arms)], 1).astype(np.float32)
+
+
+def moment(action: np.ndarray, motion: Motion, tools: np.ndarray, frame: int) -> Moment:
+    """One frame as a success test sees it."""
+    gripper = action[frame, [column for _, column in ARMS]]
+    return Moment(motion.object_pose[frame], motion.object_joint[frame], tools[frame], gripper, motion.contact[frame])
+
+
+def failure(cell: Cell) -> tuple[str, str] | None:
+    """Why a cell does not count: one of `episode.FAILURES` and a sentence; None if it succeeded."""
+    if cell.commands.problem is not None:
+        return "plan", cell.commands.problem
+    if cell.motion.overflow:
+        return "overflow", "a contact or constraint buffer was too small, or the state was not finite"
+    if cell.motion.arm_overlap > DEEPEST_OVERLAP:
+        return "plan", f"an arm pressed {1000 * cell.motion.arm_overlap:.0f} mm into the table or the other arm"
+    first, last = (moment(cell.commands.action, cell.motion, cell.tool_pose, frame) for frame in (0, -1))
+    if cell.task.success(cell.scene, first):
+        return "plan", "the scene is solved before it begins"
+    return None if cell.task.success(cell.scene, last) else _lost(cell)
+
+
+def _lost(cell: Cell) -> tuple[str, str]:
+    """Which hold did not come about or did not last."""
+    for hold in cell.path.holds:
+        frames = slice(int(hold.start * cell.path.frame_rate), int(hold.end * cell.path.frame_rate) + 1)
+        touched = cell.motion.contact[frames, hold.arm, cell.scene.index(hold.name)]
+        side = ("left", "right")[hold.arm]
+        if not touched.any():
+            return "grasp", f"the {side} hand never touched the {hold.name}"
+        if not touched[-3:].any():
+            return "slip", f"the {side} hand lost the {hold.name}"
+    return "timeout", "the plan ended short of success"
+
+
+def _recording(cell: Cell) -> Recording:
+    return recording(cell.robot, cell.scene, cell.motion.joint_pos, cell.motion.object_pose, cell.motion.object_joint)
+
+
+def recording(
+    robot: RobotSpec, scene: Scene, joint_pos: np.ndarray, object_pose: np.ndarray, object_joint: np.ndarray
+) -> Recording:
+    """What the camera looks at, from recorded states."""
+    things, thing_pose = scene_things(scene, object_pose, object_joint)
+    return Recording(robot, joint_pos, things, thing_pose)
+
+
+def _write(cell: Cell, pixels: tuple[Observation, np.ndarray] | None, out: Path, renderer: Renderer) -> Record:
+    record = _record(cell, renderer)
+    if pixels is None:
+        write_episode(out, record)
+    else:
+        view, render = pixels
+        write_episode(out, record, _states(cell, view), view.rgb, render)
+    return record
+
+
+def _record(cell: Cell, renderer: Renderer) -> Record:
+    reason, detail = failure(cell) or (None, "")
+    return Record(
+        task=cell.task.name,
+        seed=cell.scene.seed,
+        robot=cell.robot.key,
+        success=reason is None,
+        failure=reason,
+        failure_detail=detail,
+        instruction=cell.task.instruction.format(**cell.scene.words),
+        frame_count=cell.path.frame_count,
+        object_names=cell.scene.names,
+        keypoint_names=keypoint_names(cell.robot),
+        scene_hash=scene_hash(cell.scene),
+        versions={"xew": xew.__version__} | {name: version(name) for name in ("newton", "mujoco", "mujoco-warp", "warp-lang")},
+        device=wp.get_device(renderer.device).name,
+    )
+
+
+def _states(cell: Cell, view: Observation) -> States:
+    return States(
+        action=cell.commands.action,
+        joint_pos=cell.motion.joint_pos,
+        joint_vel=cell.motion.joint_vel,
+        tool_pose=cell.tool_pose,
+        object_pose=cell.motion.object_pose,
+        object_joint=cell.motion.object_joint,
+        contact=cell.motion.contact,
+        keypoints=view.keypoints,
+        keypoint_visible=view.keypoint_visible,
+        robot_mask=view.robot_mask,
+        intrinsics=HEAD_CAMERA.intrinsics,
+        extrinsics=HEAD_CAMERA.extrinsics,
+    )
+
+
+def render_again(folder: Path, renderer: Renderer) -> None:
+    """Make an episode's pixels, mask and keypoints anew from its recorded joints, objects and commands, and compare.
+
+    Raises:
+        EpisodeError: the scene or anything rendered differs from what is recorded.
+    """
+    record, states = read_record(folder), read_states(folder)
+    robot = get_robot(record.robot)
+    scene = get_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
+    view = observe(renderer, [recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)])[0]
+    render = command_renders([(record.robot, states.action)], renderer=renderer)[0]
+    again = dataclasses.replace(
+        states, keypoints=view.keypoints, keypoint_visible=view.keypoint_visible, robot_mask=view.robot_mask
+    )
+    found = {"states": states_hash(again), "rgb": array_hash(view.rgb), "robot": array_hash(render)}
+    found["scene"] = scene_hash(scene)
+    for name, expected in (record.hashes | {"scene": record.scene_hash}).items():
+        if found[name] != expected:
+            raise EpisodeError(
+                f"{folder}: rendered again on {renderer.device.name}, {name} has hash {found[name][:12]}, recorded on "
+                f"{record.device} was {expected[:12]}; with the same device and versions they must agree."
+            )
