@@ -8,8 +8,8 @@ The robots of a seed are made together, because a seed counts only when all of t
 
 import dataclasses
 import os
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -45,6 +45,10 @@ DEEPEST_OVERLAP = 0.005
 """How deep an arm may press into the table or the other arm before its episode is refused [m]."""
 
 
+FRAMES_AT_ONCE = 8192
+"""Frames of one group of seeds: about half a megabyte of pixels each."""
+
+
 @dataclass(frozen=True)
 class Job:
     """One scene, to be done by the robots that do not have it yet."""
@@ -67,23 +71,51 @@ class Cell:
     """None where the robot cannot follow the plan."""
 
     @property
+    def moved(self) -> Motion:
+        """The motion of a cell that is known to have one."""
+        assert self.motion is not None, f"{self.robot.key} cannot follow the plan of {self.scene.task}/{self.scene.seed}"
+        return self.motion
+
+    @property
     def tool_pose(self) -> np.ndarray:
         """[t 2 7] measured tool poses, world."""
-        return measured_tools(self.robot, self.motion.joint_pos)
+        return measured_tools(self.robot, self.moved.joint_pos)
+
+
+Pixels = tuple[Observation, np.ndarray]
+"""What the camera sees, and the robot alone [t h w 3] uint8."""
 
 
 def produce(jobs: Sequence[Job], out: Path, renderer: Renderer, device: str | None = None) -> list[list[Record]]:
-    """Make all episodes of some seeds and write them under `out`; the headers of each job in the order of its robots."""
-    seeds = _with_motion(_commanded(jobs), device)
-    accepted = [cell for cells in seeds if all(failure(cell) is None for cell in cells) for cell in cells]
-    views = observe(renderer, [_recording(cell) for cell in accepted])
-    renders = command_renders([(cell.robot.key, cell.commands.action) for cell in accepted], renderer=renderer)
-    pixels = {id(cell): pair for cell, *pair in zip(accepted, views, renders, strict=True)}
+    """Make all episodes of some seeds and write them under `out`; the headers of each job in the order of its robots.
+
+    Seeds are rendered a group at a time while the group before is being written: that bounds the pixels in memory.
+    """
+    seeds = simulate_cells(plan_cells(jobs), device)
+    writing: list[list[Future[Record]]] = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # OpenCV and zlib let go of the interpreter's lock
-        return [list(pool.map(lambda cell: _write(cell, pixels.get(id(cell)), out, renderer), cells)) for cells in seeds]
+        for group in _groups(seeds):
+            accepted = [cell for cells in group for cell in cells if all(failure(other) is None for other in cells)]
+            pixels = dict(zip(map(id, accepted), render_cells(accepted, renderer), strict=True))
+            wait([future for cells in writing for future in cells])
+            for cells in group:
+                writing.append([pool.submit(_write, cell, pixels.get(id(cell)), out, renderer.device) for cell in cells])
+        return [[future.result() for future in cells] for cells in writing]
 
 
-def _commanded(jobs: Sequence[Job]) -> list[list[Cell]]:
+def _groups(seeds: list[list[Cell]]) -> Iterator[list[list[Cell]]]:
+    """The seeds in order, about `FRAMES_AT_ONCE` frames at a time."""
+    group: list[list[Cell]] = []
+    for cells in seeds:
+        group.append(cells)
+        if sum(cell.path.frame_count for others in group for cell in others) >= FRAMES_AT_ONCE:
+            yield group
+            group = []
+    if group:
+        yield group
+
+
+def plan_cells(jobs: Sequence[Job]) -> list[list[Cell]]:
     """Scene, plan and commands of every cell; the commands of all cells of a robot are solved together."""
     tasks = [get_task(job.task) for job in jobs]
     scenes = [task.sample(scene_rng(job.task, job.seed), job.seed) for job, task in zip(jobs, tasks, strict=True)]
@@ -97,11 +129,19 @@ def _commanded(jobs: Sequence[Job]) -> list[list[Cell]]:
     return seeds
 
 
-def _with_motion(seeds: list[list[Cell]], device: str | None) -> list[list[Cell]]:
+def simulate_cells(seeds: list[list[Cell]], device: str | None = None) -> list[list[Cell]]:
+    """The same cells with their motion, where the robot can follow the plan."""
     cells = [cell for cells in seeds for cell in cells if cell.commands.problem is None]
     worlds = [World(cell.robot, cell.scene, cell.commands.action) for cell in cells]
     motions = {id(cell): motion for cell, motion in zip(cells, simulate(worlds, device), strict=True)}
     return [[dataclasses.replace(cell, motion=motions.get(id(cell))) for cell in cells] for cells in seeds]
+
+
+def render_cells(cells: Sequence[Cell], renderer: Renderer) -> list[Pixels]:
+    """What the camera sees of each cell, and the robot alone by its commands."""
+    views = observe(renderer, [_recording(cell) for cell in cells])
+    renders = command_renders([(cell.robot.key, cell.commands.action) for cell in cells], renderer=renderer)
+    return list(zip(views, renders, strict=True))
 
 
 def measured_tools(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
@@ -120,11 +160,12 @@ def failure(cell: Cell) -> tuple[str, str] | None:
     """Why a cell does not count: one of `episode.FAILURES` and a sentence; None if it succeeded."""
     if cell.commands.problem is not None:
         return "plan", cell.commands.problem
-    if cell.motion.overflow:
+    motion = cell.moved
+    if motion.overflow:
         return "overflow", "a contact or constraint buffer was too small, or the state was not finite"
-    if cell.motion.arm_overlap > DEEPEST_OVERLAP:
-        return "plan", f"an arm pressed {1000 * cell.motion.arm_overlap:.0f} mm into the table or the other arm"
-    first, last = (moment(cell.commands.action, cell.motion, cell.tool_pose, frame) for frame in (0, -1))
+    if motion.arm_overlap > DEEPEST_OVERLAP:
+        return "plan", f"an arm pressed {1000 * motion.arm_overlap:.0f} mm into the table or the other arm"
+    first, last = (moment(cell.commands.action, motion, cell.tool_pose, frame) for frame in (0, -1))
     if cell.task.success(cell.scene, first):
         return "plan", "the scene is solved before it begins"
     return None if cell.task.success(cell.scene, last) else _lost(cell)
@@ -134,7 +175,7 @@ def _lost(cell: Cell) -> tuple[str, str]:
     """Which hold did not come about or did not last."""
     for hold in cell.path.holds:
         frames = slice(int(hold.start * cell.path.frame_rate), int(hold.end * cell.path.frame_rate) + 1)
-        touched = cell.motion.contact[frames, hold.arm, cell.scene.index(hold.name)]
+        touched = cell.moved.contact[frames, hold.arm, cell.scene.index(hold.name)]
         side = ("left", "right")[hold.arm]
         if not touched.any():
             return "grasp", f"the {side} hand never touched the {hold.name}"
@@ -144,7 +185,7 @@ def _lost(cell: Cell) -> tuple[str, str]:
 
 
 def _recording(cell: Cell) -> Recording:
-    return recording(cell.robot, cell.scene, cell.motion.joint_pos, cell.motion.object_pose, cell.motion.object_joint)
+    return recording(cell.robot, cell.scene, cell.moved.joint_pos, cell.moved.object_pose, cell.moved.object_joint)
 
 
 def recording(
@@ -155,8 +196,8 @@ def recording(
     return Recording(robot, joint_pos, things, thing_pose)
 
 
-def _write(cell: Cell, pixels: tuple[Observation, np.ndarray] | None, out: Path, renderer: Renderer) -> Record:
-    record = _record(cell, renderer)
+def _write(cell: Cell, pixels: Pixels | None, out: Path, device: wp.Device) -> Record:
+    record = header(cell, device)
     if pixels is None:
         write_episode(out, record)
     else:
@@ -165,7 +206,8 @@ def _write(cell: Cell, pixels: tuple[Observation, np.ndarray] | None, out: Path,
     return record
 
 
-def _record(cell: Cell, renderer: Renderer) -> Record:
+def header(cell: Cell, device: wp.Device) -> Record:
+    """What is known of a cell but its hashes: who, how long, success or the reason of failure."""
     reason, detail = failure(cell) or (None, "")
     return Record(
         task=cell.task.name,
@@ -180,19 +222,19 @@ def _record(cell: Cell, renderer: Renderer) -> Record:
         keypoint_names=keypoint_names(cell.robot),
         scene_hash=scene_hash(cell.scene),
         versions={"xew": xew.__version__} | {name: version(name) for name in ("newton", "mujoco", "mujoco-warp", "warp-lang")},
-        device=wp.get_device(renderer.device).name,
+        device=device.name,
     )
 
 
 def _states(cell: Cell, view: Observation) -> States:
     return States(
         action=cell.commands.action,
-        joint_pos=cell.motion.joint_pos,
-        joint_vel=cell.motion.joint_vel,
+        joint_pos=cell.moved.joint_pos,
+        joint_vel=cell.moved.joint_vel,
         tool_pose=cell.tool_pose,
-        object_pose=cell.motion.object_pose,
-        object_joint=cell.motion.object_joint,
-        contact=cell.motion.contact,
+        object_pose=cell.moved.object_pose,
+        object_joint=cell.moved.object_joint,
+        contact=cell.moved.contact,
         keypoints=view.keypoints,
         keypoint_visible=view.keypoint_visible,
         robot_mask=view.robot_mask,
