@@ -9,14 +9,13 @@ disk is not made again: stop the command at any time, give it again, and the res
 Command: python -m xew.sim_warp.generate --batch 256 [--tasks … --robots … --train-seeds 50 --test-seeds 20 --out data]
 """
 
-import multiprocessing
 import os
 import shutil
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -31,6 +30,7 @@ from xew.sim_warp.produce import Job, produce
 from xew.sim_warp.render import Renderer
 from xew.sim_warp.robots import ROBOTS, get_robot
 from xew.sim_warp.tasks import TASKS, get_task
+from xew.sim_warp.workers import in_processes
 
 TRIES_PER_SEED = 3
 SPARE_TRIES = 20
@@ -78,7 +78,8 @@ class Family:
 
     def next_jobs(self) -> list[Job]:
         """The first seeds that are not complete, as many as are still to be accepted."""
-        jobs, seed = [], self.first_seed
+        jobs: list[Job] = []
+        seed = self.first_seed
         while len(jobs) < self.wanted - self.accepted:
             if seed - self.first_seed >= TRIES_PER_SEED * self.wanted + SPARE_TRIES:
                 raise EpisodeError(
@@ -111,7 +112,7 @@ class Maker:
         if self.device.is_cuda:
             yield from self._in_batches(jobs)
         else:
-            yield from self._in_processes(jobs)
+            yield from in_processes(partial(_one, out=self.args.out), jobs, self.args.workers)
 
     def _in_batches(self, jobs: Sequence[Job]) -> Iterator[tuple[list[Record], float]]:
         renderer = Renderer(self.device.alias)
@@ -121,25 +122,6 @@ class Maker:
             batch = produce(jobs[start : start + size], self.args.out, renderer, self.device.alias)
             seconds = (time.perf_counter() - begin) / len(batch)
             yield from ((records, seconds) for records in batch)
-
-    def _in_processes(self, jobs: Sequence[Job]) -> Iterator[tuple[list[Record], float]]:
-        os.environ.setdefault("OMP_NUM_THREADS", "1")  # a worker is a core; more threads would wait for one another
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(max(1, self.args.workers), context) as pool:
-            try:
-                # Alone, so that Warp compiles its kernels once and not in every worker.
-                yield pool.submit(_one, jobs[0], self.args.out).result()
-                yield from _as_completed([pool.submit(_one, job, self.args.out) for job in jobs[1:]])
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
-
-
-def _as_completed(futures: list[Future[tuple[list[Record], float]]]) -> Iterator[tuple[list[Record], float]]:
-    waiting = set(futures)
-    while waiting:
-        finished, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-        yield from (future.result() for future in finished)
 
 
 _worker_renderer: list[Renderer] = []
@@ -164,7 +146,7 @@ def generate(args: Args) -> list[Family]:
         for first, wanted in ((0, args.train_seeds), (TEST_SEED_START, args.test_seeds))
     ]
     _read_existing(families, args.out)
-    spent: Counter[str] = Counter()
+    spent: dict[str, float] = defaultdict(float)
     frames: Counter[str] = Counter()
     maker = Maker(args)
     total = sum(family.wanted for family in families)
@@ -212,7 +194,7 @@ def _read_existing(families: list[Family], out: Path) -> None:
                 family.add(record)
 
 
-def _print_speed(frames: Counter[str], spent: Counter[str]) -> None:
+def _print_speed(frames: Counter[str], spent: dict[str, float]) -> None:
     for task, seconds in spent.items():
         print(
             f"{task}: {frames[task]} frames in {seconds:.1f} process-seconds, {frames[task] / seconds:.1f} frames/s a process"

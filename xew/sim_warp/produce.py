@@ -9,7 +9,7 @@ The robots of a seed are made together, because a seed counts only when all of t
 import dataclasses
 import os
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -92,15 +92,17 @@ def produce(jobs: Sequence[Job], out: Path, renderer: Renderer, device: str | No
     Seeds are rendered a group at a time while the group before is being written: that bounds the pixels in memory.
     """
     seeds = simulate_cells(plan_cells(jobs), device)
+    records: list[list[Record]] = []
     writing: list[list[Future[Record]]] = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # OpenCV and zlib let go of the interpreter's lock
         for group in _groups(seeds):
-            accepted = [cell for cells in group for cell in cells if all(failure(other) is None for other in cells)]
+            accepted = [cell for cells in group if not any(map(failure, cells)) for cell in cells]
             pixels = dict(zip(map(id, accepted), render_cells(accepted, renderer), strict=True))
-            wait([future for cells in writing for future in cells])
-            for cells in group:
-                writing.append([pool.submit(_write, cell, pixels.get(id(cell)), out, renderer.device) for cell in cells])
-        return [[future.result() for future in cells] for cells in writing]
+            records += [[future.result() for future in cells] for cells in writing]
+            writing = [
+                [pool.submit(_write, cell, pixels.get(id(cell)), out, renderer.device) for cell in cells] for cells in group
+            ]
+        return records + [[future.result() for future in cells] for cells in writing]
 
 
 def _groups(seeds: list[list[Cell]]) -> Iterator[list[list[Cell]]]:

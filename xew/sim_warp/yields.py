@@ -1,0 +1,196 @@
+"""How often the experts succeed: a fixed number of seeds of every task on every robot, in physics, without pictures.
+
+Reads  the registries of tasks and robots
+Writes a Markdown table to the terminal and, with --page, docs/tasks.md: the tasks in words and the table
+
+Unlike generate this tries every seed on every robot and stores no episode.
+
+Command: python -m xew.sim_warp.yields [--tasks … --robots … --seeds 20 --first-seed 0 --page docs/tasks.md]
+"""
+
+import importlib
+import inspect
+import os
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+import warp as wp
+from tqdm import tqdm
+
+from xew.config import user_errors
+from xew.episode import EpisodeError, Record
+from xew.sim_warp.produce import Job, header, plan_cells, simulate_cells
+from xew.sim_warp.robots import ROBOTS, get_robot
+from xew.sim_warp.tasks import TASKS, Task, get_task
+from xew.sim_warp.workers import in_processes
+
+PARTS = ("Task", "Randomisation", "Success", "After")
+"""How the paragraphs of a task's module docstring begin."""
+COMMAND = "python -m xew.sim_warp.yields"
+
+
+@dataclass(frozen=True)
+class Args:
+    """What to try."""
+
+    tasks: tuple[str, ...] = tuple(TASKS)
+    """Keys of the registry, or module:NAME."""
+    robots: tuple[str, ...] = tuple(ROBOTS)
+    """Keys of the registry, or module:NAME."""
+    seeds: int = 20
+    """Seeds of each task, all of which count."""
+    first_seed: int = 0
+    batch: int = 256
+    """Worlds that a GPU steps together."""
+    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
+    """Processes on a CPU."""
+    device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
+    """Default: a GPU if Warp finds one."""
+    page: Path | None = None
+    """Markdown file to write; none is written without it."""
+
+
+def attempts(args: Args) -> Iterator[list[Record]]:
+    """Headers of all robots of a seed, as they come.
+
+    Raises:
+        ConfigError: an unknown task or robot.
+        EpisodeError: nothing to try.
+    """
+    tasks = [get_task(name) and name for name in dict.fromkeys(args.tasks)]
+    robots = tuple(get_robot(name) and name for name in dict.fromkeys(args.robots))
+    jobs = [Job(task, args.first_seed + index, robots) for index in range(args.seeds) for task in tasks]
+    if not jobs or not robots:
+        raise EpisodeError("nothing to try: name at least one task and one robot, and --seeds of at least 1.")
+    device = wp.get_device(args.device)
+    if not device.is_cuda:
+        yield from in_processes(attempt, jobs, args.workers)
+        return
+    size = max(1, args.batch // len(robots))
+    for start in range(0, len(jobs), size):
+        yield from attempt_batch(jobs[start : start + size], device)
+
+
+def attempt(job: Job) -> list[Record]:
+    """One seed on a CPU."""
+    return attempt_batch([job], wp.get_device("cpu"))[0]
+
+
+def attempt_batch(jobs: Sequence[Job], device: wp.Device) -> list[list[Record]]:
+    """Plan and simulate some seeds; the headers that their episodes would have, without hashes."""
+    seeds = simulate_cells(plan_cells(jobs), device.alias)
+    return [[header(cell, device) for cell in cells] for cells in seeds]
+
+
+def markdown(records: Sequence[Record]) -> str:
+    """The yields of tasks (rows) on robots (columns), then every failure with its reason."""
+    cells: dict[tuple[str, str], list[bool]] = defaultdict(list)
+    for record in sorted(records, key=lambda record: (record.task, record.seed, record.robot)):
+        cells[record.task, record.robot].append(record.success)
+    tasks = list(dict.fromkeys(task for task, _ in cells))
+    robots = [name for name in ROBOTS if any(name == r for _, r in cells)]
+    robots += sorted({robot for _, robot in cells} - set(robots))
+    rows = [
+        [f"`{task}`", *(_share(cells[task, robot]) for robot in robots), _share(_together(records, task))] for task in tasks
+    ]
+    every = [[success for task in tasks for success in cells[task, robot]] for robot in robots]
+    rows.append(
+        ["**all tasks**", *map(_share, every), _share([together for task in tasks for together in _together(records, task)])]
+    )
+    head = ["task", *(f"`{robot}`" for robot in robots), "all robots on the same seed"]
+    lines = ["| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows)]
+    return "\n".join([*lines, "", *_failures(records)])
+
+
+def _together(records: Sequence[Record], task: str) -> list[bool]:
+    """For every seed of a task: have all robots succeeded?"""
+    seeds: dict[int, bool] = {}
+    for record in records:
+        if record.task == task:
+            seeds[record.seed] = seeds.get(record.seed, True) and record.success
+    return list(seeds.values())
+
+
+def _share(successes: Sequence[bool]) -> str:
+    return f"{sum(successes)}/{len(successes)} ({100 * sum(successes) / len(successes):.0f} %)" if successes else "–"
+
+
+def _failures(records: Sequence[Record]) -> list[str]:
+    failed = sorted((r for r in records if not r.success), key=lambda record: (record.task, record.robot, record.seed))
+    if not failed:
+        return ["Nothing failed."]
+    return ["What failed:", *(f"- `{r.task}`, `{r.robot}`, seed {r.seed}: {r.failure} ({r.failure_detail})" for r in failed)]
+
+
+def described(task: Task) -> dict[str, str]:
+    """The paragraphs of a task's module docstring by how they begin: what to do, what varies, when it is done."""
+    module = importlib.import_module(task.sample.__module__)
+    found: dict[str, str] = {}
+    for line in inspect.cleandoc(module.__doc__ or "").splitlines():
+        begun = next((part for part in PARTS if line.startswith((part + ":", part + " "))), None)
+        if begun:
+            found[begun] = line.removeprefix(begun + ":").strip()
+        elif line.strip() and found:
+            last = list(found)[-1]
+            found[last] += " " + line.strip()
+    return found
+
+
+def description(task: Task) -> str:
+    """A task as a section of the page."""
+    parts = described(task)
+    lines = [f"- **{part}**: {parts[part]}" for part in ("Task", "Randomisation", "Success") if part in parts]
+    return "\n".join(
+        [f"### `{task.name}`", f"*{task.instruction}*", "", *lines, *([parts["After"]] if "After" in parts else [])]
+    )
+
+
+def page(records: Sequence[Record], args: Args) -> str:
+    """docs/tasks.md."""
+    tasks = "\n\n".join(description(get_task(name)) for name in sorted(args.tasks))
+    seeds = f"{args.seeds} seeds from {args.first_seed}"
+    device = next(record.device for record in records)
+    return f"""# The tasks
+
+This page is written by `{COMMAND} --page`; the descriptions are the docstrings of `xew/sim_warp/tasks/`. Lengths are in metres,
+x to the right, y away from the robot, the origin under the table's centre; the table's top is at z = 0.74.
+Words in braces stand for colours of the scene.
+
+{tasks}
+
+## How often the experts succeed
+{seeds} of each task, in physics, on {device}:
+
+{markdown(records)}
+
+A seed belongs to the data set only when all robots succeed on it.
+"""
+
+
+@user_errors
+def main() -> None:
+    args = tyro.cli(Args, description=__doc__)
+    records: list[Record] = []
+    with tqdm(total=args.seeds * len(set(args.tasks)), desc="trying seeds", unit="seed") as bar:
+        for seed in attempts(args):
+            records += seed
+            bar.update()
+    print(markdown(records))
+    if args.page:
+        write_page(args.page, page(records, args))
+
+
+def write_page(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    except OSError as error:
+        raise EpisodeError(f"cannot write {path}: {error.strerror}. Choose another file with --page.") from error
+
+
+if __name__ == "__main__":
+    main()
