@@ -11,6 +11,7 @@ Shape letters, here and everywhere: t frames, h w c image, j joints, a action, o
 Quaternions are x y z w; the world frame has its origin under the table's centre, x right, y away from the robot, z up.
 """
 
+import errno
 import hashlib
 import json
 import os
@@ -28,6 +29,10 @@ WIDTH, HEIGHT = 320, 240
 FAILURES = ("plan", "grasp", "slip", "timeout", "overflow")
 """plan: no joint path. grasp: never held. slip: held and lost. timeout: the plan ended short of success.
 overflow: a physics buffer was too small."""
+
+
+_TEMPORARY = ".writing-"
+"""How the name of a folder begins that is not complete."""
 
 
 class EpisodeError(Exception):
@@ -129,11 +134,11 @@ def write_episode(
     temporary = None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY, dir=folder.parent))
         hashes = {}
         if states is not None:
             hashes["states"] = states_hash(states)
-            np.savez_compressed(temporary / "states.npz", **_packed(states))
+            np.savez_compressed(temporary / "states.npz", **_packed(states))  # type: ignore[arg-type]
         for name, video in (("rgb", rgb), ("robot", robot)):
             if video is not None:
                 hashes[name] = array_hash(video)
@@ -192,14 +197,24 @@ def read_states(folder: Path) -> States:
 def write_video(path: Path, video: np.ndarray, frame_rate: float = 1000 / 60) -> None:
     """Write uint8 RGB [t h w 3] losslessly (FFV1 in Matroska)."""
     height, width = video.shape[1:3]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), frame_rate, (width, height))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), frame_rate, (width, height))
     if not writer.isOpened():
-        raise OSError(f"OpenCV cannot open {path} for writing FFV1")
+        raise OSError(errno.EIO, "OpenCV cannot write FFV1 there", str(path))
     for frame in video:
         writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
     writer.release()
-    if not path.exists() or path.stat().st_size < 256 + 64 * len(video):
-        raise OSError(f"{path} is shorter than {len(video)} frames can be: the disk may be full")
+    if not _ends_with(path, video[-1], len(video)):
+        raise OSError(errno.EIO, "the video is incomplete; the disk may be full", str(path))
+
+
+def _ends_with(path: Path, frame: np.ndarray, count: int) -> bool:
+    """Is `frame` [h w 3] the last of `count` in a video? OpenCV does not tell when it could not write."""
+    capture = cv2.VideoCapture(str(path))
+    capture.set(cv2.CAP_PROP_POS_FRAMES, count - 1)
+    found, last = capture.read()
+    more, _ = capture.read()
+    capture.release()
+    return found and not more and bool((cv2.cvtColor(last, cv2.COLOR_BGR2RGB) == frame).all())
 
 
 def read_video(path: Path) -> np.ndarray:
@@ -227,16 +242,22 @@ def verify_episode(folder: Path) -> Record:
         "robot": lambda: array_hash(read_video(folder / "robot.mkv")),
     }
     for name, expected in record.hashes.items():
+        if name not in readers:
+            raise EpisodeError(
+                f"{folder} names a hash of {name!r}, expected {', '.join(readers)}; delete it and run generate again."
+            )
         found = readers[name]()
         if found != expected:
-            raise EpisodeError(f"{folder}: {name} has hash {found[:12]}, expected {expected[:12]}; delete it and run generate again.")
+            raise EpisodeError(
+                f"{folder}: {name} has hash {found[:12]}, expected {expected[:12]}; delete it and run generate again."
+            )
     return record
 
 
 def find_records(data: Path) -> Iterator[tuple[Path, Record]]:
     """All cells of a data set, accepted or not, sorted by task, seed, robot. The folders are the index."""
     for path in sorted(Path(data).glob("*/*/*/episode.json")):
-        if not path.parent.name.startswith("."):
+        if not path.parent.name.startswith(_TEMPORARY):
             yield path.parent, read_record(path.parent)
 
 
@@ -246,8 +267,15 @@ def find_accepted(data: Path) -> list[tuple[Path, Record]]:
     Raises EpisodeError if there is none, and names the command that makes them.
     """
     cells = list(find_records(data))
-    failed = {(record.task, record.seed) for _, record in cells if not record.success}
+    # Where somebody failed the others have no pictures, also if the run was stopped before it wrote who had failed.
+    failed = {(record.task, record.seed) for _, record in cells if not record.success or not record.hashes}
     accepted = [(folder, record) for folder, record in cells if (record.task, record.seed) not in failed]
     if not accepted:
         raise EpisodeError(f"no accepted episode under {data}; make some: python -m xew.sim_warp.generate --out {data}")
     return accepted
+
+
+def remove_left_overs(data: Path) -> None:
+    """Remove what a run that was killed left half-written."""
+    for folder in Path(data).glob(f"*/*/{_TEMPORARY}*"):
+        shutil.rmtree(folder, ignore_errors=True)

@@ -10,7 +10,6 @@ Command: python -m xew.sim_warp.generate --batch 256 [--tasks … --robots … -
 """
 
 import os
-import shutil
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
@@ -24,7 +23,7 @@ import warp as wp
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.episode import EpisodeError, Record, episode_folder, find_records
+from xew.episode import EpisodeError, Record, episode_folder, find_records, remove_left_overs
 from xew.protocol import TEST_SEED_START, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK
 from xew.sim_warp.produce import Job, produce
 from xew.sim_warp.render import Renderer
@@ -72,30 +71,36 @@ class Family:
         self.done[record.seed][record.robot] = record
 
     @property
+    def tries(self) -> range:
+        """The seeds that may be tried."""
+        return range(self.first_seed, self.first_seed + TRIES_PER_SEED * self.wanted + SPARE_TRIES)
+
+    @property
     def accepted(self) -> int:
         """Complete seeds on which nobody failed, counted as long as they are wanted."""
-        return min(self.wanted, sum(self._complete(seed) and self._succeeded(seed) for seed in self.done))
+        return min(self.wanted, sum(not self._missing(seed) and self._hopeful(seed) for seed in list(self.done)))
 
     def next_jobs(self) -> list[Job]:
-        """The first seeds that are not complete, as many as are still to be accepted."""
+        """What is missing of the first seeds: as many as it takes if from now on nobody fails.
+
+        Seeds on which somebody has failed are completed too, so that a run that was stopped ends like one that was not.
+        """
         jobs: list[Job] = []
-        seed = self.first_seed
-        while len(jobs) < self.wanted - self.accepted:
-            if seed - self.first_seed >= TRIES_PER_SEED * self.wanted + SPARE_TRIES:
-                raise EpisodeError(
-                    f"{self.task}: only {self.accepted} of {self.wanted} seeds were accepted in {seed - self.first_seed} "
-                    "tries. See the reasons with python -m xew.sim_warp.inspect; make the task easier or leave out a robot."
-                )
-            missing = tuple(robot for robot in self.robots if robot not in self.done[seed])
-            if missing and self._succeeded(seed):
-                jobs.append(Job(self.task, seed, missing))
-            seed += 1
+        hopeful = 0
+        for seed in self.tries:
+            if hopeful == self.wanted:
+                break
+            if missing := self._missing(seed):
+                jobs.append(Job(self.task, seed, missing, rejected=not self._hopeful(seed)))
+            hopeful += self._hopeful(seed)
         return jobs
 
-    def _complete(self, seed: int) -> bool:
-        return all(robot in self.done[seed] for robot in self.robots)
+    def _missing(self, seed: int) -> tuple[str, ...]:
+        """Robots without a record or, where all have succeeded, without an episode."""
+        done = self.done[seed]
+        return tuple(r for r in self.robots if r not in done or (self._hopeful(seed) and not done[r].hashes))
 
-    def _succeeded(self, seed: int) -> bool:
+    def _hopeful(self, seed: int) -> bool:
         """Has nobody failed so far?"""
         return all(record.success for record in self.done[seed].values())
 
@@ -151,10 +156,9 @@ def generate(args: Args) -> list[Family]:
     maker = Maker(args)
     total = sum(family.wanted for family in families)
     with tqdm(total=total, initial=sum(f.accepted for f in families), desc="accepted seeds", unit="seed") as bar:
-        while jobs := [job for family in families for job in family.next_jobs()]:
-            by_seed = {(family.task, job.seed): family for family in families for job in family.next_jobs()}
-            for records, seconds in maker.run(jobs):
-                family = by_seed[records[0].task, records[0].seed]
+        while jobs := {(family.task, job.seed): (family, job) for family in families for job in family.next_jobs()}:
+            for records, seconds in maker.run([job for _, job in jobs.values()]):
+                family, _ = jobs[records[0].task, records[0].seed]
                 for record in records:
                     family.add(record)
                 spent[family.task] += seconds
@@ -172,11 +176,13 @@ def _check(args: Args) -> None:
     for robot in args.robots:
         get_robot(robot)
     if not args.tasks or not args.robots or min(args.train_seeds, args.test_seeds) < 0 or args.batch < 1:
-        raise EpisodeError(f"nothing to make: {args}. Name tasks and robots, seeds of at least 0, a batch of at least 1.")
+        raise EpisodeError(
+            f"nothing to make of {len(args.tasks)} tasks, {len(args.robots)} robots, {args.train_seeds} training and "
+            f"{args.test_seeds} test seeds in batches of {args.batch}; name tasks and robots, seeds from 0 and batches from 1."
+        )
     try:
         args.out.mkdir(parents=True, exist_ok=True)
-        for left_over in args.out.glob("*/*/.*-*"):  # from a run that was killed while it wrote
-            shutil.rmtree(left_over, ignore_errors=True)
+        remove_left_overs(args.out)
         (args.out / ".writable").touch()
         (args.out / ".writable").unlink()
     except OSError as error:
@@ -221,10 +227,22 @@ def yield_table(records: Sequence[Record]) -> str:
     return "\n".join(lines)
 
 
+def _demand_enough(families: Sequence[Family]) -> None:
+    """Raises EpisodeError where the tries of a task are used up."""
+    short = [
+        f"{family.task}: only {family.accepted} of {family.wanted} seeds were accepted in {len(family.tries)} tries."
+        for family in families
+        if family.accepted < family.wanted
+    ]
+    if short:
+        raise EpisodeError("\n".join([*short, "The table shows why; make the task easier or leave out a robot."]))
+
+
 @user_errors
 def main() -> None:
     families = generate(tyro.cli(Args, description=__doc__))
     print(yield_table([record for family in families for seed in family.done.values() for record in seed.values()]))
+    _demand_enough(families)
 
 
 if __name__ == "__main__":

@@ -56,15 +56,20 @@ class Job:
     task: str
     seed: int
     robots: tuple[str, ...]
+    rejected: bool = False
+    """Has another robot failed on it already? Then nothing is rendered."""
 
 
 @dataclass(frozen=True)
 class Cell:
     """One (task, seed, robot) on its way."""
 
+    task_name: str
+    """As asked for: a key of the registry or module:NAME."""
     task: Task
     scene: Scene
     path: ToolPath
+    robot_name: str
     robot: RobotSpec
     commands: Commands
     motion: Motion | None = None
@@ -92,17 +97,22 @@ def produce(jobs: Sequence[Job], out: Path, renderer: Renderer, device: str | No
     Seeds are rendered a group at a time while the group before is being written: that bounds the pixels in memory.
     """
     seeds = simulate_cells(plan_cells(jobs), device)
+    rejected = {(job.task, job.seed) for job in jobs if job.rejected}
     records: list[list[Record]] = []
     writing: list[list[Future[Record]]] = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # OpenCV and zlib let go of the interpreter's lock
         for group in _groups(seeds):
-            accepted = [cell for cells in group if not any(map(failure, cells)) for cell in cells]
+            accepted = [cell for cells in group if _accepted(cells, rejected) for cell in cells]
             pixels = dict(zip(map(id, accepted), render_cells(accepted, renderer), strict=True))
             records += [[future.result() for future in cells] for cells in writing]
             writing = [
                 [pool.submit(_write, cell, pixels.get(id(cell)), out, renderer.device) for cell in cells] for cells in group
             ]
         return records + [[future.result() for future in cells] for cells in writing]
+
+
+def _accepted(cells: Sequence[Cell], rejected: set[tuple[str, int]]) -> bool:
+    return not any((cell.task_name, cell.scene.seed) in rejected or failure(cell) for cell in cells)
 
 
 def _groups(seeds: list[list[Cell]]) -> Iterator[list[list[Cell]]]:
@@ -127,7 +137,7 @@ def plan_cells(jobs: Sequence[Job]) -> list[list[Cell]]:
         mine = [index for index, job in enumerate(jobs) if name in job.robots]
         robot = get_robot(name)
         for index, commands in zip(mine, joint_commands(robot, [paths[index] for index in mine]), strict=True):
-            seeds[index].append(Cell(tasks[index], scenes[index], paths[index], robot, commands))
+            seeds[index].append(Cell(jobs[index].task, tasks[index], scenes[index], paths[index], name, robot, commands))
     return seeds
 
 
@@ -142,7 +152,7 @@ def simulate_cells(seeds: list[list[Cell]], device: str | None = None) -> list[l
 def render_cells(cells: Sequence[Cell], renderer: Renderer) -> list[Pixels]:
     """What the camera sees of each cell, and the robot alone by its commands."""
     views = observe(renderer, [_recording(cell) for cell in cells])
-    renders = command_renders([(cell.robot.key, cell.commands.action) for cell in cells], renderer=renderer)
+    renders = command_renders([(cell.robot_name, cell.commands.action) for cell in cells], renderer=renderer)
     return list(zip(views, renders, strict=True))
 
 
@@ -201,20 +211,18 @@ def recording(
 def _write(cell: Cell, pixels: Pixels | None, out: Path, device: wp.Device) -> Record:
     record = header(cell, device)
     if pixels is None:
-        write_episode(out, record)
-    else:
-        view, render = pixels
-        write_episode(out, record, _states(cell, view), view.rgb, render)
-    return record
+        return read_record(write_episode(out, record))
+    view, render = pixels
+    return read_record(write_episode(out, record, _states(cell, view), view.rgb, render))
 
 
 def header(cell: Cell, device: wp.Device) -> Record:
     """What is known of a cell but its hashes: who, how long, success or the reason of failure."""
     reason, detail = failure(cell) or (None, "")
     return Record(
-        task=cell.task.name,
+        task=cell.task_name,
         seed=cell.scene.seed,
-        robot=cell.robot.key,
+        robot=cell.robot_name,
         success=reason is None,
         failure=reason,
         failure_detail=detail,

@@ -61,8 +61,11 @@ def attempts(args: Args) -> Iterator[list[Record]]:
         ConfigError: an unknown task or robot.
         EpisodeError: nothing to try.
     """
-    tasks = [get_task(name) and name for name in dict.fromkeys(args.tasks)]
-    robots = tuple(get_robot(name) and name for name in dict.fromkeys(args.robots))
+    tasks, robots = dict.fromkeys(args.tasks), tuple(dict.fromkeys(args.robots))
+    for name in tasks:
+        get_task(name)
+    for name in robots:
+        get_robot(name)
     jobs = [Job(task, args.first_seed + index, robots) for index in range(args.seeds) for task in tasks]
     if not jobs or not robots:
         raise EpisodeError("nothing to try: name at least one task and one robot, and --seeds of at least 1.")
@@ -123,7 +126,11 @@ def _failures(records: Sequence[Record]) -> list[str]:
     failed = sorted((r for r in records if not r.success), key=lambda record: (record.task, record.robot, record.seed))
     if not failed:
         return ["Nothing failed."]
-    return ["What failed:", *(f"- `{r.task}`, `{r.robot}`, seed {r.seed}: {r.failure} ({r.failure_detail})" for r in failed)]
+    return [
+        "What failed:",
+        "",
+        *(f"- `{r.task}`, `{r.robot}`, seed {r.seed}: {r.failure} ({r.failure_detail})" for r in failed),
+    ]
 
 
 def described(task: Task) -> dict[str, str]:
@@ -144,9 +151,7 @@ def description(task: Task) -> str:
     """A task as a section of the page."""
     parts = described(task)
     lines = [f"- **{part}**: {parts[part]}" for part in ("Task", "Randomisation", "Success") if part in parts]
-    return "\n".join(
-        [f"### `{task.name}`", f"*{task.instruction}*", "", *lines, *([parts["After"]] if "After" in parts else [])]
-    )
+    return "\n".join([f"### `{task.name}`", f"*{task.instruction}*", "", *lines, "", parts.get("After", "")]).strip()
 
 
 def page(records: Sequence[Record], args: Args) -> str:
