@@ -121,7 +121,7 @@ def control_targets(robot: RobotSpec, action: np.ndarray) -> np.ndarray:
     step = np.diff(joints, axis=0)[:, None]
     position = joints[:-1, None] + share[:, None] * step
     velocity = np.broadcast_to(step * FRAME_RATE, position.shape)
-    return np.stack([position, velocity], axis=-1).reshape(*position.shape[:2], -1)
+    return np.stack([position, velocity], axis=-1).reshape(*position.shape[:2], 2 * ROBOT_DOFS)
 
 
 def build_solver(worlds: list[World], device: str, **options: object) -> newton.solvers.SolverMuJoCo:

@@ -1,0 +1,51 @@
+"""The smallest things that go the whole way: a task of twelve frames, and a robot that cannot do every seed of it.
+
+Both are reached from outside the registries, as a user's own would be: TASK and SLOW name them.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from xew.protocol import ACTION_DIM, ARMS
+from xew.sim_warp import objects
+from xew.sim_warp.plan import HOME, LEFT, RIGHT, Timeline
+from xew.sim_warp.robots import ROBOTS
+from xew.sim_warp.robots.spec import RobotSpec
+from xew.sim_warp.scene import Scene, SceneObject, upright
+from xew.sim_warp.stage import TABLE_TOP
+from xew.sim_warp.tasks.task import Moment, Task
+
+TASK = "tests.sim_warp.small:CLOSE"
+SLOW = "tests.sim_warp.small:SLOW_PIPER"
+
+
+def sample(rng: np.random.Generator, seed: int) -> Scene:
+    x, y = rng.uniform([-0.1, 0.0], [0.1, 0.1])
+    block = SceneObject("block", objects.block((0.04,) * 3, (200, 45, 40)), upright(x, y, TABLE_TOP), mass=0.05)
+    return Scene(TASK, seed, (block,))
+
+
+def plan(scene: Scene) -> Timeline:
+    """Close both hands; on odd seeds raise the left one too, which is too fast for `SLOW_PIPER`."""
+    timeline = Timeline()
+    timeline.grip({LEFT: 0.0, RIGHT: 0.0})
+    timeline.follow(LEFT, [HOME[LEFT].moved(z=0.01 * (scene.seed % 2))], seconds=0.18)
+    return timeline
+
+
+def success(scene: Scene, now: Moment) -> bool:
+    return bool((now.gripper < 0.2).all())
+
+
+CLOSE = Task("close", "close both hands", sample, plan, success)
+SLOW_PIPER = replace(ROBOTS["piper"], joint_velocity=(0.02,) * 6)
+
+
+def at_home(robot: RobotSpec, frames: int) -> np.ndarray:
+    """[t 16] float32 commands to stand at home with open grippers."""
+    action = np.zeros((frames, ACTION_DIM), np.float32)
+    for arm, (joints, gripper) in zip(robot.arms, ARMS, strict=True):
+        action[:, joints.start : joints.start + robot.arm_joint_count] = arm.home
+        action[:, gripper] = 1.0
+    return action
