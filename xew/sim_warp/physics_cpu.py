@@ -19,6 +19,9 @@ from xew.sim_warp.physics import (
     shape_owners,
 )
 
+# Warnings are counted in `data.warning` and told as overflow; MuJoCo would write them to a file where the user stands, too.
+mujoco.set_mju_user_warning(lambda message: None)
+
 _ARMS = ((LEFT_FINGERS, LEFT_ARM_LINKS), (RIGHT_FINGERS, RIGHT_ARM_LINKS))
 
 

@@ -31,6 +31,8 @@ CONTACTS_PER_WORLD = 160
 CONSTRAINTS_PER_WORLD = 768
 """First sizes of MuJoCo Warp's buffers; worlds that overflow them are stepped again with twice as much."""
 ATTEMPTS = 3
+SOLVER_LIMITS = mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS
+"""Flags among MuJoCo Warp's overflows that mean no lost contact: a step whose solver used all of its iterations."""
 
 
 @wp.kernel
@@ -42,7 +44,7 @@ def set_targets(
     frame_rate: wp.float32,
     # Out:
     ctrl_out: wp.array2d[wp.float32],  # [n 36]
-):
+) -> None:
     """Targets of one step: position and velocity of each joint, commands being linear between frames."""
     world, joint = wp.tid()
     before = joints[world, frame[0], joint]
@@ -132,6 +134,7 @@ class _Batch:
         self.solver = build_solver(worlds, device, nconmax=scale * CONTACTS_PER_WORLD, njmax=scale * CONSTRAINTS_PER_WORLD)
         self.model, self.data = self.solver.mjw_model, self.solver.mjw_data
         self.model.opt.timestep.fill_(TIME_STEP)
+        self.model.opt.warn_overflow = 0  # what overflows is stepped again, or told in `Motion.overflow`
         self.frame_count = max(len(world.action) for world in worlds)
         self.joints = self._array(np.stack([self._joints(world) for world in worlds]))
         self.owners = self._array(self._geom_owners(), wp.int32)
@@ -183,7 +186,7 @@ class _Batch:
 
     def _motions(self) -> list[Motion]:
         qpos, qvel, contact = self.qpos.numpy(), self.qvel.numpy(), self.contact.numpy()
-        overlap, overflow = self.overlap.numpy(), self.data.overflow.numpy()
+        overlap, overflow = self.overlap.numpy(), self.data.overflow.numpy() & ~int(SOLVER_LIMITS)
         motions = []
         for index, world in enumerate(self.worlds):
             frames = slice(len(world.action))
