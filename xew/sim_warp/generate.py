@@ -12,7 +12,8 @@ Command: python -m xew.sim_warp.generate --batch 256 [--tasks … --robots … -
 import os
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -29,7 +30,7 @@ from xew.sim_warp.produce import Job, produce
 from xew.sim_warp.render import Renderer
 from xew.sim_warp.robots import ROBOTS, get_robot
 from xew.sim_warp.tasks import TASKS, get_task
-from xew.sim_warp.workers import in_processes
+from xew.sim_warp.workers import Workers
 
 TRIES_PER_SEED = 3
 SPARE_TRIES = 20
@@ -105,34 +106,34 @@ class Family:
         return all(record.success for record in self.done[seed].values())
 
 
-class Maker:
-    """Runs jobs on the device at hand: worker processes on a CPU, large batches on a GPU."""
+Made = tuple[list[Record], float]
+"""Records of one job, and the seconds spent on it."""
 
-    def __init__(self, args: Args) -> None:
-        self.args = args
-        self.device = wp.get_device(args.device)
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[list[Record], float]]:
-        """Records of each job, as they come, with the seconds spent on it."""
-        if self.device.is_cuda:
-            yield from self._in_batches(jobs)
-        else:
-            yield from in_processes(partial(_one, out=self.args.out), jobs, self.args.workers)
+@contextmanager
+def maker(args: Args) -> Iterator[Callable[[Sequence[Job]], Iterator[Made]]]:
+    """What runs jobs on the device at hand: worker processes on a CPU, large batches on a GPU."""
+    device = wp.get_device(args.device)
+    if device.is_cuda:
+        yield partial(_in_batches, args=args, renderer=Renderer(device.alias))
+    else:
+        with Workers(args.workers) as workers:
+            yield partial(workers.run, partial(_one, out=args.out))
 
-    def _in_batches(self, jobs: Sequence[Job]) -> Iterator[tuple[list[Record], float]]:
-        renderer = Renderer(self.device.alias)
-        size = max(1, self.args.batch // len(self.args.robots))
-        for start in range(0, len(jobs), size):
-            begin = time.perf_counter()
-            batch = produce(jobs[start : start + size], self.args.out, renderer, self.device.alias)
-            seconds = (time.perf_counter() - begin) / len(batch)
-            yield from ((records, seconds) for records in batch)
+
+def _in_batches(jobs: Sequence[Job], args: Args, renderer: Renderer) -> Iterator[Made]:
+    size = max(1, args.batch // len(args.robots))
+    for start in range(0, len(jobs), size):
+        begin = time.perf_counter()
+        batch = produce(jobs[start : start + size], args.out, renderer, renderer.device.alias)
+        seconds = (time.perf_counter() - begin) / len(batch)
+        yield from ((records, seconds) for records in batch)
 
 
 _worker_renderer: list[Renderer] = []
 
 
-def _one(job: Job, out: Path) -> tuple[list[Record], float]:
+def _one(job: Job, out: Path) -> Made:
     """One job in a worker process, which keeps its renderer."""
     if not _worker_renderer:
         _worker_renderer.append(Renderer("cpu"))
@@ -153,11 +154,11 @@ def generate(args: Args) -> list[Family]:
     _read_existing(families, args.out)
     spent: dict[str, float] = defaultdict(float)
     frames: Counter[str] = Counter()
-    maker = Maker(args)
     total = sum(family.wanted for family in families)
-    with tqdm(total=total, initial=sum(f.accepted for f in families), desc="accepted seeds", unit="seed") as bar:
+    bar = tqdm(total=total, initial=sum(f.accepted for f in families), desc="accepted seeds", unit="seed")
+    with bar, maker(args) as make:
         while jobs := {(family.task, job.seed): (family, job) for family in families for job in family.next_jobs()}:
-            for records, seconds in maker.run([job for _, job in jobs.values()]):
+            for records, seconds in make([job for _, job in jobs.values()]):
                 family, _ = jobs[records[0].task, records[0].seed]
                 for record in records:
                     family.add(record)
@@ -209,7 +210,7 @@ def _print_speed(frames: Counter[str], spent: dict[str, float]) -> None:
 
 def yield_table(records: Sequence[Record]) -> str:
     """A line per task and robot: cells tried, succeeded, why not, and frames; then a line per task of accepted seeds."""
-    lines = [f"{'task':<24}{'robot':<16}{'tried':>6}{'succeeded':>11}{'frames':>8}  reasons"]
+    lines = [f"{'task':<24} {'robot':<16} {'tried':>6}{'succeeded':>11}{'frames':>8}  reasons"]
     cells: dict[tuple[str, str], list[Record]] = defaultdict(list)
     seeds: dict[str, dict[int, bool]] = defaultdict(dict)
     for record in records:
@@ -221,9 +222,9 @@ def yield_table(records: Sequence[Record]) -> str:
         reasons = Counter(record.failure for record in tried if not record.success)
         told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
         share = f"{len(good)} ({100 * len(good) / len(tried):.0f} %)"
-        lines.append(f"{task:<24}{robot:<16}{len(tried):>6}{share:>11}{frames:>8}  {told}")
+        lines.append(f"{task:<24} {robot:<16} {len(tried):>6}{share:>11}{frames:>8}  {told}")
     for task, accepted in sorted(seeds.items()):
-        lines.append(f"{task:<24}all robots together: {sum(accepted.values())} of {len(accepted)} seeds accepted")
+        lines.append(f"{task:<24} all robots together: {sum(accepted.values())} of {len(accepted)} seeds accepted")
     return "\n".join(lines)
 
 

@@ -21,28 +21,40 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
-def in_processes(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
-    """Results of `function` on every job, in the order in which they are done.
+class Workers:
+    """Processes that are started as they are needed and stay until the end of a `with` block."""
 
-    Raises:
-        EpisodeError: a worker was killed.
-    """
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # a worker is a core; more threads would wait for one another
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(max(1, min(workers, len(jobs))), context, initializer=_become_worker) as pool:
+    def __init__(self, count: int) -> None:
+        os.environ.setdefault("OMP_NUM_THREADS", "1")  # a worker is a core; more threads would wait for one another
+        context = multiprocessing.get_context("spawn")
+        self._pool = ProcessPoolExecutor(max(1, count), context, initializer=_become_worker)
+        self._has_compiled = False
+
+    def __enter__(self) -> "Workers":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+    def run(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[Result]:
+        """Results of `function` on every job, in the order in which they are done.
+
+        Raises:
+            EpisodeError: a worker was killed.
+        """
+        # The first of all is done alone, so that Warp compiles its kernels once and not in every worker.
+        alone = 0 if self._has_compiled else 1
         try:
-            # Alone, so that Warp compiles its kernels once and not in every worker.
-            yield from (pool.submit(function, job).result() for job in jobs[:1])
-            for future in as_completed([pool.submit(function, job) for job in jobs[1:]]):
+            for job in jobs[:alone]:
+                yield self._pool.submit(function, job).result()
+                self._has_compiled = True
+            for future in as_completed([self._pool.submit(function, job) for job in jobs[alone:]]):
                 yield future.result()
         except BrokenProcessPool as error:
             raise EpisodeError(
                 "a worker process was killed, perhaps for want of memory. What is done is kept: give the command again, "
                 "with fewer --workers if it happens again."
             ) from error
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
 
 
 def _become_worker() -> None:

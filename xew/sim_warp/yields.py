@@ -26,7 +26,7 @@ from xew.episode import EpisodeError, Record
 from xew.sim_warp.produce import Job, header, plan_cells, simulate_cells
 from xew.sim_warp.robots import ROBOTS, get_robot
 from xew.sim_warp.tasks import TASKS, Task, get_task
-from xew.sim_warp.workers import in_processes
+from xew.sim_warp.workers import Workers
 
 PARTS = ("Task", "Randomisation", "Success", "After")
 """How the paragraphs of a task's module docstring begin."""
@@ -71,7 +71,8 @@ def attempts(args: Args) -> Iterator[list[Record]]:
         raise EpisodeError("nothing to try: name at least one task and one robot, and --seeds of at least 1.")
     device = wp.get_device(args.device)
     if not device.is_cuda:
-        yield from in_processes(attempt, jobs, args.workers)
+        with Workers(args.workers) as workers:
+            yield from workers.run(attempt, jobs)
         return
     size = max(1, args.batch // len(robots))
     for start in range(0, len(jobs), size):

@@ -1,0 +1,244 @@
+"""The command that makes data: counts, resumes, and tells what is wrong; runs in worker processes as a user's would."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.sim_warp.small import SLOW, TASK
+from xew.config import ConfigError
+from xew.episode import EpisodeError, Record, episode_folder, find_accepted, find_records, verify_episode
+from xew.protocol import TEST_SEED_START
+from xew.sim_warp import generate as command
+from xew.sim_warp.generate import Args, Family, generate, main, yield_table
+from xew.sim_warp.produce import Job, produce
+from xew.sim_warp.render import Renderer
+from xew.sim_warp.workers import Workers
+
+ROOT = Path(__file__).parents[2]
+ROBOTS = ("franka_panda", SLOW)
+FLAGS = ("--tasks", TASK, "--robots", *ROBOTS, "--train-seeds", "3", "--test-seeds", "1", "--device", "cpu")
+ACCEPTED = (0, 2, 4, TEST_SEED_START)
+"""The slow robot cannot do odd seeds: three training seeds are had at the fifth try."""
+REJECTED = (1, 3)
+
+
+def arguments(out: Path, workers: int = 2) -> Args:
+    return Args(tasks=(TASK,), robots=ROBOTS, train_seeds=3, test_seeds=1, out=out, workers=workers, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("undisturbed")
+    families = generate(arguments(out))
+    assert [family.accepted for family in families] == [3, 1]
+    return out
+
+
+def contents(out: Path) -> dict[str, tuple[Record, list[str]]]:
+    """All cells with their headers and names of files; nothing else may lie in the tree."""
+    cells = {str(folder.relative_to(out)): (record, sorted(os.listdir(folder))) for folder, record in find_records(out)}
+    assert len(cells) == len(list(out.glob("*/*/*"))), "left-overs"
+    return cells
+
+
+def test_seeds_are_tried_until_enough_are_accepted(undisturbed: Path) -> None:
+    records = [record for _, record in find_records(undisturbed)]
+    assert {record.seed for record in records} == {*ACCEPTED, *REJECTED}
+    assert {record.seed for _, record in find_accepted(undisturbed)} == set(ACCEPTED)
+    assert len(records) == len(ROBOTS) * 6
+    for folder, record in find_accepted(undisturbed):
+        assert verify_episode(folder) == record and set(record.hashes) == {"states", "rgb", "robot"}
+
+
+def test_what_was_rejected_is_on_record_with_its_reason(undisturbed: Path) -> None:
+    failed = [record for _, record in find_records(undisturbed) if not record.success]
+    assert [(record.seed, record.robot, record.failure) for record in failed] == [(seed, SLOW, "plan") for seed in REJECTED]
+    lines = yield_table([record for _, record in find_records(undisturbed)]).splitlines()
+    assert lines[1].split()[1:] == ["franka_panda", "6", "6", "(100", "%)", "12"]
+    assert lines[2].split()[1:] == [SLOW, "6", "4", "(67", "%)", "12", "plan", "2"]
+    assert lines[3].endswith("all robots together: 4 of 6 seeds accepted")
+
+
+def test_neither_workers_nor_batches_change_a_byte(undisturbed: Path, tmp_path: Path) -> None:
+    jobs = [Job(TASK, seed, ROBOTS) for seed in (4, 1, TEST_SEED_START)]
+    produce(jobs, tmp_path, Renderer("cpu"), "cpu")
+    found, expected = contents(tmp_path), contents(undisturbed)
+    assert len(found) == 6 and all(expected[name] == cell for name, cell in found.items())
+
+
+def test_what_is_there_is_not_made_again(undisturbed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def none(*args: object, **kwargs: object) -> None:
+        raise AssertionError("nothing was missing")
+
+    monkeypatch.setattr(command.Workers, "run", none)
+    assert [family.accepted for family in generate(arguments(undisturbed))] == [3, 1]
+
+
+def test_what_is_deleted_is_made_again(undisturbed: Path, tmp_path: Path) -> None:
+    """A cell of an accepted seed, the failed one of a rejected seed, and the good one of another."""
+    out = tmp_path / "data"
+    shutil.copytree(undisturbed, out)
+    for seed, robot in ((2, SLOW), (1, SLOW), (3, "franka_panda")):
+        shutil.rmtree(episode_folder(out, TASK, seed, robot))
+    left_over = episode_folder(out, TASK, 0, ".writing-abc")
+    left_over.mkdir()
+    generate(arguments(out, workers=1))
+    assert contents(out) == contents(undisturbed)
+
+
+def test_a_run_killed_in_the_middle_is_taken_up_again(undisturbed: Path, tmp_path: Path) -> None:
+    run = subprocess.Popen(
+        [sys.executable, "-m", "xew.sim_warp.generate", *FLAGS, "--workers", "2", "--out", str(tmp_path)],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+    )  # fmt: skip
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("*/*/[!.]*/episode.json")):
+        assert time.monotonic() < deadline and run.poll() is None, run.communicate()[0]
+        time.sleep(0.01)
+    run.send_signal(signal.SIGKILL)
+    run.communicate()  # the pipe ends when the last worker has gone
+    assert not alive(run.pid), "workers outlive their parent"
+    assert 0 < len(list(find_records(tmp_path))) < len(contents(undisturbed))
+    generate(arguments(tmp_path, workers=1))
+    assert contents(tmp_path) == contents(undisturbed)
+
+
+def alive(session: int) -> list[str]:
+    """Commands of the processes of a session that still run."""
+    listed = subprocess.run(["ps", "-o", "stat=,args=", "-s", str(session)], capture_output=True, text=True)
+    return [line for line in listed.stdout.splitlines() if not line.startswith("Z")]
+
+
+# --- What is told to a user.
+
+
+def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, *flags: str) -> str:
+    """What the command says when it refuses: one line, exit code 2."""
+    monkeypatch.setattr(sys, "argv", ["generate", *flags])
+    with pytest.raises(SystemExit) as left:
+        main()
+    assert left.value.code == 2
+    return capsys.readouterr().err.strip().splitlines()[-1]
+
+
+def test_a_full_disk_in_a_worker_is_one_line(tmp_path: Path) -> None:
+    """A limit on the size of files stands for the disk; the video of twelve frames is larger."""
+    limited = f"ulimit -f 20; exec {sys.executable} -m xew.sim_warp.generate " + " ".join([*FLAGS, "--out", str(tmp_path)])
+    run = subprocess.run(["bash", "-c", f"trap '' XFSZ; {limited}"], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 2 and "Traceback" not in run.stderr, run.stderr
+    assert "cannot write the episode" in run.stderr and "Free some space or choose another --out" in run.stderr
+    assert not list(tmp_path.glob("*/*/*"))
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--tasks", "grab_rollers"), "error: unknown task 'grab_rollers'; did you mean 'grab_roller'?"),
+        (("--robots", "panda"), "error: unknown robot 'panda';"),
+        (("--robots", "tests.sim_warp.small:CLOSE"), "is a Task; expected a RobotSpec"),
+        (("--train-seeds", "-1"), "error: nothing to make of 6 tasks, 5 robots, -1 training"),
+        (("--batch", "0"), "batches from 1"),
+    ],
+)
+def test_mistakes_are_told_in_a_line(
+    flags: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    assert message in refused(monkeypatch, capsys, *flags, "--out", str(tmp_path / "data"))
+
+
+def test_a_file_for_a_folder_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "data").write_text("a file")
+    line = refused(monkeypatch, capsys, *FLAGS, "--out", str(tmp_path / "data"))
+    assert line == f"error: cannot write to {tmp_path / 'data'}: File exists. Choose another folder with --out."
+    line = refused(monkeypatch, capsys, *FLAGS, "--out", str(tmp_path / "data" / "below"))
+    assert "Not a directory. Choose another folder with --out." in line
+
+
+def test_a_damaged_header_is_told_before_any_work(
+    undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    out = tmp_path / "data"
+    shutil.copytree(undisturbed, out)
+    broken = episode_folder(out, TASK, 2, SLOW) / "episode.json"
+    broken.write_text(broken.read_text()[:100])
+    line = refused(monkeypatch, capsys, *FLAGS, "--out", str(out))
+    assert line.startswith(f"error: {broken} is damaged") and "delete its folder and run generate again" in line
+    shutil.rmtree(broken.parent)
+    broken.parent.with_name("franka_panda").rename(broken.parent)
+    assert "move or delete it" in refused(monkeypatch, capsys, *FLAGS, "--out", str(out))
+
+
+# --- Families: which seeds are tried.
+
+
+def outcome(seed: int, robot: str, success: bool = True, pictures: bool = True) -> Record:
+    return Record("task", seed, robot, success, hashes={"rgb": "0"} if success and pictures else {})
+
+
+def family(wanted: int, *records: Record) -> Family:
+    made = Family("task", 10, wanted, ("a", "b"))
+    for record in records:
+        made.add(record)
+    return made
+
+
+def test_as_many_seeds_are_tried_as_could_be_accepted() -> None:
+    assert [job.seed for job in family(2).next_jobs()] == [10, 11]
+    assert family(0).next_jobs() == []
+    tried = family(2, outcome(10, "a", pictures=False), outcome(10, "b", success=False), outcome(11, "a"), outcome(11, "b"))
+    assert tried.accepted == 1 and tried.next_jobs() == [Job("task", 12, ("a", "b"))]
+
+
+def test_only_what_is_missing_is_made() -> None:
+    assert family(1, outcome(10, "a")).next_jobs() == [Job("task", 10, ("b",))]
+    rejected = family(1, outcome(10, "a", success=False))
+    assert rejected.next_jobs() == [Job("task", 10, ("b",), rejected=True), Job("task", 11, ("a", "b"))]
+    without_pictures = family(1, outcome(10, "a", pictures=False))
+    assert without_pictures.accepted == 0 and without_pictures.next_jobs() == [Job("task", 10, ("a", "b"))]
+
+
+def test_a_robot_added_later_can_undo_an_accepted_seed() -> None:
+    added = replace(family(1, outcome(10, "a"), outcome(10, "b")), robots=("a", "b", "c"))
+    assert added.next_jobs() == [Job("task", 10, ("c",))]
+    added.add(outcome(10, "c", success=False))
+    assert added.accepted == 0 and added.next_jobs() == [Job("task", 11, ("a", "b", "c"))]
+
+
+def test_a_hopeless_task_gives_up_and_says_so() -> None:
+    hopeless = family(1)
+    rounds = 0
+    while jobs := hopeless.next_jobs():
+        rounds += 1
+        for job in jobs:
+            hopeless.add(outcome(job.seed, "a", success=False))
+            hopeless.add(outcome(job.seed, "b", pictures=False))
+    assert rounds == len(hopeless.tries) == 23
+    with pytest.raises(EpisodeError, match="task: only 0 of 1 seeds were accepted in 23 tries"):
+        command._demand_enough([family(0), hopeless])
+
+
+# --- Worker processes.
+
+
+def half(number: int) -> int:
+    if number == 13:
+        raise ConfigError("thirteen")
+    if number == 17:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number // 2
+
+
+def test_workers_hand_over_results_and_errors() -> None:
+    with Workers(2) as workers:
+        assert sorted(workers.run(half, [2, 4, 6])) == [1, 2, 3]
+        with pytest.raises(ConfigError, match="thirteen"):
+            list(workers.run(half, [13]))
+        with pytest.raises(EpisodeError, match=r"a worker process was killed.*What is done is kept"):
+            list(workers.run(half, [2, 17, 4]))
