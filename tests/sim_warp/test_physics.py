@@ -27,7 +27,7 @@ from xew.sim_warp.physics import (
     template_joints,
 )
 from xew.sim_warp.plan import HOME, LEFT, RIGHT, Timeline
-from xew.sim_warp.produce import DEEPEST_OVERLAP, Cell, Job, failure, plan_cells
+from xew.sim_warp.produce import DEEPEST_OVERLAP, Cell, Job, plan_cells
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.robots.spec import RobotSpec
 from xew.sim_warp.scene import Scene, scene_rng
@@ -142,7 +142,7 @@ def test_a_hand_driven_into_the_table_is_seen() -> None:
     timeline.follow(LEFT, [HOME[LEFT].moved(z=-0.22)], seconds=1.2)
     cell = driven(ROBOTS["franka_panda"], timeline)
     assert cell.moved.arm_overlap > DEEPEST_OVERLAP
-    reason, words = failure(cell) or ("", "")
+    reason, words = cell.failure or ("", "")
     assert reason == "plan" and "into the table or the other arm" in words
 
 

@@ -9,7 +9,7 @@ import pytest
 from xew.config import ConfigError
 from xew.episode import FAILURES, Record
 from xew.sim_warp.plan import LEFT, RIGHT
-from xew.sim_warp.produce import Cell, Job, failure, moment, plan_cells, simulate_cells
+from xew.sim_warp.produce import Cell, Job, moment, plan_cells, simulate_cells
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.scene import Scene, scene_rng
 from xew.sim_warp.tasks import TASKS, get_task
@@ -37,7 +37,7 @@ def at(cell: Cell, frame: int) -> Moment:
 @pytest.mark.parametrize("name", TASKS)
 def test_an_expert_turns_failure_into_success(name: str, solved: dict[str, Cell]) -> None:
     cell = solved[name]
-    assert failure(cell) is None
+    assert cell.failure is None
     assert not cell.task.success(cell.scene, at(cell, 0))
     assert cell.task.success(cell.scene, at(cell, -1))
 
@@ -60,7 +60,7 @@ def test_an_expert_that_closes_no_hand_is_told_so(name: str, solved: dict[str, C
         field: np.repeat(getattr(cell.moved, field)[:1], cell.path.frame_count, 0) for field in ("object_pose", "object_joint")
     }
     idle = replace(cell, motion=replace(cell.moved, **still, contact=np.zeros_like(cell.moved.contact)))
-    reason, words = failure(idle) or ("", "")
+    reason, words = idle.failure or ("", "")
     assert reason == "grasp" and reason in FAILURES and "never touched" in words
 
 
@@ -71,16 +71,16 @@ def test_what_is_lost_on_the_way_is_a_slip(solved: dict[str, Cell]) -> None:
     contact[int(hold.end * cell.path.frame_rate) - 12 :] = False
     pose = np.repeat(cell.moved.object_pose[:1], cell.path.frame_count, 0)
     lost = replace(cell, motion=replace(cell.moved, contact=contact, object_pose=pose))
-    assert failure(lost) == ("slip", f"the {('left', 'right')[hold.arm]} hand lost the cup")
+    assert lost.failure == ("slip", f"the {('left', 'right')[hold.arm]} hand lost the cup")
 
 
 def test_an_overflow_and_an_early_success_are_told(solved: dict[str, Cell]) -> None:
     cell = solved["grab_roller"]
-    assert (failure(replace(cell, motion=replace(cell.moved, overflow=True))) or ("",))[0] == "overflow"
+    assert (replace(cell, motion=replace(cell.moved, overflow=True)).failure or ("",))[0] == "overflow"
     early = replace(cell, task=replace(cell.task, success=lambda scene, now: True))
-    assert failure(early) == ("plan", "the scene is solved before it begins")
+    assert early.failure == ("plan", "the scene is solved before it begins")
     late = replace(cell, task=replace(cell.task, success=lambda scene, now: False))
-    assert (failure(late) or ("",))[0] == "timeout"
+    assert (late.failure or ("",))[0] == "timeout"
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -11,6 +11,7 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
 
@@ -82,10 +83,15 @@ class Cell:
         assert self.motion is not None, f"{self.robot.key} cannot follow the plan of {self.scene.task}/{self.scene.seed}"
         return self.motion
 
-    @property
+    @cached_property
     def tool_pose(self) -> np.ndarray:
         """[t 2 7] measured tool poses, world."""
         return measured_tools(self.robot, self.moved.joint_pos)
+
+    @cached_property
+    def failure(self) -> tuple[str, str] | None:
+        """Why it does not count: one of `episode.FAILURES` and a sentence; None if it succeeded."""
+        return _failure(self)
 
 
 Pixels = tuple[Observation, np.ndarray]
@@ -113,7 +119,7 @@ def produce(jobs: Sequence[Job], out: Path, renderer: Renderer, device: str | No
 
 
 def _accepted(cells: Sequence[Cell], rejected: set[tuple[str, int]]) -> bool:
-    return not any((cell.task_name, cell.scene.seed) in rejected or failure(cell) for cell in cells)
+    return not any((cell.task_name, cell.scene.seed) in rejected or cell.failure for cell in cells)
 
 
 def _groups(seeds: list[list[Cell]]) -> Iterator[list[list[Cell]]]:
@@ -169,8 +175,7 @@ def moment(action: np.ndarray, motion: Motion, tools: np.ndarray, frame: int) ->
     return Moment(motion.object_pose[frame], motion.object_joint[frame], tools[frame], gripper, motion.contact[frame])
 
 
-def failure(cell: Cell) -> tuple[str, str] | None:
-    """Why a cell does not count: one of `episode.FAILURES` and a sentence; None if it succeeded."""
+def _failure(cell: Cell) -> tuple[str, str] | None:
     if cell.commands.problem is not None:
         return "plan", cell.commands.problem
     motion = cell.moved
@@ -219,7 +224,7 @@ def _write(cell: Cell, pixels: Pixels | None, out: Path, device: wp.Device) -> R
 
 def header(cell: Cell, device: wp.Device) -> Record:
     """What is known of a cell but its hashes: who, how long, success or the reason of failure."""
-    reason, detail = failure(cell) or (None, "")
+    reason, detail = cell.failure or (None, "")
     return Record(
         task=cell.task_name,
         seed=cell.scene.seed,
@@ -232,9 +237,14 @@ def header(cell: Cell, device: wp.Device) -> Record:
         object_names=cell.scene.names,
         keypoint_names=keypoint_names(cell.robot),
         scene_hash=scene_hash(cell.scene),
-        versions={"xew": xew.__version__} | {name: version(name) for name in ("newton", "mujoco", "mujoco-warp", "warp-lang")},
+        versions=_versions(),
         device=device.name,
     )
+
+
+@cache
+def _versions() -> dict[str, str]:
+    return {"xew": xew.__version__} | {name: version(name) for name in ("newton", "mujoco", "mujoco-warp", "warp-lang")}
 
 
 def _states(cell: Cell, view: Observation) -> States:

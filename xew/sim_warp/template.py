@@ -10,6 +10,8 @@ gravity and without a shape, below the table.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 import newton
 import numpy as np
@@ -72,9 +74,10 @@ class RigidGroup:
     """(name, points [k 3])."""
 
 
-def arm_groups(urdf: Urdf, arm: Arm) -> tuple[list[RigidGroup], list[RigidGroup]]:
+@lru_cache(maxsize=64)
+def arm_groups(path: Path, arm: Arm) -> tuple[list[RigidGroup], list[RigidGroup]]:
     """The rigid groups of an arm's revolute joints, base outwards, and those of its two fingers."""
-    moving = [*arm.joints, *arm.fingers]
+    urdf, moving = load_urdf(path), [*arm.joints, *arm.fingers]
     groups = {name: _rigid_group(urdf, urdf.joints[name], moving) for name in moving}
     return [groups[name] for name in arm.joints], [groups[name] for name in arm.fingers]
 
@@ -146,13 +149,13 @@ def add_world(builder: newton.ModelBuilder, robot: RobotSpec, scene: Scene) -> N
     """Append one world of the template: `robot` before `scene`."""
     builder.begin_world(label=f"{scene.task}/{scene.seed}/{robot.key}")
     for side, arm in zip(SIDES, robot.arms, strict=True):
-        _add_arm(builder, side, arm, load_urdf(robot.urdf))
+        _add_arm(builder, side, arm, robot.urdf)
     _add_objects(builder, scene)
     builder.end_world()
 
 
-def _add_arm(builder: newton.ModelBuilder, side: str, arm: Arm, urdf: Urdf) -> None:
-    links, fingers = arm_groups(urdf, arm)
+def _add_arm(builder: newton.ModelBuilder, side: str, arm: Arm, path: Path) -> None:
+    links, fingers = arm_groups(path, arm)
     root = wp.transform(*arm.root_pose)
     joints, parent = [], -1
     for number, group in enumerate(links, 1):
@@ -339,14 +342,20 @@ def _add_hinge_slot(builder: newton.ModelBuilder, thing: SceneObject | None, sce
 
 
 def _add_hull(builder: newton.ModelBuilder, body: int, points: np.ndarray, friction: float, group: int, label: str) -> None:
-    hull = trimesh.convex.convex_hull(np.asarray(points, float))
     builder.add_shape_convex_hull(
         body,
-        mesh=newton.Mesh(hull.vertices.astype(np.float32), hull.faces.flatten().astype(np.int32), compute_inertia=False),
+        mesh=_hull(np.asarray(points, np.float32).tobytes()),
         cfg=newton.ModelBuilder.ShapeConfig(mu=friction, density=0.0, gap=0.0, collision_group=group),
         label=label,
         custom_attributes={"mujoco:condim": 4},
     )
+
+
+@lru_cache(maxsize=4096)
+def _hull(points: bytes) -> newton.Mesh:
+    """The convex hull of float32 points [k 3]; a batch holds the same links hundreds of times."""
+    hull = trimesh.convex.convex_hull(np.frombuffer(points, np.float32).reshape(-1, 3).astype(float))
+    return newton.Mesh(hull.vertices.astype(np.float32), hull.faces.flatten().astype(np.int32), compute_inertia=False)
 
 
 def _transform(matrix: np.ndarray) -> wp.transform:
