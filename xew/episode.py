@@ -254,11 +254,16 @@ def verify_episode(folder: Path) -> Record:
     return record
 
 
+def find_folders(data: Path) -> list[Path]:
+    """Folders of all cells of a data set, sorted by task, seed, robot. They are the index."""
+    folders = (path.parent for path in Path(data).glob("*/*/*/episode.json"))
+    return sorted(folder for folder in folders if not folder.name.startswith(_TEMPORARY))
+
+
 def find_records(data: Path) -> Iterator[tuple[Path, Record]]:
-    """All cells of a data set, accepted or not, sorted by task, seed, robot. The folders are the index."""
-    for path in sorted(Path(data).glob("*/*/*/episode.json")):
-        if not path.parent.name.startswith(_TEMPORARY):
-            yield path.parent, read_record(path.parent)
+    """All cells of a data set with their headers, accepted or not. Raises EpisodeError at a damaged header."""
+    for folder in find_folders(data):
+        yield folder, read_record(folder)
 
 
 def find_accepted(data: Path) -> list[tuple[Path, Record]]:

@@ -18,7 +18,7 @@ import tyro
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.episode import EpisodeError, Record, find_records, read_states, read_video, verify_episode
+from xew.episode import EpisodeError, Record, find_folders, read_record, read_states, read_video, verify_episode
 from xew.sim_warp.generate import yield_table
 from xew.sim_warp.produce import render_again
 from xew.sim_warp.render import Renderer
@@ -47,39 +47,54 @@ class Args:
 @user_errors
 def main() -> None:
     args = tyro.cli(Args, description=__doc__)
-    cells = list(find_records(args.data))
-    if not cells:
-        raise EpisodeError(f"no episode under {args.data}; make some: python -m xew.sim_warp.generate --out {args.data}")
+    cells, damaged = read_headers(args.data)
     print(yield_table([record for _, record in cells]))
     for folder, record in cells:
         if not record.success:
             print(f"{folder}: {record.failure}: {record.failure_detail}")
     pictured = [(folder, record) for folder, record in cells if record.hashes]
     if args.verify:
-        verify([folder for folder, _ in pictured])
+        damaged += verify([folder for folder, _ in pictured])
+    if damaged:
+        raise EpisodeError("\n".join([*damaged, f"{len(damaged)} damaged."]))
+    if not pictured and (args.rerender or args.pictures):
+        raise EpisodeError(f"no seed under {args.data} is accepted, so there is nothing to render or draw.")
     if args.rerender:
         rerender([folder for folder, _ in pictured], args.rerender)
     if args.pictures:
         draw(pictured, args.pictures, args.seeds)
 
 
-def verify(folders: list[Path]) -> None:
-    """Compare all files with their hashes; names every damaged episode, then fails if there was one."""
+def read_headers(data: Path) -> tuple[list[tuple[Path, Record]], list[str]]:
+    """All cells whose headers can be read, and what is wrong with the others. Raises EpisodeError if there is no cell."""
+    cells: list[tuple[Path, Record]] = []
+    damaged: list[str] = []
+    for folder in find_folders(data):
+        try:
+            cells.append((folder, read_record(folder)))
+        except EpisodeError as error:
+            damaged.append(str(error))
+    if not cells and not damaged:
+        raise EpisodeError(f"no episode under {data}; make some: python -m xew.sim_warp.generate --out {data}")
+    return cells, damaged
+
+
+def verify(folders: list[Path]) -> list[str]:
+    """Compare all files with their hashes; what is wrong with which episode."""
     damaged = []
     for folder in tqdm(folders, desc="verifying", unit="episode"):
         try:
             verify_episode(folder)
         except EpisodeError as error:
             damaged.append(str(error))
-    if damaged:
-        raise EpisodeError("\n".join([*damaged, f"{len(damaged)} of {len(folders)} episodes are damaged."]))
-    print(f"{len(folders)} episodes agree with their hashes")
+    print(f"{len(folders) - len(damaged)} of {len(folders)} episodes agree with their hashes")
+    return damaged
 
 
 def rerender(folders: list[Path], count: int) -> None:
     """Render some episodes again, spread over the data set."""
     renderer = Renderer()
-    chosen = [folders[index] for index in np.unique(np.linspace(0, len(folders) - 1, count).astype(int))]
+    chosen = [folders[index] for index in np.unique(np.linspace(0, len(folders) - 1, max(1, count)).astype(int))]
     for folder in tqdm(chosen, desc="rendering again", unit="episode"):
         render_again(folder, renderer)
     print(f"{len(chosen)} episodes rendered again from their states agree with their hashes")
@@ -90,7 +105,10 @@ def draw(cells: list[tuple[Path, Record]], out: Path, seeds: int) -> None:
     by_task: dict[str, dict[int, list[tuple[Path, Record]]]] = defaultdict(lambda: defaultdict(list))
     for folder, record in cells:
         by_task[record.task][record.seed].append((folder, record))
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise EpisodeError(f"cannot write to {out}: {error.strerror}. Choose another folder with --pictures.") from error
     for task, of_task in tqdm(by_task.items(), desc="drawing", unit="task"):
         for seed in sorted(of_task)[:seeds]:
             save_png(out / f"{task}_{seed}.png", contact_sheet([folder for folder, _ in of_task[seed]]))

@@ -1,0 +1,116 @@
+"""The command that looks into data: yields, hashes, rendering again, pictures."""
+
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.sim_warp.small import SLOW, TASK
+from xew.episode import episode_folder
+from xew.sim_warp.inspect import GAP, SHEET_TIMES, STRIP_FRAMES, contact_sheet, main, strip, tiled
+from xew.sim_warp.produce import Job, produce
+from xew.sim_warp.render import Renderer
+
+ROBOTS = ("franka_panda", SLOW)
+Inspect = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One accepted seed and one rejected."""
+    out = tmp_path_factory.mktemp("data")
+    produce([Job(TASK, seed, ROBOTS) for seed in (0, 1)], out, Renderer("cpu"), "cpu")
+    return out
+
+
+@pytest.fixture
+def data(made: Path, tmp_path: Path) -> Path:
+    """A copy to damage."""
+    return Path(shutil.copytree(made, tmp_path / "data"))
+
+
+@pytest.fixture
+def inspect(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> Inspect:
+    """Give the command; exit code, standard output, what was told as error."""
+
+    def run(*flags: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["inspect", *map(str, flags)])
+        code = 0
+        try:
+            main()
+        except SystemExit as left:
+            code = int(left.code or 0)
+        told = capsys.readouterr()
+        return code, told.out, told.err[told.err.find("error: ") :] if "error: " in told.err else ""
+
+    return run
+
+
+def test_yields_and_reasons_are_told(made: Path, inspect: Inspect) -> None:
+    code, out, _ = inspect(made)
+    assert code == 0 and "all robots together: 1 of 2 seeds accepted" in out
+    assert f"{episode_folder(made, TASK, 1, SLOW)}: plan: left joint" in out
+
+
+def test_sound_data_is_verified_and_rendered_again(made: Path, inspect: Inspect) -> None:
+    code, out, _ = inspect(made, "--verify", "--rerender", 5)
+    assert code == 0
+    assert "2 of 2 episodes agree with their hashes" in out
+    assert "2 episodes rendered again from their states agree with their hashes" in out
+
+
+def test_every_damaged_episode_is_named(data: Path, inspect: Inspect) -> None:
+    panda, piper = (episode_folder(data, TASK, 0, robot) for robot in ROBOTS)
+    content = bytearray((panda / "rgb.mkv").read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    (panda / "rgb.mkv").write_bytes(content)
+    (piper / "states.npz").write_bytes((piper / "states.npz").read_bytes()[:-100])
+    broken = episode_folder(data, TASK, 1, SLOW) / "episode.json"
+    broken.write_text("{")
+    code, out, told = inspect(data, "--verify")
+    assert code == 2 and "0 of 2 episodes agree" in out
+    assert f"{panda}: rgb has hash" in told or f"{panda / 'rgb.mkv'} is missing or holds no readable frame" in told
+    assert f"{piper / 'states.npz'} is damaged" in told and f"{broken} is damaged" in told
+    assert told.strip().endswith("3 damaged.") and "Traceback" not in told
+
+
+def test_altered_states_do_not_pass_for_the_rendered_ones(data: Path, inspect: Inspect) -> None:
+    """A header that was made to agree with altered pixels fails when they are rendered again."""
+    panda, piper = (episode_folder(data, TASK, 0, robot) for robot in ROBOTS)
+    for name in ("rgb.mkv", "episode.json"):
+        shutil.copy(piper / name, panda / name)
+    code, _, told = inspect(data, "--rerender", 2)
+    assert code == 2 and "rendered again on CPU" in told
+
+
+def test_pictures_are_drawn(made: Path, tmp_path: Path, inspect: Inspect) -> None:
+    assert inspect(made, "--pictures", tmp_path / "sheets")[0] == 0
+    names = sorted(path.name for path in (tmp_path / "sheets").iterdir())
+    assert names == sorted([f"{TASK}_0.png", *(f"{TASK}_0_{robot}.png" for robot in ROBOTS)])
+    sheet = cv2.imread(str(tmp_path / "sheets" / f"{TASK}_0.png"))
+    assert sheet.shape == (len(ROBOTS) * (240 + GAP), len(SHEET_TIMES) * (320 + GAP), 3)
+    folders = [episode_folder(made, TASK, 0, robot) for robot in ROBOTS]
+    np.testing.assert_array_equal(sheet[..., ::-1], contact_sheet(folders))
+    assert strip(folders[0]).shape == (2 * (240 + GAP), STRIP_FRAMES * (320 + GAP), 3)
+
+
+def test_tiles_lie_in_rows_with_white_between() -> None:
+    red, blue = (np.full((2, 3, 3), color, np.uint8) for color in ((255, 0, 0), (0, 0, 255)))
+    picture = tiled([[red, blue]])
+    assert (picture[:2, :3] == [255, 0, 0]).all() and (picture[:2, 3 + GAP : 6 + GAP] == [0, 0, 255]).all()
+    assert (picture[2:] == 255).all() and (picture[:, 3 : 3 + GAP] == 255).all()
+
+
+def test_nothing_there_is_told_with_the_way_to_make_it(made: Path, data: Path, tmp_path: Path, inspect: Inspect) -> None:
+    code, _, told = inspect(tmp_path / "nowhere")
+    assert code == 2 and "no episode under" in told and "python -m xew.sim_warp.generate --out" in told
+    shutil.rmtree(data / TASK / "0000000")
+    code, _, told = inspect(data, "--rerender", 1)
+    assert code == 2 and "is accepted, so there is nothing to render or draw" in told
+    (tmp_path / "file").write_text("")
+    code, _, told = inspect(made, "--pictures", tmp_path / "file")
+    assert code == 2 and "Choose another folder with --pictures." in told
