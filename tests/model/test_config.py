@@ -1,5 +1,6 @@
 """Configs: strict, with errors that say what to do."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -96,9 +97,12 @@ def test_user_errors_exit_2_without_traceback(capsys: pytest.CaptureFixture[str]
 def test_pick_suggests_and_imports() -> None:
     with pytest.raises(ConfigError, match="did you mean 'mask'"):
         config.pick({"mask": 1, "none": 2}, "maks", "action")
-    assert config.pick({}, "math:tau", "action") > 6
+    registry = {"none": None, "one": 1.0}
+    assert config.pick(registry, "math:tau", "action") == math.tau
     with pytest.raises(ConfigError, match="cannot import the action 'math:taau'"):
-        config.pick({}, "math:taau", "action")
+        config.pick(registry, "math:taau", "action")
+    with pytest.raises(ConfigError, match="'math:sin' is a builtin_function_or_method; expected a float"):
+        config.pick(registry, "math:sin", "action")
 
 
 @pytest.mark.parametrize("path", MODEL_CONFIGS, ids=lambda path: path.stem)

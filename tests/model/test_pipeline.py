@@ -1,7 +1,9 @@
 """Latents, training, resuming and rollouts on synthetic data, end to end and tiny."""
 
 import json
+import os
 import shutil
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from xew.model import latents, rollout, train
 from xew.model.data import ClipSource, fake_batch, make_dataset
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.latents import LatentCache, clip_starts, load_codec, training_episodes
+from xew.model.tensorboard import RunLog
 from xew.protocol import SEEN_ROBOTS
 from xew.rollout import find_rollouts, read_rollout_video
 
@@ -69,6 +72,27 @@ def test_resumed_run_repeats_the_straight_one(world: Path, run: Path) -> None:
     assert lines(out, "train/loss") == lines(run, "train/loss")
     assert lines(out, "train/gradient_norm") == lines(run, "train/gradient_norm")
     assert len(lines(run, "train/loss")) == 4
+
+
+def test_sigterm_saves_and_the_rest_repeats(world: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, out, write = str(world / "config.yaml"), tmp_path / "run", RunLog.scalars
+
+    def interrupt(log: RunLog, step: int, values: dict[str, float]) -> None:
+        write(log, step, values)
+        if step == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(RunLog, "scalars", interrupt)
+    train.main([config, "--out", str(out)])
+    assert len(lines(out, "train/loss")) == 3
+    monkeypatch.undo()
+    train.main([config, "--out", str(out), "--resume"])
+    assert lines(out, "train/loss") == lines(run, "train/loss")
+
+
+def test_diverged_training_stops(world: Path, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="not finite"):
+        train.main([str(world / "config.yaml"), "--out", str(tmp_path / "run"), "--train.learning-rate", "inf"])
 
 
 def test_run_folder_holds_what_a_rerun_needs(run: Path, experiment: Experiment) -> None:

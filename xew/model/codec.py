@@ -18,8 +18,13 @@ TEMPORAL_FACTOR = 4
 class Codec(Protocol):
     """What the rest of the room asks of a codec."""
 
-    spatial_factor: int
-    channels: int
+    @property
+    def spatial_factor(self) -> int:
+        """Pixels a side of what one latent covers."""
+
+    @property
+    def channels(self) -> int:
+        """Of the latents."""
 
     @property
     def hash(self) -> str:

@@ -8,7 +8,7 @@ Shape letters: b batch, t h w c latent video, s tokens (t' h' w' flattened), d w
 Numbers that look arbitrary (eps 1e-6, 256 frequencies, six modulations) are those of the published weights.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,11 +20,12 @@ from jax import Array
 
 PATCH = (1, 2, 2)
 EPSILON = 1e-6
-ROTARY_BASE = 10_000.0
+WAVELENGTH_BASE = 10_000.0
 TIME_FREQUENCIES = 256
 TIMESTEPS = 1000.0
 """The network is told the noise level as sigma times this."""
 
+Activation = Callable[[Array], Array]
 Rotary = tuple[Array, Array]
 """Cosine and sine [s head_dim/2] of every token's rotation angles."""
 
@@ -39,6 +40,9 @@ class ModelSize:
     ffn_dim: int
     text_dim: int
     text_tokens: int
+    rotary_base: float = WAVELENGTH_BASE
+    """Ratio of the slowest to the fastest rotation of positions; Wan's serves clips of hundreds of positions a side, and
+    a model of few positions tells them apart sooner with less."""
 
     @property
     def head_dim(self) -> int:
@@ -47,7 +51,7 @@ class ModelSize:
 
 MODELS = {
     "tiny": ModelSize(dim=32, depth=2, heads=2, ffn_dim=64, text_dim=16, text_tokens=8),
-    "debug": ModelSize(dim=192, depth=4, heads=4, ffn_dim=512, text_dim=32, text_tokens=16),
+    "debug": ModelSize(dim=256, depth=4, heads=2, ffn_dim=768, text_dim=32, text_tokens=16, rotary_base=10.0),
     "small": ModelSize(dim=768, depth=12, heads=12, ffn_dim=3072, text_dim=256, text_tokens=32),
     "wan5b": ModelSize(dim=3072, depth=30, heads=24, ffn_dim=14336, text_dim=4096, text_tokens=512),
 }
@@ -80,6 +84,7 @@ class WorldModel(nnx.Module):
         streams: names in `STREAMS` beside rgb.
         dtype: of the matrix products; parameters, norms, modulation and the residual stream stay float32.
         remat: recompute blocks in the backward pass instead of keeping their activations.
+        unroll: blocks compiled as one loop body; more is faster on a CPU and slower to compile.
         attention: an implementation of `jax.nn.dot_product_attention` ("xla", or "cudnn" on a GPU in bfloat16).
     """
 
@@ -91,10 +96,12 @@ class WorldModel(nnx.Module):
         *,
         dtype: jnp.dtype = jnp.float32,
         remat: bool = False,
+        unroll: int = 1,
         attention: Literal["xla", "cudnn"] = "xla",
         rngs: nnx.Rngs,
     ) -> None:
-        self.size, self.channels, self.remat, self.dtype = size, channels, remat, dtype
+        self.size, self.channels, self.dtype = size, channels, dtype
+        self.remat, self.unroll = remat, unroll
         self.condition_streams = tuple(streams)
         features = channels * int(np.prod(PATCH))
         self.patch_embedding = _linear(features, size.dim, dtype, rngs)
@@ -140,7 +147,7 @@ class WorldModel(nnx.Module):
         grids = {name: token_grid(array.shape) for name, array in inputs.items()}
         tokens = jnp.concatenate([self._embed(name, array) for name, array in inputs.items()], axis=1)
         rows = np.concatenate([token_rows(STREAMS[name], grid) for name, grid in grids.items()])
-        angles = np.concatenate([rotary_angles(grid, self.size.head_dim) for grid in grids.values()])
+        angles = np.concatenate([rotary_angles(grid, self.size.head_dim, self.size.rotary_base) for grid in grids.values()])
         return tokens, rows, (jnp.asarray(np.cos(angles), jnp.float32), jnp.asarray(np.sin(angles), jnp.float32))
 
     def _embed(self, name: str, array: Array) -> Array:
@@ -160,7 +167,7 @@ class WorldModel(nnx.Module):
         def block(carry: Array, layer: nnx.State) -> tuple[Array, None]:
             return nnx.merge(graph, layer)(carry, modulation, rows, rotary, text), None
 
-        return jax.lax.scan(jax.checkpoint(block) if self.remat else block, tokens, layers)[0]
+        return jax.lax.scan(jax.checkpoint(block) if self.remat else block, tokens, layers, unroll=self.unroll)[0]
 
 
 class Block(nnx.Module):
@@ -176,7 +183,7 @@ class Block(nnx.Module):
     def __call__(self, tokens: Array, modulation: Array, rows: np.ndarray, rotary: Rotary, text: Array) -> Array:
         """tokens [b s d]; modulation [b r 6 d], of which token i takes row rows[i]; text [b l d]."""
         chunks = self.modulation[...][None] + modulation
-        shift_sa, scale_sa, gate_sa, shift_ffn, scale_ffn, gate_ffn = (chunks[:, rows, i] for i in range(6))
+        shift_sa, scale_sa, gate_sa, shift_ffn, scale_ffn, gate_ffn = (take_rows(chunks[:, :, i], rows) for i in range(6))
         attended = self.self_attn(modulate(tokens, shift_sa, scale_sa), rotary=rotary)
         tokens = tokens + attended.astype(jnp.float32) * gate_sa
         tokens = tokens + self.cross_attn(self.norm3(tokens), text).astype(jnp.float32)
@@ -218,7 +225,7 @@ class Head(nnx.Module):
     def __call__(self, tokens: Array, time: Array, rows: np.ndarray) -> Array:
         """Features [b s pt*ph*pw*c] of tokens [b s d]; time [b r d]."""
         chunks = self.modulation[...][None] + time[:, :, None]
-        return self.head(modulate(tokens, chunks[:, rows, 0], chunks[:, rows, 1]))
+        return self.head(modulate(tokens, take_rows(chunks[:, :, 0], rows), take_rows(chunks[:, :, 1], rows)))
 
 
 class TwoLayer(nnx.Module):
@@ -229,7 +236,7 @@ class TwoLayer(nnx.Module):
         features: int,
         hidden: int,
         out: int,
-        activation: nnx.Module,
+        activation: Activation,
         dtype: jnp.dtype,
         init: nnx.Initializer,
         rngs: nnx.Rngs,
@@ -252,10 +259,16 @@ def modulate(tokens: Array, shift: Array, scale: Array) -> Array:
     return (tokens - mean) * jax.lax.rsqrt(variance + EPSILON) * (1 + scale) + shift
 
 
+def take_rows(values: Array, rows: np.ndarray) -> Array:
+    """values[:, rows] of [b r d] as a sum over masks [b s d]: a gather's gradient is a scatter, slow on every device."""
+    masks = (rows[:, None] == np.arange(values.shape[1])).astype(np.float32)
+    return sum(values[:, row, None] * masks[None, :, row, None] for row in range(values.shape[1]))
+
+
 def sinusoid(timestep: Array) -> Array:
     """Cosines, then sines [... 256] of timesteps [...]."""
     half = TIME_FREQUENCIES // 2
-    frequencies = jnp.asarray(ROTARY_BASE ** (-np.arange(half) / half), jnp.float32)
+    frequencies = jnp.asarray(WAVELENGTH_BASE ** (-np.arange(half) / half), jnp.float32)
     angles = timestep[..., None] * frequencies.reshape(*(1,) * timestep.ndim, half)
     return jnp.concatenate([jnp.cos(angles), jnp.sin(angles)], axis=-1)
 
@@ -264,7 +277,7 @@ def token_grid(shape: Sequence[int]) -> tuple[int, int, int]:
     """Frames, rows and columns of the tokens of latents [b t h w c] or of joint positions [b t 16]."""
     if len(shape) == 3:
         return shape[1], 1, 1
-    return tuple(length // patch for length, patch in zip(shape[1:4], PATCH, strict=True))
+    return shape[1] // PATCH[0], shape[2] // PATCH[1], shape[3] // PATCH[2]
 
 
 def token_rows(stream: Stream, grid: tuple[int, int, int]) -> np.ndarray:
@@ -273,7 +286,7 @@ def token_rows(stream: Stream, grid: tuple[int, int, int]) -> np.ndarray:
     return np.repeat(frames, grid[1] * grid[2])
 
 
-def rotary_angles(grid: tuple[int, int, int], head_dim: int) -> np.ndarray:
+def rotary_angles(grid: tuple[int, int, int], head_dim: int, base: float = WAVELENGTH_BASE) -> np.ndarray:
     """Rotation angles [s head_dim/2] float64 of the tokens of a grid; every stream counts from (0, 0, 0).
 
     The head is split among time, height and width as in Wan (44, 42, 42 of 128; 24, 20, 20 of 64), and each part has
@@ -282,15 +295,15 @@ def rotary_angles(grid: tuple[int, int, int], head_dim: int) -> np.ndarray:
     part = 2 * (head_dim // 6)
     parts = (head_dim - 2 * part, part, part)
     positions = np.stack(np.meshgrid(*(np.arange(n) for n in grid), indexing="ij"), -1).reshape(-1, 3)
-    series = [ROTARY_BASE ** (-np.arange(0, width, 2) / width) for width in parts]
+    series = [base ** (-np.arange(0, width, 2) / width) for width in parts]
     return np.concatenate([np.outer(positions[:, axis], frequencies) for axis, frequencies in enumerate(series)], axis=-1)
 
 
 def rotate(values: Array, rotary: Rotary) -> Array:
     """Turn neighbouring pairs of features of [b s n k] by each token's angles, in float32."""
-    cos, sin = (table[None, :, None] for table in rotary)
-    even, odd = values[..., 0::2], values[..., 1::2]
-    return jnp.stack([even * cos - odd * sin, even * sin + odd * cos], axis=-1).reshape(values.shape)
+    cos, sin = (table[None, :, None, :, None] for table in rotary)
+    pairs = values.reshape(*values.shape[:-1], -1, 2)
+    return (pairs * cos + pairs[..., ::-1] * jnp.concatenate([-sin, sin], axis=-1)).reshape(values.shape)
 
 
 def patchify(latents: Array) -> Array:

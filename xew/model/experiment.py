@@ -49,6 +49,9 @@ class ModelSettings:
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Of the matrix products."""
     remat: bool = False
+    """Recompute activations in the backward pass: less memory, a third more work."""
+    unroll: int = 1
+    """Blocks compiled as one loop body."""
     attention: Literal["xla", "cudnn"] = "xla"
 
 
@@ -150,6 +153,7 @@ def create_model(experiment: Experiment) -> WorldModel:
         tuple(experiment.conditions),
         dtype=jnp.dtype(settings.dtype),
         remat=settings.remat,
+        unroll=settings.unroll,
         attention=settings.attention,
         rngs=nnx.Rngs(experiment.train.seed),
     )
@@ -157,6 +161,6 @@ def create_model(experiment: Experiment) -> WorldModel:
 
 def compile_cache() -> None:
     """Keep compiled programs between runs in the user's cache folder, unless JAX was told otherwise."""
-    if jax.config.jax_compilation_cache_dir is None:
+    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
         cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "xew" / "jax"
         jax.config.update("jax_compilation_cache_dir", str(cache))

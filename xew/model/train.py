@@ -112,11 +112,15 @@ class StopSignal:
 
     def __init__(self) -> None:
         self.received = False
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._note)
+        self.before = {number: signal.signal(number, self._note) for number in (signal.SIGTERM, signal.SIGINT)}
 
     def _note(self, number: int, frame: Any) -> None:
         self.received = True
+
+    def release(self) -> None:
+        """Give the signals back to who had them."""
+        for number, handler in self.before.items():
+            signal.signal(number, handler)
 
 
 @user_errors
@@ -178,6 +182,7 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
         if stop.received:
             print(f"stopped at step {step} and saved; continue with --resume", file=sys.stderr)
             break
+    stop.release()
     log.close()
     checkpoints.close()
 
