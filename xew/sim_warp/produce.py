@@ -88,6 +88,11 @@ class Cell:
         """[t 2 7] measured tool poses, world."""
         return measured_tools(self.robot, self.moved.joint_pos)
 
+    @property
+    def recording(self) -> Recording:
+        """What the camera looks at."""
+        return recording(self.robot, self.scene, self.moved.joint_pos, self.moved.object_pose, self.moved.object_joint)
+
     @cached_property
     def failure(self) -> tuple[str, str] | None:
         """Why it does not count: one of `episode.FAILURES` and a sentence; None if it succeeded."""
@@ -113,7 +118,7 @@ def produce(jobs: Sequence[Job], out: Path, renderer: Renderer, device: str | No
             pixels = dict(zip(map(id, accepted), render_cells(accepted, renderer), strict=True))
             records += [[future.result() for future in cells] for cells in writing]
             writing = [
-                [pool.submit(_write, cell, pixels.get(id(cell)), out, renderer.device) for cell in cells] for cells in group
+                [pool.submit(write_cell, cell, pixels.get(id(cell)), out, renderer.device) for cell in cells] for cells in group
             ]
         return records + [[future.result() for future in cells] for cells in writing]
 
@@ -158,7 +163,7 @@ def simulate_cells(seeds: list[list[Cell]], device: str | None = None) -> list[l
 
 def render_cells(cells: Sequence[Cell], renderer: Renderer) -> list[Pixels]:
     """What the camera sees of each cell, and the robot alone by its commands."""
-    views = observe(renderer, [_recording(cell) for cell in cells])
+    views = observe(renderer, [cell.recording for cell in cells])
     renders = command_renders([(cell.robot_name, cell.commands.action) for cell in cells], renderer=renderer)
     return list(zip(views, renders, strict=True))
 
@@ -202,10 +207,6 @@ def _lost(cell: Cell) -> tuple[str, str]:
     return "timeout", "the plan ended short of success"
 
 
-def _recording(cell: Cell) -> Recording:
-    return recording(cell.robot, cell.scene, cell.moved.joint_pos, cell.moved.object_pose, cell.moved.object_joint)
-
-
 def recording(
     robot: RobotSpec, scene: Scene, joint_pos: np.ndarray, object_pose: np.ndarray, object_joint: np.ndarray
 ) -> Recording:
@@ -214,7 +215,8 @@ def recording(
     return Recording(robot, joint_pos, things, thing_pose)
 
 
-def _write(cell: Cell, pixels: Pixels | None, out: Path, device: wp.Device) -> Record:
+def write_cell(cell: Cell, pixels: Pixels | None, out: Path, device: wp.Device) -> Record:
+    """Write a cell, with its episode if there are pixels, and return the header as it is on disk."""
     record = header(cell, device)
     if pixels is None:
         return read_record(write_episode(out, record))
