@@ -89,9 +89,10 @@ def pick(registry: Mapping[str, T], name: str, kind: str) -> T:
             found = getattr(importlib.import_module(module), attribute)
         except (ImportError, AttributeError, ValueError) as error:
             raise ConfigError(f"cannot import the {kind} {name!r}: {error}; expected module:NAME.") from error
-        expected = type(next(iter(registry.values())))
+        expected = tuple({type(entry) for entry in registry.values() if entry is not None})
         if not isinstance(found, expected):
-            raise ConfigError(f"the {kind} {name!r} is a {type(found).__name__}; expected a {expected.__name__}.")
+            names = " or ".join(kind.__name__ for kind in expected)
+            raise ConfigError(f"the {kind} {name!r} is a {type(found).__name__}; expected a {names}.")
         return found
     raise ConfigError(f"unknown {kind} {name!r};{suggestion(name, registry)} known: {', '.join(registry)}, or module:NAME.")
 
