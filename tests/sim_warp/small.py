@@ -22,7 +22,7 @@ SLOW = "tests.sim_warp.small:SLOW_PIPER"
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
     x, y = rng.uniform([-0.1, 0.0], [0.1, 0.1])
-    block = SceneObject("block", objects.block((0.04,) * 3, (200, 45, 40)), upright(x, y, TABLE_TOP), mass=0.05)
+    block = SceneObject("block", objects.block((0.04,) * 3, (200, 45, 40)), upright((x, y), TABLE_TOP), mass=0.05)
     return Scene(TASK, seed, (block,))
 
 

@@ -36,10 +36,10 @@ class Mesh:
 
     def scaled(self, factors: Sequence[float]) -> "Mesh":
         """This mesh stretched along x, y, z by positive factors."""
-        factors = np.asarray(factors, float)
-        normals = self.normals / factors
+        stretch = np.asarray(factors, float)
+        normals = self.normals / stretch
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        return Mesh((self.vertices * factors).astype(np.float32), self.triangles, self.colors, normals.astype(np.float32))
+        return Mesh((self.vertices * stretch).astype(np.float32), self.triangles, self.colors, normals.astype(np.float32))
 
 
 def from_trimesh(shape: trimesh.Trimesh, color: Color, crease_angle: float = np.radians(40)) -> Mesh:

@@ -44,7 +44,7 @@ def merge(*shapes: Shape) -> Shape:
 
 
 def moved(shape: Shape, xyz: tuple[float, float, float]) -> Shape:
-    return Shape(shape.mesh.transformed(xyz), tuple(h + np.float32(xyz) for h in shape.hulls))
+    return Shape(shape.mesh.transformed(xyz), tuple(h + np.array(xyz, np.float32) for h in shape.hulls))
 
 
 def block(size: tuple[float, float, float], color: Color) -> Shape:
@@ -86,7 +86,7 @@ def vessel(outline: list[tuple[float, float]], wall: float, color: Color, inside
     shell = geometry.revolve([(0, 0), *outer, *inner[::-1], (0, wall)], color)
     centres = shell.vertices[shell.triangles].mean(1)
     outward = (shell.normals.mean(1)[:, :2] * centres[:, :2]).sum(-1) >= 0
-    colors = np.where(outward[:, None], np.uint8(color), np.uint8(inside or color))
+    colors = np.where(outward[:, None], np.array(color, np.uint8), np.array(inside or color, np.uint8))
     mesh = Mesh(shell.vertices, shell.triangles, colors, shell.normals)
     return Shape(mesh, (*_wall_hulls(outer, inner), _ring(outer[0, 0], 0, wall)))
 

@@ -6,6 +6,7 @@ Writes `Timeline`, and by `Timeline.path` both tools' poses and grippers at ever
 The tool frame: x is the approach direction (out of the hand), y the axis along which the fingers open.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +15,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from xew.protocol import FRAME_RATE
 
 LEFT, RIGHT = 0, 1
+Point = Sequence[float] | np.ndarray
+"""x y z [m]."""
 TOOL_SPEED = 0.16
 """Mean speed of a tool between two waypoints [m/s]; a minimum-jerk move peaks at 1.875 times its mean."""
 TURN_SPEED = 0.45
@@ -40,13 +43,13 @@ class Tool:
         """Drawn back against the approach direction [m]."""
         return Tool(self.position - distance * self.rotation.apply([1, 0, 0]), self.rotation)
 
-    def carried(self, start: np.ndarray, goal: np.ndarray, turn: float = 0.0) -> "Tool":
+    def carried(self, start: Point, goal: Point, turn: float = 0.0) -> "Tool":
         """The hand after what it holds has moved from `start` to `goal` [3] m and turned about the world's z [rad]."""
         turned = Rotation.from_euler("z", turn)
         return Tool(np.asarray(goal) + turned.apply(self.position - np.asarray(start)), turned * self.rotation)
 
 
-def tool(position: np.ndarray | tuple[float, float, float], yaw: float = 0.0, tilt: float = 0.0, roll: float = 0.0) -> Tool:
+def tool(position: Point, yaw: float = 0.0, tilt: float = 0.0, roll: float = 0.0) -> Tool:
     """A tool frame that points down at `position`.
 
     Args:

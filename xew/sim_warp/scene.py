@@ -6,7 +6,7 @@ Writes `Scene`: objects with poses, masses, hinges; the same bytes for every rob
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from xew.sim_warp.objects import Shape
 
 Pose = tuple[float, float, float, float, float, float, float]
 """x y z [m], quaternion x y z w; world frame."""
+Point = Sequence[float] | np.ndarray
+"""x y or x y z [m]."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +72,8 @@ class Scene:
     objects: tuple[SceneObject, ...]
     words: dict[str, str] = field(default_factory=dict)
     """What the instruction's slots say of this scene (colours, sizes)."""
-    targets: dict[str, tuple[float, ...]] = field(default_factory=dict)
-    """Places drawn with the scene that are no objects, such as where a row of blocks goes [m]."""
+    targets: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Places drawn with the scene that are no objects, such as where a row of blocks goes: x y [m]."""
 
     def index(self, name: str) -> int:
         return self.names.index(name)
@@ -104,12 +106,13 @@ def scene_hash(scene: Scene) -> str:
 def _numbers(thing: SceneObject) -> tuple[object, ...]:
     """The numbers of an object without its shapes."""
     hinge = thing.hinge
-    numbers = replace(hinge, lid=None).__dict__ if hinge else None
+    numbers = {f.name: None if f.name == "lid" else getattr(hinge, f.name) for f in fields(hinge)} if hinge else None
     return (thing.name, thing.pose, thing.mass, thing.friction, numbers)
 
 
-def upright(x: float, y: float, z: float, yaw: float = 0.0) -> Pose:
-    """A pose turned by `yaw` [rad] about the world's z."""
+def upright(xy: Point, z: float, yaw: float = 0.0) -> Pose:
+    """A pose at `xy` [2] and height `z` [m], turned by `yaw` [rad] about the world's z."""
+    x, y = xy
     return (float(x), float(y), float(z), 0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
 
 

@@ -109,8 +109,8 @@ def _mass_properties(
     urdf: Urdf, parts: list[tuple[str, np.ndarray]], hulls: tuple[tuple[str, np.ndarray], ...]
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass, centre and inertia of links together (parallel axes)."""
-    known = [(urdf.links[link].inertial, pose) for link, pose in parts if urdf.links[link].inertial is not None]
-    mass = sum(inertial.mass for inertial, _ in known)
+    known = [(inertial, pose) for link, pose in parts if (inertial := urdf.links[link].inertial) is not None]
+    mass = sum((inertial.mass for inertial, _ in known), 0.0)
     if mass <= 0:
         return 0.05, np.zeros(3), np.eye(3) * 5e-5
     centers = [pose[:3, :3] @ inertial.center + pose[:3, 3] for inertial, pose in known]
@@ -157,7 +157,8 @@ def add_world(builder: newton.ModelBuilder, robot: RobotSpec, scene: Scene) -> N
 def _add_arm(builder: newton.ModelBuilder, side: str, arm: Arm, path: Path) -> None:
     links, fingers = arm_groups(path, arm)
     root = wp.transform(*arm.root_pose)
-    joints, parent = [], -1
+    joints: list[int] = []
+    parent = -1
     for number, group in enumerate(links, 1):
         is_last_of_six = number == len(links) == ARM_JOINTS - 1
         frame = root * _transform(group.parent_to_joint) if parent < 0 else _transform(group.parent_to_joint)

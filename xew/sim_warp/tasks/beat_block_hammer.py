@@ -42,8 +42,8 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         "beat_block_hammer",
         seed,
         (
-            SceneObject("hammer", hammer(), upright(0, -0.06, TABLE_TOP), mass=0.15),
-            SceneObject("block", objects.block((BLOCK,) * 3, objects.PALETTE[color]), upright(x, y, TABLE_TOP, yaw)),
+            SceneObject("hammer", hammer(), upright((0, -0.06), TABLE_TOP), mass=0.15),
+            SceneObject("block", objects.block((BLOCK,) * 3, objects.PALETTE[color]), upright((x, y), TABLE_TOP, yaw)),
         ),
         words={"color": str(color)},
     )

@@ -33,7 +33,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         SceneObject(
             f"{color}_block",
             objects.block((2 * half,) * 3, objects.PALETTE[color]),
-            upright(*place_, TABLE_TOP, yaw),
+            upright(place_, TABLE_TOP, yaw),
             mass=float(400 * (2 * half) ** 3),
         )
         for color, place_, yaw in zip(COLORS, places, yaws, strict=True)
@@ -62,7 +62,7 @@ def plan(scene: Scene) -> Timeline:
     return timeline
 
 
-def _move_block(timeline: Timeline, arm: int, block: SceneObject, target: tuple[float, ...]) -> None:
+def _move_block(timeline: Timeline, arm: int, block: SceneObject, target: tuple[float, float]) -> None:
     yaw = 2 * np.arctan2(block.pose[5], block.pose[6])
     height = TABLE_TOP + float(block.shape.mesh.vertices[:, 2].max()) - GRASP_BELOW_TOP
     grasp = tool((*block.pose[:2], height), symmetric_yaw(arm, block.pose, yaw, np.pi / 2), STEEP_TILT)

@@ -23,7 +23,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     x, y, yaw = rng.uniform([-0.15, -0.25, -0.8], [0.15, -0.05, 0.8])
     length, radius = rng.uniform([0.23, 0.017], [0.25, 0.019])
     wood, ends = (205, 160, 105), objects.PALETTE[rng.choice(sorted(objects.PALETTE))]
-    roller = SceneObject("roller", objects.prism(radius, length, wood, ends), upright(x, y, TABLE_TOP, yaw), mass=0.2)
+    roller = SceneObject("roller", objects.prism(radius, length, wood, ends), upright((x, y), TABLE_TOP, yaw), mass=0.2)
     return Scene("grab_roller", seed, (roller,))
 
 

@@ -58,13 +58,12 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     width, depth = rng.uniform([0.19, 0.14], [0.21, 0.16])
     color = [(150, 152, 158), (70, 72, 80), (190, 170, 150)][rng.integers(3)]
     base, hinge = laptop(width, depth, color)
-    return Scene("open_laptop", seed, (SceneObject("laptop", base, upright(x, y, TABLE_TOP, yaw), hinge=hinge),))
+    return Scene("open_laptop", seed, (SceneObject("laptop", base, upright((x, y), TABLE_TOP, yaw), hinge=hinge),))
 
 
 def lid_edge(scene: Scene, fraction: float) -> np.ndarray:
     """[3] world position of the middle of the lid's free edge, inner side, at a fraction of the hinge's range."""
-    thing = scene.object("laptop")
-    hinge = thing.hinge
+    thing, hinge = scene.object("laptop"), _hinge(scene)
     angle = hinge.lower + fraction * (hinge.upper - hinge.lower)
     reach = hinge.anchor[1] - hinge.lid.hulls[0][:, 1].min()
     local = np.array(hinge.anchor) + Rotation.from_euler("x", -angle).apply([0, -reach, -LID_THICKNESS / 2])
@@ -94,13 +93,18 @@ def plan(scene: Scene) -> Timeline:
     return timeline
 
 
+def _hinge(scene: Scene) -> Hinge:
+    hinge = scene.object("laptop").hinge
+    assert hinge is not None
+    return hinge
+
+
 def _yaw(thing: SceneObject) -> float:
     return float(2 * np.arctan2(thing.pose[5], thing.pose[6]))
 
 
 def success(scene: Scene, now: Moment) -> bool:
-    index = scene.index("laptop")
-    fraction = scene.objects[index].hinge.fraction(now.object_joint[index])
+    fraction = _hinge(scene).fraction(now.object_joint[scene.index("laptop")])
     near = np.linalg.norm(now.tool_pose[:, :3] - lid_edge(scene, fraction), axis=-1).min() < 0.1
     return bool(fraction > DONE and near)
 

@@ -32,7 +32,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         (
             SceneObject("cup", shape, vessel_pose(cup), mass=0.12),
             SceneObject(
-                "coaster", objects.disc(0.055, COASTER_HEIGHT, objects.PALETTE[colors[1]]), upright(*coaster, TABLE_TOP)
+                "coaster", objects.disc(0.055, COASTER_HEIGHT, objects.PALETTE[colors[1]]), upright(coaster, TABLE_TOP)
             ),
         ),
         words={"color": colors[0]},

@@ -1,12 +1,12 @@
 """What a task is: a scene to sample, a plan that solves it, and a test of success."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
 
 from xew.sim_warp.plan import ASIDE, LEFT, RIGHT, Timeline, Tool, tool
-from xew.sim_warp.scene import Pose, Scene, SceneObject, upright
+from xew.sim_warp.scene import Point, Pose, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
 
 GRASP_TILT = np.radians(30)
@@ -78,18 +78,18 @@ def pick(timeline: Timeline, grasps: dict[int, Tool], lift: float, opening: floa
     timeline.move({arm: grasp.moved(z=lift) for arm, grasp in grasps.items()})
 
 
-def radial_yaw(arm: int, position: np.ndarray | Sequence[float]) -> float:
+def radial_yaw(arm: int, position: Point) -> float:
     """The hand's yaw [rad] at which its lean points away from the arm's shoulder: the one that all robots reach best."""
     x, y = position[:2]
     return outward(arm) * float(np.arctan2(0.25 - outward(arm) * x, y + 0.45))
 
 
-def symmetric_yaw(arm: int, position: np.ndarray | Sequence[float], yaw: float, symmetry: float) -> float:
+def symmetric_yaw(arm: int, position: Point, yaw: float, symmetry: float) -> float:
     """Of the yaws `yaw` plus multiples of `symmetry` [rad] the one nearest to the radial yaw."""
     return float(yaw + symmetry * np.round((radial_yaw(arm, position) - yaw) / symmetry))
 
 
-def across(position: np.ndarray, direction: float, arm: int) -> Tool:
+def across(position: Point, direction: float, arm: int) -> Tool:
     """A grasp from above across a rod that lies along the horizontal `direction` [rad], leaning inwards."""
     yaw = radial_yaw(arm, position)
     approach, opening = tool(position, yaw, STEEP_TILT).rotation.apply([[1.0, 0, 0], [0, 1.0, 0]])
@@ -99,9 +99,9 @@ def across(position: np.ndarray, direction: float, arm: int) -> Tool:
     return tool(position, yaw, STEEP_TILT, roll)
 
 
-def vessel_pose(position: Sequence[float]) -> Pose:
+def vessel_pose(position: Point) -> Pose:
     """Upright on the table at (x, y), turned so that a wall segment faces the hand that will take it."""
-    return upright(*position[:2], TABLE_TOP, radial_yaw(arm_for(position[0]), position))
+    return upright(position[:2], TABLE_TOP, radial_yaw(arm_for(position[0]), position))
 
 
 def rim_grasp(vessel: SceneObject, wall: float, depth: float) -> tuple[int, Tool]:
