@@ -6,15 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.sim_warp.small import SLOW, TASK
 from xew.config import ConfigError
-from xew.episode import FAILURES, Record
+from xew.episode import FAILURES, EpisodeError, Record
 from xew.sim_warp.plan import LEFT, RIGHT
 from xew.sim_warp.produce import Cell, Job, moment, plan_cells, simulate_cells
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.scene import Scene, scene_rng
 from xew.sim_warp.tasks import TASKS, get_task
 from xew.sim_warp.tasks.task import Moment
-from xew.sim_warp.yields import PARTS, described, description, markdown
+from xew.sim_warp.yields import PARTS, Args, attempt, attempts, described, description, markdown, page
 
 PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
 SOLVERS = dict(zip(sorted(TASKS), [*ROBOTS, "piper"], strict=True))
@@ -185,3 +186,24 @@ def test_the_table_of_yields_counts_right() -> None:
     assert lines[0] == "| task | `arx_x5` | `piper` | all robots on the same seed |"
     assert lines[2] == "| `grab_roller` | 2/3 (67 %) | 1/2 (50 %) | 1/3 (33 %) |"
     assert lines[-1] == "- `grab_roller`, `piper`, seed 1: slip (because)"
+
+
+def test_yields_try_every_robot_and_write_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    records = [record for seed in (0, 1) for record in attempt(Job(TASK, seed, ("ur5_wsg", SLOW)))]
+    assert [(record.robot, record.success) for record in records] == [
+        ("ur5_wsg", True), (SLOW, True), ("ur5_wsg", True), (SLOW, False),
+    ]  # fmt: skip
+    text = page(records, Args(tasks=(TASK,), robots=("ur5_wsg", SLOW), seeds=2))
+    assert (
+        f"| `{TASK}` | 2/2 (100 %) | 1/2 (50 %) | 1/2 (50 %) |" in text
+        and "2 seeds from 0 of each task, in physics, on CPU:" in text
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_yields_of_nothing_or_of_the_unknown_are_refused() -> None:
+    with pytest.raises(EpisodeError, match="nothing to try"):
+        next(attempts(Args(seeds=0)))
+    with pytest.raises(ConfigError, match="unknown robot 'ur5'"):
+        next(attempts(Args(robots=("ur5",))))

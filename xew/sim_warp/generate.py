@@ -163,7 +163,7 @@ def generate(args: Args) -> list[Family]:
                 for record in records:
                     family.add(record)
                 spent[family.task] += seconds
-                frames[family.task] += sum(record.frame_count for record in records if record.success)
+                frames[family.task] += sum(record.frame_count for record in records if record.hashes)
                 bar.n = sum(f.accepted for f in families)
                 bar.set_postfix_str(f"{records[0].task} {records[0].seed}", refresh=True)
     _print_speed(frames, spent)

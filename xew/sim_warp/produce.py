@@ -42,11 +42,9 @@ from xew.sim_warp.scene import Scene, scene_hash, scene_rng
 from xew.sim_warp.streams import command_renders
 from xew.sim_warp.tasks import Moment, Task, get_task
 
-DEEPEST_OVERLAP = 0.001
-"""How deep an arm may press into the table or the other arm before its episode is refused [m]. Contacts push back: a hand
-driven with full force into the other comes 4 mm deep."""
-
-
+DEEPEST_OVERLAP = 0.002
+"""How deep an arm may press into the table or the other arm before its episode is refused [m]. A finger that brushes the
+table comes 1 mm deep, a hand driven with full force into the other 4 mm: contacts push back."""
 FRAMES_AT_ONCE = 8192
 """Frames of one group of seeds: about half a megabyte of pixels each."""
 

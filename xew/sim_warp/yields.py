@@ -162,7 +162,8 @@ def page(records: Sequence[Record], args: Args) -> str:
     device = next(record.device for record in records)
     return f"""# The tasks
 
-This page is written by `{COMMAND} --page`; the descriptions are the docstrings of `xew/sim_warp/tasks/`. Lengths are in metres,
+This page is written by `{COMMAND} --page docs/tasks.md`; the descriptions are
+the docstrings of `xew/sim_warp/tasks/`. Lengths are in metres,
 x to the right, y away from the robot, the origin under the table's centre; the table's top is at z = 0.74.
 Words in braces stand for colours of the scene.
 
