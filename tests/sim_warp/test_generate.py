@@ -130,7 +130,9 @@ def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, *fla
 
 def test_a_full_disk_in_a_worker_is_one_line(tmp_path: Path) -> None:
     """A limit on the size of files stands for the disk; the video of twelve frames is larger."""
-    limited = f"ulimit -f 20; exec {sys.executable} -m xew.sim_warp.generate " + " ".join([*FLAGS, "--out", str(tmp_path)])
+    limited = f"ulimit -f 20; exec {sys.executable} -m xew.sim_warp.generate " + " ".join(
+        [*FLAGS, "--workers", "1", "--out", str(tmp_path)]
+    )
     run = subprocess.run(["bash", "-c", f"trap '' XFSZ; {limited}"], cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 2 and "Traceback" not in run.stderr, run.stderr
     assert "cannot write the episode" in run.stderr and "Free some space or choose another --out" in run.stderr
