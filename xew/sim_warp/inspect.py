@@ -18,13 +18,14 @@ import tyro
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.episode import EpisodeError, Record, find_folders, read_record, read_states, read_video, verify_episode
+from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, find_folders, read_record, read_states, read_video, verify_episode
 from xew.sim_warp.generate import yield_table
 from xew.sim_warp.produce import render_again
 from xew.sim_warp.render import Renderer
 
 STRIP_FRAMES = 8
 SHEET_TIMES = (0.0, 0.5, 1.0)
+BLANK = np.full((HEIGHT // 2, WIDTH // 2, 3), 255, np.uint8)
 GAP = 4
 """White pixels between pictures."""
 
@@ -114,6 +115,28 @@ def draw(cells: list[tuple[Path, Record]], out: Path, seeds: int) -> None:
             save_png(out / f"{task}_{seed}.png", contact_sheet([folder for folder, _ in of_task[seed]]))
             for folder, record in of_task[seed]:
                 save_png(out / f"{task}_{seed}_{record.robot}.png", strip(folder))
+
+    save_png(out / "overview.png", overview([of_task[min(of_task)] for of_task in by_task.values()]))
+
+
+def overview(seeds: list[list[tuple[Path, Record]]]) -> np.ndarray:
+    """The first seed of every task, a column each, in its middle, with a robot a row, at half size: uint8 [h w 3]."""
+    robots = sorted({record.robot for cells in seeds for _, record in cells})
+    rows: list[list[np.ndarray]] = [[] for _ in robots]
+    for cells in seeds:
+        folders = {record.robot: folder for folder, record in cells}
+        for row, robot in zip(rows, robots, strict=True):
+            row.append(_half(_middle(folders[robot])) if robot in folders else BLANK)
+    return tiled(rows)
+
+
+def _middle(folder: Path) -> np.ndarray:
+    video = read_video(folder / "rgb.mkv")
+    return video[len(video) // 2]
+
+
+def _half(image: np.ndarray) -> np.ndarray:
+    return cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
 
 
 def contact_sheet(folders: list[Path]) -> np.ndarray:
