@@ -10,7 +10,15 @@ from tests.sim_warp.small import at_home
 from xew.protocol import ARMS, FRAME_RATE
 from xew.sim_warp import physics_gpu
 from xew.sim_warp.expert import joint_commands
-from xew.sim_warp.physics import (
+from xew.sim_warp.physics import simulate
+from xew.sim_warp.plan import HOME, LEFT, RIGHT, Timeline
+from xew.sim_warp.produce import DEEPEST_OVERLAP, Cell, Job, plan_cells
+from xew.sim_warp.robots import ROBOTS
+from xew.sim_warp.robots.spec import RobotSpec
+from xew.sim_warp.scene import Scene, scene_rng
+from xew.sim_warp.tasks import TASKS
+from xew.sim_warp.template import FREE_SLOTS
+from xew.sim_warp.worlds import (
     FIRST_OBJECT,
     LEFT_ARM_LINKS,
     LEFT_FINGERS,
@@ -23,16 +31,8 @@ from xew.sim_warp.physics import (
     control_targets,
     finger_strokes,
     shape_owners,
-    simulate,
     template_joints,
 )
-from xew.sim_warp.plan import HOME, LEFT, RIGHT, Timeline
-from xew.sim_warp.produce import DEEPEST_OVERLAP, Cell, Job, plan_cells
-from xew.sim_warp.robots import ROBOTS
-from xew.sim_warp.robots.spec import RobotSpec
-from xew.sim_warp.scene import Scene, scene_rng
-from xew.sim_warp.tasks import TASKS
-from xew.sim_warp.template import FREE_SLOTS
 
 FRAMES = 9
 

@@ -8,12 +8,12 @@ import pytest
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
+from xew.config import ConfigError
 from xew.sim_warp import geometry
 from xew.sim_warp.camera import HEAD_CAMERA, project
 from xew.sim_warp.kinematics import forward_kinematics, joint_positions, matrix_from_pose, tool_pose
 from xew.sim_warp.observe import Recording, keypoint_names, keypoint_positions, observe, scene_things
 from xew.sim_warp.render import Body, Renderer
-from xew.config import ConfigError
 from xew.sim_warp.robots import ROBOTS, load_urdf
 from xew.sim_warp.robots.bodies import body_names, keypoint_links, robot_bodies, robot_pose
 from xew.sim_warp.scene import scene_rng

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from xew.sim_warp.physics import (
+from xew.sim_warp.worlds import (
     FIRST_OBJECT,
     LEFT_ARM_LINKS,
     LEFT_FINGERS,

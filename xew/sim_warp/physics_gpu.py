@@ -8,7 +8,8 @@ import numpy as np
 import warp as wp
 
 from xew.protocol import FRAME_RATE
-from xew.sim_warp.physics import (
+from xew.sim_warp.physics_kernels import advance, record_contacts, record_joints, set_targets
+from xew.sim_warp.worlds import (
     ROBOT_DOFS,
     STEPS_PER_FRAME,
     TABLE,
@@ -21,7 +22,6 @@ from xew.sim_warp.physics import (
     shape_owners,
     template_joints,
 )
-from xew.sim_warp.physics_kernels import advance, record_contacts, record_joints, set_targets
 
 CONTACTS_PER_WORLD = 160
 CONSTRAINTS_PER_WORLD = 768

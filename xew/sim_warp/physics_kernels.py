@@ -5,7 +5,7 @@
 
 import warp as wp
 
-from xew.sim_warp.physics import FIRST_OBJECT, LEFT_ARM_LINKS, LEFT_FINGERS, RIGHT_ARM_LINKS, RIGHT_FINGERS, TABLE
+from xew.sim_warp.worlds import FIRST_OBJECT, LEFT_ARM_LINKS, LEFT_FINGERS, RIGHT_ARM_LINKS, RIGHT_FINGERS, TABLE
 
 
 @wp.kernel
