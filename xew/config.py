@@ -104,7 +104,10 @@ def suggestion(name: str, known: Iterable[str]) -> str:
 
 
 def user_errors(main: Callable[..., T]) -> Callable[..., T]:
-    """Decorate a command: a user's mistake prints its message on stderr and exits with code 2, without a traceback."""
+    """Decorate a command: a user's mistake prints its message on stderr and exits with code 2, without a traceback.
+
+    So does Ctrl-C, with code 130.
+    """
 
     @functools.wraps(main)
     def guarded(*args: Any, **kwargs: Any) -> T:
@@ -113,6 +116,9 @@ def user_errors(main: Callable[..., T]) -> Callable[..., T]:
         except (ConfigError, EpisodeError) as error:
             print(f"error: {error}", file=sys.stderr)
             raise SystemExit(2) from None
+        except KeyboardInterrupt:
+            print("stopped; the same command goes on from what is done", file=sys.stderr)
+            raise SystemExit(130) from None
 
     return guarded
 

@@ -2,4 +2,4 @@
 
 import warp
 
-warp.config.quiet = True  # no banner and no line per kernel module on every command's output
+warp.config.log_level = warp.LOG_ERROR  # no banner, no line per kernel module, no warning that a CPU is not a GPU

@@ -239,9 +239,20 @@ def _demand_enough(families: Sequence[Family]) -> None:
         raise EpisodeError("\n".join([*short, "The table shows why; make the task easier or leave out a robot."]))
 
 
+def _tell_device(name: str | None) -> None:
+    """On what it runs, and why the first run seems to stand still."""
+    device = wp.get_device(name)
+    print(f"device: {device.name}")
+    if not any(Path(wp.config.kernel_cache_dir).glob("wp_*")):
+        wait = "five minutes" if device.is_cuda else "a minute"
+        print(f"Warp compiles its kernels at the first run, about {wait}; later runs find them in {wp.config.kernel_cache_dir}")
+
+
 @user_errors
 def main() -> None:
-    families = generate(tyro.cli(Args, description=__doc__))
+    args = tyro.cli(Args, description=__doc__)
+    _tell_device(args.device)
+    families = generate(args)
     print(yield_table([record for family in families for seed in family.done.values() for record in seed.values()]))
     _demand_enough(families)
 

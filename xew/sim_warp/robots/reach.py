@@ -9,7 +9,6 @@ from itertools import product
 
 import numpy as np
 import tyro
-import warp as wp
 from scipy.spatial.transform import Rotation, Slerp
 
 from xew.sim_warp.inverse_kinematics import ArmSolver
@@ -108,7 +107,6 @@ class Args:
 
 def main() -> None:
     args = tyro.cli(Args)
-    wp.config.quiet = True
     print(markdown([get_robot(name) for name in args.robots]))
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import tyro
-import warp as wp
 
 from xew.sim_warp.camera import HEAD_CAMERA
 from xew.sim_warp.render import Renderer
@@ -52,7 +51,6 @@ class Args:
 
 def main() -> None:
     args = tyro.cli(Args)
-    wp.config.quiet = True
     args.out.mkdir(parents=True, exist_ok=True)
     renderer = Renderer()
     views = {key: nine_views(key) for key in args.robots}
