@@ -30,7 +30,7 @@ from xew.sim_warp.produce import Job, produce
 from xew.sim_warp.render import Renderer
 from xew.sim_warp.robots import ROBOTS, get_robot
 from xew.sim_warp.tasks import TASKS, get_task
-from xew.sim_warp.workers import Workers
+from xew.sim_warp.workers import Workers, quiet_warp
 
 TRIES_PER_SEED = 3
 SPARE_TRIES = 20
@@ -250,6 +250,7 @@ def _tell_device(name: str | None) -> None:
 
 @user_errors
 def main() -> None:
+    quiet_warp()
     args = tyro.cli(Args, description=__doc__)
     _tell_device(args.device)
     families = generate(args)

@@ -22,6 +22,7 @@ from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, find_folders, read_
 from xew.sim_warp.generate import yield_table
 from xew.sim_warp.produce import render_again
 from xew.sim_warp.render import Renderer
+from xew.sim_warp.workers import quiet_warp
 
 STRIP_FRAMES = 8
 SHEET_TIMES = (0.0, 0.5, 1.0)
@@ -47,6 +48,7 @@ class Args:
 
 @user_errors
 def main() -> None:
+    quiet_warp()
     args = tyro.cli(Args, description=__doc__)
     cells, damaged = read_headers(args.data)
     print(yield_table([record for _, record in cells]))

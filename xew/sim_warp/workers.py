@@ -15,6 +15,8 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
+import warp
+
 from xew.episode import EpisodeError
 
 Job = TypeVar("Job")
@@ -57,7 +59,13 @@ class Workers:
             ) from error
 
 
+def quiet_warp() -> None:
+    """For commands and their workers: no banner and no line per kernel module among the progress bars."""
+    warp.config.log_level = warp.LOG_ERROR
+
+
 def _become_worker() -> None:
+    quiet_warp()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with_parent, daemon=True).start()
 

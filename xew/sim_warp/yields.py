@@ -26,7 +26,7 @@ from xew.episode import EpisodeError, Record
 from xew.sim_warp.produce import Job, header, plan_cells, simulate_cells
 from xew.sim_warp.robots import ROBOTS, get_robot
 from xew.sim_warp.tasks import TASKS, Task, get_task
-from xew.sim_warp.workers import Workers
+from xew.sim_warp.workers import Workers, quiet_warp
 
 PARTS = ("Task", "Randomisation", "Success", "After")
 """How the paragraphs of a task's module docstring begin."""
@@ -180,6 +180,7 @@ A seed belongs to the data set only when all robots succeed on it.
 
 @user_errors
 def main() -> None:
+    quiet_warp()
     args = tyro.cli(Args, description=__doc__)
     records: list[Record] = []
     with tqdm(total=args.seeds * len(set(args.tasks)), desc="trying seeds", unit="seed") as bar:

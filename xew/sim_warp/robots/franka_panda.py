@@ -9,9 +9,9 @@ from pathlib import Path
 from xew.sim_warp.robots.spec import Arm, RobotSpec
 
 LEFT = Arm(
-    root_pose=(-0.28, -0.7, 0.5, 0, 0, 0.7071067812, 0.7071067812),
+    root_pose=(-0.28, -0.68, 0.53, 0, 0, 0.7071067812, 0.7071067812),
     joints=("panda_joint1", "panda_joint2", "panda_joint3", "panda_joint4", "panda_joint5", "panda_joint6", "panda_joint7"),
-    home=(-0.0131, -0.4912, -0.2391, -2.6131, 0.0293, 2.6428, 0.5093),
+    home=(-0.0136, -0.518, -0.2595, -2.714, 0.0195, 2.7176, 0.4963),
     tool_link="panda_hand",
     tool_pose=(0, 0, 0.0979, 0.7071067812, 0, 0.7071067812, 0),
     fingers=("panda_finger_joint1", "panda_finger_joint2"),
@@ -20,8 +20,8 @@ LEFT = Arm(
 )
 RIGHT = replace(
     LEFT,
-    root_pose=(0.28, -0.7, 0.5, 0, 0, 0.7071067812, 0.7071067812),
-    home=(0.0129, -0.4912, 0.2393, -2.6131, -0.0291, 2.6428, 1.0614),
+    root_pose=(0.28, -0.68, 0.53, 0, 0, 0.7071067812, 0.7071067812),
+    home=(0.0135, -0.518, 0.2597, -2.7141, -0.0193, 2.7176, 1.0744),
 )
 
 SPEC = RobotSpec(

@@ -15,6 +15,7 @@ from xew.sim_warp.inverse_kinematics import ArmSolver
 from xew.sim_warp.kinematics import tool_pose
 from xew.sim_warp.plan import tool
 from xew.sim_warp.robots import ROBOTS, RobotSpec, get_robot
+from xew.sim_warp.workers import quiet_warp
 
 X, Y, Z = np.linspace(-0.32, 0.10, 6), np.linspace(-0.25, 0.15, 5), np.array([0.76, 0.85, 0.95])
 """The work volume of the left arm [m]; the right arm's is its mirror image."""
@@ -106,6 +107,7 @@ class Args:
 
 
 def main() -> None:
+    quiet_warp()
     args = tyro.cli(Args)
     print(markdown([get_robot(name) for name in args.robots]))
 

@@ -15,6 +15,7 @@ from xew.sim_warp.render import Renderer
 from xew.sim_warp.robots import ROBOTS, get_robot
 from xew.sim_warp.robots.bodies import robot_bodies, robot_pose
 from xew.sim_warp.streams import home_action, nine_views
+from xew.sim_warp.workers import quiet_warp
 
 
 def sheet(views: np.ndarray) -> np.ndarray:
@@ -50,6 +51,7 @@ class Args:
 
 
 def main() -> None:
+    quiet_warp()
     args = tyro.cli(Args)
     args.out.mkdir(parents=True, exist_ok=True)
     renderer = Renderer()
