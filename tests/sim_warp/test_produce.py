@@ -119,8 +119,8 @@ def test_a_robot_that_comes_late_to_a_rejected_seed_gets_no_pictures(renderer: R
 
 
 def test_rendering_again_gives_the_recorded_hashes(data: Path, renderer: Renderer) -> None:
-    for folder, _ in find_accepted(data)[:2]:
-        render_again(folder, renderer)
+    for folder, record in find_accepted(data)[:2]:
+        assert render_again(folder, renderer) == record.hashes
 
 
 @pytest.mark.parametrize("field", ["joint_pos", "object_pose"])

@@ -264,8 +264,11 @@ def _states(cell: Cell, view: Observation) -> States:
     )
 
 
-def render_again(folder: Path, renderer: Renderer) -> None:
-    """Make an episode's pixels, mask and keypoints anew from its recorded joints, objects and commands, and compare.
+def render_again(folder: Path, renderer: Renderer) -> dict[str, str]:
+    """Make an episode's pixels, mask and keypoints anew from its recorded joints, objects and commands.
+
+    Returns:
+        Their hashes, which agree with the recorded ones.
 
     Raises:
         EpisodeError: the scene or anything rendered differs from what is recorded.
@@ -286,3 +289,4 @@ def render_again(folder: Path, renderer: Renderer) -> None:
                 f"{folder}: rendered again on {renderer.device.name}, {name} has hash {found[name][:12]}, recorded on "
                 f"{record.device} was {expected[:12]}; with the same device and versions they must agree."
             )
+    return {name: found[name] for name in record.hashes}
