@@ -21,7 +21,6 @@ import yaml
 from xew.episode import EpisodeError
 
 T = TypeVar("T")
-Parameters = TypeVar("Parameters")
 
 
 class ConfigError(Exception):

@@ -18,6 +18,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
@@ -131,29 +132,35 @@ def write_episode(
         EpisodeError: the folder cannot be written or the disk is full; nothing half-written remains.
     """
     folder = episode_folder(data, record.task, record.seed, record.robot)
-    temporary = None
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY, dir=folder.parent))
-        hashes = {}
-        if states is not None:
-            hashes["states"] = states_hash(states)
-            np.savez_compressed(temporary / "states.npz", **_packed(states))  # type: ignore[arg-type]
-        for name, video in (("rgb", rgb), ("robot", robot)):
-            if video is not None:
-                hashes[name] = array_hash(video)
-                write_video(temporary / f"{name}.mkv", video)
-        header = asdict(record) | {"hashes": hashes}
-        (temporary / "episode.json").write_text(json.dumps(header, indent=1) + "\n")
+        with complete_folder(folder) as temporary:
+            hashes = {}
+            if states is not None:
+                hashes["states"] = states_hash(states)
+                np.savez_compressed(temporary / "states.npz", **_packed(states))  # type: ignore[arg-type]
+            for name, video in (("rgb", rgb), ("robot", robot)):
+                if video is not None:
+                    hashes[name] = array_hash(video)
+                    write_video(temporary / f"{name}.mkv", video)
+            header = asdict(record) | {"hashes": hashes}
+            (temporary / "episode.json").write_text(json.dumps(header, indent=1) + "\n")
+    except OSError as error:
+        raise EpisodeError(f"cannot write the episode {folder}: {error}. Free some space or choose another --out.") from error
+    return folder
+
+
+@contextmanager
+def complete_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder to fill, which takes the name `folder` when the block ends well and else is removed."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY, dir=folder.parent))
+    try:
+        yield temporary
         if folder.exists():
             shutil.rmtree(folder)
         os.rename(temporary, folder)
-    except OSError as error:
-        raise EpisodeError(f"cannot write the episode {folder}: {error}. Free some space or choose another --out.") from error
     finally:
-        if temporary is not None and temporary.exists():
-            shutil.rmtree(temporary, ignore_errors=True)
-    return folder
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _packed(states: States) -> dict[str, np.ndarray]:

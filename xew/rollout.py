@@ -9,9 +9,6 @@ Without rollout.json the model is named after the tree's folder and the video mu
 """
 
 import json
-import os
-import shutil
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from xew.episode import EpisodeError, episode_folder, read_video, write_video
+from xew.episode import EpisodeError, complete_folder, episode_folder, read_video, write_video
 
 VIDEO_SUFFIXES = (".mkv", ".mp4", ".npz")
 
@@ -59,20 +56,12 @@ def write_rollout(root: Path, task: str, seed: int, robot: str, video: np.ndarra
         RolloutError: the folder cannot be written or the disk is full; nothing half-written remains.
     """
     folder = episode_folder(root, task, seed, robot)
-    temporary = None
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-        write_video(temporary / "rgb.mkv", video)
-        (temporary / "rollout.json").write_text(json.dumps(header | {"frame_count": len(video)}, indent=1) + "\n")
-        if folder.exists():
-            shutil.rmtree(folder)
-        os.rename(temporary, folder)
+        with complete_folder(folder) as temporary:
+            write_video(temporary / "rgb.mkv", video)
+            (temporary / "rollout.json").write_text(json.dumps(header | {"frame_count": len(video)}, indent=1) + "\n")
     except OSError as error:
         raise RolloutError(f"cannot write the rollout {folder}: {error}. Free some space or choose another --out.") from error
-    finally:
-        if temporary is not None and temporary.exists():
-            shutil.rmtree(temporary, ignore_errors=True)
     return folder
 
 

@@ -5,12 +5,11 @@ Writes `Commands`: canonical joint targets at every stored frame, or the finding
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from xew.protocol import ACTION_DIM, ARMS, FRAME_RATE
-from xew.sim_warp.inverse_kinematics import ArmSolver
+from xew.sim_warp.inverse_kinematics import arm_solver
 from xew.sim_warp.plan import LEFT, RIGHT, ToolPath
 from xew.sim_warp.robots import RobotSpec
 
@@ -35,7 +34,7 @@ def joint_commands(robot: RobotSpec, paths: list[ToolPath]) -> list[Commands]:
     longest = max(path.frame_count for path in paths)
     targets = np.stack([_lengthened(path.pose, longest) for path in paths], 1).reshape(longest, -1, 7)
     arms = np.tile([LEFT, RIGHT], len(paths))
-    solution = _solver(robot).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
+    solution = arm_solver(robot).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
     commands = []
     for index, path in enumerate(paths):
         columns, frames = slice(2 * index, 2 * index + 2), slice(path.frame_count)
@@ -43,11 +42,6 @@ def joint_commands(robot: RobotSpec, paths: list[ToolPath]) -> list[Commands]:
         problem = _out_of_reach(solution.position_error[frames, columns], solution.rotation_error[frames, columns])
         commands.append(Commands(action.astype(np.float32), problem or _too_fast(robot, action)))
     return commands
-
-
-@lru_cache(maxsize=16)
-def _solver(robot: RobotSpec) -> ArmSolver:
-    return ArmSolver(robot)
 
 
 def _lengthened(pose: np.ndarray, frames: int) -> np.ndarray:

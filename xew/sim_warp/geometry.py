@@ -11,6 +11,8 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+Pose = tuple[float, float, float, float, float, float, float]
+"""x y z [m], quaternion x y z w."""
 Color = tuple[int, int, int]
 """sRGB, 0 to 255."""
 
@@ -33,13 +35,6 @@ class Mesh:
         rotation = Rotation.from_euler("xyz", rpy).as_matrix()
         vertices = self.vertices @ rotation.T + np.asarray(xyz)
         return Mesh(vertices.astype(np.float32), self.triangles, self.colors, (self.normals @ rotation.T).astype(np.float32))
-
-    def scaled(self, factors: Sequence[float]) -> "Mesh":
-        """This mesh stretched along x, y, z by positive factors."""
-        stretch = np.asarray(factors, float)
-        normals = self.normals / stretch
-        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        return Mesh((self.vertices * stretch).astype(np.float32), self.triangles, self.colors, normals.astype(np.float32))
 
 
 def from_trimesh(shape: trimesh.Trimesh, color: Color, crease_angle: float = np.radians(40)) -> Mesh:

@@ -126,12 +126,13 @@ def inverse_kinematics(
     Returns:
         joint_pos [n d] rad, position_error [n] m, rotation_error [n] rad.
     """
-    solution = _solver(robot).solve(arm, tool_pose, seed)
+    solution = arm_solver(robot).solve(arm, tool_pose, seed)
     return solution.joint_pos, solution.position_error, solution.rotation_error
 
 
 @lru_cache(maxsize=16)
-def _solver(robot: RobotSpec) -> ArmSolver:
+def arm_solver(robot: RobotSpec) -> ArmSolver:
+    """The process's solver of a robot, made at first use."""
     return ArmSolver(robot)
 
 

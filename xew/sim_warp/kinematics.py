@@ -7,7 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xew.protocol import ARMS
-from xew.sim_warp.robots.spec import Arm, Pose, RobotSpec
+from xew.sim_warp.geometry import Pose
+from xew.sim_warp.robots.spec import Arm, RobotSpec
 from xew.sim_warp.robots.urdf import Joint, Urdf, load_urdf
 
 

@@ -11,10 +11,9 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from xew.episode import array_hash
+from xew.sim_warp.geometry import Pose
 from xew.sim_warp.objects import Shape
 
-Pose = tuple[float, float, float, float, float, float, float]
-"""x y z [m], quaternion x y z w; world frame."""
 Point = Sequence[float] | np.ndarray
 """x y or x y z [m]."""
 

@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-Pose = tuple[float, float, float, float, float, float, float]
-"""x y z [m], quaternion x y z w."""
+from xew.sim_warp.geometry import Pose
 
 
 @dataclass(frozen=True)

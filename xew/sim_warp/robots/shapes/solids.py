@@ -11,8 +11,8 @@ Vector = tuple[float, float, float]
 Part = tuple[str, trimesh.Trimesh]
 """Name of a material, and a solid in the frame of its link."""
 
-PAD_BACK, PAD_FRONT, PAD_HALF_WIDTH, PAD_THICKNESS = 0.020, 0.015, 0.011, 0.008
-"""A gripping face reaches this far behind and before the tool centre point, to either side, and outwards [m]."""
+PAD_HALF_WIDTH, PAD_THICKNESS = 0.011, 0.008
+"""A gripping face reaches this far to either side of the tool centre point, and outwards [m]."""
 
 
 @dataclass(frozen=True)
