@@ -1,6 +1,6 @@
 """What a batch costs, and how far physics repeats itself: worlds of all tasks and robots stepped together.
 
-    python benchmarks/physics.py [--device cuda:0] [--batches 64 256 1024 4096] [--repeat 200]
+    python benchmarks/physics.py [--device cuda:0] [--batches 64 256 1024 4096] [--tasks lift_pot …] [--repeat 200]
 
 The worlds are those of `generate`: the first seeds of every task on every robot, each along the commands of its expert,
 from the first frame to the last of the longest, with contacts and states recorded at every stored frame. Building (the
@@ -30,7 +30,7 @@ from xew.sim_warp.physics import simulate
 from xew.sim_warp.physics_gpu import Batch
 from xew.sim_warp.produce import Cell, Job, plan_cells
 from xew.sim_warp.robots import ROBOTS
-from xew.sim_warp.tasks import TASKS
+from xew.sim_warp.tasks import TASKS, get_task
 from xew.sim_warp.worlds import STEPS_PER_FRAME, Motion, World
 
 PACKAGES = ("newton", "mujoco-warp", "warp-lang", "numpy")
@@ -45,14 +45,16 @@ class Args:
     """Numbers of worlds."""
     frames: int | None = None
     """Stored frames that are stepped; by default all."""
+    tasks: tuple[str, ...] = ()
+    """Step each of these by itself, as `generate` does, whose batches hold one to three tasks."""
     repeat: int = 0
     """Worlds that are stepped again and again."""
 
 
-def cells_for(count: int) -> list[Cell]:
-    """At least `count` cells that their robots can follow, of all tasks and robots in turn, seed by seed."""
+def cells_for(count: int, tasks: Sequence[str] = tuple(TASKS)) -> list[Cell]:
+    """`count` cells that their robots can follow, of the tasks and all robots in turn, seed by seed."""
     cells: list[Cell] = []
-    seeds = ((seed, task) for seed in itertools.count() for task in TASKS)
+    seeds = ((seed, task) for seed in itertools.count() for task in tasks)
     while len(cells) < count:
         jobs = [Job(task, seed, tuple(ROBOTS)) for seed, task in itertools.islice(seeds, -(-count // len(ROBOTS)))]
         cells += [cell for planned in plan_cells(jobs) for cell in planned if cell.commands.problem is None]
@@ -75,31 +77,38 @@ def check(cells: list[Cell], motions: list[Motion], whole: bool) -> float:
 
 
 def table(device: wp.Device, args: Args) -> None:
-    """Print a row a number of worlds."""
+    """Print a row a number of worlds, and a row a task where tasks are named."""
     print("worlds  frames  build [s]  stepping [s]  world-steps/s  ms a step  with building  memory [GB]  success")
     begin = time.perf_counter()
     cells = cells_for(max(args.batches))
     planning = (time.perf_counter() - begin) / len(cells)
     for count in args.batches:
-        worlds = [World(cell.robot, cell.scene, cell.commands.action[: args.frames]) for cell in cells[:count]]
-        Batch([World(w.robot, w.scene, w.action[:2]) for w in worlds], device).run()  # loads or compiles kernels
-        begin = time.perf_counter()
-        batch = Batch(worlds, device)
-        wp.synchronize_device(device)
-        built = time.perf_counter()
-        motions = batch.run()
-        end = time.perf_counter()
-        used = wp.get_mempool_used_mem_current(device) / 1e9 if device.is_cuda else float("nan")
-        success = check(cells[:count], motions, args.frames is None)
-        steps = STEPS_PER_FRAME * (batch.frame_count - 1)
-        print(
-            f"{count:6d}  {batch.frame_count:6d}  {built - begin:9.1f}  {end - built:12.1f}  "
-            f"{count * steps / (end - built):13,.0f}  {1000 * (end - built) / steps:9.2f}  "
-            f"{count * steps / (end - begin):13,.0f}  {used:11.1f}  {success:7.1%}",
-            flush=True,
-        )
-        del batch
+        row(cells[:count], device, args.frames)
+    for task in args.tasks:
+        print(f"{task} alone:")
+        row(cells_for(args.batches[0], [get_task(task).name]), device, args.frames)
     print(f"planning and inverse kinematics: {1000 * planning:.1f} ms a world")
+
+
+def row(cells: list[Cell], device: wp.Device, frames: int | None) -> None:
+    """Step one batch and print what it cost."""
+    worlds = [World(cell.robot, cell.scene, cell.commands.action[:frames]) for cell in cells]
+    Batch([World(w.robot, w.scene, w.action[:2]) for w in worlds], device).run()  # loads or compiles kernels
+    begin = time.perf_counter()
+    batch = Batch(worlds, device)
+    wp.synchronize_device(device)
+    built = time.perf_counter()
+    motions = batch.run()
+    end = time.perf_counter()
+    used = wp.get_mempool_used_mem_current(device) / 1e9 if device.is_cuda else float("nan")
+    success = check(cells, motions, frames is None)
+    steps = STEPS_PER_FRAME * (batch.frame_count - 1)
+    print(
+        f"{len(cells):6d}  {batch.frame_count:6d}  {built - begin:9.1f}  {end - built:12.1f}  "
+        f"{len(cells) * steps / (end - built):13,.0f}  {1000 * (end - built) / steps:9.2f}  "
+        f"{len(cells) * steps / (end - begin):13,.0f}  {used:11.1f}  {success:7.1%}",
+        flush=True,
+    )
 
 
 def compare(label: str, cells: Sequence[Cell], ours: Sequence[Motion], others: Sequence[Motion]) -> None:

@@ -1,6 +1,6 @@
 """How long a frame takes: our two fused passes, and the same outputs by Newton's SensorCamera, same scenes, same run.
 
-    python benchmarks/render.py [--device cpu|cuda:0] [--frames N] [--pictures DIR]
+    python benchmarks/render.py [--device cpu|cuda:0] [--frames N] [--first 2] [--pictures DIR]
 
 The workload is what an episode needs, 320x240: the scene (two Panda arms and three things over the table, colour with
 anti-aliasing and shadows, robot mask, visibility of keypoints) and the robot alone by its commands (colour, mask, exact
@@ -69,6 +69,8 @@ class Args:
     """Frames of a batch of ours, 0 for 24 on a CPU and 6144 on a GPU."""
     pictures: Path | None = None
     """Folder for pictures of both side by side, one a workload."""
+    first: int = 0
+    """Workload to begin with: 0 capsules, 1 the robot's own meshes, 2 meshes of 2,000 triangles a link."""
 
 
 @dataclass(frozen=True)
@@ -402,7 +404,7 @@ def main(args: Args) -> None:
     print(f"{device.name} ({device.alias}), Python {platform.python_version()}")
     print(", ".join(f"{name} {version(name)}" for name in PACKAGES))
     renderer = Renderer(device.alias)
-    for work in workloads():
+    for work in workloads()[args.first :]:
         race(work, renderer, worlds, args.pictures)
 
 
