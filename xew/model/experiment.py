@@ -57,9 +57,16 @@ class ModelSettings:
 
 @dataclass(frozen=True)
 class TrainSettings:
-    steps: int
     batch: int
+    """Samples of one step over all devices."""
+    steps: int = 0
+    epochs: float = 0.0
+    """Passes over the training samples; give this or `steps`."""
     seed: int = 0
+    accumulate: int = 1
+    """Parts of the batch that are computed one after another: less memory, the same step."""
+    chunks: Literal[1, 2] = 1
+    """Consecutive clips of a sample; the second starts from the predicted, not the true, end of the first."""
     learning_rate: float = 5e-5
     warmup_steps: int = 0
     decay_to: float = 1.0
@@ -68,12 +75,40 @@ class TrainSettings:
     clip_norm: float = 1.0
     ema_decay: float = 0.0
     """0 keeps no average."""
+    mu_dtype: Literal["float32", "bfloat16"] = "float32"
+    """Of AdamW's first moment; bfloat16 saves two bytes a parameter."""
     shift: float = 5.0
     """Of the noise levels, in training and in sampling."""
     log_every: int = 20
     save_every: int = 1000
     sample_every: int = 1000
     keep_checkpoints: int = 2
+
+
+@dataclass(frozen=True)
+class MeshSettings:
+    """How many ways the devices share the work; -1 means what the other leaves."""
+
+    data: int = -1
+    """Copies of the parameters, each with its part of the batch."""
+    fsdp: int = 1
+    """Parts that parameters and optimizer are cut into, each with its part of the batch too."""
+
+
+@dataclass(frozen=True)
+class AdaptSettings:
+    """Adaptation of a trained run to robots that it has not seen, from a few episodes. Off without `start_from`."""
+
+    start_from: Path | None = None
+    """The run whose weights, at its latest checkpoint, are the start."""
+    robots: tuple[str, ...] = ()
+    """Whose episodes are learned from."""
+    episodes: int = 1
+    """Of each task and robot: the first so many accepted training seeds (M in the paper)."""
+    replay: float = 0.0
+    """Part of every batch that comes from the run's own training robots; 0 as in the paper."""
+    lora_rank: int = 0
+    """Learn corrections of this rank to the blocks' matrices instead of all weights; 0 as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +133,8 @@ class Experiment:
     split: str = "fixed"
     """One of protocol.SPLITS: which robots train."""
     codec: CodecSettings = CodecSettings()
+    mesh: MeshSettings = MeshSettings()
+    adapt: AdaptSettings = AdaptSettings()
     rollout: RolloutSettings = RolloutSettings()
     cache: Path | None = None
     """Encoded streams; beside the data where left out."""
