@@ -1,4 +1,4 @@
-"""Noise levels, training pairs and the sampler."""
+"""Noise levels and training pairs."""
 
 import jax
 import jax.numpy as jnp
@@ -52,25 +52,3 @@ def test_loss_ignores_the_reference_frame(latents: jax.Array) -> None:
     wrong_reference = pair.velocity.at[:, 0].add(100.0)
     np.testing.assert_array_equal(fm.sample_losses(wrong_reference, pair), np.zeros(len(latents)))
     np.testing.assert_allclose(fm.sample_losses(pair.velocity + 2, pair), np.full(len(latents), 4.0), rtol=1e-5)
-
-
-@pytest.mark.parametrize("steps", [1, 3])
-def test_sampler_solves_a_straight_flow_exactly(latents: jax.Array, steps: int) -> None:
-    """With the true velocity of a point target, Euler arrives whatever the number of steps."""
-    noise = jax.random.normal(jax.random.key(2), SHAPE, jnp.float32)
-
-    def velocity(current: jax.Array, sigma: jax.Array) -> jax.Array:
-        return (current - latents) / sigma[:, None, None, None, None]
-
-    sampled = fm.euler_sample(velocity, latents[:, :1], noise, fm.sampling_sigmas(steps, 5.0))
-    np.testing.assert_allclose(sampled, latents, atol=1e-4)
-
-
-def test_reference_is_given_to_every_step_and_returned(latents: jax.Array) -> None:
-    def velocity(current: jax.Array, sigma: jax.Array) -> jax.Array:
-        return jnp.broadcast_to(current[:, :1], current.shape)
-
-    reference = latents[:, :1]
-    sampled = fm.euler_sample(velocity, reference, jnp.zeros(SHAPE), fm.sampling_sigmas(4, 5.0))
-    np.testing.assert_array_equal(sampled[:, :1], reference)
-    np.testing.assert_allclose(sampled[:, 1:], jnp.broadcast_to(-reference, sampled[:, 1:].shape), atol=1e-5)

@@ -13,6 +13,7 @@ from xew.config import ConfigError, load, pick
 from xew.model.codec import CODECS, TEMPORAL_FACTOR, latent_frames
 from xew.model.conditions import ACTIONS, CONDITIONS, Condition
 from xew.model.dit import MODELS, PATCH, WorldModel
+from xew.model.samplers import GRIDS, SAMPLERS
 from xew.model.text import TEXT_ENCODERS
 from xew.protocol import SPLITS, Split
 
@@ -113,8 +114,17 @@ class AdaptSettings:
 
 @dataclass(frozen=True)
 class RolloutSettings:
+    sampler: str = "euler"
+    """One of SAMPLERS."""
+    grid: str = "flowwam"
+    """One of GRIDS: which project's noise levels."""
     steps: int = 50
-    """Euler steps a chunk."""
+    """Evaluations of the network a chunk."""
+    shift: float | None = None
+    """Of the noise levels; that of training where left out."""
+    guidance: float = 1.0
+    """Classifier-free guidance against `negative_prompt`; 1 is none and costs nothing. Wan's own sampling has 5."""
+    negative_prompt: str = ""
     batch: int = 4
     max_frames: int = 0
     """Predict only the first so many frames of an episode; 0 predicts all."""
@@ -166,6 +176,8 @@ def load_experiment(path: Path | str, overrides: list[str] | None = None) -> Exp
     pick(MODELS, experiment.model.size, "model size")
     pick(CODECS, experiment.codec.name, "codec")
     pick(TEXT_ENCODERS, experiment.model.text, "text encoder")
+    pick(SAMPLERS, experiment.rollout.sampler, "sampler")
+    pick(GRIDS, experiment.rollout.grid, "grid of noise levels")
     _ = experiment.robots, experiment.conditions
     _check_sizes(experiment, str(path))
     return experiment

@@ -1,10 +1,9 @@
-"""Flow matching: noise levels, the training pair, the RGB loss and the Euler sampler.
+"""Flow matching: noise levels, the training pair and the RGB loss. (samplers.py goes the way back.)
 
 x_sigma = (1 - sigma) x_0 + sigma n; the network predicts the velocity n - x_0. Latent frame 0 is the given reference:
 clean in training (up to a small perturbation), put back after every sampling step, and never in the loss.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -34,7 +33,7 @@ def shift_sigma(sigma: np.ndarray, shift: float) -> np.ndarray:
 
 
 def sampling_sigmas(steps: int, shift: float) -> np.ndarray:
-    """The `steps` + 1 levels from 1 to 0 of the Euler sampler, on the grid of DiffSynth and FlowWAM (float64)."""
+    """`steps` + 1 levels from 1 to 0 on the grid of DiffSynth and FlowWAM (float64)."""
     return np.append(shift_sigma(np.linspace(1, 0, steps + 1)[:-1], shift), 0.0)
 
 
@@ -55,27 +54,3 @@ def training_pair(key: Array, latents: Array, shift: float) -> TrainingPair:
 def sample_losses(predicted: Array, pair: TrainingPair) -> Array:
     """Mean squared velocity error [b] over latent frames 1 and on."""
     return jnp.square(predicted[:, 1:] - pair.velocity[:, 1:]).mean(axis=(1, 2, 3, 4))
-
-
-def euler_sample(velocity: Callable[[Array, Array], Array], reference: Array, noise: Array, sigmas: np.ndarray) -> Array:
-    """Integrate from noise to latents.
-
-    Args:
-        velocity: (latents [b t h w c], sigma [b]) -> [b t h w c].
-        reference: [b 1 h w c], clean latent frame 0.
-        noise: [b t h w c], unit normal; its frame 0 is not used.
-        sigmas: [k + 1] decreasing levels, as from `sampling_sigmas`.
-
-    Returns:
-        [b t h w c] whose frame 0 is the reference.
-    """
-
-    def clamp(latents: Array) -> Array:
-        return jnp.concatenate([reference, latents[:, 1:]], axis=1)
-
-    def step(latents: Array, levels: Array) -> tuple[Array, None]:
-        sigma = jnp.broadcast_to(levels[0], latents.shape[:1])
-        return clamp(latents + (levels[1] - levels[0]) * velocity(latents, sigma)), None
-
-    pairs = jnp.asarray(np.stack([sigmas[:-1], sigmas[1:]], axis=1), jnp.float32)
-    return jax.lax.scan(step, clamp(noise), pairs)[0]

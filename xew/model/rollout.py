@@ -28,9 +28,9 @@ from xew.model.checkpoint import load_run, restore_params
 from xew.model.codec import Codec
 from xew.model.data import Batch, encode_text
 from xew.model.experiment import Experiment, compile_cache, create_model
-from xew.model.flow_matching import euler_sample, sampling_sigmas
 from xew.model.frames import to_camera_size
 from xew.model.latents import Episode, encode_clip, stream_videos
+from xew.model.samplers import GRIDS, SAMPLERS, Grid
 from xew.protocol import ROBOT_NAMES, seed_split
 from xew.rollout import write_rollout
 
@@ -83,20 +83,21 @@ class Predictor:
         text = np.stack([encode_text(self.experiment, record.instruction) for _, record in episodes])
         noise = jnp.stack([jax.random.normal(key, self.experiment.latent_shape, jnp.float32) for key in keys])
         latents = np.stack([self.codec.encode(frame) for frame in reference])
-        sigmas = sampling_sigmas(self.experiment.rollout.steps, self.experiment.train.shift)
-        sampled = sample(self.graph, self.params, Batch(latents, conditions, text), noise, tuple(sigmas))
+        settings = self.experiment.rollout
+        grid = GRIDS[settings.grid](settings.steps, settings.shift or self.experiment.train.shift)
+        sampled = sample(self.graph, self.params, Batch(latents, conditions, text), noise, grid, settings.sampler)
         return np.stack([self.codec.decode(clip) for clip in np.asarray(sampled)])
 
 
-@jax.jit(static_argnums=(0, 4))
-def sample(graph: nnx.GraphDef, params: Any, batch: Batch, noise: jax.Array, sigmas: tuple[float, ...]) -> jax.Array:
+@jax.jit(static_argnums=(0, 4, 5))
+def sample(graph: nnx.GraphDef, params: Any, batch: Batch, noise: jax.Array, grid: Grid, sampler: str) -> jax.Array:
     """Latents [b t h w c] sampled from noise; `batch.latents` [b 1 h w c] is the reference."""
     model = nnx.merge(graph, params)
 
     def velocity(latents: jax.Array, sigma: jax.Array) -> jax.Array:
         return model(latents, batch.conditions, sigma, batch.text)
 
-    return euler_sample(velocity, batch.latents, noise, np.asarray(sigmas))
+    return SAMPLERS[sampler](velocity, batch.latents, noise, grid)
 
 
 def select_episodes(data: Path, split: str, robots: Sequence[str]) -> list[Episode]:
