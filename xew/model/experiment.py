@@ -14,6 +14,7 @@ from xew.model.codec import CODECS, TEMPORAL_FACTOR, latent_frames
 from xew.model.conditions import ACTIONS, CONDITIONS, Condition
 from xew.model.dit import MODELS, PATCH, WorldModel
 from xew.model.samplers import GRIDS, SAMPLERS
+from xew.model.sharding import MeshSettings
 from xew.model.text import TEXT_ENCODERS
 from xew.protocol import SPLITS, Split
 
@@ -84,16 +85,6 @@ class TrainSettings:
     save_every: int = 1000
     sample_every: int = 1000
     keep_checkpoints: int = 2
-
-
-@dataclass(frozen=True)
-class MeshSettings:
-    """How many ways the devices share the work; -1 means what the other leaves."""
-
-    data: int = -1
-    """Copies of the parameters, each with its part of the batch."""
-    fsdp: int = 1
-    """Parts that parameters and optimizer are cut into, each with its part of the batch too."""
 
 
 @dataclass(frozen=True)

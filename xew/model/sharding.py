@@ -1,0 +1,147 @@
+"""Many devices and hosts: the mesh, where parameters and batches lie on it, and starting the processes.
+
+The mesh has two axes. Batches are cut over both. Parameters, their moving average and the optimizer's moments are copied
+along `data` and cut along `fsdp` (each layer's are gathered when it is computed). The numbers do not depend on the mesh,
+up to the order of sums.
+"""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+from xew.config import ConfigError
+
+AXES = ("data", "fsdp")
+SMALL = 2**14
+"""Arrays of fewer numbers (in one layer) are copied to every device: gathering them costs more than they weigh."""
+LAYERS = "blocks"
+"""Arrays below this name have a leading axis of layers, over which the network scans: it is never cut."""
+
+
+@dataclass(frozen=True)
+class MeshSettings:
+    """How many ways the devices share the work; -1 means what the other leaves."""
+
+    data: int = -1
+    """Copies of the parameters, each with its part of the batch."""
+    fsdp: int = 1
+    """Parts that parameters and optimizer are cut into, each with its part of the batch too."""
+
+
+def start_processes(force: bool = False, environment: Mapping[str, str] = os.environ) -> None:
+    """Join the other processes of this run, if a launcher has started several.
+
+    Done when asked, or when the variables of a launcher are there: JAX_COORDINATOR_ADDRESS with JAX_NUM_PROCESSES and
+    JAX_PROCESS_ID (one pair for each process), or those of Slurm or Open MPI with more than one task, which JAX reads itself.
+
+    Raises:
+        ConfigError: the variables contradict each other, or the others were not found.
+    """
+    tasks = max(int(environment.get(name, 1)) for name in ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE"))
+    coordinator = environment.get("JAX_COORDINATOR_ADDRESS")
+    if not (force or coordinator or tasks > 1):
+        return
+    try:
+        named = {"num_processes": "JAX_NUM_PROCESSES", "process_id": "JAX_PROCESS_ID"}
+        numbers = {key: int(environment[name]) for key, name in named.items() if name in environment}
+        jax.distributed.initialize(coordinator, **numbers)
+    except (ValueError, RuntimeError) as error:
+        raise ConfigError(
+            f"cannot join the other processes: {error}. Set JAX_COORDINATOR_ADDRESS=host:port, JAX_NUM_PROCESSES and "
+            "JAX_PROCESS_ID in each, or start them with Slurm's srun or Open MPI's mpirun."
+        ) from error
+
+
+def mesh_shape(settings: MeshSettings, devices: int) -> tuple[int, int]:
+    """Sizes of the axes data and fsdp on so many devices. Raises ConfigError if they do not fill them exactly."""
+    asked = (settings.data, settings.fsdp)
+    known = math.prod(size for size in asked if size != -1)
+    if asked.count(-1) > 1 or min(asked) < -1 or 0 in asked:
+        raise ConfigError(f"mesh is data {asked[0]} x fsdp {asked[1]}; give positive numbers, at most one of them -1 (the rest).")
+    if devices % known or (-1 not in asked and known != devices):
+        raise ConfigError(
+            f"mesh is data {asked[0]} x fsdp {asked[1]}, there are {devices} devices; the product must be {devices} "
+            "(-1 takes what the other leaves)."
+        )
+    data, fsdp = (size if size != -1 else devices // known for size in asked)
+    return data, fsdp
+
+
+def make_mesh(settings: MeshSettings, devices: Sequence[jax.Device] | None = None) -> Mesh:
+    """The mesh over all devices of all processes, or over the given ones."""
+    devices = jax.devices() if devices is None else devices
+    shape = mesh_shape(settings, len(devices))
+    return jax.make_mesh(shape, AXES, axis_types=(AxisType.Auto,) * 2, devices=devices)
+
+
+def check_batch(batch: int, accumulate: int, devices: int) -> None:
+    """Raises ConfigError unless every device gets equally many samples of every part of the batch."""
+    if batch % (devices * accumulate):
+        near = max(1, round(batch / (devices * accumulate))) * devices * accumulate
+        raise ConfigError(
+            f"train.batch is {batch}; it must be a multiple of {devices} devices x train.accumulate {accumulate} = "
+            f"{devices * accumulate}, for example {near}."
+        )
+
+
+def parameter_spec(path: Sequence[Any], shape: Sequence[int], fsdp: int) -> PartitionSpec:
+    """Which axis of an array is cut: the largest that `fsdp` divides (the last of equals), never the layers'; none if small."""
+    first = 1 if LAYERS in path and len(shape) > 1 else 0
+    candidates = [axis for axis in range(first, len(shape)) if shape[axis] % fsdp == 0]
+    if fsdp == 1 or not candidates or math.prod(shape[first:]) < SMALL:
+        return PartitionSpec()
+    chosen = max(candidates, key=lambda axis: (shape[axis], axis))
+    return PartitionSpec(*("fsdp" if axis == chosen else None for axis in range(len(shape))))
+
+
+def state_shardings(state: Any, mesh: Mesh) -> Any:
+    """Where each array of a tree (parameters, optimizer) lies, in the same tree; only shapes and names are looked at."""
+
+    def place(path: tuple[Any, ...], leaf: Any) -> NamedSharding:
+        return NamedSharding(mesh, parameter_spec(path_names(path), leaf.shape, mesh.shape["fsdp"]))
+
+    return jax.tree_util.tree_map_with_path(place, state)
+
+
+def path_names(path: Sequence[Any]) -> tuple[str, ...]:
+    """The plain names along a path in a tree."""
+    return tuple(str(getattr(entry, "key", getattr(entry, "name", getattr(entry, "idx", entry)))) for entry in path)
+
+
+def batch_sharding(mesh: Mesh) -> NamedSharding:
+    """The leading axis cut over all devices."""
+    return NamedSharding(mesh, PartitionSpec(AXES))
+
+
+def replicated(mesh: Mesh) -> NamedSharding:
+    """A copy on every device."""
+    return NamedSharding(mesh, PartitionSpec())
+
+
+def process_rows(mesh: Mesh, batch: int) -> np.ndarray:
+    """Which samples of the whole batch this process loads, in order."""
+    slices = batch_sharding(mesh).addressable_devices_indices_map((batch,)).values()
+    return np.unique(np.concatenate([np.arange(batch)[index] for index in slices]))
+
+
+def place_batch(batch: Any, mesh: Mesh) -> Any:
+    """This process's samples (any tree of arrays [b' ...]) as its part of the whole batch on the mesh."""
+    sharding = batch_sharding(mesh)
+    return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, leaf), batch)
+
+
+def cut_over_batch(values: jax.Array) -> jax.Array:
+    """Tell the compiler that activations [b ...] stay cut over the batch alone, where a mesh is set; else nothing.
+
+    Left to itself it may cut their features where it has cut the parameters', which cuDNN's attention cannot take.
+    """
+    mesh = jax.sharding.get_abstract_mesh()
+    axes = tuple(axis for axis in AXES if axis in mesh.axis_names)
+    even = axes and values.shape[0] % math.prod(mesh.shape[axis] for axis in axes) == 0
+    return jax.lax.with_sharding_constraint(values, PartitionSpec(axes)) if even else values
