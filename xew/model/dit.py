@@ -18,6 +18,8 @@ import numpy as np
 from flax import nnx
 from jax import Array
 
+from xew.model.sharding import cut_over_batch
+
 PATCH = (1, 2, 2)
 EPSILON = 1e-6
 WAVELENGTH_BASE = 10_000.0
@@ -165,7 +167,7 @@ class WorldModel(nnx.Module):
         graph, layers = nnx.split(self.blocks)
 
         def block(carry: Array, layer: nnx.State) -> tuple[Array, None]:
-            return nnx.merge(graph, layer)(carry, modulation, rows, rotary, text), None
+            return nnx.merge(graph, layer)(cut_over_batch(carry), modulation, rows, rotary, text), None
 
         return jax.lax.scan(jax.checkpoint(block) if self.remat else block, tokens, layers, unroll=self.unroll)[0]
 
@@ -208,7 +210,7 @@ class Attention(nnx.Module):
         )
         if rotary is not None:
             q, k = rotate(q, rotary), rotate(k, rotary)
-        q, k, v = (x.astype(self.dtype) for x in (q, k, v))
+        q, k, v = (cut_over_batch(x.astype(self.dtype)) for x in (q, k, v))
         return self.o(jax.nn.dot_product_attention(q, k, v, implementation=self.implementation).reshape(tokens.shape))
 
     def _split(self, values: Array) -> Array:
