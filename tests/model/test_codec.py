@@ -2,10 +2,21 @@
 
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
-from xew.model.codec import PatchCodec, cut_patches, join_patches, latent_frames, reconstruction_psnr
+from xew.model.codec import (
+    PatchCodec,
+    cut_patches,
+    decode_to_pictures,
+    encode_pictures,
+    join_patches,
+    latent_frames,
+    reconstruction_psnr,
+    to_pictures,
+    to_signed,
+)
 from xew.model.frames import to_camera_size, to_model_size
 
 
@@ -42,6 +53,32 @@ def test_causal(codec: PatchCodec) -> None:
     np.testing.assert_array_equal(codec.encode(video[:1])[0], before[0])
 
 
+def test_a_batch_is_its_clips(codec: PatchCodec) -> None:
+    """On the device and in a batch, and one clip at a time as pictures, the codec is the same."""
+    videos = np.stack([smooth_clip(8), smooth_clip(9)])
+    latents = encode_pictures(codec, videos)
+    np.testing.assert_allclose(latents, np.stack([codec.encode(video) for video in videos]), atol=1e-5)
+    decoded = np.stack([codec.decode(clip) for clip in np.asarray(latents)])
+    assert np.abs(decoded.astype(int) - decode_to_pictures(codec, latents)).max() <= 1
+
+
+def test_the_next_reference_is_what_a_rollout_would_encode(codec: PatchCodec) -> None:
+    latents = codec.encode(smooth_clip(9))
+    expected = codec.encode(codec.decode(latents)[-1:])
+    found = jax.jit(lambda codec, latents: codec.next_reference(latents))(codec, latents[None])
+    assert found.shape == (1, 1, 4, 6, 24)
+    np.testing.assert_allclose(found[0], expected, atol=1e-4)
+
+
+def test_a_codec_s_arrays_are_no_constants_of_a_program(codec: PatchCodec) -> None:
+    leaves = jax.tree.leaves(codec)
+    assert sum(np.size(leaf) for leaf in leaves) > 2 * 8 * 8 * 3 * 24
+    twice = jax.tree.map(lambda leaf: leaf * 2, codec)
+    program = jax.jit(lambda codec, latents: codec.decode_batch(latents))
+    latents = codec.encode(smooth_clip(9))[None]
+    assert not np.allclose(program(codec, latents), program(twice, latents))
+
+
 def test_stillness_is_zero(codec: PatchCodec) -> None:
     still = np.repeat(smooth_clip(9)[:1], 9, 0)
     latents = codec.encode(still)
@@ -57,8 +94,8 @@ def test_latents_are_of_unit_size(codec: PatchCodec) -> None:
 
 
 def test_patches_are_lossless() -> None:
-    video = np.random.default_rng(0).integers(0, 256, (9, 16, 24, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(join_patches(*cut_patches(video, 8), 8), video)
+    videos = np.random.default_rng(0).integers(0, 256, (2, 9, 16, 24, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(to_pictures(join_patches(*cut_patches(to_signed(videos), 8), 8)), videos)
 
 
 def test_refuses_clips_that_do_not_fit(codec: PatchCodec) -> None:
@@ -69,8 +106,8 @@ def test_refuses_clips_that_do_not_fit(codec: PatchCodec) -> None:
 
 
 def test_saved_codec_is_the_same(codec: PatchCodec, tmp_path: Path) -> None:
-    codec.save(tmp_path / "codec.npz")
-    loaded = PatchCodec.load(tmp_path / "codec.npz")
+    codec.save(tmp_path)
+    loaded = PatchCodec.load(tmp_path)
     assert loaded.hash == codec.hash
     np.testing.assert_array_equal(loaded.encode(smooth_clip(9)), codec.encode(smooth_clip(9)))
 

@@ -1,7 +1,7 @@
 """Runs on disk: what a run folder holds, whether it may be written, and its checkpoints (Orbax).
 
 <out>/config.yaml       the resolved config, itself a valid input
-<out>/codec.npz         the codec that the latents were made with
+<out>/codec/            the codec that the latents were made with
 <out>/checkpoints/STEP  params, optimizer, position of the data; ema where it is kept
 <out>/metrics.jsonl     and TensorBoard's event files
 """
@@ -67,7 +67,8 @@ def prepare_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite
     try:
         out.mkdir(parents=True, exist_ok=True)
         config.save(experiment, saved)
-        codec.save(out / "codec.npz")
+        (out / "codec").mkdir(exist_ok=True)
+        codec.save(out / "codec")
     except OSError as error:
         raise ConfigError(f"cannot write the run {out}: {error}; choose another --out.") from error
 
@@ -137,7 +138,7 @@ def load_run(out: Path) -> tuple[Experiment, Codec]:
     if not (out / "config.yaml").exists():
         raise ConfigError(f"{out} holds no run; train one: python -m xew.model.train CONFIG --out {out}")
     experiment = load_experiment(out / "config.yaml")
-    return experiment, CODECS[experiment.codec.name].load(out / "codec.npz")
+    return experiment, CODECS[experiment.codec.name].load(out / "codec")
 
 
 def _abstract(tree: Any) -> Any:

@@ -1,22 +1,44 @@
-"""Video codecs: uint8 frames to latents and back. Every codec is causal: the first frame alone, then groups of four.
+"""Video codecs: frames to latents and back. Every codec is causal: the first frame alone, then groups of four.
 
-Reads  uint8 [t h w 3], t = 4 k + 1
+Reads  uint8 [t h w 3], or on the device float [b t h w 3] in [-1, 1]; t = 4 k + 1
 Writes float32 latents [k + 1, h / factor, w / factor, channels] of about unit size
-To add a codec: a class with the methods of `Codec`, and one line in CODECS.
+To add a codec: a class with the methods of `Codec` (most come with `BatchCodec`), and one line in CODECS.
+
+A codec is a JAX pytree of its arrays, so that it is passed to compiled functions and is no constant in them.
 """
 
+import functools
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array, lax
 
 TEMPORAL_FACTOR = 4
 
 
+@dataclass(frozen=True)
+class CodecSettings:
+    """The `codec` section of a config."""
+
+    name: str = "patch_pca"
+    """One of CODECS."""
+    spatial_factor: int = 8
+    channels: int = 48
+    fit_clips: int = 64
+    """patch_pca: clips of training episodes from which the components are computed."""
+
+
 class Codec(Protocol):
     """What the rest of the room asks of a codec."""
+
+    fitted: ClassVar[bool]
+    """Whether it comes from the training episodes themselves, and not from weights."""
 
     @property
     def spatial_factor(self) -> int:
@@ -36,39 +58,106 @@ class Codec(Protocol):
     def decode(self, latents: np.ndarray) -> np.ndarray:
         """float32 [t' h' w' c] -> uint8 [t h w 3]."""
 
-    def save(self, path: Path) -> None: ...
+    def encode_batch(self, frames: Array) -> Array:
+        """Float [b t h w 3] in [-1, 1] -> float32 [b t' h' w' c]; may be traced."""
+
+    def decode_batch(self, latents: Array) -> Array:
+        """Float [b t' h' w' c] -> float32 [b t h w 3], about in [-1, 1]; may be traced."""
+
+    def next_reference(self, latents: Array) -> Array:
+        """[b t' h' w' c] -> [b 1 h' w' c]: the last frame of a decoded clip, encoded alone; may be traced.
+
+        It is rounded as if it had been a picture in between, so it is what a rollout begins its next chunk with.
+        """
+
+    def save(self, folder: Path) -> None:
+        """Write all that `load` needs into a folder, under names of its own."""
 
     @classmethod
-    def load(cls, path: Path) -> Self: ...
+    def load(cls, folder: Path) -> Self: ...
+
+    @classmethod
+    def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> Self:
+        """The codec of a config; `clips` gives uint8 [t h w 3] of training episodes to one that is fitted to them."""
 
 
+class BatchCodec:
+    """A codec's functions on pictures and on single clips, from its `encode_batch` and `decode_batch`."""
+
+    spatial_factor: int
+    encode_batch: Callable[[Array], Array]
+    decode_batch: Callable[[Array], Array]
+
+    def encode(self, video: np.ndarray) -> np.ndarray:
+        """uint8 [t h w 3] -> float32 [t' h' w' c]; t must be 4 k + 1 and the sides multiples of the factor."""
+        check_clip_shape(video.shape, self.spatial_factor)
+        return np.asarray(encode_pictures(self, video[None]))[0]
+
+    def decode(self, latents: np.ndarray) -> np.ndarray:
+        """float32 [t' h' w' c] -> uint8 [t h w 3]."""
+        return np.asarray(decode_to_pictures(self, latents[None]))[0]
+
+    def next_reference(self, latents: Array) -> Array:
+        """[b t' h' w' c] -> [b 1 h' w' c]: the last decoded frame as a picture, encoded alone."""
+        return self.encode_batch(to_signed(to_pictures(self.decode_batch(latents)[:, -1:])))
+
+
+@jax.jit
+def encode_pictures(codec: Any, videos: Array) -> Array:
+    """uint8 [b t h w 3] -> float32 latents [b t' h' w' c]."""
+    return codec.encode_batch(to_signed(videos))
+
+
+@jax.jit
+def decode_to_pictures(codec: Any, latents: Array) -> Array:
+    """Latents [b t' h' w' c] -> uint8 [b t h w 3]."""
+    return to_pictures(codec.decode_batch(latents))
+
+
+def to_signed(pictures: Array) -> Array:
+    """uint8 -> float32 in [-1, 1]."""
+    return pictures.astype(jnp.float32) / 127.5 - 1
+
+
+def to_pictures(frames: Array) -> Array:
+    """Float, about in [-1, 1] -> uint8."""
+    return jnp.clip(jnp.rint((frames + 1) * 127.5), 0, 255).astype(jnp.uint8)
+
+
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("mean", "directions", "scale"), meta_fields=())
 @dataclass(frozen=True)
 class Basis:
     """An affine map between patches [p] and latent channels [c]."""
 
-    mean: np.ndarray
+    mean: Any
     """[p] float32."""
-    directions: np.ndarray
+    directions: Any
     """[p c] float32, orthonormal columns."""
-    scale: np.ndarray
+    scale: Any
     """[c] float32, divides the coordinates along the directions."""
 
-    def encode(self, patches: np.ndarray) -> np.ndarray:
-        """[... p] -> [... c]."""
-        return (patches - self.mean) @ self.directions / self.scale
+    def encode(self, patches: Array) -> Array:
+        """[... p] -> [... c]. At the highest precision: TF32, the default of some GPUs, costs the codec decibels."""
+        centred = patches - over_last(self.mean, patches.ndim)
+        return jnp.matmul(centred, self.directions, precision=lax.Precision.HIGHEST) / over_last(self.scale, patches.ndim)
 
-    def decode(self, latents: np.ndarray) -> np.ndarray:
+    def decode(self, latents: Array) -> Array:
         """[... c] -> [... p]."""
-        return (latents * self.scale) @ self.directions.T + self.mean
+        scaled = latents * over_last(self.scale, latents.ndim)
+        patches = jnp.matmul(scaled, self.directions.T, precision=lax.Precision.HIGHEST)
+        return patches + over_last(self.mean, latents.ndim)
 
 
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("first", "later"), meta_fields=("spatial_factor",))
 @dataclass(frozen=True)
-class PatchCodec:
+class PatchCodec(BatchCodec):
     """A linear codec without pretrained weights: principal components of square patches.
 
     Frame 0 is coded as it is; a group of four later frames as its difference from frame 0, as video codecs code frames
     between key frames. What stays still is zero, so copying the reference asks nothing of the model.
     """
+
+    fitted: ClassVar[bool] = True
 
     spatial_factor: int
     first: Basis
@@ -88,27 +177,31 @@ class PatchCodec:
                 digest.update(np.ascontiguousarray(getattr(basis, field.name)).tobytes())
         return digest.hexdigest()
 
-    def encode(self, video: np.ndarray) -> np.ndarray:
-        """uint8 [t h w 3] -> float32 [t' h' w' c]; t must be 4 k + 1 and the sides multiples of the factor."""
-        check_clip_shape(video.shape, self.spatial_factor)
-        first, later = cut_patches(video, self.spatial_factor)
-        return np.concatenate([self.first.encode(first)[None], self.later.encode(later)])
+    def encode_batch(self, frames: Array) -> Array:
+        """Float [b t h w 3] in [-1, 1] -> float32 [b t' h' w' c]."""
+        first, later = cut_patches(frames, self.spatial_factor)
+        return jnp.concatenate([self.first.encode(first), self.later.encode(later)], axis=1)
 
-    def decode(self, latents: np.ndarray) -> np.ndarray:
-        """float32 [t' h' w' c] -> uint8 [t h w 3]."""
-        return join_patches(self.first.decode(latents[0]), self.later.decode(latents[1:]), self.spatial_factor)
+    def decode_batch(self, latents: Array) -> Array:
+        """Float32 [b t' h' w' c] -> float32 [b t h w 3], about in [-1, 1]."""
+        return join_patches(self.first.decode(latents[:, :1]), self.later.decode(latents[:, 1:]), self.spatial_factor)
 
-    def save(self, path: Path) -> None:
+    def save(self, folder: Path) -> None:
+        """Write codec.npz."""
         arrays = {
             f"{name}_{f.name}": getattr(getattr(self, name), f.name) for name in ("first", "later") for f in fields(Basis)
         }
-        np.savez(path, spatial_factor=self.spatial_factor, **arrays)
+        np.savez(folder / "codec.npz", spatial_factor=self.spatial_factor, **arrays)
 
     @classmethod
-    def load(cls, path: Path) -> "PatchCodec":
-        with np.load(path) as stored:
+    def load(cls, folder: Path) -> "PatchCodec":
+        with np.load(folder / "codec.npz") as stored:
             first, later = (Basis(*(stored[f"{name}_{f.name}"] for f in fields(Basis))) for name in ("first", "later"))
             return cls(int(stored["spatial_factor"]), first, later)
+
+    @classmethod
+    def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> "PatchCodec":
+        return cls.fit(clips(), settings.spatial_factor, settings.channels)
 
     @classmethod
     def fit(cls, clips: list[np.ndarray], spatial_factor: int, channels: int, whitening: float = 0.5) -> "PatchCodec":
@@ -118,13 +211,18 @@ class PatchCodec:
             whitening: 1 gives every channel unit variance, 0 keeps the patches' own proportions; the scale is such that
                 the mean variance over channels is 1 either way.
         """
-        cut = [cut_patches(clip, spatial_factor) for clip in clips]
-        first = np.concatenate([part.reshape(-1, part.shape[-1]) for part, _ in cut])
-        later = np.concatenate([part.reshape(-1, part.shape[-1]) for _, part in cut])
+        cut = [cut_patches(clip[None].astype(np.float32) / 127.5 - 1, spatial_factor) for clip in clips]
+        first = np.concatenate([np.reshape(part, (-1, part.shape[-1])) for part, _ in cut])
+        later = np.concatenate([np.reshape(part, (-1, part.shape[-1])) for _, part in cut])
         return cls(spatial_factor, _fit(first, channels, whitening, True), _fit(later, channels, whitening, False))
 
 
 CODECS = {"patch_pca": PatchCodec}
+
+
+def over_last(vector: Array, ndim: int) -> Array:
+    """[c] -> [1 ... 1 c]: to be broadcast over the last of `ndim` axes."""
+    return jnp.reshape(vector, (1,) * (ndim - 1) + (-1,))
 
 
 def check_clip_shape(shape: tuple[int, ...], spatial_factor: int) -> None:
@@ -139,24 +237,23 @@ def latent_frames(frames: int) -> int:
     return (frames - 1) // TEMPORAL_FACTOR + 1
 
 
-def cut_patches(video: np.ndarray, factor: int) -> tuple[np.ndarray, np.ndarray]:
-    """uint8 [t h w 3] -> first frame's patches [h' w' p] and later groups' difference patches [k h' w' 4p], in [-1, 1]."""
-    t, h, w, _ = video.shape
-    values = video.astype(np.float32) / 127.5 - 1
-    cut = values.reshape(t, h // factor, factor, w // factor, factor, 3).transpose(0, 1, 3, 2, 4, 5)
-    groups = (cut[1:] - cut[:1]).reshape(-1, TEMPORAL_FACTOR, *cut.shape[1:]).transpose(0, 2, 3, 1, 4, 5, 6)
-    patch = factor * factor * 3
-    return cut[0].reshape(*cut.shape[1:3], patch), groups.reshape(*groups.shape[:3], TEMPORAL_FACTOR * patch)
+def cut_patches(frames: Any, factor: int) -> tuple[Any, Any]:
+    """Frames [b t h w 3] -> first frame's patches [b 1 h' w' p] and later groups' difference patches [b k h' w' 4p]."""
+    b, t, h, w, _ = frames.shape
+    rows, columns, patch = h // factor, w // factor, factor * factor * 3
+    cut = frames.reshape(b, t, rows, factor, columns, factor, 3).transpose(0, 1, 2, 4, 3, 5, 6)
+    groups = (cut[:, 1:] - cut[:, :1]).reshape(b, (t - 1) // TEMPORAL_FACTOR, TEMPORAL_FACTOR, *cut.shape[2:])
+    later = groups.transpose(0, 1, 3, 4, 2, 5, 6, 7)
+    return cut[:, :1].reshape(b, 1, rows, columns, patch), later.reshape(*later.shape[:4], TEMPORAL_FACTOR * patch)
 
 
-def join_patches(first: np.ndarray, later: np.ndarray, factor: int) -> np.ndarray:
-    """The inverse of `cut_patches`, rounded to uint8."""
-    h, w = first.shape[:2]
-    groups = later.reshape(-1, h, w, TEMPORAL_FACTOR, factor, factor, 3).transpose(0, 3, 1, 2, 4, 5, 6)
-    cut = first.reshape(1, h, w, factor, factor, 3)
-    frames = np.concatenate([cut, cut + groups.reshape(-1, *cut.shape[1:])])
-    values = frames.transpose(0, 1, 3, 2, 4, 5).reshape(-1, h * factor, w * factor, 3)
-    return np.clip(np.rint((values + 1) * 127.5), 0, 255).astype(np.uint8)
+def join_patches(first: Array, later: Array, factor: int) -> Array:
+    """The inverse of `cut_patches`."""
+    b, k, h, w, _ = later.shape
+    groups = later.reshape(b, k, h, w, TEMPORAL_FACTOR, factor, factor, 3).transpose(0, 1, 4, 2, 3, 5, 6, 7)
+    cut = first.reshape(b, 1, h, w, factor, factor, 3)
+    frames = jnp.concatenate([cut, cut + groups.reshape(b, k * TEMPORAL_FACTOR, *cut.shape[2:])], axis=1)
+    return frames.transpose(0, 1, 2, 4, 3, 5, 6).reshape(b, -1, h * factor, w * factor, 3)
 
 
 def reconstruction_psnr(codec: Codec, clips: list[np.ndarray]) -> float:

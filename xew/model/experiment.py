@@ -1,7 +1,7 @@
 """The config of a world-model experiment: what configs/*.yaml hold. Fields without a default must be given."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from xew.config import ConfigError, load, pick
-from xew.model.codec import CODECS, TEMPORAL_FACTOR, latent_frames
+from xew.model.codec import CODECS, TEMPORAL_FACTOR, CodecSettings, latent_frames
 from xew.model.conditions import ACTIONS, CONDITIONS, Condition
 from xew.model.dit import MODELS, PATCH, WorldModel
 from xew.model.samplers import GRIDS, SAMPLERS
@@ -28,15 +28,6 @@ class Clip:
     height: int
     """Pixels; the camera's 320x240 is padded to this aspect ratio, then resized."""
     width: int
-
-
-@dataclass(frozen=True)
-class CodecSettings:
-    name: str = "patch_pca"
-    spatial_factor: int = 8
-    channels: int = 48
-    fit_clips: int = 64
-    """Clips of training episodes from which the components are computed."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +124,7 @@ class Experiment:
     train: TrainSettings
     split: str = "fixed"
     """One of protocol.SPLITS: which robots train."""
-    codec: CodecSettings = CodecSettings()
+    codec: CodecSettings = field(default_factory=CodecSettings)
     mesh: MeshSettings = MeshSettings()
     adapt: AdaptSettings = AdaptSettings()
     rollout: RolloutSettings = RolloutSettings()

@@ -1,7 +1,8 @@
 """The latent cache: every stream of every training episode goes through the codec once, and no video is read in training.
 
 Reads  episodes
-Writes <cache>/codec-KEY.npz, <cache>/<task>/<seed>/<robot>/<stream>-KEY.npy float16 [clips ...], <cache>/header.json
+Writes <cache>/<task>/<seed>/<robot>/<stream>-KEY.npy float16 [clips ...], <cache>/header.json,
+       <cache>/codec-KEY/ if the codec is one that is fitted
 
 KEY names the codec, the source data and the cut into clips, so that what is stale is not found and never mistaken.
 Command: python -m xew.model.latents CONFIG [--data … and other overrides]
@@ -9,6 +10,7 @@ Command: python -m xew.model.latents CONFIG [--data … and other overrides]
 
 import argparse
 import hashlib
+import itertools
 import json
 import os
 import sys
@@ -20,7 +22,7 @@ import numpy as np
 from tqdm import tqdm
 
 from xew.config import ConfigError, digest, user_errors
-from xew.episode import Record, episode_folder, find_accepted, read_states, read_video
+from xew.episode import Record, complete_folder, episode_folder, find_accepted, read_states, read_video
 from xew.model.codec import CODECS, TEMPORAL_FACTOR, Codec
 from xew.model.conditions import Condition, command_of
 from xew.model.experiment import Experiment, load_experiment
@@ -48,9 +50,14 @@ class LatentCache:
         condition = self.streams[stream]
         name = condition.name if condition else stream
         sources = (record.hashes["rgb"],) if condition is None else (record.hashes["states"], record.hashes["robot"])
-        content = (CACHE_VERSION, self.codec.hash, digest(self.experiment.clip), name, *sources)
+        cut = digest(self.experiment.clip) if self.experiment.train.chunks == 1 else (digest(self.experiment.clip), "chunks")
+        content = (CACHE_VERSION, self.codec.hash, cut, name, *sources)
         key = hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]
         return episode_folder(self.experiment.cache_folder, record.task, record.seed, record.robot) / f"{name}-{key}.npy"
+
+    def starts(self, record: Record) -> tuple[int, ...]:
+        """First frames of the clips of an episode."""
+        return clip_starts(record.frame_count, self.experiment.clip.frames, self.experiment.train.chunks)
 
     def read(self, record: Record, stream: str) -> np.ndarray:
         """One stream of one episode, float16 [clips ...] memory-mapped; conditions that are not aligned have one clip.
@@ -73,7 +80,7 @@ class LatentCache:
         missing = [name for name in self.streams if not self.path(record, name).exists()]
         if not missing:
             return 0
-        starts = clip_starts(record.frame_count, self.experiment.clip.frames)
+        starts = self.starts(record)
         videos = stream_videos(self.experiment, folder, record, missing)
         return sum(_write(self.path(record, name), self._encode_stream(name, video, starts)) for name, video in videos.items())
 
@@ -83,10 +90,23 @@ class LatentCache:
         return np.stack([encode_clip(self.codec, condition, video, start, self.experiment.clip.frames) for start in starts])
 
 
-def clip_starts(frame_count: int, frames: int) -> tuple[int, ...]:
-    """First frames of an episode's clips: those of the rollout's chunks that fit, and the last that fits."""
-    last = max(frame_count - frames, 0)
-    return tuple(sorted({*range(0, last + 1, frames - 1), last}))
+def sample_starts(frame_count: int, frames: int, chunks: int = 1) -> tuple[tuple[int, ...], ...]:
+    """First frames of the chunks of every training sample of an episode.
+
+    One chunk: the chunks of a rollout that fit, and the last clip that fits. Two: every chunk of a rollout with its
+    successor, which shares one frame with it and may go past the episode's end; an episode of one chunk is one sample of it.
+    """
+    if chunks == 1:
+        last = max(frame_count - frames, 0)
+        return tuple((start,) for start in sorted({*range(0, last + 1, frames - 1), last}))
+    starts = tuple(range(0, max(frame_count - 1, 1), frames - 1))
+    return tuple(itertools.pairwise(starts)) or (starts,)
+
+
+def clip_starts(frame_count: int, frames: int, chunks: int = 1) -> tuple[int, ...]:
+    """First frames of all clips of an episode that any training sample has."""
+    samples = sample_starts(frame_count, frames, chunks)
+    return tuple(sorted({start for sample in samples for start in sample}))
 
 
 def stream_videos(experiment: Experiment, folder: Path, record: Record, streams: Sequence[str]) -> dict[str, np.ndarray]:
@@ -132,23 +152,39 @@ def test_episodes(data: Path, robots: Sequence[str]) -> list[Episode]:
 
 
 def codec_path(experiment: Experiment, episodes: Sequence[Episode]) -> Path:
-    """Where the codec fitted on these episodes is kept."""
+    """The folder where the codec fitted on these episodes is kept."""
     hashes = [(record.hashes["rgb"], record.hashes["robot"]) for _, record in episodes]
     content = (CACHE_VERSION, digest(experiment.codec), digest(experiment.clip), hashes)
-    return experiment.cache_folder / f"codec-{hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]}.npz"
+    return experiment.cache_folder / f"codec-{hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]}"
 
 
 def load_codec(experiment: Experiment, episodes: Sequence[Episode]) -> Codec:
-    """The codec that was fitted on these episodes. Raises ConfigError if `latents` has not been run for them."""
+    """The codec of these episodes: fitted on them, or read from the weights that the config names.
+
+    Raises:
+        ConfigError: `latents` has not been run for them, or the weights are missing or do not fit.
+    """
+    kind = CODECS[experiment.codec.name]
+    if not kind.fitted:
+        return kind.prepare(experiment.codec, list)
     path = codec_path(experiment, episodes)
     if not path.exists():
         command = f"python -m xew.model.latents CONFIG --data {experiment.data}"
         raise ConfigError(f"no codec fitted on {experiment.data} as it is now under {path.parent}; run `{command}`.")
-    return CODECS[experiment.codec.name].load(path)
+    return kind.load(path)
 
 
 def fit_codec(experiment: Experiment, episodes: Sequence[Episode]) -> Codec:
-    """Fit the codec on evenly chosen clips, scene and robot-only, of training episodes, and keep it."""
+    """Fit the codec on clips of training episodes, and keep it."""
+    codec = CODECS[experiment.codec.name].prepare(experiment.codec, lambda: _clips_to_fit(experiment, episodes))
+    path = codec_path(experiment, episodes)
+    with complete_folder(path) as unfinished:
+        codec.save(unfinished)
+    return codec
+
+
+def _clips_to_fit(experiment: Experiment, episodes: Sequence[Episode]) -> list[np.ndarray]:
+    """Evenly chosen clips, scene and robot-only, uint8 [t h w 3] at the model's size."""
     settings, clip = experiment.codec, experiment.clip
     chosen = [episodes[i] for i in np.linspace(0, len(episodes) - 1, min(len(episodes), settings.fit_clips // 2)).astype(int)]
     clips = []
@@ -159,11 +195,7 @@ def fit_codec(experiment: Experiment, episodes: Sequence[Episode]) -> Codec:
             video = read_video(folder / f"{name}.mkv")[start : start + clip.frames]
             video = video[np.minimum(np.arange(clip.frames), len(video) - 1)]
             clips.append(to_model_size(video, clip.height, clip.width))
-    codec = CODECS[settings.name].fit(clips, settings.spatial_factor, settings.channels)
-    path = codec_path(experiment, episodes)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    codec.save(path)
-    return codec
+    return clips
 
 
 def ceiling_psnr(experiment: Experiment, codec: Codec, episodes: Sequence[Episode]) -> float:
@@ -195,8 +227,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args, overrides = parser.parse_known_args(arguments)
     experiment = load_experiment(args.config, overrides)
     episodes = training_episodes(experiment)
-    fitted = codec_path(experiment, episodes).exists()
-    codec = load_codec(experiment, episodes) if fitted else fit_codec(experiment, episodes)
+    to_fit = CODECS[experiment.codec.name].fitted and not codec_path(experiment, episodes).exists()
+    codec = fit_codec(experiment, episodes) if to_fit else load_codec(experiment, episodes)
     cache = LatentCache(experiment, codec)
     written = sum(cache.encode(episode) for episode in tqdm(episodes, desc="encode", unit="episode"))
     ceiling_on = (test_episodes(experiment.data, experiment.robots.held_out_robots) or episodes)[:8]
