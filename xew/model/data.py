@@ -5,17 +5,18 @@ Writes `Batch`
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import grain
 import jax
 import numpy as np
 
-from xew.model.codec import latent_frames
+from xew.episode import Record
+from xew.model.codec import TEMPORAL_FACTOR, latent_frames
 from xew.model.dit import MODELS, STREAMS
 from xew.model.experiment import Experiment
-from xew.model.latents import Episode, LatentCache, clip_starts
+from xew.model.latents import Episode, LatentCache, sample_starts
 from xew.model.text import TEXT_ENCODERS
 from xew.protocol import ACTION_DIM
 
@@ -31,32 +32,65 @@ class Batch:
     """Stream name -> [b t' h' w' c] latents or [b t' 16] joint positions, float32."""
     text: Any
     """[b l e] float32, zero-padded."""
+    shown: Any = None
+    """[b t] float32, 1 where a latent frame shows the episode and 0 past its end; None where all do."""
+    following: "Batch | None" = None
+    """The next chunk, whose first frame is the last of this one; None where one chunk is trained. A sample whose episode
+    ends before it has a following chunk of which nothing is shown."""
 
 
 class ClipSource:
-    """Random access to the clips of the cache, for Grain: index -> Batch without its leading axis."""
+    """Random access to the training samples of the cache, for Grain: index -> Batch without its leading axis.
 
-    def __init__(self, cache: LatentCache, episodes: Sequence[Episode]) -> None:
+    Args:
+        episodes: those to learn from.
+        replay: episodes of which every batch has a part beside them.
+    """
+
+    def __init__(self, cache: LatentCache, episodes: Sequence[Episode], replay: Sequence[Episode] = ()) -> None:
         self.cache = cache
-        frames = cache.experiment.clip.frames
-        self.clips = [(record, i) for _, record in episodes for i in range(len(clip_starts(record.frame_count, frames)))]
-        self.text = {record.instruction: encode_text(cache.experiment, record.instruction) for _, record in episodes}
+        self.samples = [sample for _, record in episodes for sample in self._samples(record)]
+        self.fresh = len(self.samples)
+        self.samples += [sample for _, record in replay for sample in self._samples(record)]
+        every = [record for _, record in (*episodes, *replay)]
+        self.text = {record.instruction: encode_text(cache.experiment, record.instruction) for record in every}
+
+    def _samples(self, record: Record) -> list[tuple[Record, tuple[int, ...]]]:
+        experiment = self.cache.experiment
+        starts = sample_starts(record.frame_count, experiment.clip.frames, experiment.train.chunks)
+        return [(record, chunks) for chunks in starts]
 
     def __len__(self) -> int:
-        return len(self.clips)
+        return len(self.samples)
 
     def check(self) -> None:
         """Raise ConfigError unless every stream of every episode is in the cache and fits the data."""
-        for record, clip in self.clips:
-            if clip == 0:
-                for name in self.cache.streams:
-                    self.cache.read(record, name)
+        for record in {id(record): record for record, _ in self.samples}.values():
+            for name in self.cache.streams:
+                self.cache.read(record, name)
 
     def __getitem__(self, index: int) -> Batch:
-        record, clip = self.clips[index]
+        record, starts = self.samples[index]
+        first = self._chunk(record, starts[0])
+        if self.cache.experiment.train.chunks == 1:
+            return first
+        if len(starts) == 2:
+            return replace(first, following=self._chunk(record, starts[1]))
+        return replace(first, following=replace(first, shown=np.zeros_like(first.shown)))
+
+    def _chunk(self, record: Record, start: int) -> Batch:
+        experiment = self.cache.experiment
+        clip = self.cache.starts(record).index(start)
         streams = {name: self.cache.read(record, name) for name in self.cache.streams}
         arrays = {name: stream[min(clip, len(stream) - 1)].astype(np.float32) for name, stream in streams.items()}
-        return Batch(arrays.pop("rgb"), arrays, self.text[record.instruction])
+        shown = shown_frames(record.frame_count - start, experiment.clip.frames)
+        return Batch(arrays.pop("rgb"), arrays, self.text[record.instruction], shown)
+
+
+def shown_frames(left: int, frames: int) -> np.ndarray:
+    """Which latent frames of a clip show anything of an episode that has `left` frames from there on: float32 [t]."""
+    firsts = np.maximum(np.arange(latent_frames(frames)) * TEMPORAL_FACTOR - (TEMPORAL_FACTOR - 1), 0)
+    return (firsts < left).astype(np.float32)
 
 
 def encode_text(experiment: Experiment, instruction: str) -> np.ndarray:
@@ -65,10 +99,40 @@ def encode_text(experiment: Experiment, instruction: str) -> np.ndarray:
     return TEXT_ENCODERS[experiment.model.text](instruction, size.text_tokens, size.text_dim)
 
 
-def make_dataset(source: ClipSource, batch: int, seed: int) -> grain.IterDataset:
-    """Endless shuffled batches; the iterator's get_state and set_state carry its position."""
-    dataset = grain.MapDataset.source(source).seed(seed).shuffle().repeat()
-    return dataset.batch(batch, batch_fn=stack).to_iter_dataset(grain.ReadOptions(num_threads=2, prefetch_buffer_size=8))
+def replayed(batch: int, replay: float) -> int:
+    """How many samples of a batch are replayed: the nearest whole number, at least one where any are asked for."""
+    return max(1, round(batch * replay)) if replay else 0
+
+
+def make_dataset(
+    source: ClipSource, batch: int, seed: int, replay: float = 0.0, rows: np.ndarray | None = None
+) -> grain.IterDataset:
+    """Endless shuffled batches; the iterator's get_state and set_state carry its position.
+
+    The order is that of whole batches, of which each process loads its rows, so that neither the numbers nor the position
+    depend on how many processes there are.
+
+    Args:
+        batch: samples over all processes.
+        replay: part of each batch that comes from the source's replayed episodes.
+        rows: which samples of each batch to load; all where left out.
+    """
+    old = replayed(batch, replay)
+    parts = [_order(range(source.fresh), seed, batch - old)]
+    if old:
+        parts.append(_order(range(source.fresh, len(source)), seed + 1, old))
+    rows = np.arange(batch) if rows is None else rows
+
+    def load(indices: Sequence[np.ndarray]) -> Batch:
+        return stack([source[int(index)] for index in np.concatenate(indices)[rows]])
+
+    dataset = grain.experimental.ZipMapDataset(parts).map(load)
+    return dataset.to_iter_dataset(grain.ReadOptions(num_threads=2, prefetch_buffer_size=4))
+
+
+def _order(samples: range, seed: int, count: int) -> grain.MapDataset:
+    """Batches of `count` sample numbers without end; each pass over the samples has its own order."""
+    return grain.MapDataset.source(samples).seed(seed).shuffle().repeat().batch(count)
 
 
 def stack(examples: Sequence[Batch]) -> Batch:
@@ -84,9 +148,14 @@ def fake_batch(experiment: Experiment, batch: int, seed: int = 0) -> Batch:
     def normal(*shape: int) -> np.ndarray:
         return rng.standard_normal((batch, *shape), np.float32)
 
-    joints_shape = (latent_frames(experiment.clip.frames), ACTION_DIM)
-    shapes = {
-        name: joints_shape if STREAMS[name].source == "joints" else experiment.latent_shape for name in experiment.conditions
-    }
-    conditions = {name: normal(*shape) for name, shape in shapes.items()}
-    return Batch(normal(*experiment.latent_shape), conditions, normal(size.text_tokens, size.text_dim))
+    def chunk() -> Batch:
+        joints_shape = (latent_frames(experiment.clip.frames), ACTION_DIM)
+        shapes = {
+            name: joints_shape if STREAMS[name].source == "joints" else experiment.latent_shape for name in experiment.conditions
+        }
+        conditions = {name: normal(*shape) for name, shape in shapes.items()}
+        latents, text = normal(*experiment.latent_shape), normal(size.text_tokens, size.text_dim)
+        return Batch(latents, conditions, text, np.ones(latents.shape[:2], np.float32))
+
+    first = chunk()
+    return replace(first, following=chunk()) if experiment.train.chunks == 2 else first
