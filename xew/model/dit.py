@@ -2,22 +2,30 @@
 
 Reads  latents [b t h w c] of each stream, noise level, text embeddings [b l e]
 Writes velocity [b t h w c] of the RGB stream
-To add a size: one line in MODELS. To add a stream: one line in STREAMS.
+To add a size: one line in MODELS. To add a stream: one line in STREAMS. Published weights: dit_layouts.py.
 
-Shape letters: b batch, t h w c latent video, s tokens (t' h' w' flattened), d width, n heads, r distinct noise levels.
+Shape letters: b batch, t h w c latent video, s tokens (t' h' w' flattened), d width, n heads, r distinct noise levels,
+l text tokens (in a cache: layers).
 Numbers that look arbitrary (eps 1e-6, 256 frequencies, six modulations) are those of the published weights.
+
+Precision: matrix products and attention in `dtype`; norms, modulation, residual sums, time embedding and head in float32
+and written so that they fuse: no [b s 6 d] is formed, and what enters several products is rounded once.
 """
 
+import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax import Array
+from jax.ad_checkpoint import checkpoint_name
 
+from xew.config import ConfigError
 from xew.model.sharding import cut_over_batch
 
 PATCH = (1, 2, 2)
@@ -30,6 +38,19 @@ TIMESTEPS = 1000.0
 Activation = Callable[[Array], Array]
 Rotary = tuple[Array, Array]
 """Cosine and sine [s head_dim/2] of every token's rotation angles."""
+AttentionName = Literal["auto", "xla", "cudnn"]
+RematName = Literal["none", "attention", "dots", "full"]
+Visibility = Literal["joint", "one_way"]
+TimeEmbedding = Literal["exact", "flowwam"]
+
+
+class ConditionCache(NamedTuple):
+    """What every layer's RGB tokens read of the condition tokens, when these do not look back (`one_way`)."""
+
+    keys: Array
+    """[layers b s n head_dim], rotated."""
+    values: Array
+    """[layers b s n head_dim]."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +105,16 @@ class WorldModel(nnx.Module):
         size: one of `MODELS`.
         channels: of the latents.
         streams: names in `STREAMS` beside rgb.
-        dtype: of the matrix products; parameters, norms, modulation and the residual stream stay float32.
-        remat: recompute blocks in the backward pass instead of keeping their activations.
+        dtype: of the matrix products; parameters, norms and modulation stay float32.
+        residual: of the tokens between blocks; sums are float32 either way. bfloat16 (as diffusers') halves what is kept
+            of each block and most of what is moved, and rounds the tokens 90 times.
+        remat: what the backward pass computes again instead of keeping; see `REMAT`.
         unroll: blocks compiled as one loop body; more is faster on a CPU and slower to compile.
-        attention: an implementation of `jax.nn.dot_product_attention` ("xla", or "cudnn" on a GPU in bfloat16).
+        attention: see `choose_attention`.
+        visibility: "joint": all tokens see all, as in FlowWAM. "one_way": condition tokens see condition tokens only and
+            are told the noise level 0, so that a sampler computes them once a clip (`condition_cache`); a departure.
+        time: "exact", or "flowwam": the rounding with which FlowWAM's published weights were trained.
+        words: rows of a learned table of words; text is then ids [b l] instead of embeddings. 0 has none.
     """
 
     def __init__(
@@ -97,13 +124,17 @@ class WorldModel(nnx.Module):
         streams: Sequence[str] = (),
         *,
         dtype: jnp.dtype = jnp.float32,
-        remat: bool = False,
+        residual: jnp.dtype = jnp.float32,
+        remat: RematName = "none",
         unroll: int = 1,
-        attention: Literal["xla", "cudnn"] = "xla",
+        attention: AttentionName = "auto",
+        visibility: Visibility = "joint",
+        time: TimeEmbedding = "exact",
+        words: int = 0,
         rngs: nnx.Rngs,
     ) -> None:
-        self.size, self.channels, self.dtype = size, channels, dtype
-        self.remat, self.unroll = remat, unroll
+        self.size, self.channels, self.dtype, self.residual = size, channels, dtype, residual
+        self.remat, self.unroll, self.visibility, self.time = remat, unroll, visibility, time
         self.condition_streams = tuple(streams)
         features = channels * int(np.prod(PATCH))
         self.patch_embedding = _linear(features, size.dim, dtype, rngs)
@@ -112,6 +143,7 @@ class WorldModel(nnx.Module):
         self.time_projection = _linear(size.dim, 6 * size.dim, jnp.float32, rngs)
         self.blocks = _stacked_blocks(size, dtype, attention, rngs)
         self.head = Head(size.dim, features, rngs)
+        self.words = nnx.Embed(words, size.text_dim, embedding_init=nnx.initializers.normal(1.0), rngs=rngs) if words else None
         self.stream_embeddings = nnx.data({})
         self.stream_inputs = nnx.data({})
         for name in self.condition_streams:
@@ -124,33 +156,70 @@ class WorldModel(nnx.Module):
             return TwoLayer(16, self.size.dim, self.size.dim, nnx.silu, self.dtype, nnx.initializers.xavier_uniform(), rngs)
         return jax.tree.map(jnp.copy, self.patch_embedding)
 
-    def __call__(self, latents: Array, conditions: Mapping[str, Array], sigma: Array, text: Array) -> Array:
+    def __call__(
+        self,
+        latents: Array,
+        conditions: Mapping[str, Array],
+        sigma: Array,
+        text: Array,
+        cache: ConditionCache | None = None,
+    ) -> Array:
         """Velocity of the RGB latents.
 
         Args:
             latents: [b t h w c] float32; latent frame 0 is the clean reference.
-            conditions: name of each condition stream -> [b t' h' w' c] latents, or [b t' 16] joint positions.
+            conditions: name of each condition stream -> [b t' h' w' c] latents, or [b t' 16] joint positions. Not read
+                where a cache is given.
             sigma: [b] float32, noise level in [0, 1] of latent frames 1 and on.
-            text: [b l e] float32, zero-padded (there is no mask, as in Wan).
+            text: [b l e] float32, zero-padded (there is no mask, as in Wan); or ids [b l] int32 of `words`, 0 for none.
+            cache: of these conditions and this text, from `condition_cache`.
 
         Returns:
             [b t h w c] float32; frame 0 carries no meaning.
         """
-        tokens, rows, rotary = self.embed_streams(latents, conditions)
-        time = self.time_embedding(sinusoid(jnp.stack([jnp.zeros_like(sigma), TIMESTEPS * sigma], axis=1)))
-        modulation = self.modulation(time)
-        tokens = self.apply_blocks(tokens, modulation, rows, rotary, self.text_embedding(text))
         rgb = np.prod(token_grid(latents.shape)).item()
-        return unpatchify(self.head(tokens[:, :rgb], time, rows[:rgb]), latents.shape)
+        tokens, rows, rotary = self.embed_streams(latents, {} if cache else conditions, cached=cache is not None)
+        time = self.embed_time(sigma)
+        tokens = self.apply_blocks(tokens, self.modulation(time), rows, rotary, self.context(text), rgb, cache)
+        return unpatchify(self.head(tokens[:, :rgb].astype(jnp.float32), time, rows[:rgb]), latents.shape)
 
-    def embed_streams(self, latents: Array, conditions: Mapping[str, Array]) -> tuple[Array, np.ndarray, Rotary]:
+    def condition_cache(self, conditions: Mapping[str, Array], text: Array) -> ConditionCache:
+        """Keys and values of the condition tokens in every layer; they hold for all steps of sampling a clip.
+
+        Raises:
+            ValueError: the model is not `one_way`, so that condition tokens depend on the RGB tokens of each step.
+        """
+        if self.visibility != "one_way":
+            raise ValueError("condition tokens can only be computed ahead in a model of visibility one_way.")
+        tokens, rows, rotary = self._join({name: conditions[name] for name in self.condition_streams})
+        modulation, context = self.modulation(self.embed_time(jnp.zeros(tokens.shape[0], jnp.float32))), self.context(text)
+        graph, layers = nnx.split(self.blocks)
+
+        def block(carry: Array, layer: nnx.State) -> tuple[Array, ConditionCache]:
+            module = nnx.merge(graph, layer)
+            read = ConditionCache(*module.keys_values(carry, modulation, rows, rotary))
+            return module(carry, modulation, rows, rotary, context), read
+
+        return jax.lax.scan(block, tokens, layers, unroll=self.unroll)[1]
+
+    def embed_streams(
+        self, latents: Array, conditions: Mapping[str, Array], cached: bool = False
+    ) -> tuple[Array, np.ndarray, Rotary]:
         """All streams' tokens [b s d], the row of the noise level that each token is told [s], and their rotations."""
-        inputs = {"rgb": latents} | {name: conditions[name] for name in self.condition_streams}
+        return self._join({"rgb": latents} | {name: conditions[name] for name in self.condition_streams if not cached})
+
+    def _join(self, inputs: Mapping[str, Array]) -> tuple[Array, np.ndarray, Rotary]:
         grids = {name: token_grid(array.shape) for name, array in inputs.items()}
         tokens = jnp.concatenate([self._embed(name, array) for name, array in inputs.items()], axis=1)
-        rows = np.concatenate([token_rows(STREAMS[name], grid) for name, grid in grids.items()])
+        rows = np.concatenate([token_rows(self._stream(name), grid) for name, grid in grids.items()])
         angles = np.concatenate([rotary_angles(grid, self.size.head_dim, self.size.rotary_base) for grid in grids.values()])
-        return tokens, rows, (jnp.asarray(np.cos(angles), jnp.float32), jnp.asarray(np.sin(angles), jnp.float32))
+        rotary = jnp.asarray(np.cos(angles), jnp.float32), jnp.asarray(np.sin(angles), jnp.float32)
+        return tokens.astype(self.residual), rows, rotary
+
+    def _stream(self, name: str) -> Stream:
+        """A stream as this model tells it the time: nothing that RGB does not feed can know its noise level."""
+        stream = STREAMS[name]
+        return dataclasses.replace(stream, timestep="clean") if self.visibility == "one_way" and name != "rgb" else stream
 
     def _embed(self, name: str, array: Array) -> Array:
         if name == "rgb":
@@ -158,63 +227,131 @@ class WorldModel(nnx.Module):
         values = array if STREAMS[name].source == "joints" else patchify(array)
         return self.stream_inputs[name](values).astype(jnp.float32) + self.stream_embeddings[name][None, None]
 
+    def embed_time(self, sigma: Array) -> Array:
+        """Time embeddings [b 2 d] of the two noise levels of each sample: none, and its own [b]."""
+        timesteps = jnp.stack([jnp.zeros_like(sigma), TIMESTEPS * sigma], axis=1)
+        return self.time_embedding(rounded_sinusoid(timesteps) if self.time == "flowwam" else sinusoid(timesteps))
+
+    def context(self, text: Array) -> Array:
+        """What cross-attention reads [b l d] of text embeddings [b l e] or of ids of words [b l]."""
+        if self.words is not None:
+            text = self.words(text) * (text > 0)[..., None].astype(jnp.float32)
+        return self.text_embedding(text)
+
     def modulation(self, time: Array) -> Array:
         """Adaptive-norm shifts, scales and gates [b r 6 d] of time embeddings [b r d]."""
         return self.time_projection(nnx.silu(time)).reshape(*time.shape[:-1], 6, self.size.dim)
 
-    def apply_blocks(self, tokens: Array, modulation: Array, rows: np.ndarray, rotary: Rotary, text: Array) -> Array:
-        """The block stack as a scan over the leading axis of the stacked parameters."""
+    def apply_blocks(
+        self,
+        tokens: Array,
+        modulation: Array,
+        rows: np.ndarray,
+        rotary: Rotary,
+        text: Array,
+        rgb: int | None = None,
+        cache: ConditionCache | None = None,
+    ) -> Array:
+        """The block stack as a scan over the leading axis of the stacked parameters; the first `rgb` tokens are RGB's."""
         graph, layers = nnx.split(self.blocks)
+        alone = rgb if self.visibility == "one_way" and rgb != tokens.shape[1] else None
 
-        def block(carry: Array, layer: nnx.State) -> tuple[Array, None]:
-            return nnx.merge(graph, layer)(cut_over_batch(carry), modulation, rows, rotary, text), None
+        def block(carry: Array, xs: tuple[nnx.State, ConditionCache | None]) -> tuple[Array, None]:
+            layer, read = xs
+            return nnx.merge(graph, layer)(cut_over_batch(carry), modulation, rows, rotary, text, alone=alone, cache=read), None
 
-        return jax.lax.scan(jax.checkpoint(block) if self.remat else block, tokens, layers, unroll=self.unroll)[0]
+        if self.remat != "none":
+            # The loop already keeps recomputation apart from the forward pass; only without a loop must it be forced.
+            block = jax.checkpoint(block, policy=REMAT[self.remat], prevent_cse=self.unroll >= self.size.depth)
+        return jax.lax.scan(block, tokens, (layers, cache), unroll=self.unroll)[0]
 
 
 class Block(nnx.Module):
     """Self-attention over all streams, cross-attention to the text, feed-forward; modulated by the noise level."""
 
-    def __init__(self, size: ModelSize, dtype: jnp.dtype, attention: Literal["xla", "cudnn"], rngs: nnx.Rngs) -> None:
+    def __init__(self, size: ModelSize, dtype: jnp.dtype, attention: AttentionName, rngs: nnx.Rngs) -> None:
+        self.dtype = dtype
         self.modulation = nnx.Param(_scaled_normal(rngs.params(), (1, 6, size.dim)))
         self.self_attn = Attention(size, dtype, attention, rngs)
         self.cross_attn = Attention(size, dtype, attention, rngs)
-        self.norm3 = nnx.LayerNorm(size.dim, epsilon=EPSILON, dtype=jnp.float32, rngs=rngs)
+        self.norm3 = nnx.LayerNorm(size.dim, epsilon=EPSILON, use_fast_variance=False, dtype=jnp.float32, rngs=rngs)
         self.ffn = TwoLayer(size.dim, size.ffn_dim, size.dim, _gelu, dtype, nnx.initializers.xavier_uniform(), rngs)
 
-    def __call__(self, tokens: Array, modulation: Array, rows: np.ndarray, rotary: Rotary, text: Array) -> Array:
-        """tokens [b s d]; modulation [b r 6 d], of which token i takes row rows[i]; text [b l d]."""
+    def __call__(
+        self,
+        tokens: Array,
+        modulation: Array,
+        rows: np.ndarray,
+        rotary: Rotary,
+        text: Array,
+        alone: int | None = None,
+        cache: ConditionCache | None = None,
+    ) -> Array:
+        """tokens [b s d]; modulation [b r 6 d], of which token i takes row rows[i]; text [b l d].
+
+        Tokens from `alone` on see none before them; those before see all, and the keys and values of `cache` too.
+        """
+        shift_sa, scale_sa, gate_sa, shift_ffn, scale_ffn, gate_ffn = self._chunks(modulation, rows)
+        attended = self.self_attn(modulate(tokens, shift_sa, scale_sa, self.dtype), rotary=rotary, alone=alone, cache=cache)
+        tokens = add(tokens, attended, gate_sa)
+        tokens = add(tokens, self.cross_attn(self.norm3(tokens).astype(self.dtype), text))
+        return add(tokens, self.ffn(modulate(tokens, shift_ffn, scale_ffn, self.dtype)), gate_ffn)
+
+    def keys_values(self, tokens: Array, modulation: Array, rows: np.ndarray, rotary: Rotary) -> tuple[Array, Array]:
+        """What others' self-attention reads of these tokens: keys and values [b s n head_dim]."""
+        shift, scale = self._chunks(modulation, rows)[:2]
+        return self.self_attn.keys_values(modulate(tokens, shift, scale, self.dtype), rotary)
+
+    def _chunks(self, modulation: Array, rows: np.ndarray) -> list[Array]:
+        """Six [b s d]: shift, scale and gate of self-attention, then of the feed-forward; never formed at once."""
         chunks = self.modulation[...][None] + modulation
-        shift_sa, scale_sa, gate_sa, shift_ffn, scale_ffn, gate_ffn = (take_rows(chunks[:, :, i], rows) for i in range(6))
-        attended = self.self_attn(modulate(tokens, shift_sa, scale_sa), rotary=rotary)
-        tokens = tokens + attended.astype(jnp.float32) * gate_sa
-        tokens = tokens + self.cross_attn(self.norm3(tokens), text).astype(jnp.float32)
-        return tokens + self.ffn(modulate(tokens, shift_ffn, scale_ffn)).astype(jnp.float32) * gate_ffn
+        return [take_rows(chunks[:, :, i], rows) for i in range(6)]
 
 
 class Attention(nnx.Module):
     """Multi-head attention; queries and keys are normalised over the full width, before they are split into heads."""
 
-    def __init__(self, size: ModelSize, dtype: jnp.dtype, implementation: Literal["xla", "cudnn"], rngs: nnx.Rngs) -> None:
+    def __init__(self, size: ModelSize, dtype: jnp.dtype, implementation: AttentionName, rngs: nnx.Rngs) -> None:
         self.heads, self.dtype, self.implementation = size.heads, dtype, implementation
         self.q, self.k, self.v, self.o = (_linear(size.dim, size.dim, dtype, rngs) for _ in range(4))
         self.norm_q, self.norm_k = (nnx.RMSNorm(size.dim, epsilon=EPSILON, dtype=jnp.float32, rngs=rngs) for _ in range(2))
 
-    def __call__(self, tokens: Array, context: Array | None = None, rotary: Rotary | None = None) -> Array:
-        """tokens [b s d] attend to context [b l d], or to each other under rotary positions."""
-        context = tokens if context is None else context
-        q, k, v = (
-            self._split(self.norm_q(self.q(tokens))),
-            self._split(self.norm_k(self.k(context))),
-            self._split(self.v(context)),
-        )
-        if rotary is not None:
-            q, k = rotate(q, rotary), rotate(k, rotary)
-        q, k, v = (cut_over_batch(x.astype(self.dtype)) for x in (q, k, v))
-        return self.o(jax.nn.dot_product_attention(q, k, v, implementation=self.implementation).reshape(tokens.shape))
+    def __call__(
+        self,
+        tokens: Array,
+        context: Array | None = None,
+        rotary: Rotary | None = None,
+        alone: int | None = None,
+        cache: ConditionCache | None = None,
+    ) -> Array:
+        """tokens [b s d] attend to context [b l d], or to each other under rotary positions.
 
-    def _split(self, values: Array) -> Array:
-        return values.reshape(*values.shape[:2], self.heads, -1)
+        Tokens from `alone` on see none before them: two calls of attention instead of a mask [s s]. The keys and values
+        of `cache` (one layer's) are seen beside the tokens' own.
+        """
+        q = self._heads(self.norm_q(self.q(tokens)), rotary)
+        k, v = self.keys_values(tokens if context is None else context, rotary)
+        if cache is not None:
+            k, v = jnp.concatenate([k, cache.keys], axis=1), jnp.concatenate([v, cache.values], axis=1)
+        if alone is None:
+            attended = self._attend(q, k, v)
+        else:
+            parts = self._attend(q[:, :alone], k, v), self._attend(q[:, alone:], k[:, alone:], v[:, alone:])
+            attended = jnp.concatenate(parts, axis=1)
+        return self.o(attended.reshape(tokens.shape))
+
+    def keys_values(self, context: Array, rotary: Rotary | None) -> tuple[Array, Array]:
+        """Keys (rotated where there are positions) and values [b l n head_dim] of context [b l d]."""
+        return self._heads(self.norm_k(self.k(context)), rotary), self._heads(self.v(context), None)
+
+    def _heads(self, values: Array, rotary: Rotary | None) -> Array:
+        values = values.reshape(*values.shape[:2], self.heads, -1)
+        return cut_over_batch((values if rotary is None else rotate(values, rotary)).astype(self.dtype))
+
+    def _attend(self, q: Array, k: Array, v: Array) -> Array:
+        chosen = choose_attention(self.implementation, q.shape[-1], self.dtype)
+        attended = jax.nn.dot_product_attention(q, k, v, implementation=chosen)
+        return attended if chosen == "cudnn" else checkpoint_name(attended, "attention")
 
 
 class Head(nnx.Module):
@@ -254,17 +391,47 @@ class TwoLayer(nnx.Module):
 EMBEDDING_INIT = nnx.initializers.normal(0.02)
 
 
-def modulate(tokens: Array, shift: Array, scale: Array) -> Array:
-    """LayerNorm without parameters in float32, then scale and shift [b s d]."""
-    mean = tokens.mean(-1, keepdims=True)
-    variance = tokens.var(-1, keepdims=True)
-    return (tokens - mean) * jax.lax.rsqrt(variance + EPSILON) * (1 + scale) + shift
+def modulate(tokens: Array, shift: Array, scale: Array, dtype: jnp.dtype = jnp.float32) -> Array:
+    """LayerNorm without parameters in float32, then scale and shift [b s d], rounded once for all who read it."""
+    tokens = tokens.astype(jnp.float32)
+    centred = tokens - tokens.mean(-1, keepdims=True)
+    normed = centred * jax.lax.rsqrt(jnp.square(centred).mean(-1, keepdims=True) + EPSILON)
+    return (normed * (1 + scale) + shift).astype(dtype)
+
+
+def add(tokens: Array, change: Array, gate: Array | None = None) -> Array:
+    """tokens + change * gate [b s d] in float32, in the type of the tokens."""
+    change = change.astype(jnp.float32)
+    return (tokens.astype(jnp.float32) + (change if gate is None else change * gate)).astype(tokens.dtype)
 
 
 def take_rows(values: Array, rows: np.ndarray) -> Array:
-    """values[:, rows] of [b r d] as a sum over masks [b s d]: a gather's gradient is a scatter, slow on every device."""
-    masks = (rows[:, None] == np.arange(values.shape[1])).astype(np.float32)
-    return sum(values[:, row, None] * masks[None, :, row, None] for row in range(values.shape[1]))
+    """values[:, rows] [b s d] of [b r d] float32, in forms whose gradient is no scatter (slow on every device).
+
+    Two rows are a choice, which fuses into what uses it and whose gradient is a masked sum. More (a row for each latent
+    frame) are a gather whose gradient is a product with the matrix of ones that says which token has which row.
+    """
+    count = values.shape[1]
+    if count <= 2:
+        return jnp.where((rows == 0)[None, :, None], values[:, :1], values[:, count - 1 :])
+    return _gather_rows(values, tuple(rows.tolist()))
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
+def _gather_rows(values: Array, rows: tuple[int, ...]) -> Array:
+    return values[:, np.asarray(rows)]
+
+
+def _gather_rows_forward(values: Array, rows: tuple[int, ...]) -> tuple[Array, int]:
+    return _gather_rows(values, rows), values.shape[1]
+
+
+def _gather_rows_backward(rows: tuple[int, ...], count: int, gradient: Array) -> tuple[Array]:
+    has_row = jnp.asarray(np.equal(rows, np.arange(count)[:, None]), gradient.dtype)
+    return (jnp.einsum("rs,bsd->brd", has_row, gradient, precision=jax.lax.Precision.HIGHEST),)
+
+
+_gather_rows.defvjp(_gather_rows_forward, _gather_rows_backward)
 
 
 def sinusoid(timestep: Array) -> Array:
@@ -273,6 +440,31 @@ def sinusoid(timestep: Array) -> Array:
     frequencies = jnp.asarray(WAVELENGTH_BASE ** (-np.arange(half) / half), jnp.float32)
     angles = timestep[..., None] * frequencies.reshape(*(1,) * timestep.ndim, half)
     return jnp.concatenate([jnp.cos(angles), jnp.sin(angles)], axis=-1)
+
+
+def rounded_sinusoid(timestep: Array) -> Array:
+    """`sinusoid` as FlowWAM computes it: of the timestep in bfloat16, in float64, the result rounded to bfloat16.
+
+    JAX has no float64 here, but needs none: the rounded timestep has 8 significant bits, so its product with the upper
+    16 bits of a frequency is exact in float32, and the small rest is turned by the addition theorem.
+    """
+    half = TIME_FREQUENCIES // 2
+    exact = WAVELENGTH_BASE ** (-np.arange(half) / half)
+    upper = _upper_bits(exact.astype(np.float32))
+    shape = (1,) * timestep.ndim + (half,)
+    rounded = timestep.astype(jnp.bfloat16).astype(jnp.float32)[..., None]
+    angle, rest = (
+        rounded * jnp.asarray(upper.reshape(shape)),
+        rounded * jnp.asarray((exact - upper).astype(np.float32).reshape(shape)),
+    )
+    cos, sin, cos_rest, sin_rest = jnp.cos(angle), jnp.sin(angle), jnp.cos(rest), jnp.sin(rest)
+    features = [cos * cos_rest - sin * sin_rest, sin * cos_rest + cos * sin_rest]
+    return jnp.concatenate(features, axis=-1).astype(jnp.bfloat16).astype(jnp.float32)
+
+
+def _upper_bits(values: np.ndarray) -> np.ndarray:
+    """float32 values cut to 16 significant bits."""
+    return (values.view(np.uint32) & np.uint32(0xFFFFFF00)).view(np.float32)
 
 
 def token_grid(shape: Sequence[int]) -> tuple[int, int, int]:
@@ -324,6 +516,114 @@ def unpatchify(features: Array, shape: Sequence[int]) -> Array:
     return cut.transpose(0, 1, 4, 2, 5, 3, 6, 7).reshape(shape)
 
 
+def _is_attention(primitive: Any, *_: Any, **__: Any) -> bool:
+    """Results of cuDNN's attention (output and logarithms of its sums), which has no other name to be kept by."""
+    return str(primitive.name).startswith("dot_product_attention_fwd")
+
+
+_POLICIES = jax.checkpoint_policies
+_KEEP_ATTENTION = _POLICIES.save_from_both_policies(_POLICIES.save_only_these_names("attention"), _is_attention)
+REMAT: dict[str, Callable[..., bool] | None] = {
+    "attention": _KEEP_ATTENTION,
+    "dots": _POLICIES.save_from_both_policies(_POLICIES.dots_with_no_batch_dims_saveable, _KEEP_ATTENTION),
+    "full": None,
+}
+"""What the backward pass finds kept beside each block's input, by name.
+
+full       nothing: the forward pass is computed twice (4/3 of the work), the least memory
+attention  results of attention, so that all but its quadratic part is computed twice; one width more a token and block
+dots       results of all matrix products and of attention, so that only norms and activations are computed twice
+none       everything that the backward pass reads
+"""
+
+
+def choose_attention(asked: AttentionName, head_dim: int, dtype: jnp.dtype) -> Literal["xla", "cudnn"]:
+    """The implementation of `jax.nn.dot_product_attention` on this machine.
+
+    "auto" is cuDNN's on a CUDA GPU of compute capability 8.0 and up, in bfloat16 or float16, where the width of a head is
+    a multiple of 8 and at most 256 (128 before Hopper, 9.0); else XLA's, which forms [n s s]. cuDNN takes any number of
+    tokens, so nothing is padded. (The limits are those that jax itself checks.)
+
+    Raises:
+        ConfigError: cuDNN was asked for and cannot do it.
+    """
+    if asked == "xla":
+        return "xla"
+    reason = _cudnn_lacks(head_dim, jnp.dtype(dtype))
+    if reason and asked == "cudnn":
+        raise ConfigError(f"attention: cudnn cannot be used: {reason}; set model.attention to auto or xla.")
+    return "xla" if reason else "cudnn"
+
+
+def _cudnn_lacks(head_dim: int, dtype: np.dtype) -> str:
+    """Why cuDNN's attention cannot be used here; empty if it can."""
+    device = jax.devices()[0]
+    if device.platform != "gpu" or "cuda" not in device.client.platform_version:
+        return f"it needs a CUDA GPU and JAX runs on {device.platform}"
+    capability = tuple(int(part) for part in str(device.compute_capability).split("."))
+    widest = 256 if capability >= (9, 0) else 128
+    if capability < (8, 0):
+        return f"it needs compute capability 8.0 and {device.device_kind} has {device.compute_capability}"
+    if dtype not in (jnp.bfloat16, jnp.float16):
+        return f"it needs model.dtype bfloat16 and the model has {dtype.name}"
+    if head_dim % 8 or head_dim > widest:
+        return f"it needs heads of a multiple of 8 and at most {widest} features and the model's have {head_dim}"
+    return ""
+
+
+def flops(
+    size: ModelSize,
+    grids: Sequence[tuple[int, int, int]],
+    text_tokens: int | None = None,
+    batch: int = 1,
+    *,
+    visibility: Visibility = "joint",
+    cached: bool = False,
+    channels: int = 48,
+) -> float:
+    """Floating-point operations of one forward pass: two for each multiply-add of the matrix products, nothing else.
+
+    A training step is three times this (what remat computes again is not counted, as is usual for MFU).
+
+    Args:
+        size: of the model.
+        grids: tokens (t', h', w') of each stream, RGB first, as from `token_grid`.
+        text_tokens: the model's own number where left out.
+        batch: samples.
+        visibility: as of the model.
+        cached: a step of sampling in which the condition tokens are read from a cache.
+        channels: of the latents.
+    """
+    text = size.text_tokens if text_tokens is None else text_tokens
+    counts = [int(np.prod(grid)) for grid in grids]
+    rgb, conditions = counts[0], sum(counts[1:])
+    tokens = rgb if cached else rgb + conditions
+    pairs = rgb * (rgb + conditions) + (
+        0 if cached else conditions * (conditions if visibility == "one_way" else rgb + conditions)
+    )
+    dim, features = size.dim, channels * int(np.prod(PATCH))
+    of_block = tokens * (6 * dim * dim + 2 * dim * size.ffn_dim) + 2 * dim * pairs
+    of_text = 2 * text * dim * dim + 2 * dim * tokens * text
+    of_ends = (tokens + rgb) * features * dim + text * (size.text_dim + dim) * dim
+    return 2.0 * batch * (size.depth * (of_block + of_text) + of_ends)
+
+
+def compute_params(graph: nnx.GraphDef, params: Any) -> Any:
+    """Parameters with every matrix in the type in which its product is computed; the others stay as they are.
+
+    With it the rounding is done once, before the loop over blocks (and over the steps of a sampler), instead of in every
+    block of every pass, and sharded parameters are gathered in half the bytes. Within a loss it is differentiable: the
+    gradients leave it in the type of the master copy.
+    """
+    model = nnx.merge(graph, params)
+    types = {path: module.dtype for path, module in nnx.iter_modules(model) if isinstance(module, nnx.Linear) and module.dtype}
+    flat = nnx.to_flat_state(params)
+    rounded = [
+        (path, leaf.replace(leaf.get_value().astype(types[path[:-1]])) if path[:-1] in types else leaf) for path, leaf in flat
+    ]
+    return nnx.from_flat_state(rounded)
+
+
 def parameter_count(model: nnx.Module) -> int:
     """How many numbers the model learns."""
     return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)))
@@ -342,7 +642,7 @@ def _scaled_normal(key: Array, shape: tuple[int, ...]) -> Array:
     return jax.random.normal(key, shape, jnp.float32) / np.sqrt(shape[-1]).astype(np.float32)
 
 
-def _stacked_blocks(size: ModelSize, dtype: jnp.dtype, attention: Literal["xla", "cudnn"], rngs: nnx.Rngs) -> Block:
+def _stacked_blocks(size: ModelSize, dtype: jnp.dtype, attention: AttentionName, rngs: nnx.Rngs) -> Block:
     """`depth` blocks as one whose parameters have a leading layer axis."""
 
     @nnx.split_rngs(splits=size.depth)

@@ -12,7 +12,7 @@ from flax import nnx
 from xew.config import ConfigError, load, pick
 from xew.model.codec import CODECS, TEMPORAL_FACTOR, CodecSettings, latent_frames
 from xew.model.conditions import ACTIONS, CONDITIONS, Condition
-from xew.model.dit import MODELS, PATCH, WorldModel
+from xew.model.dit import MODELS, PATCH, AttentionName, RematName, TimeEmbedding, Visibility, WorldModel
 from xew.model.samplers import GRIDS, SAMPLERS
 from xew.model.sharding import MeshSettings
 from xew.model.text import TEXT_ENCODERS
@@ -41,11 +41,20 @@ class ModelSettings:
     text: str = "hashed_words"
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Of the matrix products."""
-    remat: bool = False
-    """Recompute activations in the backward pass: less memory, a third more work."""
+    residual: Literal["float32", "bfloat16"] = "float32"
+    """Of the tokens between blocks; their sums are float32 either way."""
+    remat: RematName = "none"
+    """What the backward pass computes again: nothing, all but the attention or matrix products, or everything (dit.REMAT)."""
     unroll: int = 1
     """Blocks compiled as one loop body."""
-    attention: Literal["xla", "cudnn"] = "xla"
+    attention: AttentionName = "auto"
+    """cuDNN's where it can be used, else XLA's (dit.choose_attention)."""
+    visibility: Visibility = "joint"
+    """one_way: condition tokens see condition tokens only, and are computed once a clip when sampling. A departure."""
+    time: TimeEmbedding = "exact"
+    """flowwam: with the rounding under which FlowWAM's published weights were trained."""
+    weights: Path | None = None
+    """Published weights to start from: official Wan, diffusers, FlowWAM (dit_layouts.load_dit); from nothing if left out."""
 
 
 @dataclass(frozen=True)
@@ -183,9 +192,12 @@ def create_model(experiment: Experiment) -> WorldModel:
         experiment.codec.channels,
         tuple(experiment.conditions),
         dtype=jnp.dtype(settings.dtype),
+        residual=jnp.dtype(settings.residual),
         remat=settings.remat,
         unroll=settings.unroll,
         attention=settings.attention,
+        visibility=settings.visibility,
+        time=settings.time,
         rngs=nnx.Rngs(experiment.train.seed),
     )
 
