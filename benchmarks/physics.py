@@ -14,6 +14,7 @@ at the last), and in how many worlds both end alike in success or failure. Conta
 that is let go a hair earlier rolls elsewhere.
 """
 
+import gc
 import itertools
 import os
 import platform
@@ -94,13 +95,15 @@ def row(cells: list[Cell], device: wp.Device, frames: int | None) -> None:
     """Step one batch and print what it cost."""
     worlds = [World(cell.robot, cell.scene, cell.commands.action[:frames]) for cell in cells]
     Batch([World(w.robot, w.scene, w.action[:2]) for w in worlds], device).run()  # loads or compiles kernels
+    gc.collect()  # the last batch and its graph
+    before = used_memory(device)
     begin = time.perf_counter()
     batch = Batch(worlds, device)
     wp.synchronize_device(device)
     built = time.perf_counter()
     motions = batch.run()
     end = time.perf_counter()
-    used = wp.get_mempool_used_mem_current(device) / 1e9 if device.is_cuda else float("nan")
+    used = used_memory(device) - before
     success = check(cells, motions, frames is None)
     steps = STEPS_PER_FRAME * (batch.frame_count - 1)
     print(
@@ -109,6 +112,11 @@ def row(cells: list[Cell], device: wp.Device, frames: int | None) -> None:
         f"{len(cells) * steps / (end - begin):13,.0f}  {used:11.1f}  {success:7.1%}",
         flush=True,
     )
+
+
+def used_memory(device: wp.Device) -> float:
+    """Of the device [GB]."""
+    return wp.get_mempool_used_mem_current(device) / 1e9 if device.is_cuda else float("nan")
 
 
 def compare(label: str, cells: Sequence[Cell], ours: Sequence[Motion], others: Sequence[Motion]) -> None:
