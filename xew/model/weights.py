@@ -41,7 +41,7 @@ class Source:
 
     keys: tuple[str, ...]
     """One tensor, or one for each layer; `stacked` tells which."""
-    layout: Literal["as_is", "linear", "conv", "patches", "ones"] = "as_is"
+    layout: Literal["as_is", "linear", "conv", "patches", "ones", "leading_ones"] = "as_is"
     """How the tensor's axes become the leaf's.
 
     as_is    unchanged
@@ -49,9 +49,10 @@ class Source:
     conv     [out in *kernel] -> [*kernel in out], a kernel of any rank
     patches  [out in *kernel] -> [in*kernel out]: a convolution whose stride is its kernel, as a matrix (`kernel` given)
     ones     [*shape 1 1 1] -> [*shape]: a vector written with trailing ones (`kernel` given)
+    leading_ones  [1 1 *shape] -> [*shape] (`kernel` given)
     """
     kernel: tuple[int, ...] = ()
-    """The kernel of `patches`, the trailing ones of `ones`."""
+    """The kernel of `patches`, the ones of `ones` and `leading_ones`."""
     stacked: bool | None = None
     """Layers stacked on the leading axis; by default so if there are several keys."""
 
@@ -200,6 +201,10 @@ AXES: dict[str, Axes] = {
     "ones": Axes(
         lambda tensor, kernel: tensor.reshape(tensor.shape[: tensor.ndim - len(kernel)]),
         lambda leaf, kernel: leaf.reshape(*leaf.shape, *kernel),
+    ),
+    "leading_ones": Axes(
+        lambda tensor, kernel: tensor.reshape(tensor.shape[len(kernel) :]),
+        lambda leaf, kernel: leaf.reshape(*kernel, *leaf.shape),
     ),
 }
 
