@@ -7,6 +7,7 @@ A module's `Layout` says for each of its leaves which tensors it comes from and 
 read one at a time, so that a checkpoint of 20 GB is never held twice, and nothing is ever unpickled freely.
 """
 
+import itertools
 import json
 import os
 import pickle
@@ -437,23 +438,18 @@ def _write(path: Path, tensors: dict[str, np.ndarray]) -> None:
         partial.unlink(missing_ok=True)
 
 
-def _write_shards(folder: Path, leaves: Mapping[str, nnx.Variable], layout: Layout, limit: int = SHARD_BYTES) -> None:
+def _write_shards(folder: Path, leaves: Mapping[str, nnx.Variable], layout: Layout) -> None:
     """Shards as they fill up; their names say how many there are, so the plan comes first. The index comes last."""
     sizes = {
         key: int(np.prod(_tensor_shape(leaves[path].shape, source))) * np.dtype(leaves[path].dtype).itemsize
         for path, source in layout.items()
         for key in source.keys
     }
-    plan = _plan_shards(sizes, limit)
+    plan = _plan_shards(sizes, SHARD_BYTES)
     count = max(plan.values(), default=0) + 1
     names = [f"diffusion_pytorch_model-{shard + 1:05d}-of-{count:05d}.safetensors" for shard in range(count)]
-    held: dict[str, np.ndarray] = {}
-    for number, (key, tensor) in enumerate(_written(leaves, layout), start=1):
-        held[key] = tensor
-        last = number == len(plan) or list(plan.values())[number] != plan[key]
-        if last:
-            _write(folder / names[plan[key]], held)
-            held = {}
+    for shard, tensors in itertools.groupby(_written(leaves, layout), key=lambda written: plan[written[0]]):
+        _write(folder / names[shard], dict(tensors))
     index = {"metadata": {"total_size": sum(sizes.values())}, "weight_map": {key: names[shard] for key, shard in plan.items()}}
     (folder / "diffusion_pytorch_model.safetensors.index.json").write_text(json.dumps(index, indent=2, sort_keys=True))
 
