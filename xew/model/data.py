@@ -15,7 +15,7 @@ import numpy as np
 from xew.episode import Record
 from xew.model.codec import TEMPORAL_FACTOR, latent_frames
 from xew.model.dit import MODELS, STREAMS
-from xew.model.experiment import Experiment
+from xew.model.experiment import Experiment, replayed
 from xew.model.latents import Episode, LatentCache, sample_starts
 from xew.model.text import TEXT_ENCODERS
 from xew.protocol import ACTION_DIM
@@ -99,11 +99,6 @@ def encode_text(experiment: Experiment, instruction: str) -> np.ndarray:
     return TEXT_ENCODERS[experiment.model.text](instruction, size.text_tokens, size.text_dim)
 
 
-def replayed(batch: int, replay: float) -> int:
-    """How many samples of a batch are replayed: the nearest whole number, at least one where any are asked for."""
-    return max(1, round(batch * replay)) if replay else 0
-
-
 def make_dataset(
     source: ClipSource, batch: int, seed: int, replay: float = 0.0, rows: np.ndarray | None = None
 ) -> grain.IterDataset:
@@ -150,10 +145,8 @@ def fake_batch(experiment: Experiment, batch: int, seed: int = 0) -> Batch:
 
     def chunk() -> Batch:
         joints_shape = (latent_frames(experiment.clip.frames), ACTION_DIM)
-        shapes = {
-            name: joints_shape if STREAMS[name].source == "joints" else experiment.latent_shape for name in experiment.conditions
-        }
-        conditions = {name: normal(*shape) for name, shape in shapes.items()}
+        of_joints = {name: STREAMS[name].source == "joints" for name in experiment.conditions}
+        conditions = {name: normal(*(joints_shape if yes else experiment.latent_shape)) for name, yes in of_joints.items()}
         latents, text = normal(*experiment.latent_shape), normal(size.text_tokens, size.text_dim)
         return Batch(latents, conditions, text, np.ones(latents.shape[:2], np.float32))
 

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from xew.config import ConfigError, load, pick
+from xew.config import ConfigError, load, pick, suggestion
 from xew.model.codec import CODECS, TEMPORAL_FACTOR, CodecSettings, latent_frames
 from xew.model.conditions import ACTIONS, CONDITIONS, Condition
 from xew.model.dit import MODELS, PATCH, AttentionName, RematName, TimeEmbedding, Visibility, WorldModel
 from xew.model.samplers import GRIDS, SAMPLERS
 from xew.model.sharding import MeshSettings
 from xew.model.text import TEXT_ENCODERS
-from xew.protocol import SPLITS, Split
+from xew.protocol import ROBOT_NAMES, SPLITS, Split
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Experiment:
     split: str = "fixed"
     """One of protocol.SPLITS: which robots train."""
     codec: CodecSettings = field(default_factory=CodecSettings)
-    mesh: MeshSettings = MeshSettings()
+    mesh: MeshSettings = field(default_factory=MeshSettings)
     adapt: AdaptSettings = AdaptSettings()
     rollout: RolloutSettings = RolloutSettings()
     cache: Path | None = None
@@ -171,6 +171,7 @@ def load_experiment(path: Path | str, overrides: list[str] | None = None) -> Exp
     pick(GRIDS, experiment.rollout.grid, "grid of noise levels")
     _ = experiment.robots, experiment.conditions
     _check_sizes(experiment, str(path))
+    _check_training(experiment, str(path))
     return experiment
 
 
@@ -182,6 +183,28 @@ def _check_sizes(experiment: Experiment, source: str) -> None:
     if clip.height % factor or clip.width % factor:
         found = f"clip is {clip.width}x{clip.height}"
         raise ConfigError(f"{source}: {found}; both sides must be multiples of {factor} (codec factor x patch).")
+
+
+def _check_training(experiment: Experiment, source: str) -> None:
+    train, adapt = experiment.train, experiment.adapt
+    if (train.steps > 0) == (train.epochs > 0):
+        raise ConfigError(f"{source}: train.steps is {train.steps}, train.epochs {train.epochs:g}; give one of them, over 0.")
+    if adapt.start_from is None:
+        return
+    for robot in adapt.robots:
+        if robot not in ROBOT_NAMES:
+            raise ConfigError(f"{source}: adapt.robots: unknown robot {robot!r};{suggestion(robot, ROBOT_NAMES)}")
+    if not adapt.robots or adapt.episodes < 1:
+        raise ConfigError(f"{source}: adapt needs the robots to adapt to and at least one episode of each task and robot.")
+    if not 0 <= adapt.replay < 1 or (adapt.replay and replayed(train.batch, adapt.replay) >= train.batch):
+        raise ConfigError(
+            f"{source}: adapt.replay is {adapt.replay:g} of a batch of {train.batch}; it is a part that leaves room for others."
+        )
+
+
+def replayed(batch: int, replay: float) -> int:
+    """How many samples of a batch are replayed: the nearest whole number, at least one where any are asked for."""
+    return max(1, round(batch * replay)) if replay else 0
 
 
 def create_model(experiment: Experiment) -> WorldModel:

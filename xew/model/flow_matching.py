@@ -51,6 +51,9 @@ def training_pair(key: Array, latents: Array, shift: float) -> TrainingPair:
     return TrainingPair(jnp.concatenate([reference, noisy[:, 1:]], axis=1), noise - latents, sigma)
 
 
-def sample_losses(predicted: Array, pair: TrainingPair) -> Array:
-    """Mean squared velocity error [b] over latent frames 1 and on."""
-    return jnp.square(predicted[:, 1:] - pair.velocity[:, 1:]).mean(axis=(1, 2, 3, 4))
+def sample_losses(predicted: Array, pair: TrainingPair, shown: Array | None = None) -> Array:
+    """Mean squared velocity error [b] over latent frames 1 and on, of those that show the episode [b t] (else all)."""
+    errors = jnp.square(predicted[:, 1:] - pair.velocity[:, 1:]).mean(axis=(2, 3, 4))
+    if shown is None:
+        return errors.mean(axis=1)
+    return (errors * shown[:, 1:]).sum(axis=1) / jnp.maximum(shown[:, 1:].sum(axis=1), 1)

@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from xew.config import ConfigError, digest, user_errors
 from xew.episode import Record, complete_folder, episode_folder, find_accepted, read_states, read_video
+from xew.model.checkpoint import load_run
 from xew.model.codec import CODECS, TEMPORAL_FACTOR, Codec
 from xew.model.conditions import Condition, command_of
 from xew.model.experiment import Experiment, load_experiment
@@ -136,14 +137,48 @@ def encode_clip(codec: Codec, condition: Condition | None, video: np.ndarray, st
 
 
 def training_episodes(experiment: Experiment) -> list[Episode]:
-    """Accepted episodes of training seeds and training robots. Raises ConfigError or EpisodeError if there are none."""
-    robots = experiment.robots.train_robots
+    """The episodes to learn from, of training seeds: all of the split's training robots, or a few of the robots to adapt to.
+
+    Raises:
+        ConfigError, EpisodeError: there are none, or too few to adapt to.
+    """
+    adapt = experiment.adapt
+    if adapt.start_from is None:
+        return _training_episodes_of(experiment, experiment.robots.train_robots)
+    return first_of_each(_training_episodes_of(experiment, adapt.robots), adapt.episodes)
+
+
+def replay_episodes(experiment: Experiment) -> list[Episode]:
+    """In an adaptation with replay, what the run that it starts from was trained on; else none."""
+    start, replay = experiment.adapt.start_from, experiment.adapt.replay
+    if start is None or not replay:
+        return []
+    source = load_experiment(start / "config.yaml").robots.train_robots
+    return _training_episodes_of(experiment, [robot for robot in source if robot not in experiment.adapt.robots])
+
+
+def _training_episodes_of(experiment: Experiment, robots: Sequence[str]) -> list[Episode]:
     accepted = find_accepted(experiment.data)
     chosen = [(f, r) for f, r in accepted if r.robot in robots and seed_split(r.seed) == "train"]
-    if not chosen:
+    missing = [robot for robot in robots if robot not in {record.robot for _, record in chosen}]
+    if missing and (experiment.adapt.start_from is not None or not chosen):
         command = f"python -m xew.sim_warp.generate --robots {' '.join(robots)} --out {experiment.data}"
-        raise ConfigError(f"{experiment.data} has no training episode of {', '.join(robots)}; make some: {command}")
+        raise ConfigError(f"{experiment.data} has no training episode of {', '.join(missing)}; make some: {command}")
     return chosen
+
+
+def first_of_each(episodes: Sequence[Episode], count: int) -> list[Episode]:
+    """The first `count` seeds of every task and robot. Raises ConfigError where there are fewer."""
+    groups: dict[tuple[str, str], list[Episode]] = {}
+    for episode in sorted(episodes, key=lambda episode: episode[1].seed):
+        groups.setdefault((episode[1].task, episode[1].robot), []).append(episode)
+    for (task, robot), group in groups.items():
+        if len(group) < count:
+            raise ConfigError(
+                f"adapt.episodes is {count}, there are only {len(group)} training episodes of {robot} in {task}; lower it, or "
+                "make more with `python -m xew.sim_warp.generate`."
+            )
+    return [episode for _, group in sorted(groups.items()) for episode in group[:count]]
 
 
 def test_episodes(data: Path, robots: Sequence[str]) -> list[Episode]:
@@ -164,6 +199,8 @@ def load_codec(experiment: Experiment, episodes: Sequence[Episode]) -> Codec:
     Raises:
         ConfigError: `latents` has not been run for them, or the weights are missing or do not fit.
     """
+    if experiment.adapt.start_from is not None:
+        return load_run(experiment.adapt.start_from)[1]
     kind = CODECS[experiment.codec.name]
     if not kind.fitted:
         return kind.prepare(experiment.codec, list)
@@ -227,10 +264,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args, overrides = parser.parse_known_args(arguments)
     experiment = load_experiment(args.config, overrides)
     episodes = training_episodes(experiment)
-    to_fit = CODECS[experiment.codec.name].fitted and not codec_path(experiment, episodes).exists()
+    adapts = experiment.adapt.start_from is not None
+    to_fit = CODECS[experiment.codec.name].fitted and not adapts and not codec_path(experiment, episodes).exists()
     codec = fit_codec(experiment, episodes) if to_fit else load_codec(experiment, episodes)
     cache = LatentCache(experiment, codec)
-    written = sum(cache.encode(episode) for episode in tqdm(episodes, desc="encode", unit="episode"))
+    written = sum(
+        cache.encode(episode) for episode in tqdm([*episodes, *replay_episodes(experiment)], desc="encode", unit="episode")
+    )
     ceiling_on = (test_episodes(experiment.data, experiment.robots.held_out_robots) or episodes)[:8]
     ceiling = ceiling_psnr(experiment, codec, ceiling_on)
     header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip), "streams": list(cache.streams)}

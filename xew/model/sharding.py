@@ -63,7 +63,9 @@ def mesh_shape(settings: MeshSettings, devices: int) -> tuple[int, int]:
     asked = (settings.data, settings.fsdp)
     known = math.prod(size for size in asked if size != -1)
     if asked.count(-1) > 1 or min(asked) < -1 or 0 in asked:
-        raise ConfigError(f"mesh is data {asked[0]} x fsdp {asked[1]}; give positive numbers, at most one of them -1 (the rest).")
+        raise ConfigError(
+            f"mesh is data {asked[0]} x fsdp {asked[1]}; give positive numbers, at most one of them -1 (the rest)."
+        )
     if devices % known or (-1 not in asked and known != devices):
         raise ConfigError(
             f"mesh is data {asked[0]} x fsdp {asked[1]}, there are {devices} devices; the product must be {devices} "
@@ -110,8 +112,9 @@ def state_shardings(state: Any, mesh: Mesh) -> Any:
 
 
 def path_names(path: Sequence[Any]) -> tuple[str, ...]:
-    """The plain names along a path in a tree."""
-    return tuple(str(getattr(entry, "key", getattr(entry, "name", getattr(entry, "idx", entry)))) for entry in path)
+    """The plain names along a path in a tree, such as (blocks, self_attn, q, kernel)."""
+    names = [str(getattr(entry, "key", getattr(entry, "name", getattr(entry, "idx", entry)))) for entry in path]
+    return tuple(names[:-1] if names and names[-1] == "value" else names)  # NNX ends a parameter's path so
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:

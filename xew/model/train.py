@@ -1,107 +1,116 @@
-"""Training: the latent cache to checkpoints.
+"""Training: the latent cache to checkpoints, on any number of devices and hosts.
 
 Reads  the latent cache
 Writes <out>: config, checkpoints, metrics.jsonl, TensorBoard curves and sample videos
 Command: python -m xew.model.train CONFIG [--resume | --overwrite] [--train.steps … and other overrides]
+         python -m xew.model.train CONFIG --estimate --devices 8 --memory-gb 80
 """
 
 import argparse
-import functools
+import contextlib
 import itertools
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optax
 from flax import nnx
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.model.checkpoint import TrainState, open_checkpoints, prepare_run, restore_state, save_state
-from xew.model.data import Batch, ClipSource, make_dataset
-from xew.model.experiment import Experiment, TrainSettings, compile_cache, create_model, load_experiment
-from xew.model.flow_matching import sample_losses, training_pair
-from xew.model.latents import LatentCache, load_codec, training_episodes
+from xew.model.adaptation import corrected
+from xew.model.checkpoint import (
+    TrainState,
+    check_start,
+    note_start,
+    open_checkpoints,
+    prepare_run,
+    restore_start,
+    restore_state,
+    save_state,
+)
+from xew.model.codec import Codec
+from xew.model.data import ClipSource, fake_batch, make_dataset
+from xew.model.experiment import Experiment, compile_cache, load_experiment
+from xew.model.latents import LatentCache, load_codec, replay_episodes, training_episodes
+from xew.model.memory import check_memory, estimate_memory, flops_of_step, peak_flops
+from xew.model.optimizer import learning_rate, make_optimizer, with_steps
 from xew.model.rollout import Predictor
 from xew.model.samples import log_samples
+from xew.model.sharding import check_batch, make_mesh, mesh_shape, place_batch, process_rows, start_processes, state_shardings
 from xew.model.tensorboard import RunLog
+from xew.model.training_step import StepResult, abstract_state, init_train_state, make_train_step
+
+__all__ = ["fake_batch", "init_train_state", "make_mesh", "make_optimizer", "make_train_step", "place_batch", "train"]
 
 NOISE_LEVEL_EDGES = (0.0, 0.5, 0.8, 0.95, 1.0)
 """Bins of the noise level in which the loss is shown apart."""
 
 
-class StepResult(NamedTuple):
-    """What one training step reports."""
+@dataclass
+class Meter:
+    """What has happened since the last log line."""
 
-    losses: jax.Array
-    """[b], one for each sample."""
-    sigma: jax.Array
-    """[b], their noise levels."""
-    gradient_norm: jax.Array
-    """Global norm before clipping."""
+    flops: float
+    """Of one step, forward and backward, counted on the model."""
+    samples: int
+    """Of one step."""
+    results: list[StepResult] = field(default_factory=list)
+    wait_s: float = 0.0
+    """Time in which the devices had to wait for data."""
+    since: float = field(default_factory=time.perf_counter)
 
+    def add(self, result: StepResult, wait_s: float) -> None:
+        self.results.append(result)
+        self.wait_s += wait_s
 
-def make_optimizer(settings: TrainSettings) -> optax.GradientTransformation:
-    """AdamW with clipping, optional warm-up and cosine decay."""
-    decay = optax.cosine_decay_schedule(settings.learning_rate, max(settings.steps, 1), alpha=settings.decay_to)
-    constant = optax.constant_schedule(settings.learning_rate)
-    schedule = constant if settings.decay_to == 1 else decay
-    if settings.warmup_steps:
-        warmup = optax.linear_schedule(0.0, settings.learning_rate, settings.warmup_steps)
-        schedule = optax.join_schedules([warmup, schedule], [settings.warmup_steps])
-    return optax.chain(optax.clip_by_global_norm(settings.clip_norm), optax.adamw(schedule, weight_decay=settings.weight_decay))
+    def demand_finite(self) -> None:
+        """End the program if any step since the last log line was not finite: the state is spoilt and must not be saved."""
+        steps = len(self.results)
+        for number, result in enumerate(self.results):
+            if not bool(result.finite):
+                sys.exit(
+                    f"error: loss, gradients or update are not finite {steps - number - 1} steps ago; nothing of it was saved. "
+                    "--resume returns to the last checkpoint, or lower the rate (train.learning_rate)."
+                )
 
+    def take(self) -> dict[str, float]:
+        """The values of a log line; begins anew."""
+        results, seconds = jax.device_get(self.results), time.perf_counter() - self.since
+        values = summarise(results) | {
+            "time/step_s": seconds / len(results),
+            "time/data_wait_s": self.wait_s / len(results),
+            "time/samples_per_s": len(results) * self.samples / seconds,
+        }
+        if peak := peak_flops(jax.devices()[0].device_kind):
+            values["time/mfu"] = len(results) * self.flops / seconds / (peak * jax.device_count())
+        if used := (jax.local_devices()[0].memory_stats() or {}).get("peak_bytes_in_use"):
+            values["memory/peak_gb"] = used / 1e9
+        self.results, self.wait_s, self.since = [], 0.0, time.perf_counter()
+        return values
 
-def init_train_state(experiment: Experiment, optimizer: optax.GradientTransformation) -> tuple[nnx.GraphDef, TrainState]:
-    """The network's structure and the state of step 0."""
-    graph = nnx.split(nnx.eval_shape(lambda: create_model(experiment)), nnx.Param)[0]
-
-    @jax.jit
-    def init() -> TrainState:
-        params = nnx.state(create_model(experiment), nnx.Param)
-        ema = jax.tree.map(jnp.copy, params) if experiment.train.ema_decay else None
-        return TrainState(jnp.int32(0), params, optimizer.init(params), ema)
-
-    return graph, init()
-
-
-def make_train_step(
-    graph: nnx.GraphDef, optimizer: optax.GradientTransformation, settings: TrainSettings
-) -> Callable[[TrainState, Batch], tuple[TrainState, StepResult]]:
-    """The compiled step; its noise depends on the seed and the step only, so that a resumed run repeats it."""
-
-    @functools.partial(jax.jit, donate_argnums=0)
-    def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, StepResult]:
-        key = jax.random.fold_in(jax.random.key(settings.seed), state.step)
-        pair = training_pair(key, batch.latents, settings.shift)
-
-        def loss(params: Any) -> tuple[jax.Array, jax.Array]:
-            predicted = nnx.merge(graph, params)(pair.noisy, batch.conditions, pair.sigma, batch.text)
-            losses = sample_losses(predicted, pair)
-            return losses.mean(), losses
-
-        (_, losses), gradients = jax.value_and_grad(loss, has_aux=True)(state.params)
-        updates, optimizer_state = optimizer.update(gradients, state.optimizer, state.params)
-        params = optax.apply_updates(state.params, updates)
-        ema = None if state.ema is None else optax.incremental_update(params, state.ema, 1 - settings.ema_decay)
-        result = StepResult(losses, pair.sigma, optax.tree.norm(gradients))
-        return TrainState(state.step + 1, params, optimizer_state, ema), result
-
-    return train_step
+    @contextlib.contextmanager
+    def paused(self) -> Iterator[None]:
+        """Leave out what is not training."""
+        begin = time.perf_counter()
+        yield
+        self.since += time.perf_counter() - begin
 
 
-def summarise(results: Sequence[StepResult], seconds: float) -> dict[str, float]:
-    """Means since the last log line: loss, loss by noise level, gradient norm, step time."""
-    losses, sigma, norms = (np.concatenate([np.atleast_1d(part) for part in parts]) for parts in zip(*results, strict=True))
-    values = {"train/loss": losses.mean(), "train/gradient_norm": norms.mean(), "train/step_s": seconds / len(results)}
+def summarise(results: Sequence[StepResult]) -> dict[str, float]:
+    """Means of the loss, of the loss by noise level and of the gradient norm over some steps."""
+    losses, sigma, weights = (np.concatenate([getattr(r, name) for r in results]) for name in ("losses", "sigma", "weights"))
+    norms = [float(result.gradient_norm) for result in results]
+    values = {"train/loss": (weights * losses).sum(axis=1).mean(), "train/gradient_norm": np.mean(norms)}
     for low, high in itertools.pairwise(NOISE_LEVEL_EDGES):
-        inside = (sigma > low) & (sigma <= high)
+        inside = (sigma > low) & (sigma <= high) & (weights > 0)
         if inside.any():
             values[f"train/loss_at_noise_{low:g}_{high:g}"] = losses[inside].mean()
     return {name: float(value) for name, value in values.items()}
@@ -117,6 +126,12 @@ class StopSignal:
     def _note(self, number: int, frame: Any) -> None:
         self.received = True
 
+    def agreed(self) -> bool:
+        """Whether any process was asked to stop; all processes must ask at the same step."""
+        if jax.process_count() == 1:
+            return self.received
+        return bool(np.any(multihost_utils.process_allgather(np.asarray(self.received))))
+
     def release(self) -> None:
         """Give the signals back to who had them."""
         for number, handler in self.before.items():
@@ -130,61 +145,146 @@ def main(arguments: Sequence[str] | None = None) -> None:
     existing = parser.add_mutually_exclusive_group()
     existing.add_argument("--resume", action="store_true", help="continue the run in --out if there is one")
     existing.add_argument("--overwrite", action="store_true", help="replace the run in --out")
+    parser.add_argument("--distributed", action="store_true", help="join the other processes that a launcher has started")
+    parser.add_argument("--ignore-memory", action="store_true", help="start even if the estimate says that memory is too small")
+    parser.add_argument("--estimate", action="store_true", help="print the memory that training needs, and do nothing else")
+    parser.add_argument("--devices", type=int, default=1, help="with --estimate: how many")
+    parser.add_argument("--memory-gb", type=float, help="with --estimate: of each device")
     args, overrides = parser.parse_known_args(arguments)
     experiment = load_experiment(args.config, overrides)
+    if args.estimate:
+        print_estimate(experiment, args.devices, args.memory_gb)
+        return
+    start_processes(args.distributed)
     compile_cache()
-    train(experiment, resume=args.resume, overwrite=args.overwrite)
+    train(experiment, resume=args.resume, overwrite=args.overwrite, ignore_memory=args.ignore_memory)
 
 
-def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = False) -> None:
+def print_estimate(experiment: Experiment, devices: int, memory_gb: float | None) -> None:
+    """The memory of a run on devices that need not be there, with the arithmetic."""
+    _, fsdp = mesh_shape(experiment.mesh, devices)
+    check_batch(experiment.train.batch, experiment.train.accumulate, devices)
+    memory = estimate_memory(experiment, devices, fsdp)
+    print(memory.table())
+    if memory_gb:
+        print(f"{'fits' if memory.total < memory_gb * 1e9 else 'does not fit'} in {memory_gb:g} GB a device")
+
+
+def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = False, ignore_memory: bool = False) -> None:
     """Train an experiment to its last step, from the start or from its latest checkpoint."""
-    settings = experiment.train
-
-    # Data: everything that can be missing is found before a run folder is made.
-    episodes = training_episodes(experiment)
-    codec = load_codec(experiment, episodes)
-    source = ClipSource(LatentCache(experiment, codec), episodes)
-    source.check()
-    prepare_run(experiment, codec, resume=resume, overwrite=overwrite)
-    position = iter(make_dataset(source, settings.batch, settings.seed))
+    # Everything that can be missing or too small is found before a run folder is made.
+    mesh = make_mesh(experiment.mesh)
+    check_batch(experiment.train.batch, experiment.train.accumulate, mesh.size)
+    source, codec = open_data(experiment)
+    experiment, asked = with_steps(experiment, source.fresh), experiment
+    check_memory(estimate_memory(experiment, mesh.size, mesh.shape["fsdp"]), ignore=ignore_memory)
+    begin_run(asked, codec, resume=resume, overwrite=overwrite)
 
     # State: step 0, or where the run was left.
-    optimizer = make_optimizer(settings)
-    graph, state = init_train_state(experiment, optimizer)
+    settings = experiment.train
+    rows = process_rows(mesh, settings.batch)
+    batches = iter(make_dataset(source, settings.batch, settings.seed, experiment.adapt.replay, rows))
     checkpoints = open_checkpoints(experiment.out, settings.keep_checkpoints)
-    if checkpoints.latest_step() is not None:
-        state, data_position = restore_state(checkpoints, state)
-        position.set_state(data_position)
-    train_step = make_train_step(graph, optimizer, settings)
+    if checkpoints.latest_step() is None:
+        graph, state = init_train_state(experiment, mesh, start_params(experiment, mesh))
+    else:
+        graph, state, position = left_state(experiment, mesh, checkpoints)
+        batches.set_state(position)
+    train_step = make_train_step(experiment, graph, mesh, codec)
 
     # Steps.
-    log, stop, results, since = RunLog(experiment.out), StopSignal(), [], time.perf_counter()
+    log = RunLog(experiment.out) if jax.process_index() == 0 else None
+    stop, schedule = StopSignal(), learning_rate(settings)
+    meter = Meter(flops_of_step(experiment), settings.batch)
     begin = int(state.step)
     progress = tqdm(range(begin, settings.steps), desc="train", initial=begin, total=settings.steps, file=sys.stderr)
     for step in (number + 1 for number in progress):
-        state, result = train_step(state, next(position))
-        results.append(result)
-        if step % settings.log_every == 0 or step == settings.steps:
-            values = summarise(jax.device_get(results), time.perf_counter() - since)
-            log.scalars(step, values)
+        last = step == settings.steps
+        asking = time.perf_counter()
+        batch = place_batch(next(batches), mesh)
+        wait_s = time.perf_counter() - asking
+        state, result = train_step(state, batch)
+        meter.add(result, wait_s)
+        logs = step % settings.log_every == 0 or last
+        stops = stop.agreed() if logs or jax.process_count() == 1 else False
+        if logs or stops or step % settings.save_every == 0:
+            meter.demand_finite()
+        if logs:
+            values = meter.take() | {"train/learning_rate": float(schedule(step - 1))}
             progress.set_postfix(loss=f"{values['train/loss']:.4f}")
-            if not np.isfinite(values["train/loss"]):
-                sys.exit(
-                    f"error: the loss is not finite at step {step}; --resume returns to the last checkpoint, or lower the rate."
-                )
-            results, since = [], time.perf_counter()
-        if step % settings.save_every == 0 or step == settings.steps or stop.received:
-            save_state(checkpoints, state, position.get_state())
-        if step % settings.sample_every == 0 or step == settings.steps:
-            predictor = Predictor(experiment, codec, graph, state.params if state.ema is None else state.ema)
-            log_samples(log, predictor, step)
-            since = time.perf_counter()
-        if stop.received:
+            if log:
+                log.scalars(step, values)
+            stops = stops or stop.agreed()
+        if step % settings.save_every == 0 or last or stops:
+            save_state(checkpoints, state, batches.get_state())
+        if step % settings.sample_every == 0 or last:
+            with meter.paused():
+                draw_samples(log, experiment, codec, graph, state, mesh, step)
+        if stops:
             print(f"stopped at step {step} and saved; continue with --resume", file=sys.stderr)
             break
     stop.release()
-    log.close()
+    if log:
+        log.close()
     checkpoints.close()
+
+
+def open_data(experiment: Experiment) -> tuple[ClipSource, Codec]:
+    """The training samples and the codec that made them. Raises ConfigError if any of it is missing or stale."""
+    if experiment.adapt.start_from is not None:
+        check_start(experiment)
+    episodes = training_episodes(experiment)
+    codec = load_codec(experiment, episodes)
+    source = ClipSource(LatentCache(experiment, codec), episodes, replay_episodes(experiment))
+    source.check()
+    return source, codec
+
+
+def begin_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite: bool) -> None:
+    """Make the run folder ready, by the first process; the others wait for it."""
+    if jax.process_index() == 0:
+        prepare_run(experiment, codec, resume=resume, overwrite=overwrite)
+        if experiment.adapt.start_from is not None and not resume:
+            note_start(experiment)
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices("run folder")
+
+
+def start_params(experiment: Experiment, mesh: Mesh) -> Any:
+    """What step 0 begins with, placed on the mesh: the parameters of the run to adapt, or None for random ones."""
+    if experiment.adapt.start_from is None:
+        return None
+    return restore_start(experiment, network_shapes(experiment, mesh))
+
+
+def network_shapes(experiment: Experiment, mesh: Mesh) -> Any:
+    """Shapes and places of the network's parameters."""
+    state = abstract_state(experiment)[1]
+    return placed(state.params if state.base is None else state.base, mesh)
+
+
+def placed(shapes: Any, mesh: Mesh) -> Any:
+    """Shapes with their places on the mesh."""
+    return jax.tree.map(
+        lambda leaf, place: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), shapes, state_shardings(shapes, mesh)
+    )
+
+
+def left_state(experiment: Experiment, mesh: Mesh, checkpoints: Any) -> tuple[nnx.GraphDef, TrainState, dict[str, Any]]:
+    """Structure, state and data position at the latest checkpoint, whatever mesh it was saved from."""
+    graph, shapes = abstract_state(experiment)
+    base = start_params(experiment, mesh) if experiment.adapt.lora_rank else None
+    state, position = restore_state(checkpoints, placed(shapes, mesh))
+    return graph, replace(state, base=base), position
+
+
+def draw_samples(
+    log: RunLog | None, experiment: Experiment, codec: Codec, graph: nnx.GraphDef, state: TrainState, mesh: Mesh, step: int
+) -> None:
+    """Predict clips of seen and unseen robots beside the truth."""
+    with jax.set_mesh(mesh):
+        params = jax.jit(corrected)(state.base, state.params if state.ema is None else state.ema)
+    log_samples(log, Predictor(experiment, codec, graph, params), step)
 
 
 if __name__ == "__main__":

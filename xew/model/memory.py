@@ -1,0 +1,151 @@
+"""How much memory training needs, before anything is compiled, and how much arithmetic it does.
+
+The numbers are of one device: parameters, optimizer, moving average and gradients are cut along `fsdp`; activations are
+those of the device's samples of one part of the batch. The estimate is made from shapes alone; what XLA adds (buffers that
+overlap, fragments) is covered by `MARGIN`.
+"""
+
+import math
+import os
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from xew.config import ConfigError
+from xew.model.data import fake_batch
+from xew.model.dit import MODELS, ModelSize, flops, token_grid
+from xew.model.experiment import Experiment
+from xew.model.sharding import parameter_spec, path_names
+from xew.model.training_step import abstract_state
+
+MARGIN = 1.1
+"""Room for what the estimate does not see."""
+PEAK_FLOPS = {"H100": 989e12, "H200": 989e12, "A100": 312e12}
+"""Dense bfloat16 products a second by the maker's data sheets, by part of the device's name."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Bytes on each device, by what they are for."""
+
+    parts: dict[str, float]
+    layout: str
+    """How the work is laid out, for people."""
+
+    @property
+    def total(self) -> float:
+        return MARGIN * sum(self.parts.values())
+
+    def line(self) -> str:
+        """In one line."""
+        shares = ", ".join(f"{name} {size / 1e9:.2f}" for name, size in self.parts.items() if size)
+        return f"memory of each device [GB]: {shares}; with {MARGIN - 1:.0%} of room {self.total / 1e9:.2f} ({self.layout})"
+
+    def table(self) -> str:
+        """With every part on a line of its own."""
+        rows = [f"{name:<28}{size / 1e9:10.3f} GB" for name, size in self.parts.items()]
+        total = f"{'total with ' + format(MARGIN - 1, '.0%') + ' of room':<28}{self.total / 1e9:10.3f} GB"
+        return "\n".join([f"each device, {self.layout}:", *rows, total])
+
+
+def estimate_memory(experiment: Experiment, devices: int, fsdp: int) -> Memory:
+    """What each of `devices` devices needs to train an experiment with its state cut in `fsdp` parts."""
+    settings, compute = experiment.train, jnp.dtype(experiment.model.dtype).itemsize
+    state = abstract_state(experiment)[1]
+    network = state.params if state.base is None else state.base
+    weights = cut_bytes(network, fsdp, 1)  # numbers a device
+    summed = settings.accumulate > 1 or settings.chunks > 1
+    samples = settings.batch / devices / settings.accumulate
+    parts = {
+        "parameters": cut_bytes(state.params, fsdp),
+        "parameters kept as they are": cut_bytes(state.base, fsdp),
+        "optimizer": cut_bytes(state.optimizer, fsdp),
+        "moving average": cut_bytes(state.ema, fsdp),
+        f"rounded to {experiment.model.dtype}": weights * compute if compute < 4 else 0.0,
+        "gradients": weights * compute + (weights * 4 if summed else 0.0),
+        "layers gathered": 2 * compute * cut_bytes(network, 1, 1) / MODELS[experiment.model.size].depth if fsdp > 1 else 0.0,
+        "activations": samples * activation_bytes(experiment),
+    }
+    layout = f"{devices} devices, state in {fsdp} parts, {samples:g} samples at once on each, remat {experiment.model.remat}"
+    return Memory(parts, layout)
+
+
+def cut_bytes(tree: Any, fsdp: int, itemsize: int = 0) -> float:
+    """Bytes of a tree on each device (with `itemsize` a number, if given)."""
+
+    def size(path: tuple[Any, ...], leaf: Any) -> float:
+        cut = any(parameter_spec(path_names(path), leaf.shape, fsdp))
+        return math.prod(leaf.shape) * (itemsize or leaf.dtype.itemsize) / (fsdp if cut else 1)
+
+    return float(sum(size(path, leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)))
+
+
+def activation_bytes(experiment: Experiment) -> float:
+    """Bytes of activations of one sample: what is kept of every block, and the work of one block in the backward pass."""
+    settings, size = experiment.model, MODELS[experiment.model.size]
+    tokens = sum(math.prod(grid) for grid in stream_grids(experiment))
+    compute, residual = jnp.dtype(settings.dtype).itemsize, 4
+    everything = tokens * kept_bytes(size, compute, residual) + logits_bytes(experiment, tokens)
+    kept = {
+        "full": tokens * residual * size.dim,
+        "attention": tokens * (residual + compute) * size.dim,
+        "dots": tokens * (residual * size.dim + compute * (7 * size.dim + size.ffn_dim)),
+        "none": everything,
+    }[settings.remat]
+    return size.depth * kept + 2 * everything
+
+
+def kept_bytes(size: ModelSize, compute: int, residual: int) -> float:
+    """Bytes a token of all that the backward pass of one block reads: 14 widths and two of the hidden width, and the norms."""
+    return compute * (14 * size.dim + 2 * size.ffn_dim) + residual * 5 * size.dim
+
+
+def logits_bytes(experiment: Experiment, tokens: int) -> float:
+    """Of XLA's attention, which forms every pair of tokens (float32, and rounded); cuDNN's forms none."""
+    settings = experiment.model
+    fused = settings.attention == "cudnn" or (settings.attention == "auto" and settings.dtype == "bfloat16")
+    compute = jnp.dtype(settings.dtype).itemsize
+    return 0.0 if fused else MODELS[settings.size].heads * tokens**2 * (4 + compute)
+
+
+def stream_grids(experiment: Experiment) -> list[tuple[int, int, int]]:
+    """Tokens (t', h', w') of each stream, RGB first."""
+    batch = fake_batch(experiment, 1)
+    arrays = [batch.latents, *(batch.conditions[name] for name in experiment.conditions)]
+    return [token_grid(array.shape) for array in arrays]
+
+
+def flops_of_step(experiment: Experiment) -> float:
+    """Model FLOPs of one training step over all devices: three times the forward pass, recomputation not counted."""
+    settings, size = experiment.train, MODELS[experiment.model.size]
+    channels = experiment.codec.channels
+    return 3 * settings.chunks * flops(size, stream_grids(experiment), batch=settings.batch, channels=channels)
+
+
+def peak_flops(device_kind: str) -> float | None:
+    """Of one device by its name; None where it is not known, and then no MFU is logged."""
+    return next((peak for name, peak in PEAK_FLOPS.items() if name in device_kind), None)
+
+
+def device_memory() -> float:
+    """Bytes of each device that a program may use; of the machine, shared by its devices, on a CPU."""
+    stats = jax.local_devices()[0].memory_stats()
+    if stats and "bytes_limit" in stats:
+        return float(stats["bytes_limit"])
+    return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")) / jax.local_device_count()
+
+
+def check_memory(memory: Memory, ignore: bool = False) -> None:
+    """Print the estimate beside what there is. Raises ConfigError if it is too much, unless told to go on."""
+    there = device_memory()
+    if jax.process_index() == 0:
+        print(f"{memory.line()}; there is {there / 1e9:.2f}", file=sys.stderr)
+    if memory.total > there and not ignore:
+        raise ConfigError(
+            f"training needs about {memory.total / 1e9:.1f} GB a device, there is {there / 1e9:.1f} GB ({memory.layout}). "
+            "Use more devices with a larger mesh.fsdp, --model.remat full, a smaller --train.batch, a larger "
+            "--train.accumulate or --train.mu-dtype bfloat16; --ignore-memory starts all the same."
+        )
