@@ -217,7 +217,7 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
             stops = stops or stop.agreed()
         if step % settings.save_every == 0 or last or stops:
             save_state(checkpoints, state, batches.get_state())
-        if step % settings.sample_every == 0 or last:
+        if settings.sample_every and (step % settings.sample_every == 0 or last):
             with meter.paused():
                 draw_samples(log, experiment, codec, graph, state, mesh, step)
         if stops:
