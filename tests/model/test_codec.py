@@ -1,13 +1,17 @@
-"""The linear codec and the way between the camera's frames and the model's."""
+"""The codecs, linear and learned, and the way between the camera's frames and the model's."""
 
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from flax import nnx
 
+from xew.config import ConfigError
 from xew.model.codec import (
+    CodecSettings,
     PatchCodec,
+    WanVaeCodec,
     cut_patches,
     decode_to_pictures,
     encode_pictures,
@@ -18,6 +22,8 @@ from xew.model.codec import (
     to_signed,
 )
 from xew.model.frames import to_camera_size, to_model_size
+from xew.model.vae import VAES, abstract_vae
+from xew.model.vae_layouts import save_vae
 
 
 def smooth_clip(seed: int, frames: int = 9) -> np.ndarray:
@@ -135,3 +141,71 @@ def test_resizing_keeps_the_geometry(height: int, width: int) -> None:
     rows, columns = np.nonzero(back[0, ..., 0] > 127)
     assert (rows.mean(), columns.mean()) == pytest.approx((99.5, 239.5), abs=0.5)
     assert np.abs(back.astype(int) - video).mean() < 8
+
+
+# The autoencoder as a codec.
+
+
+@pytest.fixture(scope="module")
+def vae_codec(tmp_path_factory: pytest.TempPathFactory) -> WanVaeCodec:
+    """The tiny autoencoder at random, read from a file of its own."""
+    path = tmp_path_factory.mktemp("vae") / "vae.safetensors"
+    vae = abstract_vae(VAES["tiny"])
+    rng = np.random.default_rng(0)
+    for leaf in jax.tree.leaves(nnx.state(vae, nnx.Param), is_leaf=lambda leaf: isinstance(leaf, nnx.Variable)):
+        values = rng.standard_normal(leaf.shape, np.float32) / np.prod(leaf.shape[:-1]) ** 0.5
+        leaf.set_value(jax.numpy.asarray(values if len(leaf.shape) > 1 else np.abs(values)))
+    vae.latents_mean.set_value(jax.numpy.arange(8.0))
+    save_vae(vae, path)
+    return WanVaeCodec.prepare(settings(path), list)
+
+
+def settings(weights: Path | None) -> CodecSettings:
+    return CodecSettings("wan_vae", spatial_factor=8, channels=8, vae="tiny", weights=weights, chunk=2)
+
+
+def test_autoencoder_codec(vae_codec: WanVaeCodec) -> None:
+    video = smooth_clip(9, frames=13)
+    latents = vae_codec.encode(video)
+    assert latents.shape == (4, 4, 6, 8) and latents.dtype == np.float32
+    decoded = vae_codec.decode(latents)
+    assert decoded.shape == (13, 32, 48, 3) and decoded.dtype == np.uint8
+    with pytest.raises(ValueError, match="needs 4 k"):
+        vae_codec.encode(video[:12])
+
+
+def test_the_autoencoder_s_next_reference(vae_codec: WanVaeCodec) -> None:
+    """What a rollout would encode after decoding a clip to pictures."""
+    latents = vae_codec.encode(smooth_clip(9, frames=13))
+    found = jax.jit(lambda codec, latents: codec.next_reference(latents))(vae_codec, latents[None])
+    expected = vae_codec.encode(vae_codec.decode(latents)[-1:])
+    np.testing.assert_allclose(found[0], expected, atol=0.05)  # one grey level, where rounding falls the other way
+    assert np.abs(found[0] - expected).mean() < 1e-3
+
+
+def test_the_autoencoder_s_weights_are_no_constants_of_a_program(vae_codec: WanVaeCodec) -> None:
+    assert sum(np.size(leaf) for leaf in jax.tree.leaves(vae_codec)) > 600_000
+
+
+def test_saved_autoencoder_is_the_same(vae_codec: WanVaeCodec, tmp_path: Path) -> None:
+    vae_codec.save(tmp_path)
+    loaded = WanVaeCodec.load(tmp_path)
+    assert loaded.hash == vae_codec.hash and loaded.size == vae_codec.size and loaded.chunk == 2
+    np.testing.assert_array_equal(loaded.encode(smooth_clip(9)), vae_codec.encode(smooth_clip(9)))
+    other = loaded.vae
+    other.latents_mean.set_value(jax.numpy.zeros(8))
+    assert WanVaeCodec.of(other).hash != vae_codec.hash
+    assert WanVaeCodec.read(tmp_path, VAES["tiny"], "bfloat16").hash != vae_codec.hash
+
+
+def test_an_autoencoder_s_settings_are_checked(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="has 8 and 8: write those"):
+        WanVaeCodec.check(CodecSettings("wan_vae", spatial_factor=16, channels=8, vae="tiny"))
+    with pytest.raises(ConfigError, match=r"needs codec\.weights: Wan2\.2_VAE\.pth"):
+        WanVaeCodec.prepare(settings(None), list)
+    with pytest.raises(ConfigError, match="there are no weights at"):
+        WanVaeCodec.prepare(settings(tmp_path / "nowhere.safetensors"), list)
+    with pytest.raises(ConfigError, match="did you mean 'tiny'"):
+        WanVaeCodec.check(CodecSettings("wan_vae", vae="tny"))
+    with pytest.raises(ConfigError, match="give 1 to 192"):
+        PatchCodec.check(CodecSettings(spatial_factor=8, channels=200))

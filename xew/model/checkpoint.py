@@ -30,6 +30,8 @@ FREE_TO_CHANGE = (
     "data",
     "cache",
     "out",
+    "codec.chunk",
+    "codec.weights",
     "mesh.",
     "model.attention",
     "model.remat",
@@ -74,6 +76,7 @@ def prepare_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite
         shutil.rmtree(out)
     elif saved.exists() and resume:
         _check_same(load_experiment(saved), experiment, out)
+        _check_same_codec(codec, out)
     elif saved.exists():
         raise ConfigError(
             f"{out} holds a run already; continue it with --resume, replace it with --overwrite, or choose --out."
@@ -95,6 +98,12 @@ def _check_same(saved: Experiment, asked: Experiment, out: Path) -> None:
     if changed:
         found = "; ".join(f"{key} was {before[key]!r}, is {after[key]!r}" for key in changed)
         raise ConfigError(f"{out} was begun with another config ({found}); set it back, use --overwrite, or choose --out.")
+
+
+def _check_same_codec(codec: Codec, out: Path) -> None:
+    """A file of weights may have moved, but must hold the same."""
+    if (out / "codec").exists() and type(codec).load(out / "codec").hash != codec.hash:
+        raise ConfigError(f"{out} was begun with another codec than the config's now; set it back, or choose --out.")
 
 
 def _flat(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

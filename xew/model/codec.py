@@ -9,15 +9,21 @@ A codec is a JAX pytree of its arrays, so that it is passed to compiled function
 
 import functools
 import hashlib
+import json
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Literal, Protocol, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import nnx
 from jax import Array, lax
+
+from xew.config import ConfigError, parse, pick
+from xew.model.vae import VAES, VaeSize, VideoVae, abstract_vae
+from xew.model.vae_layouts import load_vae, save_vae
 
 TEMPORAL_FACTOR = 4
 
@@ -32,6 +38,14 @@ class CodecSettings:
     channels: int = 48
     fit_clips: int = 64
     """patch_pca: clips of training episodes from which the components are computed."""
+    vae: str = "wan22"
+    """wan_vae: one of VAES."""
+    weights: Path | None = None
+    """wan_vae: Wan2.2_VAE.pth, the vae folder of the diffusers layout, or what `train_vae` wrote."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """wan_vae: of the activations."""
+    chunk: int = 8
+    """wan_vae: latent frames that go through the network at once; more is faster and takes more memory, 0 takes all."""
 
 
 class Codec(Protocol):
@@ -75,6 +89,10 @@ class Codec(Protocol):
 
     @classmethod
     def load(cls, folder: Path) -> Self: ...
+
+    @classmethod
+    def check(cls, settings: CodecSettings) -> None:
+        """Raise ConfigError where settings contradict one another; reads no weights."""
 
     @classmethod
     def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> Self:
@@ -200,6 +218,15 @@ class PatchCodec(BatchCodec):
             return cls(int(stored["spatial_factor"]), first, later)
 
     @classmethod
+    def check(cls, settings: CodecSettings) -> None:
+        directions = 3 * settings.spatial_factor**2
+        if not 0 < settings.channels <= directions:
+            raise ConfigError(
+                f"codec.channels is {settings.channels}; square patches of codec.spatial_factor {settings.spatial_factor}"
+                f" have {directions} directions, so give 1 to {directions}."
+            )
+
+    @classmethod
     def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> "PatchCodec":
         return cls.fit(clips(), settings.spatial_factor, settings.channels)
 
@@ -217,7 +244,107 @@ class PatchCodec(BatchCodec):
         return cls(spatial_factor, _fit(first, channels, whitening, True), _fit(later, channels, whitening, False))
 
 
-CODECS = {"patch_pca": PatchCodec}
+@functools.partial(
+    jax.tree_util.register_dataclass, data_fields=("params",), meta_fields=("graph", "size", "dtype", "chunk", "hash")
+)
+@dataclass(frozen=True)
+class WanVaeCodec(BatchCodec):
+    """Wan2.2's autoencoder, or a smaller one of its kind, with trained weights; see `xew.model.vae`."""
+
+    fitted: ClassVar[bool] = False
+
+    params: Any
+    """State of a `VideoVae`, with the statistics of its latents."""
+    graph: nnx.GraphDef
+    size: VaeSize
+    dtype: str
+    chunk: int
+    hash: str
+
+    @property
+    def spatial_factor(self) -> int:  # type: ignore[override]
+        return self.size.spatial_factor
+
+    @property
+    def channels(self) -> int:
+        return self.size.channels
+
+    @property
+    def vae(self) -> VideoVae:
+        return nnx.merge(self.graph, self.params)
+
+    def encode_batch(self, frames: Array) -> Array:
+        """Float [b t h w 3] in [-1, 1] -> float32 [b t' h' w' c]: normalised means, as Wan's diffusion takes them."""
+        return self.vae.encode(frames, self.chunk)
+
+    def decode_batch(self, latents: Array) -> Array:
+        """Float [b t' h' w' c] -> float32 [b t h w 3] in [-1, 1]."""
+        return self.vae.decode(latents, self.chunk)
+
+    def next_reference(self, latents: Array) -> Array:
+        """[b t' h' w' c] -> [b 1 h' w' c]; decodes two latents at a time, so that it fits beside a network in training."""
+        last = self.vae.decode(latents, chunk=2, last_only=True)
+        return self.vae.encode(to_signed(to_pictures(last)))
+
+    def save(self, folder: Path) -> None:
+        """Write vae.safetensors and vae.json; weights that are there already are not written again."""
+        description = {"size": asdict(self.size), "dtype": self.dtype, "chunk": self.chunk, "hash": self.hash}
+        file = folder / "vae.json"
+        if not file.exists() or json.loads(file.read_text())["hash"] != self.hash:
+            save_vae(self.vae, folder / "vae.safetensors")
+        file.write_text(json.dumps(description, indent=1) + "\n")
+
+    @classmethod
+    def load(cls, folder: Path) -> "WanVaeCodec":
+        stored = json.loads((folder / "vae.json").read_text())
+        size = parse(VaeSize, stored["size"], str(folder / "vae.json"))
+        return cls.read(folder / "vae.safetensors", size, stored["dtype"], stored["chunk"])
+
+    @classmethod
+    def check(cls, settings: CodecSettings) -> None:
+        size = pick(VAES, settings.vae, "autoencoder")
+        if (settings.spatial_factor, settings.channels) != (size.spatial_factor, size.channels):
+            raise ConfigError(
+                f"codec.spatial_factor is {settings.spatial_factor} and codec.channels {settings.channels}; the autoencoder"
+                f" {settings.vae} has {size.spatial_factor} and {size.channels}: write those."
+            )
+        if settings.chunk < 0:
+            raise ConfigError(f"codec.chunk is {settings.chunk}; expected latent frames at once, or 0 for all.")
+
+    @classmethod
+    def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> "WanVaeCodec":
+        """Read the weights of a config.
+
+        Raises:
+            ConfigError: none are named, or they are missing, broken or of another size.
+        """
+        if settings.weights is None:
+            raise ConfigError(
+                "the codec wan_vae needs codec.weights: Wan2.2_VAE.pth, the vae folder of Wan2.2-TI2V-5B-Diffusers, or the"
+                " folder of an autoencoder trained by `python -m xew.model.train_vae CONFIG`."
+            )
+        return cls.read(settings.weights, pick(VAES, settings.vae, "autoencoder"), settings.dtype, settings.chunk)
+
+    @classmethod
+    def read(cls, weights: Path, size: VaeSize, dtype: str = "float32", chunk: int = 8) -> "WanVaeCodec":
+        """A codec from a file of weights of any known kind."""
+        vae = abstract_vae(size, jnp.dtype(dtype))
+        load_vae(vae, weights)
+        return cls.of(vae, chunk)
+
+    @classmethod
+    def of(cls, vae: VideoVae, chunk: int = 8) -> "WanVaeCodec":
+        """The codec of an autoencoder."""
+        graph, params = nnx.split(vae)
+        dtype = jnp.dtype(vae.dtype).name
+        digest = hashlib.sha256(f"wan_vae {vae.size} {dtype}".encode())
+        for path, leaf in sorted(nnx.to_flat_state(params), key=lambda item: str(item[0])):
+            digest.update(f"{path}".encode())
+            digest.update(np.asarray(jax.device_get(leaf.get_value())).tobytes())
+        return cls(params, graph, vae.size, dtype, chunk, digest.hexdigest())
+
+
+CODECS: dict[str, type[Codec]] = {"patch_pca": PatchCodec, "wan_vae": WanVaeCodec}
 
 
 def over_last(vector: Array, ndim: int) -> Array:

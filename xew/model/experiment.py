@@ -166,7 +166,7 @@ def load_experiment(path: Path | str, overrides: list[str] | None = None) -> Exp
     """Read and check a config. Raises ConfigError with every choice that does not exist or does not fit."""
     experiment = load(Experiment, path, overrides or [])
     pick(MODELS, experiment.model.size, "model size")
-    pick(CODECS, experiment.codec.name, "codec")
+    pick(CODECS, experiment.codec.name, "codec").check(experiment.codec)
     pick(TEXT_ENCODERS, experiment.model.text, "text encoder")
     pick(SAMPLERS, experiment.rollout.sampler, "sampler")
     pick(GRIDS, experiment.rollout.grid, "grid of noise levels")
