@@ -17,20 +17,23 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
 from xew.config import ConfigError, digest, user_errors
 from xew.episode import Record, complete_folder, episode_folder, find_accepted, read_states, read_video
+from xew.model.ceiling import measure_ceiling, spread
 from xew.model.checkpoint import load_run
 from xew.model.codec import CODECS, TEMPORAL_FACTOR, Codec
 from xew.model.conditions import Condition, command_of
 from xew.model.experiment import Experiment, load_experiment
-from xew.model.frames import to_camera_size, to_model_size
+from xew.model.frames import to_model_size
 from xew.protocol import seed_split
 
 Episode = tuple[Path, Record]
+CEILING_CLIPS = 8
 CACHE_VERSION = 1
 
 
@@ -235,16 +238,15 @@ def _clips_to_fit(experiment: Experiment, episodes: Sequence[Episode]) -> list[n
     return clips
 
 
-def ceiling_psnr(experiment: Experiment, codec: Codec, episodes: Sequence[Episode]) -> float:
-    """Mean PSNR [dB] at the camera's size of encoding and decoding one clip of each episode: no rollout can do better."""
-    clip, values = experiment.clip, []
-    for folder, _ in episodes:
-        video = read_video(folder / "rgb.mkv")[: clip.frames]
-        video = video[np.minimum(np.arange(clip.frames), len(video) - 1)]
-        decoded = to_camera_size(codec.decode(codec.encode(to_model_size(video, clip.height, clip.width))))
-        error = np.square(decoded.astype(np.float32) - video).mean(axis=(1, 2, 3))
-        values.append(10 * np.log10(255**2 / np.maximum(error, 1e-6)).mean())
-    return float(np.mean(values))
+def ceiling(experiment: Experiment, codec: Codec, episodes: Sequence[Episode]) -> dict[str, Any]:
+    """The codec's reconstruction of clips of held-out robots and test seeds, or of training data where there are none."""
+    held_out = test_episodes(experiment.data, experiment.robots.held_out_robots)
+    chosen = spread(held_out or episodes, CEILING_CLIPS)
+    videos = (read_video(folder / "rgb.mkv") for folder, _ in chosen)
+    measured = measure_ceiling(codec, videos, **asdict(experiment.clip))
+    on = "held-out robots" if held_out else "training episodes, for there are none of held-out robots"
+    print(f"codec ceiling: {measured}, of {on}")
+    return {**asdict(measured), "of": on, "robots": sorted({record.robot for _, record in chosen})}
 
 
 def _write(path: Path, array: np.ndarray) -> int:
@@ -271,15 +273,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     written = sum(
         cache.encode(episode) for episode in tqdm([*episodes, *replay_episodes(experiment)], desc="encode", unit="episode")
     )
-    ceiling_on = (test_episodes(experiment.data, experiment.robots.held_out_robots) or episodes)[:8]
-    ceiling = ceiling_psnr(experiment, codec, ceiling_on)
     header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip), "streams": list(cache.streams)}
-    header |= {"episodes": len(episodes), "ceiling_psnr": ceiling}
+    header |= {"episodes": len(episodes), "ceiling": ceiling(experiment, codec, episodes)}
     (experiment.cache_folder / "header.json").write_text(json.dumps(header, indent=1) + "\n")
     print(
         f"{experiment.cache_folder}: {len(episodes)} episodes, streams {', '.join(cache.streams)}, {written / 1e6:.1f} MB new"
     )
-    print(f"codec ceiling: PSNR {ceiling:.2f} dB at camera size over {len(ceiling_on)} episodes")
 
 
 if __name__ == "__main__":
