@@ -26,6 +26,7 @@ from jax import Array
 from jax.ad_checkpoint import checkpoint_name
 
 from xew.config import ConfigError
+from xew.model.mechanisms import MECHANISMS, FramedContext, create_mechanism, ray_maps
 from xew.model.sharding import cut_over_batch
 
 PATCH = (1, 2, 2)
@@ -84,8 +85,9 @@ MODELS = {
 class Stream:
     """One sequence of tokens beside the others. Only RGB is noised and has a head and a loss."""
 
-    source: Literal["latents", "joints"]
-    """Encoded video [b t h w c], or the 16-number action of each latent frame [b t 16]."""
+    source: Literal["latents", "joints", "history"]
+    """Encoded video [b t h w c], the 16-number action of each latent frame [b t 16], or earlier RGB frames, each encoded
+    alone [b n h w c], which RGB's own patch embedding takes."""
     timestep: Literal["shared", "clean"]
     """Noise level that its tokens are told: RGB's own (0 in latent frame 0), as FlowWAM does, or 0."""
 
@@ -95,6 +97,7 @@ STREAMS = {
     "action": Stream("latents", "shared"),
     "embodiment": Stream("latents", "clean"),
     "joints": Stream("joints", "shared"),
+    "history": Stream("history", "clean"),
 }
 
 
@@ -104,7 +107,7 @@ class WorldModel(nnx.Module):
     Args:
         size: one of `MODELS`.
         channels: of the latents.
-        streams: names in `STREAMS` beside rgb.
+        streams: names in `STREAMS` beside rgb, and in `mechanisms.MECHANISMS`.
         dtype: of the matrix products; parameters, norms and modulation stay float32.
         residual: of the tokens between blocks; sums are float32 either way. bfloat16 (as diffusers') halves what is kept
             of each block and most of what is moved, and rounds the tokens 90 times.
@@ -114,6 +117,7 @@ class WorldModel(nnx.Module):
         visibility: "joint": all tokens see all, as in FlowWAM. "one_way": condition tokens see condition tokens only and
             are told the noise level 0, so that a sampler computes them once a clip (`condition_cache`); a departure.
         time: "exact", or "flowwam": the rounding with which FlowWAM's published weights were trained.
+        history: when the frames of the stream history were, in latent frames from the clip's first (negative).
         words: rows of a learned table of words; text is then ids [b l] instead of embeddings. 0 has none.
     """
 
@@ -130,12 +134,15 @@ class WorldModel(nnx.Module):
         attention: AttentionName = "auto",
         visibility: Visibility = "joint",
         time: TimeEmbedding = "exact",
+        history: Sequence[float] = (),
         words: int = 0,
         rngs: nnx.Rngs,
     ) -> None:
         self.size, self.channels, self.dtype, self.residual = size, channels, dtype, residual
         self.remat, self.unroll, self.visibility, self.time = remat, unroll, visibility, time
-        self.condition_streams = tuple(streams)
+        self.history = tuple(history)
+        # Earlier frames come right after RGB's tokens, so that all frames that have a context of their own are one piece.
+        self.condition_streams = tuple(sorted((name for name in streams if name in STREAMS), key="history".__ne__))
         features = channels * int(np.prod(PATCH))
         self.patch_embedding = _linear(features, size.dim, dtype, rngs)
         self.text_embedding = TwoLayer(size.text_dim, size.dim, size.dim, _gelu, dtype, EMBEDDING_INIT, rngs)
@@ -148,7 +155,11 @@ class WorldModel(nnx.Module):
         self.stream_inputs = nnx.data({})
         for name in self.condition_streams:
             self.stream_embeddings[name] = nnx.Param(_scaled_normal(rngs.params(), (size.dim,)))
-            self.stream_inputs[name] = self._stream_input(STREAMS[name], rngs)
+            if STREAMS[name].source != "history":
+                self.stream_inputs[name] = self._stream_input(STREAMS[name], rngs)
+        self.mechanisms = nnx.data({})
+        for name in (name for name in streams if name not in STREAMS):
+            self.mechanisms[name] = create_mechanism(name, size, features, dtype, rngs)
 
     def _stream_input(self, stream: Stream, rngs: nnx.Rngs) -> nnx.Module:
         """Pixel streams start from a copy of RGB's patch embedding, as FlowWAM and the paper do."""
@@ -168,8 +179,8 @@ class WorldModel(nnx.Module):
 
         Args:
             latents: [b t h w c] float32; latent frame 0 is the clean reference.
-            conditions: name of each condition stream -> [b t' h' w' c] latents, or [b t' 16] joint positions. Not read
-                where a cache is given.
+            conditions: name of each condition stream or mechanism -> [b t' h' w' c] latents, or [b t' n] numbers. Those of
+                streams are not read where a cache is given.
             sigma: [b] float32, noise level in [0, 1] of latent frames 1 and on.
             text: [b l e] float32, zero-padded (there is no mask, as in Wan); or ids [b l] int32 of `words`, 0 for none.
             cache: of these conditions and this text, from `condition_cache`.
@@ -178,9 +189,10 @@ class WorldModel(nnx.Module):
             [b t h w c] float32; frame 0 carries no meaning.
         """
         rgb = np.prod(token_grid(latents.shape)).item()
-        tokens, rows, rotary = self.embed_streams(latents, {} if cache else conditions, cached=cache is not None)
-        time = self.embed_time(sigma)
-        tokens = self.apply_blocks(tokens, self.modulation(time), rows, rotary, self.context(text), rgb, cache)
+        tokens, rows, rotary = self.embed_streams(latents, conditions, cached=cache is not None)
+        time, rows = self.tell_frames(self.embed_time(sigma), rows, latents.shape, conditions)
+        context = self.framed_context(text, latents.shape, conditions)
+        tokens = self.apply_blocks(tokens, self.modulation(time), rows, rotary, context, rgb, cache)
         return unpatchify(self.head(tokens[:, :rgb].astype(jnp.float32), time, rows[:rgb]), latents.shape)
 
     def condition_cache(self, conditions: Mapping[str, Array], text: Array) -> ConditionCache:
@@ -192,7 +204,8 @@ class WorldModel(nnx.Module):
         if self.visibility != "one_way":
             raise ValueError("condition tokens can only be computed ahead in a model of visibility one_way.")
         tokens, rows, rotary = self._join({name: conditions[name] for name in self.condition_streams})
-        modulation, context = self.modulation(self.embed_time(jnp.zeros(tokens.shape[0], jnp.float32))), self.context(text)
+        modulation = self.modulation(self.embed_time(jnp.zeros(tokens.shape[0], jnp.float32)))
+        context = self.context(text, conditions)
         graph, layers = nnx.split(self.blocks)
 
         def block(carry: Array, layer: nnx.State) -> tuple[Array, ConditionCache]:
@@ -206,13 +219,22 @@ class WorldModel(nnx.Module):
         self, latents: Array, conditions: Mapping[str, Array], cached: bool = False
     ) -> tuple[Array, np.ndarray, Rotary]:
         """All streams' tokens [b s d], the row of the noise level that each token is told [s], and their rotations."""
-        return self._join({"rgb": latents} | {name: conditions[name] for name in self.condition_streams if not cached})
+        streams = {name: conditions[name] for name in self.condition_streams if not cached}
+        tokens, rows, rotary = self._join({"rgb": latents} | streams)
+        for name in self._entering("channels"):
+            pictures = conditions[name]
+            if MECHANISMS[name].source == "camera":
+                pictures = ray_maps(pictures, latents.shape)
+            columns = self.mechanisms[name](patchify(pictures)).astype(jnp.float32)
+            tokens = tokens.at[:, : columns.shape[1]].add(columns.astype(self.residual))
+        return tokens, rows, rotary
 
     def _join(self, inputs: Mapping[str, Array]) -> tuple[Array, np.ndarray, Rotary]:
         grids = {name: token_grid(array.shape) for name, array in inputs.items()}
         tokens = jnp.concatenate([self._embed(name, array) for name, array in inputs.items()], axis=1)
         rows = np.concatenate([token_rows(self._stream(name), grid) for name, grid in grids.items()])
-        angles = np.concatenate([rotary_angles(grid, self.size.head_dim, self.size.rotary_base) for grid in grids.values()])
+        head_dim, base, times = self.size.head_dim, self.size.rotary_base, {"history": self.history}
+        angles = np.concatenate([rotary_angles(grid, head_dim, base, times.get(name)) for name, grid in grids.items()])
         rotary = jnp.asarray(np.cos(angles), jnp.float32), jnp.asarray(np.sin(angles), jnp.float32)
         return tokens.astype(self.residual), rows, rotary
 
@@ -225,18 +247,62 @@ class WorldModel(nnx.Module):
         if name == "rgb":
             return self.patch_embedding(patchify(array)).astype(jnp.float32)
         values = array if STREAMS[name].source == "joints" else patchify(array)
-        return self.stream_inputs[name](values).astype(jnp.float32) + self.stream_embeddings[name][None, None]
+        embed = self.patch_embedding if STREAMS[name].source == "history" else self.stream_inputs[name]
+        return embed(values).astype(jnp.float32) + self.stream_embeddings[name][None, None]
 
     def embed_time(self, sigma: Array) -> Array:
         """Time embeddings [b 2 d] of the two noise levels of each sample: none, and its own [b]."""
         timesteps = jnp.stack([jnp.zeros_like(sigma), TIMESTEPS * sigma], axis=1)
         return self.time_embedding(rounded_sinusoid(timesteps) if self.time == "flowwam" else sinusoid(timesteps))
 
-    def context(self, text: Array) -> Array:
-        """What cross-attention reads [b l d] of text embeddings [b l e] or of ids of words [b l]."""
+    def _entering(self, place: str) -> list[str]:
+        """The model's mechanisms that enter the network at one place."""
+        return [name for name in self.mechanisms if MECHANISMS[name].enters == place]
+
+    def tell_frames(
+        self, time: Array, rows: np.ndarray, shape: Sequence[int], conditions: Mapping[str, Array]
+    ) -> tuple[Array, np.ndarray]:
+        """Time embeddings [b r d] and rows [s] in which each frame of RGB latents of `shape` has a row of its own.
+
+        It is the embedding of the frame's noise level plus the vectors of the mechanisms that enter there; without one,
+        all stays as it is. Other streams keep their two rows.
+        """
+        names = self._entering("time")
+        if not names:
+            return time, rows
+        frames, height, width = token_grid(shape)
+        levels = token_rows(STREAMS["rgb"], (frames, 1, 1))
+        told = sum((self.mechanisms[name](conditions[name]) for name in names), take_rows(time, levels))
+        own = np.repeat(time.shape[1] + np.arange(frames), height * width)
+        return jnp.concatenate([time, told], axis=1), np.concatenate([own, rows[len(own) :]])
+
+    def context(self, text: Array, conditions: Mapping[str, Array] | None = None) -> Array:
+        """What all tokens' cross-attention reads [b l d].
+
+        Args:
+            text: embeddings [b l e], or ids of words [b l].
+            conditions: of mechanisms whose tokens stand beside the text, or instead of it.
+        """
+        names = self._entering("context")
+        told = [self.mechanisms[name]((conditions or {})[name]).astype(self.dtype) for name in names]
+        if any(MECHANISMS[name].replaces_text for name in names):
+            return jnp.concatenate(told, axis=1)
         if self.words is not None:
             text = self.words(text) * (text > 0)[..., None].astype(jnp.float32)
-        return self.text_embedding(text)
+        return jnp.concatenate([self.text_embedding(text), *told], axis=1)
+
+    def framed_context(self, text: Array, shape: Sequence[int], conditions: Mapping[str, Array]) -> Array | FramedContext:
+        """`context`, and beside it what only the tokens of one frame read, where a mechanism has such tokens.
+
+        The frames are those of RGB latents of `shape` and, after them as in the tokens, those of the history.
+        """
+        shared, names = self.context(text, conditions), self._entering("frame")
+        if not names:
+            return shared
+        frames, height, width = token_grid(shape)
+        told = jnp.concatenate([self.mechanisms[name](conditions[name]).astype(self.dtype) for name in names], axis=2)
+        earlier = told.shape[1] - frames
+        return FramedContext(shared, jnp.concatenate([told[:, earlier:], told[:, :earlier]], axis=1), height * width)
 
     def modulation(self, time: Array) -> Array:
         """Adaptive-norm shifts, scales and gates [b r 6 d] of time embeddings [b r d]."""
@@ -248,7 +314,7 @@ class WorldModel(nnx.Module):
         modulation: Array,
         rows: np.ndarray,
         rotary: Rotary,
-        text: Array,
+        text: Array | FramedContext,
         rgb: int | None = None,
         cache: ConditionCache | None = None,
     ) -> Array:
@@ -283,7 +349,7 @@ class Block(nnx.Module):
         modulation: Array,
         rows: np.ndarray,
         rotary: Rotary,
-        text: Array,
+        text: Array | FramedContext,
         alone: int | None = None,
         cache: ConditionCache | None = None,
     ) -> Array:
@@ -294,7 +360,8 @@ class Block(nnx.Module):
         shift_sa, scale_sa, gate_sa, shift_ffn, scale_ffn, gate_ffn = self._chunks(modulation, rows)
         attended = self.self_attn(modulate(tokens, shift_sa, scale_sa, self.dtype), rotary=rotary, alone=alone, cache=cache)
         tokens = add(tokens, attended, gate_sa)
-        tokens = add(tokens, self.cross_attn(self.norm3(tokens).astype(self.dtype), text))
+        across = self.cross_attn.by_frame if isinstance(text, FramedContext) else self.cross_attn
+        tokens = add(tokens, across(self.norm3(tokens).astype(self.dtype), text))
         return add(tokens, self.ffn(modulate(tokens, shift_ffn, scale_ffn, self.dtype)), gate_ffn)
 
     def keys_values(self, tokens: Array, modulation: Array, rows: np.ndarray, rotary: Rotary) -> tuple[Array, Array]:
@@ -338,6 +405,24 @@ class Attention(nnx.Module):
         else:
             parts = self._attend(q[:, :alone], k, v), self._attend(q[:, alone:], k[:, alone:], v[:, alone:])
             attended = jnp.concatenate(parts, axis=1)
+        return self.o(attended.reshape(tokens.shape))
+
+    def by_frame(self, tokens: Array, context: FramedContext) -> Array:
+        """tokens [b s d] attend to the shared context; those of the first frames to their own frame's beside it."""
+        batch, frames, own, width = context.framed.shape
+        shared = self.keys_values(context.shared, None)
+        k, v = (
+            jnp.concatenate([jnp.repeat(all_see[:, None], frames, axis=1), one.reshape(batch, frames, own, *one.shape[2:])], 2)
+            for all_see, one in zip(
+                shared, self.keys_values(context.framed.reshape(batch, frames * own, width), None), strict=True
+            )
+        )
+        q, cut = self._heads(self.norm_q(self.q(tokens)), None), frames * context.tokens
+        by_frame = q[:, :cut].reshape(batch * frames, context.tokens, *q.shape[2:])
+        attended = self._attend(by_frame, *(x.reshape(batch * frames, *x.shape[2:]) for x in (k, v)))
+        attended = attended.reshape(batch, cut, *q.shape[2:])
+        if cut < tokens.shape[1]:
+            attended = jnp.concatenate([attended, self._attend(q[:, cut:], *shared)], axis=1)
         return self.o(attended.reshape(tokens.shape))
 
     def keys_values(self, context: Array, rotary: Rotary | None) -> tuple[Array, Array]:
@@ -435,36 +520,31 @@ _gather_rows.defvjp(_gather_rows_forward, _gather_rows_backward)
 
 
 def sinusoid(timestep: Array) -> Array:
-    """Cosines, then sines [... 256] of timesteps [...]."""
+    """Cosines, then sines [... 256] of float32 timesteps [...], as exact as Wan's float64 (to 2e-7; plain float32: 6e-5).
+
+    A timestep times a frequency is split in a product of their upper halves, which float32 holds exactly, and a small
+    rest, by which the angle is turned with the addition theorem.
+    """
     half = TIME_FREQUENCIES // 2
-    frequencies = jnp.asarray(WAVELENGTH_BASE ** (-np.arange(half) / half), jnp.float32)
-    angles = timestep[..., None] * frequencies.reshape(*(1,) * timestep.ndim, half)
-    return jnp.concatenate([jnp.cos(angles), jnp.sin(angles)], axis=-1)
+    frequencies = (WAVELENGTH_BASE ** (-np.arange(half) / half)).reshape((1,) * timestep.ndim + (half,))
+    upper_frequencies = (frequencies.astype(np.float32).view(np.uint32) & UPPER_HALF).view(np.float32)
+    lower_frequencies = (frequencies - upper_frequencies).astype(np.float32)
+    timestep = timestep[..., None]
+    bits = jax.lax.bitcast_convert_type(timestep, jnp.uint32)
+    upper = jax.lax.bitcast_convert_type(bits & UPPER_HALF, jnp.float32)
+    angle = upper * upper_frequencies
+    rest = (timestep - upper) * upper_frequencies + timestep * lower_frequencies
+    cos, sin, cos_rest, sin_rest = jnp.cos(angle), jnp.sin(angle), jnp.cos(rest), jnp.sin(rest)
+    return jnp.concatenate([cos * cos_rest - sin * sin_rest, sin * cos_rest + cos * sin_rest], axis=-1)
+
+
+UPPER_HALF = np.uint32(0xFFFFF000)
+"""Bits of a float32 that keep 12 of its 24 significant ones."""
 
 
 def rounded_sinusoid(timestep: Array) -> Array:
-    """`sinusoid` as FlowWAM computes it: of the timestep in bfloat16, in float64, the result rounded to bfloat16.
-
-    JAX has no float64 here, but needs none: the rounded timestep has 8 significant bits, so its product with the upper
-    16 bits of a frequency is exact in float32, and the small rest is turned by the addition theorem.
-    """
-    half = TIME_FREQUENCIES // 2
-    exact = WAVELENGTH_BASE ** (-np.arange(half) / half)
-    upper = _upper_bits(exact.astype(np.float32))
-    shape = (1,) * timestep.ndim + (half,)
-    rounded = timestep.astype(jnp.bfloat16).astype(jnp.float32)[..., None]
-    angle, rest = (
-        rounded * jnp.asarray(upper.reshape(shape)),
-        rounded * jnp.asarray((exact - upper).astype(np.float32).reshape(shape)),
-    )
-    cos, sin, cos_rest, sin_rest = jnp.cos(angle), jnp.sin(angle), jnp.cos(rest), jnp.sin(rest)
-    features = [cos * cos_rest - sin * sin_rest, sin * cos_rest + cos * sin_rest]
-    return jnp.concatenate(features, axis=-1).astype(jnp.bfloat16).astype(jnp.float32)
-
-
-def _upper_bits(values: np.ndarray) -> np.ndarray:
-    """float32 values cut to 16 significant bits."""
-    return (values.view(np.uint32) & np.uint32(0xFFFFFF00)).view(np.float32)
+    """`sinusoid` as FlowWAM has it: of the timestep in bfloat16 (steps of 4 from 512 on), itself rounded to bfloat16."""
+    return sinusoid(timestep.astype(jnp.bfloat16).astype(jnp.float32)).astype(jnp.bfloat16).astype(jnp.float32)
 
 
 def token_grid(shape: Sequence[int]) -> tuple[int, int, int]:
@@ -480,7 +560,9 @@ def token_rows(stream: Stream, grid: tuple[int, int, int]) -> np.ndarray:
     return np.repeat(frames, grid[1] * grid[2])
 
 
-def rotary_angles(grid: tuple[int, int, int], head_dim: int, base: float = WAVELENGTH_BASE) -> np.ndarray:
+def rotary_angles(
+    grid: tuple[int, int, int], head_dim: int, base: float = WAVELENGTH_BASE, times: Sequence[float] | None = None
+) -> np.ndarray:
     """Rotation angles [s head_dim/2] float64 of the tokens of a grid; every stream counts from (0, 0, 0).
 
     The head is split among time, height and width as in Wan (44, 42, 42 of 128; 24, 20, 20 of 64), and each part has
@@ -488,7 +570,8 @@ def rotary_angles(grid: tuple[int, int, int], head_dim: int, base: float = WAVEL
     """
     part = 2 * (head_dim // 6)
     parts = (head_dim - 2 * part, part, part)
-    positions = np.stack(np.meshgrid(*(np.arange(n) for n in grid), indexing="ij"), -1).reshape(-1, 3)
+    axes = (np.arange(grid[0]) if times is None else np.asarray(times), np.arange(grid[1]), np.arange(grid[2]))
+    positions = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     series = [base ** (-np.arange(0, width, 2) / width) for width in parts]
     return np.concatenate([np.outer(positions[:, axis], frequencies) for axis, frequencies in enumerate(series)], axis=-1)
 
