@@ -32,6 +32,8 @@ TOOLS = 14
 """Position, roll-pitch-yaw and gripper of two tools."""
 CAMERA = 16
 """fx fy cx cy [pixels of the camera], rotation of world to camera [9], position [3, m]."""
+RAY_PATCH = 6 * 4
+"""Numbers of a patch of a ray map: direction and origin of 2x2 latent pixels."""
 HIDDEN = 4
 """Width of the hidden layer of per-frame vectors, in widths of the network (IRASim and BWM alike)."""
 POOLED_TOKENS, POOLING_LAYERS = 16, 2
@@ -178,15 +180,21 @@ MECHANISMS = {
 }
 
 
-class Context(NamedTuple):
-    """What the network's cross-attention sees."""
+class FramedContext(NamedTuple):
+    """What cross-attention reads where frames have a context of their own."""
 
     shared: Array
     """[b k d], for every token: the text's embeddings, or what stands in their place."""
-    framed: Array | None = None
+    framed: Array
     """[b f k d], beside it for the tokens of one frame each: the first f * `tokens` tokens, frame by frame."""
-    tokens: int = 0
+    tokens: int
     """Tokens of a frame."""
+
+
+def create_mechanism(name: str, size: Any, features: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> nnx.Module:
+    """The module of a mechanism for a network of this size, whose RGB patches have so many `features`."""
+    mechanism = MECHANISMS[name]
+    return mechanism.build(size, RAY_PATCH if mechanism.source == "camera" else features, dtype, rngs)
 
 
 def frames_of_groups(numbers: Array) -> Array:
