@@ -27,7 +27,7 @@ from jax.ad_checkpoint import checkpoint_name
 
 from xew.config import ConfigError
 from xew.model.mechanisms import MECHANISMS, FramedContext, create_mechanism, ray_maps
-from xew.model.sharding import cut_over_batch
+from xew.model.sharding import cut_over_batch, gathered
 
 PATCH = (1, 2, 2)
 EPSILON = 1e-6
@@ -324,7 +324,8 @@ class WorldModel(nnx.Module):
 
         def block(carry: Array, xs: tuple[nnx.State, ConditionCache | None]) -> tuple[Array, None]:
             layer, read = xs
-            return nnx.merge(graph, layer)(cut_over_batch(carry), modulation, rows, rotary, text, alone=alone, cache=read), None
+            module = nnx.merge(graph, gathered(layer, layer=True))
+            return module(cut_over_batch(carry), modulation, rows, rotary, text, alone=alone, cache=read), None
 
         if self.remat != "none":
             # The loop already keeps recomputation apart from the forward pass; only without a loop must it be forced.

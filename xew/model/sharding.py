@@ -5,6 +5,7 @@ along `data` and cut along `fsdp` (each layer's are gathered when it is computed
 up to the order of sums.
 """
 
+import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -148,3 +149,41 @@ def cut_over_batch(values: jax.Array) -> jax.Array:
     axes = tuple(axis for axis in AXES if axis in mesh.axis_names)
     even = axes and values.shape[0] % math.prod(mesh.shape[axis] for axis in axes) == 0
     return jax.lax.with_sharding_constraint(values, PartitionSpec(axes)) if even else values
+
+
+def gathered(parameters: Any, *, layer: bool = False) -> Any:
+    """Parameters that are cut along `fsdp`, whole on every device; their gradients are summed and cut again.
+
+    Left to itself the compiler moves activations instead wherever they are the smaller, many times a layer. Nothing is done
+    where no mesh is set or it does not cut.
+
+    Args:
+        layer: they are those of one layer, without the axis of layers; else all, of which the layers are left as they are.
+    """
+    fsdp = dict(jax.sharding.get_abstract_mesh().shape).get("fsdp", 1)
+    if fsdp == 1:
+        return parameters
+
+    def gather(path: tuple[Any, ...], leaf: jax.Array) -> jax.Array:
+        names = path_names(path)
+        if layer:
+            return _gather(leaf, PartitionSpec(*parameter_spec((LAYERS, *names), (1, *leaf.shape), fsdp)[1:]))
+        return leaf if LAYERS in names else _gather(leaf, parameter_spec(names, leaf.shape, fsdp))
+
+    return jax.tree_util.tree_map_with_path(gather, parameters)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
+def _gather(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
+    return jax.lax.with_sharding_constraint(leaf, PartitionSpec())
+
+
+def _gather_forward(leaf: jax.Array, spec: PartitionSpec) -> tuple[jax.Array, None]:
+    return _gather(leaf, spec), None
+
+
+def _gather_backward(spec: PartitionSpec, _: None, gradient: jax.Array) -> tuple[jax.Array]:
+    return (jax.lax.with_sharding_constraint(gradient, spec),)
+
+
+_gather.defvjp(_gather_forward, _gather_backward)

@@ -27,7 +27,7 @@ from xew.model.dit import compute_params
 from xew.model.experiment import Experiment, create_model
 from xew.model.flow_matching import TrainingPair, sample_losses, training_pair
 from xew.model.optimizer import make_optimizer
-from xew.model.sharding import replicated, state_shardings
+from xew.model.sharding import gathered, replicated, state_shardings
 
 TrainStep = Callable[[TrainState, Batch], tuple[TrainState, "StepResult"]]
 
@@ -172,7 +172,7 @@ class Objective:
         """Gradients, losses [b] and prediction of one chunk, whose samples have these shares in the loss [b]."""
 
         def loss(params: Any) -> tuple[Array, tuple[Array, Array]]:
-            predicted = nnx.merge(self.graph, params)(pair.noisy, chunk.conditions, pair.sigma, chunk.text)
+            predicted = nnx.merge(self.graph, gathered(params))(pair.noisy, chunk.conditions, pair.sigma, chunk.text)
             losses = sample_losses(predicted, pair, chunk.shown)
             return (shares * losses).sum(), (losses, predicted)
 
