@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from xew.config import ConfigError
 from xew.model import dit
 from xew.model.dit import MODELS, STREAMS, WorldModel
 
@@ -192,3 +193,201 @@ def test_sizes_are_consistent(name: str) -> None:
     size = MODELS[name]
     assert size.dim == size.heads * size.head_dim
     assert size.head_dim % 2 == 0
+
+
+@pytest.mark.parametrize("rows", [[0, 1, 1, 0], [0, 0, 0, 0], [2, 0, 3, 1, 1]])
+def test_rows_and_their_gradient(rows: list[int]) -> None:
+    """A choice of two or a gather of many: values and gradient of plain indexing."""
+    values, weights = normal(7, 2, max(2, max(rows) + 1), 5), normal(8, 2, len(rows), 5)
+    for function in (lambda x: dit.take_rows(x, np.array(rows)), lambda x: x[:, np.array(rows)]):
+        found, gradient = jax.value_and_grad(lambda x, f=function: (f(x) * weights).sum())(values)
+        expected = np.zeros(values.shape, np.float32)
+        np.add.at(expected, (slice(None), rows), np.asarray(weights))
+        np.testing.assert_allclose(found, (np.asarray(values)[:, rows] * np.asarray(weights)).sum(), rtol=1e-5)
+        np.testing.assert_allclose(gradient, expected, atol=1e-6)
+
+
+def test_one_way_conditions_do_not_see_rgb() -> None:
+    """Their tokens are the same whatever RGB and its noise level are; RGB's tokens see them."""
+    latents, text, conditions = normal(2, *SHAPE), normal(3, 2, 8, 16), {"action": normal(4, *SHAPE)}
+
+    def tokens(model: WorldModel, latents: jax.Array, sigma: float) -> np.ndarray:
+        embedded, rows, rotary = model.embed_streams(latents, conditions)
+        modulation = model.modulation(model.embed_time(jnp.full(2, sigma, jnp.float32)))
+        return np.asarray(model.apply_blocks(embedded, modulation, rows, rotary, model.context(text), rgb=18))
+
+    for visibility in ("joint", "one_way"):
+        model = tiny(("action",), visibility=visibility)
+        first, second = tokens(model, latents, 0.2), tokens(model, 1 + latents, 0.7)
+        assert np.abs(first[:, :18] - second[:, :18]).max() > 0.1
+        assert (np.abs(first[:, 18:] - second[:, 18:]).max() > 0.1) == (visibility == "joint")
+        if visibility == "one_way":
+            np.testing.assert_array_equal(first[:, 18:], second[:, 18:])
+
+
+@pytest.mark.parametrize("remat", ["none", "full"])
+def test_condition_cache_is_the_training_path(remat: dit.RematName, inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+    latents, sigma, text = inputs
+    model = tiny(("action", "embodiment", "joints"), visibility="one_way", remat=remat)
+    conditions = {"action": normal(4, *SHAPE), "embodiment": normal(5, 2, 1, 4, 6, CHANNELS), "joints": normal(6, 2, 3, 16)}
+    expected = model(latents, conditions, sigma, text)
+    cache = model.condition_cache(conditions, text)
+    assert cache.keys.shape == (MODELS["tiny"].depth, 2, 18 + 6 + 3, 2, 16)
+    for scale in (1.0, 0.5):  # one cache serves every noise level
+        np.testing.assert_allclose(
+            model(latents, {}, scale * sigma, text, cache), model(latents, conditions, scale * sigma, text), atol=1e-5
+        )
+    assert np.abs(model(latents, {}, sigma, text, jax.tree.map(jnp.zeros_like, cache)) - expected).max() > 1e-3
+
+
+def test_no_cache_where_conditions_see_rgb() -> None:
+    with pytest.raises(ValueError, match="visibility one_way"):
+        tiny(("action",)).condition_cache({"action": normal(4, *SHAPE)}, normal(3, 2, 8, 16))
+
+
+def test_learned_words() -> None:
+    """Ids are rows of the model's own table; 0 is no word, as zero padding is, and learns nothing."""
+    model, ids = tiny(words=9), jnp.asarray([[3, 8, 0], [1, 0, 0]], jnp.int32)
+    table = np.array(model.words.embedding[...])
+    table[0] = 0
+    np.testing.assert_allclose(model.context(ids), model.text_embedding(jnp.asarray(table)[np.asarray(ids)]), atol=TOLERANCE)
+    graph, params = nnx.split(model)
+    gradient = jax.grad(lambda params: nnx.merge(graph, params).context(ids).sum())(params)
+    rows = np.asarray(gradient["words"]["embedding"][...])
+    assert [number for number, row in enumerate(rows) if row.any()] == [1, 3, 8]
+
+
+def test_compute_params_are_the_same_model_rounded_once(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+    latents, sigma, text = inputs
+    graph, params = nnx.split(tiny(("embodiment",), dtype=jnp.bfloat16), nnx.Param)
+    rounded = dit.compute_params(graph, params)
+    types = {".".join(map(str, path)): leaf.dtype for path, leaf in nnx.to_flat_state(rounded)}
+    for name in (
+        "blocks.ffn.first.kernel",
+        "patch_embedding.bias",
+        "stream_inputs.embodiment.kernel",
+        "text_embedding.first.kernel",
+    ):
+        assert types[name] == jnp.bfloat16, name
+    for name in (
+        "blocks.modulation",
+        "blocks.norm3.scale",
+        "blocks.self_attn.norm_q.scale",
+        "time_projection.kernel",
+        "head.head.kernel",
+    ):
+        assert types[name] == jnp.float32, name
+    assert next(leaf.dtype for path, leaf in nnx.to_flat_state(params) if path[-2:] == ("first", "kernel")) == jnp.float32
+    conditions = {"embodiment": normal(4, *SHAPE)}
+
+    def loss(params: nnx.State) -> jax.Array:
+        return jnp.square(nnx.merge(graph, params)(latents, conditions, sigma, text)).sum()
+
+    with jax.numpy_dtype_promotion("standard"):
+        value, plain = jax.jit(jax.value_and_grad(loss))(params)
+        same, once = jax.jit(jax.value_and_grad(lambda params: loss(dit.compute_params(graph, params))))(params)
+    np.testing.assert_allclose(same, value, rtol=1e-3)
+    for found, expected in zip(jax.tree.leaves(once), jax.tree.leaves(plain), strict=True):
+        assert found.dtype == jnp.float32
+        np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max())
+
+
+def test_residual_in_bfloat16(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+    latents, sigma, text = inputs
+    exact, rounded = (tiny(residual=dtype)(latents, {}, sigma, text) for dtype in (jnp.float32, jnp.bfloat16))
+    assert rounded.dtype == jnp.float32
+    assert 0 < np.abs(rounded - exact).max() < 0.1 * np.abs(exact).max()
+
+
+# The rule of attention, on machines that are not here.
+
+
+class Gpu:
+    platform, device_kind = "gpu", "NVIDIA Something"
+
+    def __init__(self, capability: str, version: str = "cuda 13000") -> None:
+        self.compute_capability, self.client = capability, type("Client", (), {"platform_version": version})
+
+
+@pytest.mark.parametrize(
+    ("device", "head_dim", "dtype", "reason"),
+    [
+        (Gpu("9.0"), 128, jnp.bfloat16, ""),
+        (Gpu("9.0"), 256, jnp.float16, ""),
+        (Gpu("8.0"), 128, jnp.bfloat16, ""),
+        (Gpu("8.0"), 192, jnp.bfloat16, "at most 128"),
+        (Gpu("7.5"), 128, jnp.bfloat16, "compute capability 8.0 and NVIDIA Something has 7.5"),
+        (Gpu("9.0"), 12, jnp.bfloat16, "multiple of 8"),
+        (Gpu("9.0"), 128, jnp.float32, "needs model.dtype bfloat16 and the model has float32"),
+        (Gpu("9.0", "rocm 70000"), 128, jnp.bfloat16, "a CUDA GPU"),
+        (None, 128, jnp.bfloat16, "a CUDA GPU and JAX runs on cpu"),
+    ],
+)
+def test_attention_by_rule(
+    device: Gpu | None, head_dim: int, dtype: jnp.dtype, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if device is not None:
+        monkeypatch.setattr(jax, "devices", lambda: [device])
+    assert dit.choose_attention("xla", head_dim, dtype) == "xla"
+    assert dit.choose_attention("auto", head_dim, dtype) == ("xla" if reason else "cudnn")
+    if not reason:
+        assert dit.choose_attention("cudnn", head_dim, dtype) == "cudnn"
+        return
+    with pytest.raises(ConfigError, match=f"attention: cudnn cannot be used: .*{reason}.*; set model.attention to auto or xla"):
+        dit.choose_attention("cudnn", head_dim, dtype)
+
+
+# Work.
+
+OF_320X256, OF_640X480 = (8, 10), (15, 20)
+
+
+@pytest.mark.parametrize(
+    ("frames", "side", "streams", "tera"),
+    [
+        (31, OF_320X256, 1, 24.9),
+        (31, OF_320X256, 2, 53.7),
+        (31, OF_320X256, 3, 87.0),
+        (21, OF_320X256, 2, 34.6),
+        (21, OF_320X256, 3, 54.7),
+        (15, OF_320X256, 2, 24.0),
+        (15, OF_320X256, 3, 37.3),
+        (9, OF_320X256, 2, 14.1),
+        (9, OF_320X256, 3, 21.5),
+        (31, OF_640X480, 2, 293),
+        (31, OF_640X480, 3, 535),
+    ],
+)
+def test_flops_of_the_published_size(frames: int, side: tuple[int, int], streams: int, tera: float) -> None:
+    """Counted by hand for 5B (reference table): 30 blocks of projections, attention, text keys and values."""
+    found = dit.flops(MODELS["wan5b"], [(frames, *side)] * streams)
+    assert found == pytest.approx(1e12 * tera, rel=0.02)
+    assert dit.flops(MODELS["wan5b"], [(frames, *side)] * streams, batch=3) == pytest.approx(3 * found)
+
+
+def test_flops_of_a_cached_step() -> None:
+    grids = [(31, *OF_320X256)] * 3
+    joint, one_way, cached = (
+        dit.flops(MODELS["wan5b"], grids, visibility=visibility, cached=cached)
+        for visibility, cached in (("joint", False), ("one_way", False), ("one_way", True))
+    )
+    assert cached == pytest.approx(29.4e12, rel=0.03)
+    assert cached < one_way < joint
+
+
+def test_flops_are_those_that_xla_counts(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+    """Of the whole network at a size where matrix products are nearly all; XLA counts a loop's body once."""
+    size = dit.ModelSize(dim=64, depth=1, heads=2, ffn_dim=256, text_dim=64, text_tokens=16)
+    model = nnx.eval_shape(lambda: WorldModel(size, CHANNELS, ("action",), rngs=nnx.Rngs(0)))
+    graph, params = nnx.split(model)
+    latents = jax.ShapeDtypeStruct((2, 4, 16, 16, CHANNELS), jnp.float32)
+    shapes = (
+        params,
+        latents,
+        {"action": latents},
+        jax.ShapeDtypeStruct((2,), jnp.float32),
+        jax.ShapeDtypeStruct((2, 16, 64), jnp.float32),
+    )
+    compiled = jax.jit(lambda params, *inputs: nnx.merge(graph, params)(*inputs)).lower(*shapes).compile()
+    counted = compiled.cost_analysis()["flops"]
+    assert dit.flops(size, [(4, 8, 8)] * 2, 16, batch=2, channels=CHANNELS) == pytest.approx(counted, rel=0.1)

@@ -16,7 +16,8 @@ from safetensors.numpy import load_file, save_file
 from xew.config import ConfigError
 from xew.model import weights
 from xew.model.dit import MODELS, WorldModel
-from xew.model.dit_layouts import dit_layout, load_dit, load_dit_params, naming_of, save_dit, stream_layout, wan_layout
+from xew.model.dit_layouts import dit_layout, flowwam_layout, load_dit, load_dit_params, naming_of, save_dit, wan_layout
+from xew.model.mechanisms import MECHANISMS
 from xew.model.weights import Source, checkpoint_shapes, load_weights, read_tensors, save_weights
 
 REFERENCE = Path(__file__).parent / "reference"
@@ -59,7 +60,7 @@ def wan(*streams: str, **options: int) -> WorldModel:
 def wan_arrays(naming: str = "official", *streams: str) -> Arrays:
     """A random checkpoint of the tiny network under a project's names."""
     model = nnx.eval_shape(lambda: wan(*streams))
-    shapes = checkpoint_shapes(model, {**wan_layout(model, naming), **stream_layout(model)})
+    shapes = checkpoint_shapes(model, {**wan_layout(model, naming), **flowwam_layout(model)})
     random = np.random.default_rng(0)
     return {key: random.standard_normal(shape, np.float32) for key, shape in shapes.items()}
 
@@ -314,9 +315,16 @@ def flat(model: nnx.Module) -> list[tuple[str, object]]:
     return [(".".join(map(str, path)), leaf) for path, leaf in nnx.to_flat_state(nnx.state(model, nnx.Param))]
 
 
-def test_every_leaf_of_a_model_with_streams_and_words_has_a_name() -> None:
-    model = nnx.eval_shape(lambda: wan("action", "embodiment", "joints", words=7))
-    assert {path for path, _ in flat(model)} == set(dit_layout(model, "official"))
+def test_models_that_no_other_project_has_go_out_and_in(tmp_path: Path) -> None:
+    """Streams, mechanisms and words beside Wan's leaves: every leaf is written and read again."""
+    names = ("action", "embodiment", "joints", "history", *MECHANISMS)
+    model, other = (WorldModel(MODELS["tiny"], CHANNELS, names, words=7, rngs=nnx.Rngs(seed)) for seed in (0, 1))
+    save_dit(model, tmp_path / "weights.safetensors")
+    load_dit(other, tmp_path / "weights.safetensors")
+    written = dict(flat(model))
+    assert written.keys() == set(dit_layout(model, "diffusers")) and len(written) > 825 // 30
+    for path, leaf in flat(other):
+        np.testing.assert_array_equal(leaf[...], written[path][...], err_msg=path)
 
 
 @pytest.mark.parametrize("form", ["file", "shards", "pth"])

@@ -70,28 +70,20 @@ def wan_layout(model: WorldModel, naming: Naming) -> Layout:
     return layout
 
 
-def stream_layout(model: WorldModel) -> Layout:
-    """What streams add: the action stream under FlowWAM's names, the others, which no project has, under their own."""
-    layout: dict[str, Source] = {}
-    for name in model.condition_streams:
-        flow = name == FLOW_STREAM
-        layout[f"stream_embeddings.{name}"] = Source(
-            ("flow_stream.stream_embed" if flow else f"streams.{name}.stream_embed",), "leading_ones", (1, 1)
-        )
-        if STREAMS[name].source == "joints":
-            for layer in ("first", "second"):
-                layout |= dict(_linear(f"stream_inputs.{name}.{layer}", (f"streams.{name}.{layer}",)))
-        else:
-            theirs = "flow_stream.flow_patch_embedding" if flow else f"streams.{name}.patch_embedding"
-            layout |= dict(_patches(f"stream_inputs.{name}", theirs))
-    if model.words is not None:
-        layout["words.embedding"] = Source(("words.weight",))
-    return layout
+def flowwam_layout(model: WorldModel) -> Layout:
+    """What FlowWAM has beside: the patch embedding and the embedding of its flow stream."""
+    if FLOW_STREAM not in model.condition_streams:
+        return {}
+    embedding = Source(("flow_stream.stream_embed",), "leading_ones", (1, 1))
+    patches = _patches(f"stream_inputs.{FLOW_STREAM}", "flow_stream.flow_patch_embedding")
+    return {f"stream_embeddings.{FLOW_STREAM}": embedding, **dict(patches)}
 
 
 def dit_layout(model: WorldModel, naming: Naming) -> Layout:
-    """Every leaf of a model: Wan's own and those of its streams."""
-    return {**wan_layout(model, naming), **stream_layout(model)}
+    """Every leaf of a model: Wan's, FlowWAM's, and under their own paths those that no other project has."""
+    named = {**wan_layout(model, naming), **flowwam_layout(model)}
+    paths = (".".join(map(str, path)) for path, _ in nnx.to_flat_state(nnx.state(model, nnx.Param)))
+    return named | {path: Source((path,)) for path in paths if path not in named}
 
 
 def load_dit(model: WorldModel, path: Path) -> None:
@@ -99,7 +91,7 @@ def load_dit(model: WorldModel, path: Path) -> None:
 
     What the file lacks of the streams starts from what it has: a picture stream's patch embedding becomes a copy of the
     loaded RGB one. FlowWAM's flow stream without a stream embedding gets none (zeros), as its world model was trained;
-    other new leaves (stream embeddings, numeric streams, words) keep their random start.
+    other new leaves (stream embeddings, numeric streams, mechanisms, words) keep their random start.
 
     Args:
         model: of any size; of `nnx.eval_shape` only if the file has all of its leaves.
@@ -109,12 +101,13 @@ def load_dit(model: WorldModel, path: Path) -> None:
         ConfigError: tensors are missing, left over or of another shape.
     """
     tensors = read_tensors(path)
-    extra = stream_layout(model)
-    fill(model, tensors, dit_layout(model, naming_of(tensors)), optional=(*extra, *NOT_OURS))
-    for name in filter(_is_picture, model.condition_streams):
-        if extra[f"stream_inputs.{name}.kernel"].keys[0] not in tensors:
+    naming = naming_of(tensors)
+    layout = dit_layout(model, naming)
+    fill(model, tensors, layout, optional=(*(layout.keys() - wan_layout(model, naming).keys()), *NOT_OURS))
+    for name in model.condition_streams:
+        if STREAMS[name].source == "latents" and layout[f"stream_inputs.{name}.kernel"].keys[0] not in tensors:
             model.stream_inputs[name] = jax.tree.map(jnp.copy, model.patch_embedding)
-        elif name == FLOW_STREAM and extra[f"stream_embeddings.{name}"].keys[0] not in tensors:
+        elif name == FLOW_STREAM and layout[f"stream_embeddings.{name}"].keys[0] not in tensors:
             embedding = model.stream_embeddings[name]
             embedding.set_value(jnp.zeros_like(embedding.get_value()))
 
@@ -130,7 +123,7 @@ def save_dit(model: WorldModel, path: Path, naming: Naming = "diffusers") -> Non
     """Write a model as safetensors (one file, or a folder of shards) under the names of a project.
 
     A folder of diffusers' names gets its config.json too, so that `WanTransformer3DModel.from_pretrained` opens it. What
-    streams and words add is written beside, under the names that `load_dit` knows; that class passes over it.
+    streams, mechanisms and words add is written beside, under the names that `load_dit` knows; that class passes over it.
 
     Raises:
         ConfigError: the file cannot be written.
@@ -164,10 +157,6 @@ def diffusers_config(model: WorldModel) -> dict[str, Any]:
 def naming_of(tensors: Tensors) -> Naming:
     """Whose names a checkpoint uses."""
     return "diffusers" if any(key.startswith("condition_embedder.") for key in tensors) else "official"
-
-
-def _is_picture(name: str) -> bool:
-    return STREAMS[name].source == "latents"
 
 
 def _linear(ours: str, theirs: tuple[str, ...], stacked: bool = False) -> Iterator[tuple[str, Source]]:
