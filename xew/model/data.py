@@ -14,10 +14,10 @@ import numpy as np
 
 from xew.episode import Record
 from xew.model.codec import TEMPORAL_FACTOR, latent_frames
-from xew.model.dit import MODELS, STREAMS
+from xew.model.dit import STREAMS
 from xew.model.experiment import Experiment, replayed
 from xew.model.latents import Episode, LatentCache, sample_starts
-from xew.model.text import TEXT_ENCODERS
+from xew.model.text import VOCABULARY, encode_instructions
 from xew.protocol import ACTION_DIM
 
 
@@ -31,7 +31,7 @@ class Batch:
     conditions: dict[str, Any]
     """Stream name -> [b t' h' w' c] latents or [b t' 16] joint positions, float32."""
     text: Any
-    """[b l e] float32, zero-padded."""
+    """[b l e] float32, or [b l] int32 rows of the network's table of words; zero-padded."""
     shown: Any = None
     """[b t] float32, 1 where a latent frame shows the episode and 0 past its end; None where all do."""
     following: "Batch | None" = None
@@ -53,7 +53,7 @@ class ClipSource:
         self.fresh = len(self.samples)
         self.samples += [sample for _, record in replay for sample in self._samples(record)]
         every = [record for _, record in (*episodes, *replay)]
-        self.text = {record.instruction: encode_text(cache.experiment, record.instruction) for record in every}
+        self.text = encode_instructions(cache.experiment, (record.instruction for record in every))
 
     def _samples(self, record: Record) -> list[tuple[Record, tuple[int, ...]]]:
         experiment = self.cache.experiment
@@ -91,12 +91,6 @@ def shown_frames(left: int, frames: int) -> np.ndarray:
     """Which latent frames of a clip show anything of an episode that has `left` frames from there on: float32 [t]."""
     firsts = np.maximum(np.arange(latent_frames(frames)) * TEMPORAL_FACTOR - (TEMPORAL_FACTOR - 1), 0)
     return (firsts < left).astype(np.float32)
-
-
-def encode_text(experiment: Experiment, instruction: str) -> np.ndarray:
-    """Embeddings of an instruction [l e] float32."""
-    size = MODELS[experiment.model.size]
-    return TEXT_ENCODERS[experiment.model.text](instruction, size.text_tokens, size.text_dim)
 
 
 def make_dataset(
@@ -138,7 +132,8 @@ def stack(examples: Sequence[Batch]) -> Batch:
 def fake_batch(experiment: Experiment, batch: int, seed: int = 0) -> Batch:
     """A batch of noise in the shapes that the experiment's data would have, for tests and compile checks."""
     rng = np.random.default_rng(seed)
-    size = MODELS[experiment.model.size]
+    tokens, width = experiment.size.text_tokens, experiment.size.text_dim
+    learned = experiment.text_encoder.learned
 
     def normal(*shape: int) -> np.ndarray:
         return rng.standard_normal((batch, *shape), np.float32)
@@ -147,7 +142,8 @@ def fake_batch(experiment: Experiment, batch: int, seed: int = 0) -> Batch:
         joints_shape = (latent_frames(experiment.clip.frames), ACTION_DIM)
         of_joints = {name: STREAMS[name].source == "joints" for name in experiment.conditions}
         conditions = {name: normal(*(joints_shape if yes else experiment.latent_shape)) for name, yes in of_joints.items()}
-        latents, text = normal(*experiment.latent_shape), normal(size.text_tokens, size.text_dim)
+        latents = normal(*experiment.latent_shape)
+        text = rng.integers(1, VOCABULARY, (batch, tokens), np.int32) if learned else normal(tokens, width)
         return Batch(latents, conditions, text, np.ones(latents.shape[:2], np.float32))
 
     first = chunk()

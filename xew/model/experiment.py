@@ -1,7 +1,7 @@
 """The config of a world-model experiment: what configs/*.yaml hold. Fields without a default must be given."""
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -12,10 +12,10 @@ from flax import nnx
 from xew.config import ConfigError, load, pick, suggestion
 from xew.model.codec import CODECS, TEMPORAL_FACTOR, CodecSettings, latent_frames
 from xew.model.conditions import ACTIONS, CONDITIONS, Condition
-from xew.model.dit import MODELS, PATCH, AttentionName, RematName, TimeEmbedding, Visibility, WorldModel
+from xew.model.dit import MODELS, PATCH, AttentionName, ModelSize, RematName, TimeEmbedding, Visibility, WorldModel
 from xew.model.samplers import GRIDS, SAMPLERS
 from xew.model.sharding import MeshSettings
-from xew.model.text import TEXT_ENCODERS
+from xew.model.text import TEXT_ENCODERS, VOCABULARY, TextEncoder
 from xew.protocol import ROBOT_NAMES, SPLITS, Split
 
 
@@ -38,7 +38,14 @@ class ModelSettings:
     """One of ACTIONS: how the commanded motion is shown."""
     embodiment: str = "none"
     """One of CONDITIONS: how the robot's looks are shown."""
-    text: str = "hashed_words"
+    text: str = "learned"
+    """One of TEXT_ENCODERS: a table of words that the network learns, or Wan's frozen encoder."""
+    text_weights: Path | None = None
+    """umt5: models_t5_umt5-xxl-enc-bf16.pth, or the text_encoder folder of the diffusers layout."""
+    text_tokenizer: Path | None = None
+    """umt5: the folder google/umt5-xxl, or the tokenizer folder of the diffusers layout."""
+    text_prefix: str = ""
+    """Put before every instruction, as FlowWAM's published weights expect it."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Of the matrix products."""
     residual: Literal["float32", "bfloat16"] = "float32"
@@ -156,6 +163,16 @@ class Experiment:
         return {condition.stream: condition for condition in chosen if condition is not None}
 
     @property
+    def size(self) -> ModelSize:
+        """Of the network; the width of the text is its encoder's."""
+        size, width = pick(MODELS, self.model.size, "model size"), self.text_encoder.width
+        return replace(size, text_dim=width) if width else size
+
+    @property
+    def text_encoder(self) -> TextEncoder:
+        return pick(TEXT_ENCODERS, self.model.text, "text encoder")
+
+    @property
     def latent_shape(self) -> tuple[int, int, int, int]:
         """Of one RGB clip [t h w c]."""
         factor = self.codec.spatial_factor
@@ -165,12 +182,10 @@ class Experiment:
 def load_experiment(path: Path | str, overrides: list[str] | None = None) -> Experiment:
     """Read and check a config. Raises ConfigError with every choice that does not exist or does not fit."""
     experiment = load(Experiment, path, overrides or [])
-    pick(MODELS, experiment.model.size, "model size")
     pick(CODECS, experiment.codec.name, "codec").check(experiment.codec)
-    pick(TEXT_ENCODERS, experiment.model.text, "text encoder")
     pick(SAMPLERS, experiment.rollout.sampler, "sampler")
     pick(GRIDS, experiment.rollout.grid, "grid of noise levels")
-    _ = experiment.robots, experiment.conditions
+    _ = experiment.size, experiment.robots, experiment.conditions
     _check_sizes(experiment, str(path))
     _check_training(experiment, str(path))
     return experiment
@@ -212,7 +227,7 @@ def create_model(experiment: Experiment) -> WorldModel:
     """The network of an experiment at its random start; wrap in `nnx.eval_shape` for shapes only."""
     settings = experiment.model
     return WorldModel(
-        MODELS[settings.size],
+        experiment.size,
         experiment.codec.channels,
         tuple(experiment.conditions),
         dtype=jnp.dtype(settings.dtype),
@@ -222,6 +237,7 @@ def create_model(experiment: Experiment) -> WorldModel:
         attention=settings.attention,
         visibility=settings.visibility,
         time=settings.time,
+        words=VOCABULARY if experiment.text_encoder.learned else 0,
         rngs=nnx.Rngs(experiment.train.seed),
     )
 

@@ -26,11 +26,12 @@ from xew.config import CONVERTER, ConfigError, suggestion, user_errors
 from xew.episode import EpisodeError, episode_folder, find_accepted
 from xew.model.checkpoint import load_run, restore_params
 from xew.model.codec import Codec
-from xew.model.data import Batch, encode_text
+from xew.model.data import Batch
 from xew.model.experiment import Experiment, compile_cache, create_model
 from xew.model.frames import to_camera_size
 from xew.model.latents import Episode, encode_clip, stream_videos
 from xew.model.samplers import GRIDS, SAMPLERS, Grid
+from xew.model.text import encode_instructions
 from xew.protocol import ROBOT_NAMES, seed_split
 from xew.rollout import write_rollout
 
@@ -80,7 +81,8 @@ class Predictor:
             name: np.stack([encode_clip(self.codec, condition, stream[name], start, frames) for stream in streams])
             for name, condition in self.experiment.conditions.items()
         }
-        text = np.stack([encode_text(self.experiment, record.instruction) for _, record in episodes])
+        words = encode_instructions(self.experiment, [record.instruction for _, record in episodes])
+        text = np.stack([words[record.instruction] for _, record in episodes])
         noise = jnp.stack([jax.random.normal(key, self.experiment.latent_shape, jnp.float32) for key in keys])
         latents = np.stack([self.codec.encode(frame) for frame in reference])
         settings = self.experiment.rollout
