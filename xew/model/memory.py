@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from xew.config import ConfigError
 from xew.model.data import fake_batch
-from xew.model.dit import MODELS, ModelSize, flops, token_grid
+from xew.model.dit import ModelSize, flops, token_grid
 from xew.model.experiment import Experiment
 from xew.model.sharding import parameter_spec, path_names
 from xew.model.training_step import abstract_state
@@ -66,7 +66,7 @@ def estimate_memory(experiment: Experiment, devices: int, fsdp: int) -> Memory:
         "moving average": cut_bytes(state.ema, fsdp),
         f"rounded to {experiment.model.dtype}": weights * compute if compute < 4 else 0.0,
         "gradients": weights * compute + (weights * 4 if summed else 0.0),
-        "layers gathered": 2 * compute * cut_bytes(network, 1, 1) / MODELS[experiment.model.size].depth if fsdp > 1 else 0.0,
+        "layers gathered": 2 * compute * cut_bytes(network, 1, 1) / experiment.size.depth if fsdp > 1 else 0.0,
         "activations": samples * activation_bytes(experiment),
     }
     layout = f"{devices} devices, state in {fsdp} parts, {samples:g} samples at once on each, remat {experiment.model.remat}"
@@ -85,9 +85,9 @@ def cut_bytes(tree: Any, fsdp: int, itemsize: int = 0) -> float:
 
 def activation_bytes(experiment: Experiment) -> float:
     """Bytes of activations of one sample: what is kept of every block, and the work of one block in the backward pass."""
-    settings, size = experiment.model, MODELS[experiment.model.size]
+    settings, size = experiment.model, experiment.size
     tokens = sum(math.prod(grid) for grid in stream_grids(experiment))
-    compute, residual = jnp.dtype(settings.dtype).itemsize, 4
+    compute, residual = jnp.dtype(settings.dtype).itemsize, jnp.dtype(settings.residual).itemsize
     everything = tokens * kept_bytes(size, compute, residual) + logits_bytes(experiment, tokens)
     kept = {
         "full": tokens * residual * size.dim,
@@ -108,7 +108,7 @@ def logits_bytes(experiment: Experiment, tokens: int) -> float:
     settings = experiment.model
     fused = settings.attention == "cudnn" or (settings.attention == "auto" and settings.dtype == "bfloat16")
     compute = jnp.dtype(settings.dtype).itemsize
-    return 0.0 if fused else MODELS[settings.size].heads * tokens**2 * (4 + compute)
+    return 0.0 if fused else experiment.size.heads * tokens**2 * (4 + compute)
 
 
 def stream_grids(experiment: Experiment) -> list[tuple[int, int, int]]:
@@ -120,7 +120,7 @@ def stream_grids(experiment: Experiment) -> list[tuple[int, int, int]]:
 
 def flops_of_step(experiment: Experiment) -> float:
     """Model FLOPs of one training step over all devices: three times the forward pass, recomputation not counted."""
-    settings, size = experiment.train, MODELS[experiment.model.size]
+    settings, size = experiment.train, experiment.size
     channels = experiment.codec.channels
     return 3 * settings.chunks * flops(size, stream_grids(experiment), batch=settings.batch, channels=channels)
 

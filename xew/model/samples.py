@@ -12,19 +12,28 @@ STRIP_FRAMES = 5
 
 
 def sample_episodes(predictor: Predictor) -> dict[str, Episode]:
-    """An episode of each robot of the split by role and robot, of test seeds where there are any."""
-    robots = predictor.experiment.robots
+    """An episode of each robot of the split by role and robot, of test seeds where there are any.
+
+    In an adapted run the robots adapted to are the target, and seen are those of the run that it started from.
+    """
+    robots, targets = predictor.experiment.robots, predictor.experiment.adapt.robots
     roles = dict.fromkeys(robots.train_robots, "seen") | dict.fromkeys(robots.held_out_robots, "unseen")
+    roles |= dict.fromkeys(targets, "target")
     found = test_episodes(predictor.experiment.data, tuple(roles)) or training_episodes(predictor.experiment)
     first = {record.robot: (folder, record) for folder, record in reversed(found)}
     return {f"{roles[robot]}/{robot}": first[robot] for robot in roles if robot in first}
 
 
-def log_samples(log: RunLog, predictor: Predictor, step: int) -> None:
-    """Predict one clip of each sample episode; log PSNR, a strip (truth above prediction) and a video."""
+def log_samples(log: RunLog | None, predictor: Predictor, step: int) -> None:
+    """Predict one clip of each sample episode; log PSNR, a strip (truth above prediction) and a video.
+
+    Every process predicts, for each has a part of the parameters; the one with a log writes.
+    """
     named = sample_episodes(predictor)
     clip = predictor.experiment.clip
     predicted = predictor.predict(list(named.values()), clip.frames)
+    if log is None:
+        return
     scores = {}
     for (name, (folder, _)), video in zip(named.items(), predicted, strict=True):
         truth = to_model_size(read_video(folder / "rgb.mkv")[: clip.frames], clip.height, clip.width)

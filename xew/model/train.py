@@ -38,6 +38,7 @@ from xew.model.checkpoint import (
 )
 from xew.model.codec import Codec
 from xew.model.data import ClipSource, fake_batch, make_dataset
+from xew.model.dit_layouts import load_dit_params
 from xew.model.experiment import Experiment, compile_cache, load_experiment
 from xew.model.latents import LatentCache, load_codec, replay_episodes, training_episodes
 from xew.model.memory import check_memory, estimate_memory, flops_of_step, peak_flops
@@ -46,7 +47,7 @@ from xew.model.rollout import Predictor
 from xew.model.samples import log_samples
 from xew.model.sharding import check_batch, make_mesh, mesh_shape, place_batch, process_rows, start_processes, state_shardings
 from xew.model.tensorboard import RunLog
-from xew.model.training_step import StepResult, abstract_state, init_train_state, make_train_step
+from xew.model.training_step import StepResult, abstract_state, init_train_state, make_train_step, random_params
 
 __all__ = ["fake_batch", "init_train_state", "make_mesh", "make_optimizer", "make_train_step", "place_batch", "train"]
 
@@ -251,10 +252,12 @@ def begin_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite: 
 
 
 def start_params(experiment: Experiment, mesh: Mesh) -> Any:
-    """What step 0 begins with, placed on the mesh: the parameters of the run to adapt, or None for random ones."""
-    if experiment.adapt.start_from is None:
-        return None
-    return restore_start(experiment, network_shapes(experiment, mesh))
+    """What step 0 begins with, placed on the mesh: those of the run to adapt, published weights, or None for random ones."""
+    if experiment.adapt.start_from is not None:
+        return restore_start(experiment, network_shapes(experiment, mesh))
+    if experiment.model.weights is not None:
+        return load_dit_params(*random_params(experiment, mesh), experiment.model.weights)
+    return None
 
 
 def network_shapes(experiment: Experiment, mesh: Mesh) -> Any:
@@ -284,7 +287,7 @@ def draw_samples(
     """Predict clips of seen and unseen robots beside the truth."""
     with jax.set_mesh(mesh):
         params = jax.jit(corrected)(state.base, state.params if state.ema is None else state.ema)
-    log_samples(log, Predictor(experiment, codec, graph, params), step)
+        log_samples(log, Predictor(experiment, codec, graph, params), step)
 
 
 if __name__ == "__main__":

@@ -76,6 +76,13 @@ def init_train_state(experiment: Experiment, mesh: Mesh, start: Any = None) -> t
         return graph, init(start)
 
 
+def random_params(experiment: Experiment, mesh: Mesh) -> tuple[nnx.GraphDef, Any]:
+    """The network's structure and its parameters at their random start, made where they lie on the mesh."""
+    graph, shapes = nnx.split(nnx.eval_shape(lambda: create_model(experiment)), nnx.Param)
+    init = jax.jit(lambda: nnx.state(create_model(experiment), nnx.Param), out_shardings=state_shardings(shapes, mesh))
+    return graph, init()
+
+
 def make_train_step(experiment: Experiment, graph: nnx.GraphDef, mesh: Mesh, codec: Codec | None = None) -> TrainStep:
     """The compiled step; its noise depends on the seed, the step and the place in the batch only, so a resumed run repeats it.
 
