@@ -14,11 +14,10 @@ import numpy as np
 
 from xew.episode import Record
 from xew.model.codec import TEMPORAL_FACTOR, latent_frames
-from xew.model.dit import STREAMS
 from xew.model.experiment import Experiment, replayed
-from xew.model.latents import Episode, LatentCache, sample_starts
+from xew.model.latents import Episode, LatentCache, load_scales, sample_starts
+from xew.model.scales import apply_scales
 from xew.model.text import VOCABULARY, encode_instructions
-from xew.protocol import ACTION_DIM
 
 
 @jax.tree_util.register_dataclass
@@ -29,7 +28,7 @@ class Batch:
     latents: Any
     """[b t h w c] float32, the RGB stream."""
     conditions: dict[str, Any]
-    """Stream name -> [b t' h' w' c] latents or [b t' 16] joint positions, float32."""
+    """Stream or mechanism -> [b t' h' w' c] latents or [b t' n] numbers, scaled, float32."""
     text: Any
     """[b l e] float32, or [b l] int32 rows of the network's table of words; zero-padded."""
     shown: Any = None
@@ -53,6 +52,7 @@ class ClipSource:
         self.fresh = len(self.samples)
         self.samples += [sample for _, record in replay for sample in self._samples(record)]
         every = [record for _, record in (*episodes, *replay)]
+        self.scales = load_scales(cache.experiment, episodes)
         self.text = encode_instructions(cache.experiment, (record.instruction for record in every))
 
     def _samples(self, record: Record) -> list[tuple[Record, tuple[int, ...]]]:
@@ -84,7 +84,9 @@ class ClipSource:
         streams = {name: self.cache.read(record, name) for name in self.cache.streams}
         arrays = {name: stream[min(clip, len(stream) - 1)].astype(np.float32) for name, stream in streams.items()}
         shown = shown_frames(record.frame_count - start, experiment.clip.frames)
-        return Batch(arrays.pop("rgb"), arrays, self.text[record.instruction], shown)
+        latents = arrays.pop("rgb")
+        conditions = apply_scales(self.scales, experiment.conditions, arrays)
+        return Batch(latents, conditions, self.text[record.instruction], shown)
 
 
 def shown_frames(left: int, frames: int) -> np.ndarray:
@@ -139,9 +141,7 @@ def fake_batch(experiment: Experiment, batch: int, seed: int = 0) -> Batch:
         return rng.standard_normal((batch, *shape), np.float32)
 
     def chunk() -> Batch:
-        joints_shape = (latent_frames(experiment.clip.frames), ACTION_DIM)
-        of_joints = {name: STREAMS[name].source == "joints" for name in experiment.conditions}
-        conditions = {name: normal(*(joints_shape if yes else experiment.latent_shape)) for name, yes in of_joints.items()}
+        conditions = {name: normal(*experiment.condition_shape(name)) for name in experiment.conditions}
         latents = normal(*experiment.latent_shape)
         text = rng.integers(1, VOCABULARY, (batch, tokens), np.int32) if learned else normal(tokens, width)
         return Batch(latents, conditions, text, np.ones(latents.shape[:2], np.float32))

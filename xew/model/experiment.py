@@ -11,12 +11,13 @@ from flax import nnx
 
 from xew.config import ConfigError, load, pick, suggestion
 from xew.model.codec import CODECS, TEMPORAL_FACTOR, CodecSettings, latent_frames
-from xew.model.conditions import ACTIONS, CONDITIONS, Condition
+from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition
 from xew.model.dit import MODELS, PATCH, AttentionName, ModelSize, RematName, TimeEmbedding, Visibility, WorldModel
+from xew.model.mechanisms import MECHANISMS
 from xew.model.samplers import GRIDS, SAMPLERS
 from xew.model.sharding import MeshSettings
 from xew.model.text import TEXT_ENCODERS, VOCABULARY, TextEncoder
-from xew.protocol import ROBOT_NAMES, SPLITS, Split
+from xew.protocol import ACTION_DIM, ROBOT_NAMES, SPLITS, Split
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,8 @@ class ModelSettings:
     """One of ACTIONS: how the commanded motion is shown."""
     embodiment: str = "none"
     """One of CONDITIONS: how the robot's looks are shown."""
+    history: tuple[int, ...] = ()
+    """Earlier frames that are shown too, counted from the clip's first, as [-40, -20]; before the episode its first counts."""
     text: str = "learned"
     """One of TEXT_ENCODERS: a table of words that the network learns, or Wan's frozen encoder."""
     text_weights: Path | None = None
@@ -51,11 +54,11 @@ class ModelSettings:
     residual: Literal["float32", "bfloat16"] = "float32"
     """Of the tokens between blocks; their sums are float32 either way."""
     remat: RematName = "none"
-    """What the backward pass computes again: nothing, all but the attention or matrix products, or everything (dit.REMAT)."""
+    """What the backward pass computes again: nothing, all but the attention or matrix products, or everything (blocks.REMAT)."""
     unroll: int = 1
     """Blocks compiled as one loop body."""
     attention: AttentionName = "auto"
-    """cuDNN's where it can be used, else XLA's (dit.choose_attention)."""
+    """cuDNN's where it can be used, else XLA's (blocks.choose_attention)."""
     visibility: Visibility = "joint"
     """one_way: condition tokens see condition tokens only, and are computed once a clip when sampling. A departure."""
     time: TimeEmbedding = "exact"
@@ -88,6 +91,8 @@ class TrainSettings:
     """Of AdamW's first moment; bfloat16 saves two bytes a parameter."""
     shift: float = 5.0
     """Of the noise levels, in training and in sampling."""
+    history_noise: float = 0.0
+    """Standard deviation of what is added to earlier frames' latents in training; Ctrl-World has 0.3."""
     log_every: int = 20
     save_every: int = 1000
     sample_every: int = 1000
@@ -158,8 +163,10 @@ class Experiment:
 
     @property
     def conditions(self) -> dict[str, Condition]:
-        """The streams beside rgb, by the name of the stream that each feeds; the key of the registry is in `.name`."""
-        chosen = (pick(ACTIONS, self.model.action, "action"), pick(CONDITIONS, self.model.embodiment, "embodiment"))
+        """What the network is told beside rgb, by the stream or mechanism that each feeds; `.name` is its name in the cache."""
+        action = pick(ACTIONS, self.model.action, "action")
+        system = action if isinstance(action, tuple) else (action,)
+        chosen = (*system, pick(CONDITIONS, self.model.embodiment, "embodiment"), HISTORY if self.model.history else None)
         return {condition.stream: condition for condition in chosen if condition is not None}
 
     @property
@@ -171,6 +178,15 @@ class Experiment:
     @property
     def text_encoder(self) -> TextEncoder:
         return pick(TEXT_ENCODERS, self.model.text, "text encoder")
+
+    def condition_shape(self, stream: str) -> tuple[int, ...]:
+        """Of what one stream or mechanism is told of a clip: latents [t h w c] or numbers [t n]."""
+        condition, history = self.conditions[stream], len(self.model.history)
+        frames, *picture = self.latent_shape
+        width = ACTION_DIM if stream == "joints" else MECHANISMS[stream].width if stream in MECHANISMS else 0
+        if width:
+            return frames + (history if condition.with_history else 0), width
+        return history if condition.make is None else frames, *picture
 
     @property
     def latent_shape(self) -> tuple[int, int, int, int]:
@@ -188,6 +204,7 @@ def load_experiment(path: Path | str, overrides: list[str] | None = None) -> Exp
     _ = experiment.size, experiment.robots, experiment.conditions
     _check_sizes(experiment, str(path))
     _check_training(experiment, str(path))
+    _check_history(experiment, str(path))
     return experiment
 
 
@@ -223,6 +240,19 @@ def replayed(batch: int, replay: float) -> int:
     return max(1, round(batch * replay)) if replay else 0
 
 
+def _check_history(experiment: Experiment, source: str) -> None:
+    settings = experiment.model
+    if any(frame >= 0 for frame in settings.history) or list(settings.history) != sorted(settings.history):
+        found = f"{source}: model.history is {list(settings.history)}"
+        raise ConfigError(f"{found}; give frames before the clip, the earliest first, as [-40, -20].")
+    framed = [name for name in experiment.conditions if name in MECHANISMS and MECHANISMS[name].enters == "frame"]
+    if settings.visibility == "one_way" and framed and settings.history:
+        raise ConfigError(
+            f"{source}: model.visibility one_way computes earlier frames without the poses that action {settings.action} tells "
+            "them; use joint, or leave model.history out."
+        )
+
+
 def create_model(experiment: Experiment) -> WorldModel:
     """The network of an experiment at its random start; wrap in `nnx.eval_shape` for shapes only."""
     settings = experiment.model
@@ -237,6 +267,7 @@ def create_model(experiment: Experiment) -> WorldModel:
         attention=settings.attention,
         visibility=settings.visibility,
         time=settings.time,
+        history=tuple(frame / TEMPORAL_FACTOR for frame in settings.history),
         words=VOCABULARY if experiment.text_encoder.learned else 0,
         rngs=nnx.Rngs(experiment.train.seed),
     )

@@ -26,10 +26,11 @@ from xew.config import ConfigError, digest, user_errors
 from xew.episode import Record, complete_folder, episode_folder, find_accepted, read_states, read_video
 from xew.model.ceiling import measure_ceiling, spread
 from xew.model.checkpoint import load_run
-from xew.model.codec import CODECS, TEMPORAL_FACTOR, Codec
-from xew.model.conditions import Condition, command_of
+from xew.model.codec import CODECS, Codec
+from xew.model.conditions import Command, Condition, clip_numbers, command_of
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.frames import to_model_size
+from xew.model.scales import Scale, fit_scales, load_run_scales, read_scales, save_scales
 from xew.protocol import seed_split
 
 Episode = tuple[Path, Record]
@@ -53,7 +54,10 @@ class LatentCache:
         """The file of one stream of one episode."""
         condition = self.streams[stream]
         name = condition.name if condition else stream
-        sources = (record.hashes["rgb"],) if condition is None else (record.hashes["states"], record.hashes["robot"])
+        of_scene = condition is None or condition.make is None
+        sources = (record.hashes["rgb"],) if of_scene else (record.hashes["states"], record.hashes["robot"])
+        if condition is not None and (of_scene or condition.with_history):
+            sources = (*sources, str(self.experiment.model.history))
         cut = digest(self.experiment.clip) if self.experiment.train.chunks == 1 else (digest(self.experiment.clip), "chunks")
         content = (CACHE_VERSION, self.codec.hash, cut, name, *sources)
         key = hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]
@@ -64,7 +68,7 @@ class LatentCache:
         return clip_starts(record.frame_count, self.experiment.clip.frames, self.experiment.train.chunks)
 
     def read(self, record: Record, stream: str) -> np.ndarray:
-        """One stream of one episode, float16 [clips ...] memory-mapped; conditions that are not aligned have one clip.
+        """One stream of one episode, float16 [clips ...] memory-mapped, numbers float32; what is not aligned has one clip.
 
         Raises:
             ConfigError: it was never encoded, or from other data, codec or clips.
@@ -91,7 +95,8 @@ class LatentCache:
     def _encode_stream(self, name: str, video: np.ndarray, starts: Sequence[int]) -> np.ndarray:
         condition = self.streams[name]
         starts = starts if condition is None or condition.aligned else (0,)
-        return np.stack([encode_clip(self.codec, condition, video, start, self.experiment.clip.frames) for start in starts])
+        frames, history = self.experiment.clip.frames, self.experiment.model.history
+        return np.stack([encode_clip(self.codec, condition, video, start, frames, history) for start in starts])
 
 
 def sample_starts(frame_count: int, frames: int, chunks: int = 1) -> tuple[tuple[int, ...], ...]:
@@ -114,28 +119,46 @@ def clip_starts(frame_count: int, frames: int, chunks: int = 1) -> tuple[int, ..
 
 
 def stream_videos(experiment: Experiment, folder: Path, record: Record, streams: Sequence[str]) -> dict[str, np.ndarray]:
-    """Whole-episode input of the named streams: uint8 [t h w 3] at the model's size, or float32 [t 16]."""
+    """Whole-episode input of the named streams: uint8 [t h w 3] at the model's size, or float32 [t n]."""
     conditions = {name: condition for name, condition in experiment.conditions.items() if name in streams}
-    videos = {"rgb": read_video(folder / "rgb.mkv")} if "rgb" in streams else {}
-    if conditions:
-        from xew.sim_warp.robots import use_robots_of
-
-        use_robots_of(experiment.data)  # a robot of a user's own is kept beside its data
-        command = command_of(folder, record, read_states(folder))
-        videos |= {name: condition.make(command) for name, condition in conditions.items()}
+    of_scene = [name for name in streams if name == "rgb" or conditions[name].make is None]
+    videos = dict.fromkeys(of_scene, read_video(folder / "rgb.mkv")) if of_scene else {}
+    if len(of_scene) < len(streams):
+        command = episode_command(experiment, folder, record)
+        videos |= {name: condition.make(command) for name, condition in conditions.items() if condition.make is not None}
     clip = experiment.clip
     return {name: to_model_size(v, clip.height, clip.width) if v.ndim == 4 else v for name, v in videos.items()}
 
 
-def encode_clip(codec: Codec, condition: Condition | None, video: np.ndarray, start: int, frames: int) -> np.ndarray:
-    """One clip of one stream as the network takes it: latents [t' h' w' c] or joint positions [t' 16].
+def episode_command(experiment: Experiment, folder: Path, record: Record) -> Command:
+    """What conditions may be made from, of an episode of the experiment's data."""
+    from xew.sim_warp.robots import use_robots_of
 
-    Past the end the last frame is repeated. A condition that is not aligned is encoded whole.
+    use_robots_of(experiment.data)  # a robot of a user's own is kept beside its data
+    return command_of(folder, record, read_states(folder))
+
+
+def encode_clip(
+    codec: Codec,
+    condition: Condition | None,
+    video: np.ndarray,
+    start: int,
+    frames: int,
+    history: Sequence[int] = (),
+) -> np.ndarray:
+    """One clip of one stream as the network takes it: latents [t' h' w' c] or numbers [t' n], not scaled yet.
+
+    Past the end the last frame is repeated. A condition that is not aligned is encoded whole. Earlier frames are encoded one
+    by one (`history`, counted from the clip's first frame); before the start the first is repeated.
     """
+    if condition is not None and condition.make is None:
+        earlier = np.maximum(start + np.asarray(history), 0)
+        return np.concatenate([codec.encode(video[frame : frame + 1]) for frame in earlier])
+    if video.ndim == 2:
+        assert condition is not None
+        return clip_numbers(condition, video, start, frames, history)
     if condition is None or condition.aligned:
         video = video[np.minimum(np.arange(start, start + frames), len(video) - 1)]
-    if video.ndim == 2:
-        return video[::TEMPORAL_FACTOR].astype(np.float32)
     return codec.encode(video)
 
 
@@ -214,6 +237,36 @@ def load_codec(experiment: Experiment, episodes: Sequence[Episode]) -> Codec:
     return kind.load(path)
 
 
+def scales_path(experiment: Experiment, episodes: Sequence[Episode]) -> Path:
+    """Where the scales of numbers of these episodes are kept."""
+    content = (CACHE_VERSION, sorted(record.hashes["states"] for _, record in episodes))
+    names = sorted({condition.name for condition in experiment.conditions.values() if condition.scale != "none"})
+    key = hashlib.sha256(json.dumps((*content, names)).encode()).hexdigest()[:12]
+    return experiment.cache_folder / f"scales-{key}.json"
+
+
+def load_scales(experiment: Experiment, episodes: Sequence[Episode]) -> dict[str, Scale]:
+    """The scales of these episodes' numbers, or in an adaptation those of the run that it starts from.
+
+    Raises:
+        ConfigError: `latents` has not been run for them.
+    """
+    start = experiment.adapt.start_from
+    if start is not None:
+        return load_run_scales(experiment, start)
+    command = f"python -m xew.model.latents CONFIG --data {experiment.data}"
+    return read_scales(scales_path(experiment, episodes), tuple(experiment.conditions.values()), f"run `{command}`")
+
+
+def keep_scales(experiment: Experiment, episodes: Sequence[Episode]) -> None:
+    """Find and keep the scales of numbers of these episodes, where any is needed and they are not there yet."""
+    path = scales_path(experiment, episodes)
+    needed = any(condition.scale != "none" for condition in experiment.conditions.values())
+    if needed and experiment.adapt.start_from is None and not path.exists():
+        commands = (episode_command(experiment, folder, record) for folder, record in episodes)
+        save_scales(path, fit_scales(experiment.conditions.values(), commands))
+
+
 def fit_codec(experiment: Experiment, episodes: Sequence[Episode]) -> Codec:
     """Fit the codec on clips of training episodes, and keep it."""
     codec = CODECS[experiment.codec.name].prepare(experiment.codec, lambda: _clips_to_fit(experiment, episodes))
@@ -250,13 +303,14 @@ def ceiling(experiment: Experiment, codec: Codec, episodes: Sequence[Episode]) -
 
 
 def _write(path: Path, array: np.ndarray) -> int:
-    """Save atomically as float16; returns the size in bytes."""
+    """Save atomically, latents as float16 and numbers as float32; returns the size in bytes."""
+    array = array.astype(np.float32 if array.ndim == 3 else np.float16)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     with temporary.open("wb") as file:
-        np.save(file, array.astype(np.float16))
+        np.save(file, array)
     os.replace(temporary, path)
-    return array.size * 2
+    return array.nbytes
 
 
 @user_errors
@@ -269,6 +323,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     adapts = experiment.adapt.start_from is not None
     to_fit = CODECS[experiment.codec.name].fitted and not adapts and not codec_path(experiment, episodes).exists()
     codec = fit_codec(experiment, episodes) if to_fit else load_codec(experiment, episodes)
+    keep_scales(experiment, episodes)
     cache = LatentCache(experiment, codec)
     written = sum(
         cache.encode(episode) for episode in tqdm([*episodes, *replay_episodes(experiment)], desc="encode", unit="episode")

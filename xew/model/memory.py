@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from xew.config import ConfigError
 from xew.model.data import fake_batch
-from xew.model.dit import ModelSize, flops, token_grid
+from xew.model.dit import STREAMS, ModelSize, flops, token_grid
 from xew.model.experiment import Experiment
 from xew.model.sharding import parameter_spec, path_names
 from xew.model.training_step import abstract_state
@@ -91,8 +91,8 @@ def activation_bytes(experiment: Experiment) -> float:
     everything = tokens * kept_bytes(size, compute, residual) + logits_bytes(experiment, tokens)
     kept = {
         "full": tokens * residual * size.dim,
-        "attention": tokens * (residual + compute) * size.dim,
-        "dots": tokens * (residual * size.dim + compute * (7 * size.dim + size.ffn_dim)),
+        "attention": tokens * (residual + 2 * compute) * size.dim,
+        "dots": tokens * (residual * size.dim + compute * (9 * size.dim + size.ffn_dim)),
         "none": everything,
     }[settings.remat]
     return size.depth * kept + 2 * everything
@@ -114,7 +114,7 @@ def logits_bytes(experiment: Experiment, tokens: int) -> float:
 def stream_grids(experiment: Experiment) -> list[tuple[int, int, int]]:
     """Tokens (t', h', w') of each stream, RGB first."""
     batch = fake_batch(experiment, 1)
-    arrays = [batch.latents, *(batch.conditions[name] for name in experiment.conditions)]
+    arrays = [batch.latents, *(batch.conditions[name] for name in experiment.conditions if name in STREAMS)]
     return [token_grid(array.shape) for array in arrays]
 
 

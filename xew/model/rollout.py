@@ -11,8 +11,8 @@ import argparse
 import json
 import sys
 import zlib
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from xew.model.experiment import Experiment, compile_cache, create_model
 from xew.model.frames import to_camera_size
 from xew.model.latents import Episode, encode_clip, stream_videos
 from xew.model.samplers import GRIDS, SAMPLERS, Grid
+from xew.model.scales import Scale, apply_scales, load_run_scales
 from xew.model.text import encode_instructions
 from xew.protocol import ROBOT_NAMES, seed_split
 from xew.rollout import write_rollout
@@ -44,6 +45,8 @@ class Predictor:
     codec: Codec
     graph: nnx.GraphDef
     params: Any
+    scales: Mapping[str, Scale] = field(default_factory=dict)
+    """Of the numbers that the network is told, as in training."""
 
     def predict(self, episodes: Sequence[Episode], frame_count: int) -> np.ndarray:
         """The first `frame_count` frames of each episode, predicted from its first: uint8 [b t h w 3] at the model's size.
@@ -57,6 +60,9 @@ class Predictor:
         frames: list[np.ndarray] = []
         for chunk, start in enumerate(range(0, max(frame_count - 1, 1), horizon)):
             keys = [self._key(episode, chunk) for episode in episodes]
+            if self.experiment.model.history:  # what the model has made itself; the recorded frames would show the future
+                past = np.concatenate([*frames], axis=1) if frames else reference
+                streams = [stream | {"history": video} for stream, video in zip(streams, past, strict=True)]
             predicted = self._predict_chunk(episodes, streams, reference, start, keys)
             frames.append(predicted[:, 1:] if frames else predicted)
             reference = predicted[:, -1:]
@@ -76,11 +82,12 @@ class Predictor:
         keys: Sequence[jax.Array],
     ) -> np.ndarray:
         """One clip of each episode [b t h w 3] from reference frames [b 1 h w 3]."""
-        frames = self.experiment.clip.frames
+        frames, history = self.experiment.clip.frames, self.experiment.model.history
         conditions = {
-            name: np.stack([encode_clip(self.codec, condition, stream[name], start, frames) for stream in streams])
+            name: np.stack([encode_clip(self.codec, condition, stream[name], start, frames, history) for stream in streams])
             for name, condition in self.experiment.conditions.items()
         }
+        conditions = apply_scales(self.scales, self.experiment.conditions, conditions)
         words = encode_instructions(self.experiment, [record.instruction for _, record in episodes])
         text = np.stack([words[record.instruction] for _, record in episodes])
         noise = jnp.stack([jax.random.normal(key, self.experiment.latent_shape, jnp.float32) for key in keys])
@@ -163,7 +170,7 @@ def load_predictor(run: Path) -> tuple[Predictor, int]:
     experiment, codec = load_run(run)
     graph, params = nnx.split(create_model(experiment), nnx.Param)
     params, step = restore_params(run, params)
-    return Predictor(experiment, codec, graph, params), step
+    return Predictor(experiment, codec, graph, params, load_run_scales(experiment, run)), step
 
 
 @user_errors

@@ -12,7 +12,7 @@ import itertools
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,7 @@ from xew.model.memory import check_memory, estimate_memory, flops_of_step, peak_
 from xew.model.optimizer import learning_rate, make_optimizer, with_steps
 from xew.model.rollout import Predictor
 from xew.model.samples import log_samples
+from xew.model.scales import SCALES, Scale, load_run_scales, save_scales
 from xew.model.sharding import check_batch, make_mesh, mesh_shape, place_batch, process_rows, start_processes, state_shardings
 from xew.model.tensorboard import RunLog
 from xew.model.training_step import StepResult, abstract_state, init_train_state, make_train_step, random_params
@@ -180,6 +181,7 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     experiment, asked = with_steps(experiment, source.fresh), experiment
     check_memory(estimate_memory(experiment, mesh.size, mesh.shape["fsdp"]), ignore=ignore_memory)
     begin_run(asked, codec, resume=resume, overwrite=overwrite)
+    source.scales = run_scales(experiment, source.scales)
 
     # State: step 0, or where the run was left.
     settings = experiment.train
@@ -251,6 +253,16 @@ def begin_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite: 
         multihost_utils.sync_global_devices("run folder")
 
 
+def run_scales(experiment: Experiment, found: Mapping[str, Scale]) -> Mapping[str, Scale]:
+    """The scales of numbers that the run was begun with; those found in the data if it is new."""
+    path = experiment.out / SCALES
+    if found and not path.exists() and jax.process_index() == 0:
+        save_scales(path, found)
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices("scales")
+    return load_run_scales(experiment, experiment.out)
+
+
 def start_params(experiment: Experiment, mesh: Mesh) -> Any:
     """What step 0 begins with, placed on the mesh: those of the run to adapt, published weights, or None for random ones."""
     if experiment.adapt.start_from is not None:
@@ -287,7 +299,8 @@ def draw_samples(
     """Predict clips of seen and unseen robots beside the truth."""
     with jax.set_mesh(mesh):
         params = jax.jit(corrected)(state.base, state.params if state.ema is None else state.ema)
-        log_samples(log, Predictor(experiment, codec, graph, params), step)
+        scales = load_run_scales(experiment, experiment.out)
+        log_samples(log, Predictor(experiment, codec, graph, params, scales), step)
 
 
 if __name__ == "__main__":

@@ -29,6 +29,8 @@ from xew.model.flow_matching import TrainingPair, sample_losses, training_pair
 from xew.model.optimizer import make_optimizer
 from xew.model.sharding import gathered, replicated, state_shardings
 
+HISTORY_KEY = 7
+"""Folded into a sample's key for the noise of its earlier frames, which `training_pair` does not know of."""
 TrainStep = Callable[[TrainState, Batch], tuple[TrainState, "StepResult"]]
 
 
@@ -90,7 +92,7 @@ def make_train_step(experiment: Experiment, graph: nnx.GraphDef, mesh: Mesh, cod
         codec: needed where `train.chunks` is 2, to decode and encode the first chunk's prediction.
     """
     settings, optimizer = experiment.train, make_optimizer(experiment.train)
-    objective = Objective(graph, mesh, settings.shift, settings.accumulate)
+    objective = Objective(graph, mesh, settings.shift, settings.accumulate, settings.history_noise)
 
     def step(state: TrainState, batch: Batch, codec: Codec | None) -> tuple[TrainState, StepResult]:
         key = jax.random.fold_in(jax.random.key(settings.seed), state.step)
@@ -137,6 +139,8 @@ class Objective:
     shift: float
     parts: int
     """How many parts of the batch are computed one after another."""
+    history_noise: float = 0.0
+    """Of earlier frames' latents."""
 
     def place(self, tree: Any) -> Any:
         """Keep a tree in the shape of the parameters cut along fsdp as they are: the compiler might gather it too soon."""
@@ -166,6 +170,7 @@ class Objective:
         for number in range(rows.weights.shape[1]):
             keys = jax.vmap(jax.random.fold_in, (0, None))(rows.keys, number)
             pair = sample_pairs(keys, chunk.latents, self.shift)
+            chunk = with_noisy_history(keys, chunk, self.history_noise)
             of_chunk, loss, predicted = self._of_chunk(params, chunk, pair, rows.weights[:, number] / size)
             gradients = of_chunk if gradients is None else self.place(_sum(gradients, of_chunk))
             losses.append(loss)
@@ -196,6 +201,16 @@ def sample_pairs(keys: Array, latents: Array, shift: float) -> TrainingPair:
     """`training_pair` of each sample with its own key [b]."""
     pairs = jax.vmap(lambda key, sample: training_pair(key, sample[None], shift))(keys, latents)
     return jax.tree.map(lambda leaf: leaf[:, 0], pairs)
+
+
+def with_noisy_history(keys: Array, chunk: Batch, strength: float) -> Batch:
+    """A chunk whose earlier frames, if it has any, are not as clean as recorded: a rollout's are its own predictions."""
+    if "history" not in chunk.conditions or not strength:
+        return chunk
+    history = chunk.conditions["history"]
+    keys = jax.vmap(jax.random.fold_in, (0, None))(keys, HISTORY_KEY)
+    noise = jax.vmap(lambda key, sample: jax.random.normal(key, sample.shape, jnp.float32))(keys, history)
+    return replace(chunk, conditions={**chunk.conditions, "history": history + strength * noise})
 
 
 def estimate(latents: Array, pair: TrainingPair, predicted: Array) -> Array:
