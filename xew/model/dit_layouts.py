@@ -1,4 +1,4 @@
-"""Published weights of the network: where each leaf lies in the files of Wan2.2 (official and diffusers) and of FlowWAM.
+"""Published weights of the network: where each leaf lies in the files of Wan2.2 (official and diffusers), FlowWAM and BWM.
 
 Reads and writes checkpoints through weights.py.
 Names: Wan2.2's own `wan/modules/model.py`, diffusers' `WanTransformer3DModel`, FlowWAM's `flow_stream`.
@@ -13,7 +13,9 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from xew.model.dit import EPSILON, PATCH, STREAMS, TIME_FREQUENCIES, WorldModel
+from xew.model.blocks import EPSILON
+from xew.model.dit import STREAMS, WorldModel
+from xew.model.tokens import PATCH, TIME_FREQUENCIES
 from xew.model.weights import Layout, Source, Tensors, fill, read_tensors, save_weights
 
 Naming = Literal["official", "diffusers"]
@@ -51,8 +53,16 @@ BLOCK_VECTORS = {
 
 FLOW_STREAM = "action"
 """Our stream that FlowWAM's optical-flow stream becomes."""
-NOT_OURS = ("flow_stream.flow_head.*",)
-"""FlowWAM has a head for its flow too, which a world model does not use; its published file may lack it."""
+BWM_LINEARS = {
+    "mechanisms.pose_context.first": "action_encoder.action_mlp1.0",
+    "mechanisms.pose_context.second": "action_encoder.action_mlp1.2",
+    "mechanisms.pose_time.first": "action_encoder.action_mlp2.0",
+    "mechanisms.pose_time.second": "action_encoder.action_mlp2.2",
+}
+"""What Boundless-World-Model has beside Wan's keys: the two paths of its tool poses (action bwm)."""
+NOT_OURS = ("flow_stream.flow_head.*", "action_encoder.action_embedding.*")
+"""FlowWAM has a head for its flow too, which a world model does not use; its published file may lack it. BWM's class has an
+embedding that its network does not use."""
 
 
 def wan_layout(model: WorldModel, naming: Naming) -> Layout:
@@ -79,9 +89,18 @@ def flowwam_layout(model: WorldModel) -> Layout:
     return {f"stream_embeddings.{FLOW_STREAM}": embedding, **dict(patches)}
 
 
+def bwm_layout(model: WorldModel) -> Layout:
+    """What Boundless-World-Model has beside: its two paths of tool poses."""
+    layout: dict[str, Source] = {}
+    for ours, theirs in BWM_LINEARS.items():
+        if ours.split(".")[1] in model.mechanisms:
+            layout |= dict(_linear(ours, (theirs,)))
+    return layout
+
+
 def dit_layout(model: WorldModel, naming: Naming) -> Layout:
-    """Every leaf of a model: Wan's, FlowWAM's, and under their own paths those that no other project has."""
-    named = {**wan_layout(model, naming), **flowwam_layout(model)}
+    """Every leaf of a model: Wan's, FlowWAM's, BWM's, and under their own paths those that no other project has."""
+    named = {**wan_layout(model, naming), **flowwam_layout(model), **bwm_layout(model)}
     paths = (".".join(map(str, path)) for path, _ in nnx.to_flat_state(nnx.state(model, nnx.Param)))
     return named | {path: Source((path,)) for path in paths if path not in named}
 
