@@ -7,7 +7,7 @@ import pytest
 from flax import nnx
 
 from xew.config import ConfigError
-from xew.model import dit
+from xew.model import blocks, dit
 from xew.model.dit import MODELS, STREAMS, WorldModel
 
 pytestmark = pytest.mark.usefixtures("strict_types")
@@ -155,7 +155,9 @@ def test_rotation_is_a_complex_product_of_neighbouring_pairs() -> None:
     values, angles = np.asarray(normal(6, 1, 12, 2, 16)), dit.rotary_angles((3, 2, 2), 16)
     pairs = values[..., 0::2] + 1j * values[..., 1::2]
     expected = pairs * np.exp(1j * angles)[None, :, None]
-    rotated = dit.rotate(jnp.asarray(values), (jnp.asarray(np.cos(angles), "float32"), jnp.asarray(np.sin(angles), "float32")))
+    rotated = blocks.rotate(
+        jnp.asarray(values), (jnp.asarray(np.cos(angles), "float32"), jnp.asarray(np.sin(angles), "float32"))
+    )
     rotated = np.asarray(rotated)
     np.testing.assert_allclose(rotated[..., 0::2] + 1j * rotated[..., 1::2], expected, atol=1e-5)
 
@@ -328,13 +330,13 @@ def test_attention_by_rule(
 ) -> None:
     if device is not None:
         monkeypatch.setattr(jax, "devices", lambda: [device])
-    assert dit.choose_attention("xla", head_dim, dtype) == "xla"
-    assert dit.choose_attention("auto", head_dim, dtype) == ("xla" if reason else "cudnn")
+    assert blocks.choose_attention("xla", head_dim, dtype) == "xla"
+    assert blocks.choose_attention("auto", head_dim, dtype) == ("xla" if reason else "cudnn")
     if not reason:
-        assert dit.choose_attention("cudnn", head_dim, dtype) == "cudnn"
+        assert blocks.choose_attention("cudnn", head_dim, dtype) == "cudnn"
         return
     with pytest.raises(ConfigError, match=f"attention: cudnn cannot be used: .*{reason}.*; set model.attention to auto or xla"):
-        dit.choose_attention("cudnn", head_dim, dtype)
+        blocks.choose_attention("cudnn", head_dim, dtype)
 
 
 # Work.

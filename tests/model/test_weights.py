@@ -290,6 +290,8 @@ def test_shards_are_written_under_their_limit(tmp_path: Path, monkeypatch: pytes
     assert index["metadata"]["total_size"] == sum(sizes)
     assert all(size <= 150 or len(load_file(tmp_path / "many" / name)) == 1 for size, name in zip(sizes, shards, strict=True))
     assert not list((tmp_path / "many").glob(".*"))
+    (tmp_path / "plain").touch()
+    assert (tmp_path / "one.safetensors").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
 def test_where_nothing_can_be_written(tmp_path: Path) -> None:

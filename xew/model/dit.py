@@ -7,71 +7,53 @@ To add a size: one line in MODELS. To add a stream: one line in STREAMS. Publish
 Shape letters: b batch, t h w c latent video, s tokens (t' h' w' flattened), d width, n heads, r distinct noise levels,
 l text tokens (in a cache: layers).
 Numbers that look arbitrary (eps 1e-6, 256 frequencies, six modulations) are those of the published weights.
-
-Precision: matrix products and attention in `dtype`; norms, modulation, residual sums, time embedding and head in float32
-and written so that they fuse: no [b s 6 d] is formed, and what enters several products is rounded once.
 """
 
 import dataclasses
-import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax import Array
-from jax.ad_checkpoint import checkpoint_name
 
-from xew.config import ConfigError
+from xew.model.blocks import (
+    REMAT,
+    AttentionName,
+    ConditionCache,
+    Head,
+    ModelSize,
+    RematName,
+    Rotary,
+    TwoLayer,
+    gelu,
+    linear,
+    scaled_normal,
+    stacked_blocks,
+    take_rows,
+)
 from xew.model.mechanisms import MECHANISMS, FramedContext, create_mechanism, ray_maps
 from xew.model.sharding import cut_over_batch, gathered
+from xew.model.tokens import (
+    PATCH,
+    TIME_FREQUENCIES,
+    patchify,
+    rotary_angles,
+    rounded_sinusoid,
+    sinusoid,
+    token_grid,
+    unpatchify,
+)
 
-PATCH = (1, 2, 2)
-EPSILON = 1e-6
-WAVELENGTH_BASE = 10_000.0
-TIME_FREQUENCIES = 256
 TIMESTEPS = 1000.0
 """The network is told the noise level as sigma times this."""
+EMBEDDING_INIT = nnx.initializers.normal(0.02)
 
-Activation = Callable[[Array], Array]
-Rotary = tuple[Array, Array]
-"""Cosine and sine [s head_dim/2] of every token's rotation angles."""
-AttentionName = Literal["auto", "xla", "cudnn"]
-RematName = Literal["none", "attention", "dots", "full"]
 Visibility = Literal["joint", "one_way"]
 TimeEmbedding = Literal["exact", "flowwam"]
-
-
-class ConditionCache(NamedTuple):
-    """What every layer's RGB tokens read of the condition tokens, when these do not look back (`one_way`)."""
-
-    keys: Array
-    """[layers b s n head_dim], rotated."""
-    values: Array
-    """[layers b s n head_dim]."""
-
-
-@dataclass(frozen=True)
-class ModelSize:
-    """Everything that distinguishes one size of the network from another."""
-
-    dim: int
-    depth: int
-    heads: int
-    ffn_dim: int
-    text_dim: int
-    text_tokens: int
-    rotary_base: float = WAVELENGTH_BASE
-    """Ratio of the slowest to the fastest rotation of positions; Wan's serves clips of hundreds of positions a side, and
-    a model of few positions tells them apart sooner with less."""
-
-    @property
-    def head_dim(self) -> int:
-        return self.dim // self.heads
-
 
 MODELS = {
     "tiny": ModelSize(dim=32, depth=2, heads=2, ffn_dim=64, text_dim=16, text_tokens=8),
@@ -144,17 +126,17 @@ class WorldModel(nnx.Module):
         # Earlier frames come right after RGB's tokens, so that all frames that have a context of their own are one piece.
         self.condition_streams = tuple(sorted((name for name in streams if name in STREAMS), key="history".__ne__))
         features = channels * int(np.prod(PATCH))
-        self.patch_embedding = _linear(features, size.dim, dtype, rngs)
-        self.text_embedding = TwoLayer(size.text_dim, size.dim, size.dim, _gelu, dtype, EMBEDDING_INIT, rngs)
+        self.patch_embedding = linear(features, size.dim, dtype, rngs)
+        self.text_embedding = TwoLayer(size.text_dim, size.dim, size.dim, gelu, dtype, EMBEDDING_INIT, rngs)
         self.time_embedding = TwoLayer(TIME_FREQUENCIES, size.dim, size.dim, nnx.silu, jnp.float32, EMBEDDING_INIT, rngs)
-        self.time_projection = _linear(size.dim, 6 * size.dim, jnp.float32, rngs)
-        self.blocks = _stacked_blocks(size, dtype, attention, rngs)
+        self.time_projection = linear(size.dim, 6 * size.dim, jnp.float32, rngs)
+        self.blocks = stacked_blocks(size, dtype, attention, rngs)
         self.head = Head(size.dim, features, rngs)
         self.words = nnx.Embed(words, size.text_dim, embedding_init=nnx.initializers.normal(1.0), rngs=rngs) if words else None
         self.stream_embeddings = nnx.data({})
         self.stream_inputs = nnx.data({})
         for name in self.condition_streams:
-            self.stream_embeddings[name] = nnx.Param(_scaled_normal(rngs.params(), (size.dim,)))
+            self.stream_embeddings[name] = nnx.Param(scaled_normal(rngs.params(), (size.dim,)))
             if STREAMS[name].source != "history":
                 self.stream_inputs[name] = self._stream_input(STREAMS[name], rngs)
         self.mechanisms = nnx.data({})
@@ -333,326 +315,10 @@ class WorldModel(nnx.Module):
         return jax.lax.scan(block, tokens, (layers, cache), unroll=self.unroll)[0]
 
 
-class Block(nnx.Module):
-    """Self-attention over all streams, cross-attention to the text, feed-forward; modulated by the noise level."""
-
-    def __init__(self, size: ModelSize, dtype: jnp.dtype, attention: AttentionName, rngs: nnx.Rngs) -> None:
-        self.dtype = dtype
-        self.modulation = nnx.Param(_scaled_normal(rngs.params(), (1, 6, size.dim)))
-        self.self_attn = Attention(size, dtype, attention, rngs)
-        self.cross_attn = Attention(size, dtype, attention, rngs)
-        self.norm3 = nnx.LayerNorm(size.dim, epsilon=EPSILON, use_fast_variance=False, dtype=jnp.float32, rngs=rngs)
-        self.ffn = TwoLayer(size.dim, size.ffn_dim, size.dim, _gelu, dtype, nnx.initializers.xavier_uniform(), rngs)
-
-    def __call__(
-        self,
-        tokens: Array,
-        modulation: Array,
-        rows: np.ndarray,
-        rotary: Rotary,
-        text: Array | FramedContext,
-        alone: int | None = None,
-        cache: ConditionCache | None = None,
-    ) -> Array:
-        """tokens [b s d]; modulation [b r 6 d], of which token i takes row rows[i]; text [b l d].
-
-        Tokens from `alone` on see none before them; those before see all, and the keys and values of `cache` too.
-        """
-        shift_sa, scale_sa, gate_sa, shift_ffn, scale_ffn, gate_ffn = self._chunks(modulation, rows)
-        attended = self.self_attn(modulate(tokens, shift_sa, scale_sa, self.dtype), rotary=rotary, alone=alone, cache=cache)
-        tokens = add(tokens, attended, gate_sa)
-        across = self.cross_attn.by_frame if isinstance(text, FramedContext) else self.cross_attn
-        tokens = add(tokens, across(self.norm3(tokens).astype(self.dtype), text))
-        return add(tokens, self.ffn(modulate(tokens, shift_ffn, scale_ffn, self.dtype)), gate_ffn)
-
-    def keys_values(self, tokens: Array, modulation: Array, rows: np.ndarray, rotary: Rotary) -> tuple[Array, Array]:
-        """What others' self-attention reads of these tokens: keys and values [b s n head_dim]."""
-        shift, scale = self._chunks(modulation, rows)[:2]
-        return self.self_attn.keys_values(modulate(tokens, shift, scale, self.dtype), rotary)
-
-    def _chunks(self, modulation: Array, rows: np.ndarray) -> list[Array]:
-        """Six [b s d]: shift, scale and gate of self-attention, then of the feed-forward; never formed at once."""
-        chunks = self.modulation[...][None] + modulation
-        return [take_rows(chunks[:, :, i], rows) for i in range(6)]
-
-
-class Attention(nnx.Module):
-    """Multi-head attention; queries and keys are normalised over the full width, before they are split into heads."""
-
-    def __init__(self, size: ModelSize, dtype: jnp.dtype, implementation: AttentionName, rngs: nnx.Rngs) -> None:
-        self.heads, self.dtype, self.implementation = size.heads, dtype, implementation
-        self.q, self.k, self.v, self.o = (_linear(size.dim, size.dim, dtype, rngs) for _ in range(4))
-        self.norm_q, self.norm_k = (nnx.RMSNorm(size.dim, epsilon=EPSILON, dtype=jnp.float32, rngs=rngs) for _ in range(2))
-
-    def __call__(
-        self,
-        tokens: Array,
-        context: Array | None = None,
-        rotary: Rotary | None = None,
-        alone: int | None = None,
-        cache: ConditionCache | None = None,
-    ) -> Array:
-        """tokens [b s d] attend to context [b l d], or to each other under rotary positions.
-
-        Tokens from `alone` on see none before them: two calls of attention instead of a mask [s s]. The keys and values
-        of `cache` (one layer's) are seen beside the tokens' own.
-        """
-        q = self._heads(self.norm_q(self.q(tokens)), rotary)
-        k, v = self.keys_values(tokens if context is None else context, rotary)
-        if cache is not None:
-            k, v = jnp.concatenate([k, cache.keys], axis=1), jnp.concatenate([v, cache.values], axis=1)
-        if alone is None:
-            attended = self._attend(q, k, v)
-        else:
-            parts = self._attend(q[:, :alone], k, v), self._attend(q[:, alone:], k[:, alone:], v[:, alone:])
-            attended = jnp.concatenate(parts, axis=1)
-        return self.o(attended.reshape(tokens.shape))
-
-    def by_frame(self, tokens: Array, context: FramedContext) -> Array:
-        """tokens [b s d] attend to the shared context; those of the first frames to their own frame's beside it."""
-        batch, frames, own, width = context.framed.shape
-        shared = self.keys_values(context.shared, None)
-        k, v = (
-            jnp.concatenate([jnp.repeat(all_see[:, None], frames, axis=1), one.reshape(batch, frames, own, *one.shape[2:])], 2)
-            for all_see, one in zip(
-                shared, self.keys_values(context.framed.reshape(batch, frames * own, width), None), strict=True
-            )
-        )
-        q, cut = self._heads(self.norm_q(self.q(tokens)), None), frames * context.tokens
-        by_frame = q[:, :cut].reshape(batch * frames, context.tokens, *q.shape[2:])
-        attended = self._attend(by_frame, *(x.reshape(batch * frames, *x.shape[2:]) for x in (k, v)))
-        attended = attended.reshape(batch, cut, *q.shape[2:])
-        if cut < tokens.shape[1]:
-            attended = jnp.concatenate([attended, self._attend(q[:, cut:], *shared)], axis=1)
-        return self.o(attended.reshape(tokens.shape))
-
-    def keys_values(self, context: Array, rotary: Rotary | None) -> tuple[Array, Array]:
-        """Keys (rotated where there are positions) and values [b l n head_dim] of context [b l d]."""
-        return self._heads(self.norm_k(self.k(context)), rotary), self._heads(self.v(context), None)
-
-    def _heads(self, values: Array, rotary: Rotary | None) -> Array:
-        values = values.reshape(*values.shape[:2], self.heads, -1)
-        return cut_over_batch((values if rotary is None else rotate(values, rotary)).astype(self.dtype))
-
-    def _attend(self, q: Array, k: Array, v: Array) -> Array:
-        chosen = choose_attention(self.implementation, q.shape[-1], self.dtype)
-        attended = jax.nn.dot_product_attention(q, k, v, implementation=chosen)
-        return attended if chosen == "cudnn" else checkpoint_name(attended, "attention")
-
-
-class Head(nnx.Module):
-    """Norm modulated by the time embedding itself (not by its projection), then one linear layer, zero at the start."""
-
-    def __init__(self, dim: int, features: int, rngs: nnx.Rngs) -> None:
-        self.modulation = nnx.Param(_scaled_normal(rngs.params(), (1, 2, dim)))
-        self.head = nnx.Linear(dim, features, dtype=jnp.float32, kernel_init=nnx.initializers.zeros_init(), rngs=rngs)
-
-    def __call__(self, tokens: Array, time: Array, rows: np.ndarray) -> Array:
-        """Features [b s pt*ph*pw*c] of tokens [b s d]; time [b r d]."""
-        chunks = self.modulation[...][None] + time[:, :, None]
-        return self.head(modulate(tokens, take_rows(chunks[:, :, 0], rows), take_rows(chunks[:, :, 1], rows)))
-
-
-class TwoLayer(nnx.Module):
-    """Linear, activation, linear."""
-
-    def __init__(
-        self,
-        features: int,
-        hidden: int,
-        out: int,
-        activation: Activation,
-        dtype: jnp.dtype,
-        init: nnx.Initializer,
-        rngs: nnx.Rngs,
-    ) -> None:
-        self.activation = activation
-        self.first = nnx.Linear(features, hidden, dtype=dtype, kernel_init=init, rngs=rngs)
-        self.second = nnx.Linear(hidden, out, dtype=dtype, kernel_init=init, rngs=rngs)
-
-    def __call__(self, values: Array) -> Array:
-        return self.second(self.activation(self.first(values)))
-
-
-EMBEDDING_INIT = nnx.initializers.normal(0.02)
-
-
-def modulate(tokens: Array, shift: Array, scale: Array, dtype: jnp.dtype = jnp.float32) -> Array:
-    """LayerNorm without parameters in float32, then scale and shift [b s d], rounded once for all who read it."""
-    tokens = tokens.astype(jnp.float32)
-    centred = tokens - tokens.mean(-1, keepdims=True)
-    normed = centred * jax.lax.rsqrt(jnp.square(centred).mean(-1, keepdims=True) + EPSILON)
-    return (normed * (1 + scale) + shift).astype(dtype)
-
-
-def add(tokens: Array, change: Array, gate: Array | None = None) -> Array:
-    """tokens + change * gate [b s d] in float32, in the type of the tokens."""
-    change = change.astype(jnp.float32)
-    return (tokens.astype(jnp.float32) + (change if gate is None else change * gate)).astype(tokens.dtype)
-
-
-def take_rows(values: Array, rows: np.ndarray) -> Array:
-    """values[:, rows] [b s d] of [b r d] float32, in forms whose gradient is no scatter (slow on every device).
-
-    Two rows are a choice, which fuses into what uses it and whose gradient is a masked sum. More (a row for each latent
-    frame) are a gather whose gradient is a product with the matrix of ones that says which token has which row.
-    """
-    count = values.shape[1]
-    if count <= 2:
-        return jnp.where((rows == 0)[None, :, None], values[:, :1], values[:, count - 1 :])
-    return _gather_rows(values, tuple(rows.tolist()))
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
-def _gather_rows(values: Array, rows: tuple[int, ...]) -> Array:
-    return values[:, np.asarray(rows)]
-
-
-def _gather_rows_forward(values: Array, rows: tuple[int, ...]) -> tuple[Array, int]:
-    return _gather_rows(values, rows), values.shape[1]
-
-
-def _gather_rows_backward(rows: tuple[int, ...], count: int, gradient: Array) -> tuple[Array]:
-    has_row = jnp.asarray(np.equal(rows, np.arange(count)[:, None]), gradient.dtype)
-    return (jnp.einsum("rs,bsd->brd", has_row, gradient, precision=jax.lax.Precision.HIGHEST),)
-
-
-_gather_rows.defvjp(_gather_rows_forward, _gather_rows_backward)
-
-
-def sinusoid(timestep: Array) -> Array:
-    """Cosines, then sines [... 256] of float32 timesteps [...], as exact as Wan's float64 (to 2e-7; plain float32: 6e-5).
-
-    A timestep times a frequency is split in a product of their upper halves, which float32 holds exactly, and a small
-    rest, by which the angle is turned with the addition theorem.
-    """
-    half = TIME_FREQUENCIES // 2
-    frequencies = (WAVELENGTH_BASE ** (-np.arange(half) / half)).reshape((1,) * timestep.ndim + (half,))
-    upper_frequencies = (frequencies.astype(np.float32).view(np.uint32) & UPPER_HALF).view(np.float32)
-    lower_frequencies = (frequencies - upper_frequencies).astype(np.float32)
-    timestep = timestep[..., None]
-    bits = jax.lax.bitcast_convert_type(timestep, jnp.uint32)
-    upper = jax.lax.bitcast_convert_type(bits & UPPER_HALF, jnp.float32)
-    angle = upper * upper_frequencies
-    rest = (timestep - upper) * upper_frequencies + timestep * lower_frequencies
-    cos, sin, cos_rest, sin_rest = jnp.cos(angle), jnp.sin(angle), jnp.cos(rest), jnp.sin(rest)
-    return jnp.concatenate([cos * cos_rest - sin * sin_rest, sin * cos_rest + cos * sin_rest], axis=-1)
-
-
-UPPER_HALF = np.uint32(0xFFFFF000)
-"""Bits of a float32 that keep 12 of its 24 significant ones."""
-
-
-def rounded_sinusoid(timestep: Array) -> Array:
-    """`sinusoid` as FlowWAM has it: of the timestep in bfloat16 (steps of 4 from 512 on), itself rounded to bfloat16."""
-    return sinusoid(timestep.astype(jnp.bfloat16).astype(jnp.float32)).astype(jnp.bfloat16).astype(jnp.float32)
-
-
-def token_grid(shape: Sequence[int]) -> tuple[int, int, int]:
-    """Frames, rows and columns of the tokens of latents [b t h w c] or of joint positions [b t 16]."""
-    if len(shape) == 3:
-        return shape[1], 1, 1
-    return shape[1] // PATCH[0], shape[2] // PATCH[1], shape[3] // PATCH[2]
-
-
 def token_rows(stream: Stream, grid: tuple[int, int, int]) -> np.ndarray:
     """Which noise level each token is told [s]: row 0 is clean, row 1 the sample's own."""
     frames = np.zeros(grid[0], int) if stream.timestep == "clean" else np.minimum(np.arange(grid[0]), 1)
     return np.repeat(frames, grid[1] * grid[2])
-
-
-def rotary_angles(
-    grid: tuple[int, int, int], head_dim: int, base: float = WAVELENGTH_BASE, times: Sequence[float] | None = None
-) -> np.ndarray:
-    """Rotation angles [s head_dim/2] float64 of the tokens of a grid; every stream counts from (0, 0, 0).
-
-    The head is split among time, height and width as in Wan (44, 42, 42 of 128; 24, 20, 20 of 64), and each part has
-    its own geometric series of frequencies.
-    """
-    part = 2 * (head_dim // 6)
-    parts = (head_dim - 2 * part, part, part)
-    axes = (np.arange(grid[0]) if times is None else np.asarray(times), np.arange(grid[1]), np.arange(grid[2]))
-    positions = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    series = [base ** (-np.arange(0, width, 2) / width) for width in parts]
-    return np.concatenate([np.outer(positions[:, axis], frequencies) for axis, frequencies in enumerate(series)], axis=-1)
-
-
-def rotate(values: Array, rotary: Rotary) -> Array:
-    """Turn neighbouring pairs of features of [b s n k] by each token's angles, in float32."""
-    cos, sin = (table[None, :, None, :, None] for table in rotary)
-    pairs = values.reshape(*values.shape[:-1], -1, 2)
-    return (pairs * cos + pairs[..., ::-1] * jnp.concatenate([-sin, sin], axis=-1)).reshape(values.shape)
-
-
-def patchify(latents: Array) -> Array:
-    """[b t h w c] -> tokens [b s c*ph*pw] in the feature order of Wan's convolution weights."""
-    b, _, _, _, c = latents.shape
-    t, h, w = token_grid(latents.shape)
-    cut = latents.reshape(b, t, PATCH[0], h, PATCH[1], w, PATCH[2], c)
-    return cut.transpose(0, 1, 3, 5, 7, 2, 4, 6).reshape(b, t * h * w, -1)
-
-
-def unpatchify(features: Array, shape: Sequence[int]) -> Array:
-    """Head features [b s pt*ph*pw*c] -> latents of `shape` [b t h w c]; here c runs fastest."""
-    b, _, _, _, c = shape
-    t, h, w = token_grid(shape)
-    cut = features.reshape(b, t, h, w, *PATCH, c)
-    return cut.transpose(0, 1, 4, 2, 5, 3, 6, 7).reshape(shape)
-
-
-def _is_attention(primitive: Any, *_: Any, **__: Any) -> bool:
-    """Results of cuDNN's attention (output and logarithms of its sums), which has no other name to be kept by."""
-    return str(primitive.name).startswith("dot_product_attention_fwd")
-
-
-_POLICIES = jax.checkpoint_policies
-_KEEP_ATTENTION = _POLICIES.save_from_both_policies(_POLICIES.save_only_these_names("attention"), _is_attention)
-REMAT: dict[str, Callable[..., bool] | None] = {
-    "attention": _KEEP_ATTENTION,
-    "dots": _POLICIES.save_from_both_policies(_POLICIES.dots_with_no_batch_dims_saveable, _KEEP_ATTENTION),
-    "full": None,
-}
-"""What the backward pass finds kept beside each block's input, by name.
-
-full       nothing: the forward pass is computed twice (4/3 of the work), the least memory
-attention  results of attention, so that all but its quadratic part is computed twice; one width more a token and block
-dots       results of all matrix products and of attention, so that only norms and activations are computed twice
-none       everything that the backward pass reads
-"""
-
-
-def choose_attention(asked: AttentionName, head_dim: int, dtype: jnp.dtype) -> Literal["xla", "cudnn"]:
-    """The implementation of `jax.nn.dot_product_attention` on this machine.
-
-    "auto" is cuDNN's on a CUDA GPU of compute capability 8.0 and up, in bfloat16 or float16, where the width of a head is
-    a multiple of 8 and at most 256 (128 before Hopper, 9.0); else XLA's, which forms [n s s]. cuDNN takes any number of
-    tokens, so nothing is padded. (The limits are those that jax itself checks.)
-
-    Raises:
-        ConfigError: cuDNN was asked for and cannot do it.
-    """
-    if asked == "xla":
-        return "xla"
-    reason = _cudnn_lacks(head_dim, jnp.dtype(dtype))
-    if reason and asked == "cudnn":
-        raise ConfigError(f"attention: cudnn cannot be used: {reason}; set model.attention to auto or xla.")
-    return "xla" if reason else "cudnn"
-
-
-def _cudnn_lacks(head_dim: int, dtype: np.dtype) -> str:
-    """Why cuDNN's attention cannot be used here; empty if it can."""
-    device = jax.devices()[0]
-    if device.platform != "gpu" or "cuda" not in device.client.platform_version:
-        return f"it needs a CUDA GPU and JAX runs on {device.platform}"
-    capability = tuple(int(part) for part in str(device.compute_capability).split("."))
-    widest = 256 if capability >= (9, 0) else 128
-    if capability < (8, 0):
-        return f"it needs compute capability 8.0 and {device.device_kind} has {device.compute_capability}"
-    if dtype not in (jnp.bfloat16, jnp.float16):
-        return f"it needs model.dtype bfloat16 and the model has {dtype.name}"
-    if head_dim % 8 or head_dim > widest:
-        return f"it needs heads of a multiple of 8 and at most {widest} features and the model's have {head_dim}"
-    return ""
 
 
 def flops(
@@ -711,27 +377,3 @@ def compute_params(graph: nnx.GraphDef, params: Any) -> Any:
 def parameter_count(model: nnx.Module) -> int:
     """How many numbers the model learns."""
     return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)))
-
-
-def _gelu(values: Array) -> Array:
-    return nnx.gelu(values, approximate=True)
-
-
-def _linear(features: int, out: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> nnx.Linear:
-    return nnx.Linear(features, out, dtype=dtype, kernel_init=nnx.initializers.xavier_uniform(), rngs=rngs)
-
-
-def _scaled_normal(key: Array, shape: tuple[int, ...]) -> Array:
-    """Wan's start for modulations: normal over the root of the width."""
-    return jax.random.normal(key, shape, jnp.float32) / np.sqrt(shape[-1]).astype(np.float32)
-
-
-def _stacked_blocks(size: ModelSize, dtype: jnp.dtype, attention: AttentionName, rngs: nnx.Rngs) -> Block:
-    """`depth` blocks as one whose parameters have a leading layer axis."""
-
-    @nnx.split_rngs(splits=size.depth)
-    @nnx.vmap(in_axes=0, out_axes=0)
-    def create(layer_rngs: nnx.Rngs) -> Block:
-        return Block(size, dtype, attention, layer_rngs)
-
-    return create(rngs)

@@ -143,7 +143,7 @@ def fill(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Coll
     for path, source in wanted.items():
         variable = leaves[path]
         value = _leaf_value(tensors, source, variable.shape, np.dtype(variable.dtype))
-        variable.set_value(jax.device_put(value, getattr(variable.get_value(), "sharding", None)))
+        variable.set_value(_placed(value, variable.get_value()))
 
 
 def save_weights(module: nnx.Module, path: Path, layout: Layout) -> None:
@@ -175,6 +175,14 @@ def checkpoint_shapes(module: nnx.Module, layout: Layout) -> dict[str, tuple[int
     """Key -> shape of every tensor that the layout asks for; works on modules of `nnx.eval_shape`."""
     leaves = _leaves(module, layout)
     return {key: _tensor_shape(leaves[path].shape, source) for path, source in layout.items() for key in source.keys}
+
+
+def _placed(value: np.ndarray, like: Any) -> jax.Array:
+    """A value where the leaf lay before; each process gives its own devices their parts."""
+    sharding = getattr(like, "sharding", None)
+    if sharding is None:
+        return jax.device_put(value)
+    return jax.make_array_from_callback(value.shape, sharding, lambda index: value[index])
 
 
 # Axes.
@@ -433,6 +441,9 @@ def _write(path: Path, tensors: dict[str, np.ndarray]) -> None:
     partial = path.with_name(f".{path.name}.partial")
     try:
         save_file(tensors, partial, metadata={"format": "pt"})
+        mask = os.umask(0)  # the library lets nobody else read its files; ours are as readable as any of this user's
+        os.umask(mask)
+        partial.chmod(0o666 & ~mask)
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)

@@ -1,0 +1,83 @@
+"""Videos to tokens and back, and the numbers that tell tokens their place and their noise level.
+
+Reads  latents [b t h w c], timesteps
+Writes tokens' features [b s c*ph*pw], rotation angles [s head_dim/2], time features [... 256]
+"""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+PATCH = (1, 2, 2)
+WAVELENGTH_BASE = 10_000.0
+TIME_FREQUENCIES = 256
+
+
+def sinusoid(timestep: Array) -> Array:
+    """Cosines, then sines [... 256] of float32 timesteps [...], as exact as Wan's float64 (to 2e-7; plain float32: 6e-5).
+
+    A timestep times a frequency is split in a product of their upper halves, which float32 holds exactly, and a small
+    rest, by which the angle is turned with the addition theorem.
+    """
+    half = TIME_FREQUENCIES // 2
+    frequencies = (WAVELENGTH_BASE ** (-np.arange(half) / half)).reshape((1,) * timestep.ndim + (half,))
+    upper_frequencies = (frequencies.astype(np.float32).view(np.uint32) & UPPER_HALF).view(np.float32)
+    lower_frequencies = (frequencies - upper_frequencies).astype(np.float32)
+    timestep = timestep[..., None]
+    bits = jax.lax.bitcast_convert_type(timestep, jnp.uint32)
+    upper = jax.lax.bitcast_convert_type(bits & UPPER_HALF, jnp.float32)
+    angle = upper * upper_frequencies
+    rest = (timestep - upper) * upper_frequencies + timestep * lower_frequencies
+    cos, sin, cos_rest, sin_rest = jnp.cos(angle), jnp.sin(angle), jnp.cos(rest), jnp.sin(rest)
+    return jnp.concatenate([cos * cos_rest - sin * sin_rest, sin * cos_rest + cos * sin_rest], axis=-1)
+
+
+UPPER_HALF = np.uint32(0xFFFFF000)
+"""Bits of a float32 that keep 12 of its 24 significant ones."""
+
+
+def rounded_sinusoid(timestep: Array) -> Array:
+    """`sinusoid` as FlowWAM has it: of the timestep in bfloat16 (steps of 4 from 512 on), itself rounded to bfloat16."""
+    return sinusoid(timestep.astype(jnp.bfloat16).astype(jnp.float32)).astype(jnp.bfloat16).astype(jnp.float32)
+
+
+def token_grid(shape: Sequence[int]) -> tuple[int, int, int]:
+    """Frames, rows and columns of the tokens of latents [b t h w c] or of joint positions [b t 16]."""
+    if len(shape) == 3:
+        return shape[1], 1, 1
+    return shape[1] // PATCH[0], shape[2] // PATCH[1], shape[3] // PATCH[2]
+
+
+def rotary_angles(
+    grid: tuple[int, int, int], head_dim: int, base: float = WAVELENGTH_BASE, times: Sequence[float] | None = None
+) -> np.ndarray:
+    """Rotation angles [s head_dim/2] float64 of the tokens of a grid; every stream counts from (0, 0, 0).
+
+    The head is split among time, height and width as in Wan (44, 42, 42 of 128; 24, 20, 20 of 64), and each part has
+    its own geometric series of frequencies.
+    """
+    part = 2 * (head_dim // 6)
+    parts = (head_dim - 2 * part, part, part)
+    axes = (np.arange(grid[0]) if times is None else np.asarray(times), np.arange(grid[1]), np.arange(grid[2]))
+    positions = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    series = [base ** (-np.arange(0, width, 2) / width) for width in parts]
+    return np.concatenate([np.outer(positions[:, axis], frequencies) for axis, frequencies in enumerate(series)], axis=-1)
+
+
+def patchify(latents: Array) -> Array:
+    """[b t h w c] -> tokens [b s c*ph*pw] in the feature order of Wan's convolution weights."""
+    b, _, _, _, c = latents.shape
+    t, h, w = token_grid(latents.shape)
+    cut = latents.reshape(b, t, PATCH[0], h, PATCH[1], w, PATCH[2], c)
+    return cut.transpose(0, 1, 3, 5, 7, 2, 4, 6).reshape(b, t * h * w, -1)
+
+
+def unpatchify(features: Array, shape: Sequence[int]) -> Array:
+    """Head features [b s pt*ph*pw*c] -> latents of `shape` [b t h w c]; here c runs fastest."""
+    b, _, _, _, c = shape
+    t, h, w = token_grid(shape)
+    cut = features.reshape(b, t, h, w, *PATCH, c)
+    return cut.transpose(0, 1, 4, 2, 5, 3, 6, 7).reshape(shape)
