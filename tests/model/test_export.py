@@ -1,0 +1,76 @@
+"""A run's checkpoint out to other projects, and back in as published weights."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from safetensors.numpy import load_file
+
+from xew.model import export
+from xew.model.checkpoint import TrainState, open_checkpoints, save_state
+from xew.model.dit_layouts import load_dit
+from xew.model.experiment import create_model, load_experiment
+from xew.model.weights import read_tensors
+
+CONFIG = """
+data: data
+clip: {frames: 5, height: 64, width: 80}
+codec: {spatial_factor: 8, channels: 4}
+model: {size: tiny, embodiment: robot_render}
+train: {steps: 2, batch: 1}
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with checkpoints of random networks at steps 1 and 2."""
+    out = tmp_path_factory.mktemp("run")
+    (out / "config.yaml").write_text(f"out: {out}\n{CONFIG}")
+    experiment = load_experiment(out / "config.yaml")
+    with open_checkpoints(out, keep=2) as checkpoints:
+        for step in (1, 2):
+            params = jax.tree.map(lambda leaf, step=step: leaf + step, nnx.state(create_model(experiment), nnx.Param))
+            save_state(checkpoints, TrainState(jnp.int32(step), params, {"count": jnp.int32(0)}), {})
+        checkpoints.wait_until_finished()
+    return out
+
+
+@pytest.mark.parametrize("naming", ["diffusers", "official"])
+def test_network_goes_out_and_comes_back(naming: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    export.main([str(run), "--out", str(tmp_path / "out"), "--naming", naming])
+    assert "of step 2" in capsys.readouterr().out
+    assert (tmp_path / "out" / "config.json").exists() == (naming == "diffusers")
+    model = create_model(load_experiment(run / "config.yaml"))
+    expected = jax.tree.map(lambda leaf: leaf + 2, nnx.state(model, nnx.Param))
+    load_dit(model, tmp_path / "out")
+    jax.tree.map(np.testing.assert_array_equal, nnx.state(model, nnx.Param), expected)
+
+
+def test_one_file_of_an_earlier_step_rounded(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "wan.safetensors"
+    export.main([str(run), "--out", str(out), "--naming", "official", "--dtype", "bfloat16", "--checkpoint", "1"])
+    assert "belong to streams" in capsys.readouterr().out
+    tensors = read_tensors(out)
+    assert {str(array.dtype) for array in tensors.values()} == {"bfloat16"}
+    np.testing.assert_array_equal(np.asarray(tensors["blocks.1.norm3.weight"], np.float32), 2)
+    assert load_file(out).keys() == set(tensors)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--checkpoint", "7"], "has no checkpoint of step 7; it has 1, 2"),
+        (["--out", "."], "exists already; choose another --out"),
+    ],
+)
+def test_what_cannot_be_exported(
+    arguments: list[str], said: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        export.main([str(run), "--out", str(tmp_path / "out"), *arguments])
+    assert stop.value.code == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

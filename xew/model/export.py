@@ -1,0 +1,60 @@
+"""A trained run's network for other projects: its weights under the names of diffusers or of Wan's own code.
+
+Reads  a run's checkpoint (the moving average where one was kept, corrections of an adaptation added)
+Writes a folder of safetensors with config.json, as `WanTransformer3DModel.from_pretrained` opens it; or one .safetensors
+Command: python -m xew.model.export RUN --out FOLDER [--naming official] [--dtype bfloat16]
+"""
+
+import argparse
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from xew.config import ConfigError, user_errors
+from xew.model.checkpoint import restore_params
+from xew.model.dit import parameter_count
+from xew.model.dit_layouts import Naming, save_dit, wan_layout
+from xew.model.experiment import create_model, load_experiment
+from xew.model.weights import checkpoint_shapes
+
+
+def export(run: Path, out: Path, naming: Naming = "diffusers", dtype: str = "float32", step: int | None = None) -> int:
+    """Write the network of a run, and tell the step of the checkpoint that it is of.
+
+    Raises:
+        ConfigError: there is no such run or checkpoint, or the place is taken or cannot be written.
+    """
+    experiment = load_experiment(run / "config.yaml")
+    if out.exists() and (out.is_file() or any(out.iterdir())):
+        raise ConfigError(f"{out} exists already; choose another --out.")
+    graph, shapes = nnx.split(nnx.eval_shape(lambda: create_model(experiment)), nnx.Param)
+    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), shapes)
+    params, step = restore_params(run, like, step)
+    model = nnx.merge(graph, jax.tree.map(lambda leaf: leaf.astype(jnp.dtype(dtype)), params))
+    save_dit(model, out, naming)
+    total = parameter_count(model)
+    added = total - sum(math.prod(shape) for shape in checkpoint_shapes(model, wan_layout(model, naming)).values())
+    beside = f"; {added:,} of them belong to streams, mechanisms or words, which Wan does not have" if added else ""
+    print(f"{out}: {total:,} parameters of step {step} under the names of {naming}, {dtype}{beside}")
+    return step
+
+
+@user_errors
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m xew.model.export", description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, help="folder of a trained run")
+    parser.add_argument("--out", type=Path, required=True, help="folder, or a file that ends in .safetensors")
+    parser.add_argument("--naming", choices=("diffusers", "official"), default="diffusers", help="default: diffusers")
+    parser.add_argument("--dtype", choices=("float32", "bfloat16"), default="float32", help="default: float32")
+    parser.add_argument("--checkpoint", type=int, metavar="STEP", help="default: the latest")
+    args = parser.parse_args(arguments)
+    export(args.run, args.out, args.naming, args.dtype, args.checkpoint)
+
+
+if __name__ == "__main__":
+    main()
