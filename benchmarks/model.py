@@ -6,7 +6,8 @@ Random weights of Wan2.2-TI2V-5B's shape, clips of 121 frames at 320x256 (31x8x1
 The peer is diffusers in PyTorch: WanTransformer3DModel in bfloat16 with gradient checkpointing, its blocks under torch.compile
 and the faster of PyTorch's attentions (measured first), fused AdamW; it gets as many latent frames as our streams have
 together, so that both work on the same number of tokens with full attention among them. Ours: `make_train_step` as
-`xew.model.train` uses it, float32 parameters and moments, products in bfloat16. The autoencoder's peer is AutoencoderKLWan.
+`xew.model.train` uses it, float32 parameters and moments, products in bfloat16. The autoencoder's peer is
+AutoencoderKLWan, as its users run it.
 Every side runs in a process of its own, one after another, on the same machine.
 
 Before a figure is told, the work is checked: numbers of parameters and tokens, finite losses, shapes of what comes out.
@@ -60,7 +61,7 @@ class Args:
     residual: tuple[str, ...] = ("bfloat16",)
     """Ours: type of the tokens between blocks; diffusers' are bfloat16."""
     dtypes: tuple[str, ...] = ("bfloat16", "float32")
-    """Of the autoencoder."""
+    """Of the autoencoder; float32 products are rounded to TF32 on both sides, as both do unless told otherwise."""
     mesh: MeshArgs = field(default_factory=MeshArgs)
     size: str = "wan5b"
     """`tiny` to try the script on a CPU."""
@@ -251,26 +252,19 @@ def xew_vae(args: Args) -> Iterator[dict[str, Any]]:
     from xew.model.vae import VAES, VideoVae
 
     frames = jax.random.uniform(jax.random.key(0), (1, args.frames, 256, 320, 3), minval=-1, maxval=1)
-    for label, dtype, precision in precisions(args):
-        size = VAES[args.vae]
+    size = VAES[args.vae]
+    for dtype in args.dtypes:
         graph = nnx.split(nnx.eval_shape(lambda s=size, d=dtype: VideoVae(s, dtype=d, rngs=nnx.Rngs(0))))[0]
         state = jax.jit(lambda s=size, d=dtype: nnx.split(VideoVae(s, dtype=d, rngs=nnx.Rngs(0)))[1])()
-        with jax.default_matmul_precision("highest" if precision == "exact" else "default"):
-            encode = jax.jit(lambda p, x, g=graph: nnx.merge(g, p).encode(x))
-            decode = jax.jit(lambda p, z, g=graph: nnx.merge(g, p).decode(z))
-            latents = encode(state, frames)
-            out = decode(state, latents)
-            assert out.shape == frames.shape and bool(jnp.isfinite(out.astype(jnp.float32)).all())
-            row = {"side": "xew", "dtype": label, "latents": list(latents.shape)}
-            yield row | {"case": "encode", "seconds": timed(encode, state, frames, wait=jax.block_until_ready)}
-            seconds = timed(decode, state, latents, wait=jax.block_until_ready)
-            yield row | {"case": "decode", "seconds": seconds, "peak GB": peak_memory()}
-
-
-def precisions(args: Args) -> list[tuple[str, str, str]]:
-    """Label, type and whether products of float32 numbers are exact or rounded to TF32."""
-    kinds = {"bfloat16": [("bfloat16", "TF32")], "float32": [("float32", "exact"), ("float32 with TF32", "TF32")]}
-    return [(label, dtype, precision) for dtype in args.dtypes for label, precision in kinds[dtype]]
+        encode = jax.jit(lambda p, x, g=graph: nnx.merge(g, p).encode(x))
+        decode = jax.jit(lambda p, z, g=graph: nnx.merge(g, p).decode(z))
+        latents = encode(state, frames)
+        out = decode(state, latents)
+        assert out.shape == frames.shape and bool(jnp.isfinite(out.astype(jnp.float32)).all())
+        row = {"side": "xew", "dtype": dtype, "latents": list(latents.shape)}
+        yield row | {"case": "encode", "seconds": timed(encode, state, frames, wait=jax.block_until_ready)}
+        seconds = timed(decode, state, latents, wait=jax.block_until_ready)
+        yield row | {"case": "decode", "seconds": seconds, "peak GB": peak_memory()}
 
 
 # ---- diffusers' side
@@ -427,16 +421,15 @@ def peer_vae(args: Args, where: str) -> Iterator[dict[str, Any]]:
     config = widths | {"dim_mult": [1, 2, 4, 4], "is_residual": True, "in_channels": 12, "out_channels": 12, "patch_size": 2}
     config |= {"scale_factor_spatial": 16, "scale_factor_temporal": 4, "temperal_downsample": [False, True, True]}
     config |= {"latents_mean": [0.0] * widths["z_dim"], "latents_std": [1.0] * widths["z_dim"]}
-    for label, dtype, precision in precisions(args):
+    for dtype in args.dtypes:
         with torch.device(where):
             vae = AutoencoderKLWan(**config).to(getattr(torch, dtype)).eval()
         assert args.vae != "wan22" or sum(p.numel() for p in vae.parameters()) == 704_688_668
-        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = precision == "TF32"
         frames = torch.rand(1, 3, args.frames, 256, 320, device=where, dtype=getattr(torch, dtype)) * 2 - 1
         with torch.no_grad():
             latents = vae.encode(frames).latent_dist.mode()
             assert vae.decode(latents).sample.shape == frames.shape
-            row = {"side": "diffusers", "dtype": label, "latents": list(latents.shape)}
+            row = {"side": "diffusers", "dtype": dtype, "latents": list(latents.shape)}
             yield row | {"case": "encode", "seconds": timed(vae.encode, frames, wait=wait_for_torch)}
             seconds = timed(vae.decode, latents, wait=wait_for_torch)
             yield row | {"case": "decode", "seconds": seconds, "peak GB": peer_memory()}
