@@ -6,12 +6,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic
+from scipy.spatial.transform import Rotation
 
+from xew.config import ConfigError
 from xew.episode import read_record, read_states, read_video, write_episode
-from xew.model.conditions import ACTIONS, CONDITIONS, Command, command_of
+from xew.model.conditions import (
+    ACTIONS,
+    CONDITIONS,
+    POINTING_DOWN,
+    Command,
+    Condition,
+    camera,
+    clip_numbers,
+    command_of,
+    relative_tool_poses,
+    tool_deltas,
+    tool_poses,
+)
+from xew.model.scales import apply_scales, fit_scales, read_scales, save_scales
 from xew.protocol import ACTION_DIM
 
-STORED = [condition for condition in (ACTIONS["joints"], CONDITIONS["robot_render"]) if condition is not None]
+STORED = [condition for condition in (ACTIONS["joints"], CONDITIONS["robot_render"]) if isinstance(condition, Condition)]
+SYSTEMS = {name: entry for name, entry in ACTIONS.items() if isinstance(entry, tuple)}
+NUMBERS = [condition for system in SYSTEMS.values() for condition in system if condition.make in (tool_poses, camera)]
 
 
 @pytest.fixture
@@ -23,7 +40,7 @@ def test_a_command_holds_nothing_measured() -> None:
     assert {field.name for field in fields(Command)} == {"robot", "action", "intrinsics", "extrinsics", "render_path"}
 
 
-@pytest.mark.parametrize("condition", STORED, ids=lambda condition: condition.name)
+@pytest.mark.parametrize("condition", [*STORED, *NUMBERS], ids=lambda condition: condition.name)
 def test_no_condition_sees_the_recorded_future(episode: Path, condition: object) -> None:
     """Turn everything that was recorded from frame 1 on upside down: the condition stays as it was."""
     record, states = read_record(episode), read_states(episode)
@@ -53,6 +70,121 @@ def test_joints_are_the_commands(episode: Path) -> None:
 def test_registries_name_what_feeds_each_stream() -> None:
     for registry in (ACTIONS, CONDITIONS):
         assert registry["none"] is None
-        assert all(condition is None or condition.name == name for name, condition in registry.items())
+        assert all(entry.name == name for name, entry in registry.items() if isinstance(entry, Condition))
     assert {condition.stream for condition in CONDITIONS.values() if condition} == {"embodiment"}
-    assert {condition.stream for condition in ACTIONS.values() if condition} == {"action", "joints"}
+    assert {entry.stream for entry in ACTIONS.values() if isinstance(entry, Condition)} == {"action", "joints"}
+    for system in SYSTEMS.values():
+        assert len({condition.stream for condition in system}) == len(system)
+
+
+def wandering(frames: int = 12) -> np.ndarray:
+    """Tool poses [t 14] that turn about all axes and wrap round."""
+    rng = np.random.default_rng(1)
+    steps = rng.uniform(-0.2, 0.3, (frames, 14)).cumsum(axis=0)
+    steps[:, [4, 11]] = 0.5 * np.sin(steps[:, [4, 11]])
+    steps[:, [3, 5, 10, 12]] = (steps[:, [3, 5, 10, 12]] + np.pi) % (2 * np.pi) - np.pi
+    steps[:, [6, 13]] = rng.uniform(0, 1, (frames, 2))
+    return steps
+
+
+@pytest.mark.parametrize("robot", ["aloha_agilex", "franka_panda"])
+def test_tool_poses_are_forward_kinematics_of_commands(tmp_path: Path, robot: str) -> None:
+    from xew.sim_warp.kinematics import joint_positions, link_matrices, matrix_from_pose
+    from xew.sim_warp.robots import ROBOTS, load_urdf
+
+    folder = synthetic.write_cell(tmp_path, "place_empty_cup", 0, robot, frames=5)
+    states = read_states(folder)
+    poses = tool_poses(command_of(folder, read_record(folder), states))
+    assert poses.shape == (5, 14) and poses.dtype == np.float32
+    spec = ROBOTS[robot]
+    copies = joint_positions(spec, states.action.astype(float))
+    for number, arm in enumerate(spec.arms):
+        links = link_matrices(load_urdf(spec.urdf), copies[number % len(copies)])
+        frame = matrix_from_pose(arm.root_pose) @ links[arm.tool_link] @ matrix_from_pose(arm.tool_pose)
+        own = poses[:, 7 * number : 7 * number + 7]
+        np.testing.assert_allclose(own[:, :3], frame[:, :3, 3], atol=1e-5)
+        turned = Rotation.from_euler("xyz", own[:, 3:6]) * POINTING_DOWN
+        np.testing.assert_allclose(turned.as_matrix(), frame[:, :3, :3], atol=1e-5)
+        np.testing.assert_array_equal(own[:, 6], states.action[:, 7 + 8 * number])
+
+
+def test_a_tool_that_points_down_has_no_angles() -> None:
+    """x, the approach, goes down; y, along which the fingers open, to the right."""
+    np.testing.assert_allclose(POINTING_DOWN.apply([[1, 0, 0], [0, 1, 0]]), [[0, 0, -1], [1, 0, 0]], atol=1e-12)
+
+
+def test_relative_poses_lead_from_frame_to_frame() -> None:
+    """IRASim's actions, undone one after another from the first pose, give all poses again."""
+    poses = wandering()
+    relative = relative_tool_poses(poses)
+    np.testing.assert_array_equal(relative[0, [0, 1, 2, 3, 4, 5]], np.zeros(6))
+    np.testing.assert_array_equal(relative[:, [6, 13]], poses[:, [6, 13]])
+    for side in (slice(0, 7), slice(7, 14)):
+        position = poses[0, side][:3]
+        turn = Rotation.from_euler("xyz", poses[0, side][3:6]) * POINTING_DOWN
+        for now, action in zip(poses[1:, side], relative[1:, side], strict=True):
+            position = position + turn.apply(action[:3] / 20)
+            turn = turn * Rotation.from_euler("xyz", action[3:6] / 20)
+            np.testing.assert_allclose(position, now[:3], atol=1e-9)
+            expected = Rotation.from_euler("xyz", now[3:6]) * POINTING_DOWN
+            assert (turn.inv() * expected).magnitude() < 1e-7
+
+
+def test_deltas_do_not_jump_where_angles_wrap() -> None:
+    poses = np.zeros((2, 14))
+    poses[:, 3] = 3.1, -3.1
+    poses[:, 0] = 0.2, 0.5
+    delta = tool_deltas(poses)
+    np.testing.assert_allclose(delta[1, [0, 3]], [0.3, 2 * np.pi - 6.2], atol=1e-12)
+    np.testing.assert_array_equal(delta[0], np.zeros(14))
+
+
+@pytest.mark.parametrize("condition", NUMBERS, ids=lambda condition: condition.stream)
+def test_numbers_of_a_latent_frame_do_not_see_later_frames(condition: Condition) -> None:
+    """Change the commands from frame 5 on: latent frames 0 and 1 (frames 0 to 4) and earlier ones are told the same."""
+    poses = np.concatenate([wandering(), wandering()[:, :2]], axis=1) if condition.make is camera else wandering()
+    changed = poses.copy()
+    changed[5:] += 0.4
+    before, after = (clip_numbers(condition, numbers, 0, 9, (-4, -2)) for numbers in (poses, changed))
+    seen = 4 if condition.with_history else 2
+    assert before.shape == (seen + 1, {True: 4, False: 1}[condition.group] * poses.shape[1])
+    np.testing.assert_array_equal(before[:seen], after[:seen])
+    assert not np.allclose(before[seen], after[seen])
+
+
+def test_numbers_of_a_clip() -> None:
+    """A latent frame's last frame or all four; the first stands for four; past the end nothing moves."""
+    numbers = np.arange(7, dtype=np.float32)[:, None]
+    plain = Condition("n", "pose_frame", tool_poses, with_history=True)
+    grouped = Condition("n", "pose_time", tool_poses, group=True)
+    moving = Condition("n", "pose_time", tool_poses, group=True, change=lambda rows: np.diff(rows, axis=0, prepend=rows[:1]))
+    assert clip_numbers(plain, numbers, 2, 9, (-5, -1))[:, 0].tolist() == [0, 1, 2, 6, 6]
+    assert clip_numbers(plain, numbers, 2, 5)[:, 0].tolist() == [2, 6]
+    assert clip_numbers(grouped, numbers, 1, 5).tolist() == [[1, 1, 1, 1], [2, 3, 4, 5]]
+    assert clip_numbers(moving, numbers, 4, 5).tolist() == [[0, 0, 0, 0], [1, 1, 0, 0]]
+
+
+def test_scales_of_training_numbers_come_back_from_disk(tmp_path: Path) -> None:
+    folders = [synthetic.write_cell(tmp_path, "place_empty_cup", seed, "piper", frames=9) for seed in range(3)]
+    commands = [command_of(folder, read_record(folder), read_states(folder)) for folder in folders]
+    conditions = {condition.stream: condition for condition in (*SYSTEMS["ctrl_world"], *SYSTEMS["enerverse_ac"])}
+    scales = fit_scales(conditions.values(), commands)
+    assert set(scales) == {"tool_poses", "tool_deltas"}
+    told = np.concatenate([tool_poses(command) for command in commands])
+    low, high = np.percentile(told, (1, 99), axis=0)
+    scaled = scales["tool_poses"](told)
+    assert scaled.min() >= -1 and scaled.max() <= 1
+    for number in np.flatnonzero(high - low > 2e-3):
+        np.testing.assert_allclose(scales["tool_poses"](np.stack([low, high]))[:, number], [-1, 1], atol=1e-3)
+    assert np.abs(scaled[:, high - low == 0]).max(initial=0) < 1e-2
+    save_scales(tmp_path / "scales.json", scales)
+    again = read_scales(tmp_path / "scales.json", tuple(conditions.values()), "do that")
+    grouped = clip_numbers(conditions["pooled_context"], told[:9], 0, 5)[None]
+    arrays = {"pooled_context": grouped, "ray_channels": np.ones((1, 2, 16), np.float32)}
+    for loaded in (scales, again):
+        out = apply_scales(loaded, conditions, arrays)
+        np.testing.assert_array_equal(out["ray_channels"], arrays["ray_channels"])
+        by_frame = scales["tool_deltas"](grouped.reshape(-1, 14)).reshape(grouped.shape)
+        np.testing.assert_allclose(out["pooled_context"], by_frame, rtol=1e-6)
+    with pytest.raises(ConfigError, match=r"does not hold the scales of tool_deltas, tool_poses .*; do that"):
+        read_scales(tmp_path / "none.json", tuple(conditions.values()), "do that")
