@@ -155,19 +155,19 @@ def vae_codec(tmp_path_factory: pytest.TempPathFactory) -> WanVaeCodec:
     for leaf in jax.tree.leaves(nnx.state(vae, nnx.Param), is_leaf=lambda leaf: isinstance(leaf, nnx.Variable)):
         values = rng.standard_normal(leaf.shape, np.float32) / np.prod(leaf.shape[:-1]) ** 0.5
         leaf.set_value(jax.numpy.asarray(values if len(leaf.shape) > 1 else np.abs(values)))
-    vae.latents_mean.set_value(jax.numpy.arange(8.0))
+    vae.latents_mean.set_value(jax.numpy.linspace(-1.0, 1.0, 48))
     save_vae(vae, path)
     return WanVaeCodec.prepare(settings(path), list)
 
 
 def settings(weights: Path | None) -> CodecSettings:
-    return CodecSettings("wan_vae", spatial_factor=8, channels=8, vae="tiny", weights=weights, chunk=2)
+    return CodecSettings("wan_vae", spatial_factor=8, channels=48, vae="tiny", weights=weights, chunk=2)
 
 
 def test_autoencoder_codec(vae_codec: WanVaeCodec) -> None:
     video = smooth_clip(9, frames=13)
     latents = vae_codec.encode(video)
-    assert latents.shape == (4, 4, 6, 8) and latents.dtype == np.float32
+    assert latents.shape == (4, 4, 6, 48) and latents.dtype == np.float32
     decoded = vae_codec.decode(latents)
     assert decoded.shape == (13, 32, 48, 3) and decoded.dtype == np.uint8
     with pytest.raises(ValueError, match="needs 4 k"):
@@ -193,13 +193,13 @@ def test_saved_autoencoder_is_the_same(vae_codec: WanVaeCodec, tmp_path: Path) -
     assert loaded.hash == vae_codec.hash and loaded.size == vae_codec.size and loaded.chunk == 2
     np.testing.assert_array_equal(loaded.encode(smooth_clip(9)), vae_codec.encode(smooth_clip(9)))
     other = loaded.vae
-    other.latents_mean.set_value(jax.numpy.zeros(8))
+    other.latents_mean.set_value(jax.numpy.zeros(48))
     assert WanVaeCodec.of(other).hash != vae_codec.hash
     assert WanVaeCodec.read(tmp_path, VAES["tiny"], "bfloat16").hash != vae_codec.hash
 
 
 def test_an_autoencoder_s_settings_are_checked(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="has 8 and 8: write those"):
+    with pytest.raises(ConfigError, match="has 8 and 48: write those"):
         WanVaeCodec.check(CodecSettings("wan_vae", spatial_factor=16, channels=8, vae="tiny"))
     with pytest.raises(ConfigError, match=r"needs codec\.weights: Wan2\.2_VAE\.pth"):
         WanVaeCodec.prepare(settings(None), list)

@@ -109,8 +109,8 @@ def test_decoder(ours: VideoVae, theirs: Any, frames: int, height: int, width: i
 
 
 def test_frames_side_by_side_are_a_volume(ours: VideoVae) -> None:
-    """The form that GPUs get is the same function."""
-    other = abstract_vae(SIZE, taps="frames")
+    """Both ways to convolve three frames are the same function."""
+    other = abstract_vae(SIZE, taps="volume")
     nnx.update(other, nnx.state(ours))
     video, latents = noise(1, 9, 32, 32, 3), noise(1, 3, 2, 2, SIZE.channels)
     results = [(jitted_encode(vae, video), jitted_decode(vae, latents)) for vae in (ours, other)]

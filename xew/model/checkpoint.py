@@ -10,9 +10,9 @@
 import dataclasses
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -25,6 +25,8 @@ from xew.model.adaptation import corrected, init_corrections
 from xew.model.codec import CODECS, Codec
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.sharding import state_shardings
+
+T = TypeVar("T")
 
 FREE_TO_CHANGE = (
     "data",
@@ -68,15 +70,32 @@ def prepare_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite
     """Make the run folder ready: new, continued or replaced, as asked.
 
     Raises:
-        ConfigError: it holds a run and neither was asked, or it would be continued with another config.
+        ConfigError: it holds a run and neither was asked, or it would be continued with another config or codec.
     """
     out = experiment.out
+    claim_run(out, experiment, load_experiment, resume=resume, overwrite=overwrite)
+    try:
+        _check_same_codec(codec, out)
+        (out / "codec").mkdir(exist_ok=True)
+        codec.save(out / "codec")
+    except OSError as error:
+        raise ConfigError(f"cannot write the run {out}: {error}; choose another --out.") from error
+
+
+def claim_run(out: Path, settings: T, load: Callable[[Path], T], *, resume: bool, overwrite: bool) -> None:
+    """Make a folder that of a run with these settings, and write them there as config.yaml.
+
+    Args:
+        load: reads settings of this kind.
+
+    Raises:
+        ConfigError: it holds a run and neither was asked, or it would be continued with another config.
+    """
     saved = out / "config.yaml"
     if saved.exists() and overwrite:
         shutil.rmtree(out)
     elif saved.exists() and resume:
-        _check_same(load_experiment(saved), experiment, out)
-        _check_same_codec(codec, out)
+        _check_same(load(saved), settings, out)
     elif saved.exists():
         raise ConfigError(
             f"{out} holds a run already; continue it with --resume, replace it with --overwrite, or choose --out."
@@ -85,14 +104,12 @@ def prepare_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite
         raise ConfigError(f"{out} is not empty and holds no run; choose another --out.")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        config.save(experiment, saved)
-        (out / "codec").mkdir(exist_ok=True)
-        codec.save(out / "codec")
+        config.save(settings, saved)
     except OSError as error:
         raise ConfigError(f"cannot write the run {out}: {error}; choose another --out.") from error
 
 
-def _check_same(saved: Experiment, asked: Experiment, out: Path) -> None:
+def _check_same(saved: Any, asked: Any, out: Path) -> None:
     before, after = dict(_flat(saved)), dict(_flat(asked))
     changed = [key for key in after if before[key] != after[key] and not key.startswith(FREE_TO_CHANGE)]
     if changed:

@@ -29,7 +29,13 @@ PUBLISHED_STATISTICS = Path(__file__).with_name("wan22_latents.json")
 WINDOW = 3
 """Frames that a causal convolution sees, itself included."""
 
-TimeTaps = Literal["volume", "frames"]
+TimeTaps = Literal["frames", "volume"]
+"""How three frames are convolved.
+
+frames  side by side in the channels, by a 2-D convolution: the same products. XLA hands 2-D convolutions to cuDNN channels
+        last, as tensor cores want them, and transposes around 3-D ones; on a CPU this is five times as fast as
+volume  a 3-D convolution, which needs less memory.
+"""
 
 
 @dataclass(frozen=True)
@@ -68,7 +74,7 @@ class VaeSize:
 
 
 VAES = {
-    "tiny": VaeSize(8, encoder_dim=16, decoder_dim=16, multipliers=(1, 2, 2), halve_time=(True, True), blocks=1),
+    "tiny": VaeSize(48, encoder_dim=16, decoder_dim=16, multipliers=(1, 2, 2), halve_time=(True, True), blocks=1),
     "small": VaeSize(48, encoder_dim=48, decoder_dim=64, multipliers=(1, 2, 4, 4), halve_time=(False, True, True), blocks=1),
     "wan22": VaeSize(48, encoder_dim=160, decoder_dim=256, multipliers=(1, 2, 4, 4), halve_time=(False, True, True)),
 }
@@ -84,17 +90,17 @@ class VideoVae(nnx.Module):
     Args:
         size: one of `VAES`.
         dtype: of activations and products; parameters stay float32, norms are computed in it.
-        taps: how three frames are convolved, by default `default_taps()`.
+        taps: how three frames are convolved.
     """
 
-    def __init__(self, size: VaeSize, *, dtype: jnp.dtype = jnp.float32, taps: TimeTaps | None = None, rngs: nnx.Rngs) -> None:
+    def __init__(self, size: VaeSize, *, dtype: jnp.dtype = jnp.float32, taps: TimeTaps = "frames", rngs: nnx.Rngs) -> None:
         self.size, self.dtype = size, dtype
-        layers = Layers(jnp.dtype(dtype), taps or default_taps(), rngs)
+        layers = Layers(jnp.dtype(dtype), taps, rngs)
         self.encoder = Encoder(size, layers)
         self.quant = layers.pointwise(2 * size.channels, 2 * size.channels)
         self.post_quant = layers.pointwise(size.channels, size.channels)
         self.decoder = Decoder(size, layers)
-        mean, std = initial_statistics(size.channels)
+        mean, std = initial_statistics(size)
         self.latents_mean, self.latents_std = LatentStatistic(mean), LatentStatistic(std)
 
     def moments(self, frames: Array, chunk: int = 0) -> tuple[Array, Array]:
@@ -157,30 +163,21 @@ class VideoVae(nnx.Module):
             raise ValueError(f"frames are {shape}; expected [b t h w 3] with t = 4 k + 1 and sides in {factor}s")
 
 
-def abstract_vae(size: VaeSize, dtype: jnp.dtype = jnp.float32, taps: TimeTaps | None = None) -> VideoVae:
+def abstract_vae(size: VaeSize, dtype: jnp.dtype = jnp.float32, taps: TimeTaps = "frames") -> VideoVae:
     """An autoencoder of which only the statistics have values yet; weights are loaded into it."""
     vae = nnx.eval_shape(lambda: VideoVae(size, dtype=dtype, taps=taps, rngs=nnx.Rngs(0)))
-    mean, std = initial_statistics(size.channels)
+    mean, std = initial_statistics(size)
     vae.latents_mean.set_value(mean)
     vae.latents_std.set_value(std)
     return vae
 
 
-def initial_statistics(channels: int) -> tuple[Array, Array]:
-    """Mean and deviation of the latents [c]: Wan2.2's where there are as many channels, else 0 and 1."""
+def initial_statistics(size: VaeSize) -> tuple[Array, Array]:
+    """Mean and deviation of the latents [c]: those published with Wan2.2 at its size, else 0 and 1 until they are measured."""
+    if size != VAES["wan22"]:
+        return jnp.zeros(size.channels), jnp.ones(size.channels)
     published = json.loads(PUBLISHED_STATISTICS.read_text())
-    if channels != len(published["mean"]):
-        return jnp.zeros(channels), jnp.ones(channels)
     return jnp.asarray(published["mean"], jnp.float32), jnp.asarray(published["std"], jnp.float32)
-
-
-def default_taps() -> TimeTaps:
-    """How to convolve three frames: as 2-D convolutions on a GPU, as a 3-D one elsewhere.
-
-    On GPUs XLA gives cuDNN channels-last tensors, which tensor cores want, for 2-D convolutions alone; 3-D ones are
-    transposed around every call. Three frames side by side in the channels make a 2-D convolution of the same products.
-    """
-    return "frames" if jax.default_backend() == "gpu" else "volume"
 
 
 # Time.

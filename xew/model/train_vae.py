@@ -1,0 +1,382 @@
+"""Training an autoencoder of Wan2.2's kind on the project's own frames: episodes to a file of weights.
+
+Reads  episodes of training robots and training seeds; held-out robots and test seeds for the report
+Writes <out>/vae.safetensors and vae.json, which `codec.weights: <out>` reads; config, checkpoints, metrics, pictures
+
+The loss is L1 + LPIPS + a small KL divergence, without an adversary: frames are rendered, and sharp edges are few.
+Command: python -m xew.model.train_vae CONFIG [--resume | --overwrite] [--train.steps … and other overrides]
+"""
+
+import argparse
+import functools
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+from tqdm import tqdm
+
+from xew.config import ConfigError, load, pick, user_errors
+from xew.episode import find_accepted, read_video
+from xew.model.ceiling import Ceiling, measure_ceiling, spread
+from xew.model.checkpoint import TrainState, claim_run, open_checkpoints, restore_state, save_state
+from xew.model.codec import WanVaeCodec, to_signed
+from xew.model.experiment import Clip, TrainSettings, compile_cache
+from xew.model.latents import Episode, test_episodes
+from xew.model.optimizer import learning_rate, make_optimizer
+from xew.model.samples import strip
+from xew.model.tensorboard import RunLog
+from xew.model.train import StopSignal
+from xew.model.vae import VAES, LatentStatistic, VaeSize, VideoVae
+from xew.model.vae_data import Cut, check_streams, make_dataset, random_clips, video_files
+from xew.model.vae_layouts import save_vae
+from xew.protocol import SPLITS, Split, seed_split
+
+CEILING_CLIPS = 16
+SMALLEST_DEVIATION = 1e-3
+"""Of a latent channel, so that one that the autoencoder leaves unused is not blown up."""
+
+
+@dataclass(frozen=True)
+class VaeTrainSettings:
+    steps: int
+    batch: int
+    """Clips a step."""
+    frames: int = 9
+    """Of a clip, 4 k + 1."""
+    crop: int = 128
+    """Side of the square that is cut out of a frame, at most the frame's."""
+    clips_of_a_video: int = 4
+    """Clips that are cut out of a video once it is decoded."""
+    seed: int = 0
+    learning_rate: float = 5e-4
+    warmup_steps: int = 100
+    decay_to: float = 0.05
+    weight_decay: float = 0.01
+    clip_norm: float = 1.0
+    ema_decay: float = 0.999
+    lpips: float = 0.2
+    """Weight of LPIPS beside the mean absolute difference on a scale of -1 to 1."""
+    kl: float = 1e-4
+    """Weight of the divergence from the unit normal distribution, mean over latent numbers."""
+    statistics_clips: int = 128
+    """From which the mean and deviation of the latents are computed at the end."""
+    log_every: int = 20
+    save_every: int = 500
+    sample_every: int = 500
+    keep_checkpoints: int = 1
+
+
+@dataclass(frozen=True)
+class VaeExperiment:
+    """What configs/vae_*.yaml hold."""
+
+    data: Path
+    """Episodes, made by `python -m xew.sim_warp.generate`."""
+    out: Path
+    clip: Clip
+    """Of the world model that is to use it: what the statistics and the report are computed on."""
+    train: VaeTrainSettings
+    vae: str = "small"
+    """One of VAES."""
+    split: str = "fixed"
+    """One of protocol.SPLITS: which robots train."""
+    streams: tuple[str, ...] = ("rgb", "rgb", "robot_render", "optical_flow")
+    """What is learned from: the scene and conditions that are pictures; one named twice comes twice as often."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Of the activations."""
+    cache: Path | None = None
+    """Pictures that no episode has as a file; beside the data where left out."""
+
+    @property
+    def size(self) -> VaeSize:
+        return pick(VAES, self.vae, "autoencoder")
+
+    @property
+    def robots(self) -> Split:
+        return pick(SPLITS, self.split, "split")
+
+    @property
+    def cache_folder(self) -> Path:
+        return self.cache or self.data.with_name(f"{self.data.name}-frames")
+
+    @property
+    def optimizer(self) -> TrainSettings:
+        """The settings of the optimizer as the world model's training names them."""
+        names = ("batch", "steps", "learning_rate", "warmup_steps", "decay_to", "weight_decay", "clip_norm")
+        return TrainSettings(**{name: getattr(self.train, name) for name in names})
+
+    def cut(self, *, whole: bool = False) -> Cut:
+        """What is cut out of a video: crops for training, or one whole clip of the model's."""
+        size = self.clip.height, self.clip.width
+        if whole:
+            return Cut(1, self.clip.frames, size, size)
+        crop = min(self.train.crop, size[0]), min(self.train.crop, size[1])
+        return Cut(self.train.clips_of_a_video, self.train.frames, size, crop)
+
+
+def load_vae_experiment(path: Path | str, overrides: list[str] | None = None) -> VaeExperiment:
+    """Read and check a config. Raises ConfigError with what does not exist or does not fit."""
+    experiment = load(VaeExperiment, path, overrides or [])
+    check_streams(experiment.streams)
+    _ = experiment.robots
+    factor, clip, train = experiment.size.spatial_factor, experiment.clip, experiment.train
+    for name, frames in (("clip.frames", clip.frames), ("train.frames", train.frames)):
+        if frames % 4 != 1:
+            raise ConfigError(f"{path}: {name} is {frames}; it must be 4 k + 1, for example {max(5, frames // 4 * 4 + 1)}.")
+    for name, side in (("clip.height", clip.height), ("clip.width", clip.width), ("train.crop", train.crop)):
+        if side % factor or side < 32:
+            raise ConfigError(
+                f"{path}: {name} is {side}; it must be a multiple of {factor} (the factor of {experiment.vae})"
+                " and at least 32 (for LPIPS)."
+            )
+    if train.batch % train.clips_of_a_video:
+        raise ConfigError(f"{path}: train.batch is {train.batch}; it must be a multiple of train.clips_of_a_video.")
+    if train.steps < 1:
+        raise ConfigError(f"{path}: train.steps is {train.steps}; it must be over 0.")
+    return experiment
+
+
+class Losses(NamedTuple):
+    """Parts of the loss of one step, each a scalar."""
+
+    total: jax.Array
+    l1: jax.Array
+    lpips: jax.Array
+    kl: jax.Array
+    psnr: jax.Array
+    """Decibels, of the batch."""
+    gradient_norm: jax.Array
+
+
+def vae_losses(vae: VideoVae, frames: jax.Array, key: jax.Array, settings: VaeTrainSettings) -> Losses:
+    """The loss of frames [b t h w 3] in [-1, 1], with latents drawn from what the encoder gives."""
+    from xew.metrics import lpips  # only here: the model room does without metrics
+
+    mean, log_variance = vae.moments(frames)
+    latents = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
+    decoded = vae.decode_moments(latents)
+    l1 = jnp.abs(decoded - frames).mean()
+    made, true = ((jnp.clip(x, -1, 1).reshape(-1, *x.shape[2:]) + 1) / 2 for x in (decoded, frames))
+    perceptual = lpips(made, true, chunk=_lpips_chunk(len(made))).mean() if settings.lpips else jnp.float32(0)
+    kl = 0.5 * (jnp.square(mean) + jnp.exp(log_variance) - 1 - log_variance).mean()
+    psnr = -10 * jnp.log10(jnp.square(made - true).mean() + 1e-10)
+    total = l1 + settings.lpips * perceptual + settings.kl * kl
+    return Losses(total, l1, perceptual, kl, psnr, jnp.float32(0))
+
+
+def _lpips_chunk(frames: int) -> int:
+    """Frames of LPIPS at once: all where there is a GPU to fill."""
+    return frames if jax.default_backend() == "gpu" else 8
+
+
+def make_vae_step(graph: nnx.GraphDef, statistics: Any, experiment: VaeExperiment) -> Callable[..., tuple[TrainState, Losses]]:
+    """The compiled step; its noise depends on the seed and the step alone, so that a resumed run repeats it."""
+    settings, optimizer = experiment.train, make_optimizer(experiment.optimizer)
+
+    @functools.partial(jax.jit, donate_argnums=0)
+    def step(state: TrainState, pictures: jax.Array) -> tuple[TrainState, Losses]:
+        key = jax.random.fold_in(jax.random.key(settings.seed), state.step)
+
+        def loss(params: Any) -> tuple[jax.Array, Losses]:
+            losses = vae_losses(nnx.merge(graph, params, statistics), to_signed(pictures), key, settings)
+            return losses.total, losses
+
+        (_, losses), gradients = jax.value_and_grad(loss, has_aux=True)(state.params)
+        updates, optimizer_state = optimizer.update(gradients, state.optimizer, state.params)
+        params = optax.apply_updates(state.params, updates)
+        # The average of few steps is over those alone; else the random start would stay in it.
+        decay = jnp.minimum(settings.ema_decay, (1 + state.step) / (10 + state.step))
+        ema = optax.incremental_update(params, state.ema, 1 - decay)
+        losses = losses._replace(gradient_norm=optax.tree.norm(gradients))
+        return TrainState(state.step + 1, params, optimizer_state, ema), losses
+
+    return step
+
+
+def init_vae_state(experiment: VaeExperiment) -> tuple[nnx.GraphDef, Any, TrainState]:
+    """Structure, statistics of the latents (0 and 1 until the end) and the state of step 0."""
+
+    def create() -> VideoVae:
+        return VideoVae(experiment.size, dtype=jnp.dtype(experiment.dtype), rngs=nnx.Rngs(experiment.train.seed))
+
+    graph: nnx.GraphDef = nnx.split(nnx.eval_shape(create))[0]
+    optimizer = make_optimizer(experiment.optimizer)
+
+    @jax.jit
+    def init() -> tuple[Any, TrainState]:
+        vae = create()
+        params, statistics = nnx.state(vae, nnx.Param), nnx.state(vae, LatentStatistic)
+        return statistics, TrainState(jnp.int32(0), params, optimizer.init(params), jax.tree.map(jnp.copy, params))
+
+    statistics, state = init()
+    return graph, statistics, state
+
+
+@user_errors
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m xew.model.train_vae", description=__doc__.splitlines()[0])
+    parser.add_argument("config", type=Path, help="a YAML file; every field may be overridden, as in --train.steps 100")
+    existing = parser.add_mutually_exclusive_group()
+    existing.add_argument("--resume", action="store_true", help="continue the run in --out if there is one")
+    existing.add_argument("--overwrite", action="store_true", help="replace the run in --out")
+    args, overrides = parser.parse_known_args(arguments)
+    experiment = load_vae_experiment(args.config, overrides)
+    compile_cache()
+    train_vae(experiment, resume=args.resume, overwrite=args.overwrite)
+
+
+def train_vae(experiment: VaeExperiment, *, resume: bool = False, overwrite: bool = False) -> None:
+    """Train to the last step, from the start or from the latest checkpoint; then measure, and write the weights."""
+    settings = experiment.train
+    episodes = training_episodes(experiment)
+    files = video_files(experiment.streams, episodes, experiment.cache_folder)
+    batches = iter(make_dataset(files, experiment.cut(), settings.batch, settings.seed))
+    claim_run(experiment.out, experiment, load_vae_experiment, resume=resume, overwrite=overwrite)
+
+    graph, statistics, state = init_vae_state(experiment)
+    checkpoints = open_checkpoints(experiment.out, settings.keep_checkpoints)
+    if checkpoints.latest_step() is not None:
+        state, position = restore_state(checkpoints, state)
+        batches.set_state(position)
+    step = make_vae_step(graph, statistics, experiment)
+    log, stop = RunLog(experiment.out), StopSignal()
+    sample = sample_clip(experiment, episodes)
+
+    begin, meter, schedule = int(state.step), Meter(), learning_rate(experiment.optimizer)
+    progress = tqdm(range(begin, settings.steps), desc="train", initial=begin, total=settings.steps, file=sys.stderr)
+    for number in (done + 1 for done in progress):
+        last = number == settings.steps
+        pictures = meter.wait(batches)
+        state, losses = step(state, pictures)
+        meter.losses.append(losses)
+        saves = number % settings.save_every == 0 or last or stop.received
+        if number % settings.log_every == 0 or saves:
+            values = meter.take() | {"train/learning_rate": float(schedule(number - 1))}
+            log.scalars(number, values)
+            progress.set_postfix(psnr=f"{values['train/psnr']:.2f}")
+            if not np.isfinite([values["train/loss"], values["train/gradient_norm"]]).all():
+                sys.exit(f"error: the loss is not finite by step {number}; nothing of it was saved. Lower train.learning_rate.")
+        if saves:
+            save_state(checkpoints, state, batches.get_state())
+        if number % settings.sample_every == 0 or last:
+            codec = WanVaeCodec.of(nnx.merge(graph, state.ema, statistics))
+            log.image(number, "sample/unseen", strip(sample, codec.decode(codec.encode(sample))))
+        if stop.received and not last:
+            print(f"stopped at step {number} and saved; continue with --resume", file=sys.stderr)
+            break
+    stop.release()
+    checkpoints.close()
+    if int(state.step) >= settings.steps:
+        finish(experiment, nnx.merge(graph, state.ema, statistics), files, log)
+    log.close()
+
+
+@dataclass
+class Meter:
+    """What has happened since the last log line."""
+
+    losses: list[Losses] = field(default_factory=list)
+    wait_s: float = 0.0
+    since: float = field(default_factory=time.perf_counter)
+
+    def wait(self, batches: Any) -> np.ndarray:
+        """The next batch; notes how long it was waited for."""
+        asked = time.perf_counter()
+        batch = next(batches)
+        self.wait_s += time.perf_counter() - asked
+        return batch
+
+    def take(self) -> dict[str, float]:
+        """Means for a log line; begins anew."""
+        parts = [np.asarray(jax.device_get(losses)) for losses in self.losses]
+        means = dict(zip(Losses._fields, np.mean(parts, axis=0).tolist(), strict=True))
+        count, seconds = len(parts), time.perf_counter() - self.since
+        values = {"train/loss": means.pop("total")} | {f"train/{name}": value for name, value in means.items()}
+        values |= {"time/step_s": seconds / count, "time/data_wait_s": self.wait_s / count}
+        self.losses, self.wait_s, self.since = [], 0.0, time.perf_counter()
+        return values
+
+
+def training_episodes(experiment: VaeExperiment) -> list[Episode]:
+    """Accepted episodes of training seeds and training robots. Raises ConfigError if there are none."""
+    robots = experiment.robots.train_robots
+    chosen = [(f, r) for f, r in find_accepted(experiment.data) if r.robot in robots and seed_split(r.seed) == "train"]
+    if not chosen:
+        command = f"python -m xew.sim_warp.generate --robots {' '.join(robots)} --out {experiment.data}"
+        raise ConfigError(f"{experiment.data} has no training episode of {', '.join(robots)}; make some: {command}")
+    return chosen
+
+
+def report_episodes(experiment: VaeExperiment) -> dict[str, list[Episode]]:
+    """What the report is of: test seeds of held-out and of seen robots, where there are any."""
+    robots = experiment.robots
+    found = {
+        "unseen": test_episodes(experiment.data, robots.held_out_robots),
+        "seen": test_episodes(experiment.data, robots.train_robots),
+    }
+    return {name: spread(episodes, CEILING_CLIPS) for name, episodes in found.items() if episodes}
+
+
+def sample_clip(experiment: VaeExperiment, episodes: Sequence[Episode]) -> np.ndarray:
+    """The clip that is shown in training, uint8 [t h w 3] at the model's size: unseen if there is any."""
+    folder, record = next(iter(report_episodes(experiment).values()), episodes)[0]
+    return random_clips(folder / "rgb.mkv", record.frame_count, experiment.cut(whole=True), np.random.default_rng(0))[0]
+
+
+def finish(experiment: VaeExperiment, vae: VideoVae, files: Sequence[tuple[Path, int]], log: RunLog) -> None:
+    """Compute the statistics of the latents, measure the reconstruction, and write the weights with both."""
+    mean, std = latent_statistics(vae, files, experiment)
+    vae.latents_mean.set_value(mean)
+    vae.latents_std.set_value(std)
+    save_vae(vae, experiment.out / "vae.safetensors")
+    codec = WanVaeCodec.of(vae)
+    ceilings = {name: ceiling_of(experiment, codec, chosen) for name, chosen in report_episodes(experiment).items()}
+    for name, ceiling in ceilings.items():
+        print(f"{name} robots, test seeds: {ceiling}")
+        log.scalars(experiment.train.steps, {f"ceiling/{name}/psnr": ceiling.psnr, f"ceiling/{name}/lpips": ceiling.lpips})
+    report = {
+        "vae": experiment.vae,
+        "size": asdict(experiment.size),
+        "dtype": experiment.dtype,
+        "chunk": codec.chunk,
+        "hash": codec.hash,
+        "steps": experiment.train.steps,
+        "latents_mean": mean.tolist(),
+        "latents_std": std.tolist(),
+        "reconstruction": {name: asdict(ceiling) for name, ceiling in ceilings.items()},
+    }
+    (experiment.out / "vae.json").write_text(json.dumps(report, indent=1) + "\n")
+    print(f"{experiment.out / 'vae.safetensors'}: use it by codec.name wan_vae, codec.vae {experiment.vae}, codec.weights")
+
+
+def ceiling_of(experiment: VaeExperiment, codec: WanVaeCodec, episodes: Sequence[Episode]) -> Ceiling:
+    videos = (read_video(folder / "rgb.mkv") for folder, _ in episodes)
+    return measure_ceiling(codec, videos, **asdict(experiment.clip))
+
+
+def latent_statistics(
+    vae: VideoVae, files: Sequence[tuple[Path, int]], experiment: VaeExperiment
+) -> tuple[jax.Array, jax.Array]:
+    """Mean and standard deviation [c] of the latents' means over whole clips of all training streams."""
+    moments = jax.jit(lambda vae, pictures: vae.moments(to_signed(pictures), chunk=8)[0])
+    rng, total, squares, count = np.random.default_rng(0), 0.0, 0.0, 0
+    for path, frame_count in tqdm(spread(files, experiment.train.statistics_clips), desc="statistics", unit="clip"):
+        clip = random_clips(path, frame_count, experiment.cut(whole=True), rng)
+        latents = np.asarray(moments(vae, clip), np.float64).reshape(-1, experiment.size.channels)
+        total, squares, count = total + latents.sum(0), squares + np.square(latents).sum(0), count + len(latents)
+    mean = total / count
+    std = np.sqrt(np.maximum(squares / count - np.square(mean), 0))
+    return jnp.asarray(mean, jnp.float32), jnp.asarray(np.maximum(std, SMALLEST_DEVIATION), jnp.float32)
+
+
+if __name__ == "__main__":
+    main()
