@@ -1,141 +1,145 @@
 """Rollouts: a trained model predicts episodes from their first frame and their commands.
 
-Reads  a run, episodes
+Reads  a run, or a config that names published weights; episodes
 Writes <out>/<task>/<seed>/<robot>/rgb.mkv (lossless, 320x240) and rollout.json
 
-Long episodes are predicted in chunks; the last predicted frame of one is the reference of the next.
-Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … --out …]
+Episodes are predicted in batches over all devices; while these work on one, the next is read and the last is written.
+Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … --out … --rollout.steps …]
 """
 
 import argparse
 import json
 import sys
-import zlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from tqdm import tqdm
 
 from xew.config import CONVERTER, ConfigError, suggestion, user_errors
-from xew.episode import EpisodeError, episode_folder, find_accepted
+from xew.episode import EpisodeError, Record, episode_folder, find_accepted
 from xew.model.checkpoint import load_run, restore_params
-from xew.model.codec import Codec
-from xew.model.data import Batch
-from xew.model.experiment import Experiment, compile_cache, create_model
+from xew.model.codec import CODECS
+from xew.model.dit import compute_params
+from xew.model.dit_layouts import load_dit_params
+from xew.model.experiment import Experiment, compile_cache, create_model, load_experiment
 from xew.model.frames import to_camera_size
-from xew.model.latents import Episode, encode_clip, stream_videos
-from xew.model.samplers import GRIDS, SAMPLERS, Grid
-from xew.model.scales import Scale, apply_scales, load_run_scales
+from xew.model.latents import Episode, load_codec, training_episodes
+from xew.model.predict import Prediction, Predictor
+from xew.model.scales import load_run_scales
+from xew.model.sharding import MeshSettings, make_mesh, replicated
 from xew.model.text import encode_instructions
-from xew.protocol import ROBOT_NAMES, seed_split
+from xew.model.training_step import random_params
+from xew.protocol import seed_split
 from xew.rollout import write_rollout
 
-
-@dataclass(frozen=True)
-class Predictor:
-    """A trained model that continues videos."""
-
-    experiment: Experiment
-    codec: Codec
-    graph: nnx.GraphDef
-    params: Any
-    scales: Mapping[str, Scale] = field(default_factory=dict)
-    """Of the numbers that the network is told, as in training."""
-
-    def predict(self, episodes: Sequence[Episode], frame_count: int) -> np.ndarray:
-        """The first `frame_count` frames of each episode, predicted from its first: uint8 [b t h w 3] at the model's size.
-
-        Frame 0 is the codec's view of the given one. The noise depends on the episode and the chunk, not on the batch.
-        """
-        names = ("rgb", *self.experiment.conditions)
-        streams = [stream_videos(self.experiment, folder, record, names) for folder, record in episodes]
-        reference = np.stack([stream["rgb"][:1] for stream in streams])
-        horizon = self.experiment.clip.frames - 1
-        frames: list[np.ndarray] = []
-        for chunk, start in enumerate(range(0, max(frame_count - 1, 1), horizon)):
-            keys = [self._key(episode, chunk) for episode in episodes]
-            if self.experiment.model.history:  # what the model has made itself; the recorded frames would show the future
-                past = np.concatenate([*frames], axis=1) if frames else reference
-                streams = [stream | {"history": video} for stream, video in zip(streams, past, strict=True)]
-            predicted = self._predict_chunk(episodes, streams, reference, start, keys)
-            frames.append(predicted[:, 1:] if frames else predicted)
-            reference = predicted[:, -1:]
-        return np.concatenate(frames, axis=1)[:, :frame_count]
-
-    def _key(self, episode: Episode, chunk: int) -> jax.Array:
-        _, record = episode
-        name = zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode())
-        return jax.random.fold_in(jax.random.fold_in(jax.random.key(self.experiment.rollout.seed), name), chunk)
-
-    def _predict_chunk(
-        self,
-        episodes: Sequence[Episode],
-        streams: Sequence[dict[str, np.ndarray]],
-        reference: np.ndarray,
-        start: int,
-        keys: Sequence[jax.Array],
-    ) -> np.ndarray:
-        """One clip of each episode [b t h w 3] from reference frames [b 1 h w 3]."""
-        frames, history = self.experiment.clip.frames, self.experiment.model.history
-        conditions = {
-            name: np.stack([encode_clip(self.codec, condition, stream[name], start, frames, history) for stream in streams])
-            for name, condition in self.experiment.conditions.items()
-        }
-        conditions = apply_scales(self.scales, self.experiment.conditions, conditions)
-        words = encode_instructions(self.experiment, [record.instruction for _, record in episodes])
-        text = np.stack([words[record.instruction] for _, record in episodes])
-        noise = jnp.stack([jax.random.normal(key, self.experiment.latent_shape, jnp.float32) for key in keys])
-        latents = np.stack([self.codec.encode(frame) for frame in reference])
-        settings = self.experiment.rollout
-        grid = GRIDS[settings.grid](settings.steps, settings.shift or self.experiment.train.shift)
-        sampled = sample(self.graph, self.params, Batch(latents, conditions, text), noise, grid, settings.sampler)
-        return np.stack([self.codec.decode(clip) for clip in np.asarray(sampled)])
+Item = tuple[Episode, dict[str, Any]]
+"""An episode to predict and the header that its rollout will have."""
+WRITERS = 2
+"""Threads that compress videos."""
+WAITING = 16
+"""Videos that may wait for a writer before predicting waits too."""
 
 
-@jax.jit(static_argnums=(0, 4, 5))
-def sample(graph: nnx.GraphDef, params: Any, batch: Batch, noise: jax.Array, grid: Grid, sampler: str) -> jax.Array:
-    """Latents [b t h w c] sampled from noise; `batch.latents` [b 1 h w c] is the reference."""
-    model = nnx.merge(graph, params)
+def load_predictor(run: Path, step: int | None = None, overrides: Sequence[str] = ()) -> tuple[Predictor, int | None]:
+    """A model, a copy of it on each device, and the step of its checkpoint.
 
-    def velocity(latents: jax.Array, sigma: jax.Array) -> jax.Array:
-        return model(latents, batch.conditions, sigma, batch.text)
+    Args:
+        run: folder of a trained run; or a config, whose `model.weights` are then taken as they are (the step is None).
+        step: of the run's checkpoint; the latest where left out.
+        overrides: such as --rollout.steps 20. Of a run only what begins with --rollout can still be chosen.
 
-    return SAMPLERS[sampler](velocity, batch.latents, noise, grid)
+    Raises:
+        ConfigError: there is no such run, checkpoint or weights, or an override would make it another model.
+    """
+    if run.suffix in (".yaml", ".yml"):
+        return load_published(load_experiment(run, list(overrides)), run), None
+    try:
+        experiment, codec = load_run(run)
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"{run} lacks its codec ({error.filename}); copy the whole folder of the run, or train again."
+        ) from error
+    _check_overrides(overrides)
+    chosen = load_experiment(run / "config.yaml", list(overrides)).rollout
+    mesh = make_mesh(MeshSettings())
+    graph, shapes = nnx.split(nnx.eval_shape(lambda: create_model(experiment)), nnx.Param)
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=replicated(mesh)), shapes)
+    params, step = restore_params(run, like, step)
+    params = jax.jit(compute_params, static_argnums=0)(graph, params)
+    codec = jax.device_put(codec, replicated(mesh))
+    return Predictor(replace(experiment, rollout=chosen), codec, graph, params, load_run_scales(experiment, run)), step
 
 
-def select_episodes(data: Path, split: str, robots: Sequence[str]) -> list[Episode]:
-    """Accepted episodes of a seed family and of the given robots. Raises ConfigError if there is none."""
-    for robot in robots:
-        if robot not in ROBOT_NAMES:
-            raise ConfigError(f"unknown robot {robot!r};{suggestion(robot, ROBOT_NAMES)} known: {', '.join(ROBOT_NAMES)}.")
-    chosen = [(f, r) for f, r in find_accepted(data) if seed_split(r.seed) == split and r.robot in robots]
+def load_published(experiment: Experiment, source: Path) -> Predictor:
+    """A config's network with its published weights, untrained here.
+
+    Raises:
+        ConfigError: the config names no weights, or needs numbers that only training determines.
+    """
+    if experiment.model.weights is None:
+        raise ConfigError(f"{source} names no model.weights; give published ones, or the folder of a run instead of a config.")
+    scaled = [condition.name for condition in experiment.conditions.values() if condition.scale != "none"]
+    if scaled:
+        raise ConfigError(f"{source}: {', '.join(scaled)} is scaled by training episodes; train a run and roll that out.")
+    mesh = make_mesh(MeshSettings())
+    graph, params = random_params(experiment, mesh)
+    params = load_dit_params(graph, params, experiment.model.weights)
+    kind = CODECS[experiment.codec.name]
+    fitted = kind.fitted
+    codec = load_codec(experiment, training_episodes(experiment)) if fitted else kind.prepare(experiment.codec, list)
+    params = jax.jit(compute_params, static_argnums=0)(graph, params)
+    return Predictor(experiment, jax.device_put(codec, replicated(mesh)), graph, params)
+
+
+def _check_overrides(overrides: Sequence[str]) -> None:
+    wrong = [word for word in overrides if word.startswith("-") and not word.startswith("--rollout.")]
+    if wrong:
+        raise ConfigError(f"{' '.join(wrong)}: of a trained run only --rollout.… can be chosen anew (see --help for the rest).")
+
+
+def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None) -> list[Episode]:
+    """Accepted episodes of a seed family and of the given robots, or of all. Raises ConfigError if there is none."""
+    accepted = find_accepted(data)
+    known = sorted({record.robot for _, record in accepted})
+    for robot in robots or ():
+        if robot not in known:
+            raise ConfigError(f"unknown robot {robot!r};{suggestion(robot, known)} {data} has: {', '.join(known)}.")
+    chosen = [(f, r) for f, r in accepted if seed_split(r.seed) == split and (robots is None or r.robot in robots)]
     if not chosen:
-        raise EpisodeError(
-            f"{data} has no {split} episode of {', '.join(robots)}; run python -m xew.sim_warp.generate --out {data}"
-        )
+        asked = f"{split} episode of {', '.join(robots)}" if robots else f"{split} episode"
+        raise EpisodeError(f"{data} has no {asked}; run python -m xew.sim_warp.generate --out {data}")
     return chosen
 
 
-def rollout_header(experiment: Experiment, step: int, episode: Episode) -> dict[str, Any]:
-    """rollout.json: what was predicted, from what, with what."""
+def rollout_header(experiment: Experiment, step: int | None, episode: Episode) -> dict[str, Any]:
+    """rollout.json: what was predicted, from what, with what. How many were predicted at once is no part of it."""
     _, record = episode
-    limit = experiment.rollout.max_frames
-    frames = min(record.frame_count, limit) if limit else record.frame_count
     action, embodiment = experiment.model.action, experiment.model.embodiment
-    return {
-        "model": experiment.out.name,
-        "condition": "+".join(name for name in (action, embodiment) if name != "none") or "none",
-        "source_hash": record.hashes["rgb"],
-        "frame_count": frames,
-        "checkpoint_step": step,
-        "config": CONVERTER.unstructure(experiment),
-    }
+    header = common_header(
+        experiment.out.name,
+        "+".join(name for name in (action, embodiment) if name != "none") or "none",
+        record,
+        experiment.rollout.max_frames,
+    )
+    return header | {"checkpoint_step": step, "config": CONVERTER.unstructure(_without_batch(experiment))}
+
+
+def _without_batch(experiment: Experiment) -> Experiment:
+    return replace(experiment, rollout=replace(experiment.rollout, batch=0))
+
+
+def common_header(model: str, condition: str, record: Record, max_frames: int = 0) -> dict[str, Any]:
+    """What every model's rollout.json says."""
+    frames = min(record.frame_count, max_frames) if max_frames else record.frame_count
+    return {"model": model, "condition": condition, "source_hash": record.hashes["rgb"], "frame_count": frames}
 
 
 def is_done(out: Path, episode: Episode, header: dict[str, Any]) -> bool:
@@ -148,51 +152,100 @@ def is_done(out: Path, episode: Episode, header: dict[str, Any]) -> bool:
         return False
 
 
-def batches(pending: list[tuple[Episode, dict[str, Any]]], size: int) -> Iterator[list[tuple[Episode, dict[str, Any]]]]:
+def batches(pending: Sequence[Item], size: int) -> Iterator[list[Item]]:
     """Groups of episodes of similar length, so that few chunks are computed for nothing."""
     ordered = sorted(pending, key=lambda item: item[1]["frame_count"])
     for start in range(0, len(ordered), size):
         yield ordered[start : start + size]
 
 
-def predict_and_write(predictor: Predictor, group: list[tuple[Episode, dict[str, Any]]], out: Path) -> None:
-    """Roll out a group of episodes and write each as long as its header says."""
-    size = predictor.experiment.rollout.batch
-    episodes = [episode for episode, _ in group]
-    padded = episodes + [episodes[-1]] * (size - len(episodes))
-    videos = predictor.predict(padded, max(header["frame_count"] for _, header in group))
-    for ((_, record), header), video in zip(group, videos, strict=False):
-        write_rollout(out, record.task, record.seed, record.robot, to_camera_size(video[: header["frame_count"]]), header)
+class RolloutWriter:
+    """Writes rollouts in threads; the block's end waits for all of them. A failed write is raised at the next chance.
+
+    Args:
+        out: root of the rollout tree.
+        done: called, in the caller's thread, after each rollout that is on disk.
+    """
+
+    def __init__(self, out: Path, done: Callable[[], Any]) -> None:
+        self.out, self.done = out, done
+        self.threads = ThreadPoolExecutor(WRITERS)
+        self.waiting: deque[Future[Path]] = deque()
+
+    def write(self, record: Record, video: np.ndarray, header: dict[str, Any]) -> None:
+        """Hand over uint8 [t h w 3] of any size that `frames.to_model_size` gives; it is brought to the camera's."""
+        self.waiting.append(self.threads.submit(self._write, record, video, header))
+        while len(self.waiting) > WAITING or (self.waiting and self.waiting[0].done()):
+            self._settle()
+
+    def _write(self, record: Record, video: np.ndarray, header: dict[str, Any]) -> Path:
+        return write_rollout(self.out, record.task, record.seed, record.robot, to_camera_size(video), header)
+
+    def _settle(self) -> None:
+        self.waiting.popleft().result()
+        self.done()
+
+    def __enter__(self) -> "RolloutWriter":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """What was handed over is written also where the block ended in an error."""
+        self.threads.shutdown(wait=True)
+        while kind is None and self.waiting:
+            self._settle()
 
 
-def load_predictor(run: Path) -> tuple[Predictor, int]:
-    """The model of a run at its latest checkpoint, and that checkpoint's step."""
-    experiment, codec = load_run(run)
-    graph, params = nnx.split(create_model(experiment), nnx.Param)
-    params, step = restore_params(run, params)
-    return Predictor(experiment, codec, graph, params, load_run_scales(experiment, run)), step
+@dataclass(frozen=True)
+class _Begun:
+    """A batch on the devices."""
+
+    items: list[Item]
+    prediction: Prediction
+
+    def hand_over(self, writer: RolloutWriter) -> None:
+        for ((_, record), header), video in zip(self.items, self.prediction.fetch(), strict=True):
+            writer.write(record, video[: header["frame_count"]], header)
+
+
+def predict_and_write(predictor: Predictor, groups: Iterable[list[Item]], writer: RolloutWriter) -> None:
+    """Roll out groups of episodes and write each as long as its header says; reads one group ahead of the devices."""
+    begun: _Begun | None = None
+    for items in groups:
+        longest = max(header["frame_count"] for _, header in items)
+        following = _Begun(items, predictor.begin([episode for episode, _ in items], longest))
+        if begun is not None:
+            begun.hand_over(writer)
+        begun = following
+    if begun is not None:
+        begun.hand_over(writer)
 
 
 @user_errors
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m xew.model.rollout", description=__doc__.splitlines()[0])
-    parser.add_argument("run", type=Path, help="folder of a trained run")
+    parser.add_argument("run", type=Path, help="folder of a trained run, or a config with published model.weights")
+    parser.add_argument("--checkpoint", type=int, metavar="STEP", help="of the run (default: the latest)")
     parser.add_argument("--data", type=Path, help="episodes (default: those of the run's config)")
     parser.add_argument("--split", choices=("test", "train"), default="test", help="seed family (default: test)")
-    parser.add_argument("--robots", nargs="+", default=ROBOT_NAMES, metavar="ROBOT", help="default: all five")
+    parser.add_argument("--robots", nargs="+", metavar="ROBOT", help="default: all of the data")
     parser.add_argument("--out", type=Path, help="default: rollouts/<name of the run>")
-    args = parser.parse_args(arguments)
+    args, overrides = parser.parse_known_args(arguments)
     compile_cache()
-    predictor, step = load_predictor(args.run)
-    out = args.out or Path("rollouts") / args.run.name
-    episodes = select_episodes(args.data or predictor.experiment.data, args.split, args.robots)
-    headers = [(episode, rollout_header(predictor.experiment, step, episode)) for episode in episodes]
+    predictor, step = load_predictor(args.run, args.checkpoint, overrides)
+    experiment = predictor.experiment
+    out = args.out or Path("rollouts") / args.run.stem
+    episodes = select_episodes(args.data or experiment.data, args.split, args.robots)
+    headers = [(episode, rollout_header(experiment, step, episode)) for episode in episodes]
     pending = [item for item in headers if not is_done(out, *item)]
-    with tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress:
-        for group in batches(pending, predictor.experiment.rollout.batch):
-            predict_and_write(predictor, group, out)
-            progress.update(len(group))
-    print(f"{out}: {len(pending)} rollouts new, {len(headers) - len(pending)} there before, checkpoint {step}")
+    encode_instructions(experiment, [record.instruction for (_, record), _ in pending])  # all at once, where that costs
+    size = max(experiment.rollout.batch, 1)
+    with (
+        tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
+        RolloutWriter(out, progress.update) as writer,
+    ):
+        predict_and_write(predictor, batches(pending, size), writer)
+    shown = "published weights" if step is None else f"checkpoint {step}"
+    print(f"{out}: {len(pending)} rollouts new, {len(headers) - len(pending)} there before, {shown}")
 
 
 if __name__ == "__main__":

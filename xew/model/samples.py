@@ -5,7 +5,7 @@ import numpy as np
 from xew.episode import read_video
 from xew.model.frames import to_model_size
 from xew.model.latents import Episode, test_episodes, training_episodes
-from xew.model.rollout import Predictor
+from xew.model.predict import Predictor
 from xew.model.tensorboard import RunLog
 
 STRIP_FRAMES = 5

@@ -43,7 +43,7 @@ from xew.model.experiment import Experiment, compile_cache, load_experiment
 from xew.model.latents import LatentCache, load_codec, replay_episodes, training_episodes
 from xew.model.memory import check_memory, estimate_memory, flops_of_step, peak_flops
 from xew.model.optimizer import learning_rate, make_optimizer, with_steps
-from xew.model.rollout import Predictor
+from xew.model.predict import Predictor
 from xew.model.samples import log_samples
 from xew.model.scales import SCALES, Scale, load_run_scales, save_scales
 from xew.model.sharding import check_batch, make_mesh, mesh_shape, place_batch, process_rows, start_processes, state_shardings
