@@ -109,15 +109,16 @@ def make_dataset(
         rows: which samples of each batch to load; all where left out.
     """
     old = replayed(batch, replay)
-    parts = [_order(range(source.fresh), seed, batch - old)]
-    if old:
-        parts.append(_order(range(source.fresh, len(source)), seed + 1, old))
+    fresh = _order(range(source.fresh), seed, batch - old)
+    again = _order(range(source.fresh, len(source)), seed + 1, old) if old else None
     rows = np.arange(batch) if rows is None else rows
 
-    def load(indices: Sequence[np.ndarray]) -> Batch:
-        return stack([source[int(index)] for index in np.concatenate(indices)[rows]])
+    def load(number: int, indices: np.ndarray) -> Batch:
+        if again is not None:
+            indices = np.concatenate([indices, again[number]])
+        return stack([source[int(index)] for index in indices[rows]])
 
-    dataset = grain.experimental.ZipMapDataset(parts).map(load)
+    dataset = fresh.map_with_index(load)
     return dataset.to_iter_dataset(grain.ReadOptions(num_threads=2, prefetch_buffer_size=4))
 
 
