@@ -9,6 +9,7 @@ from flax import nnx
 from xew.config import ConfigError
 from xew.model import blocks, dit
 from xew.model.dit import MODELS, STREAMS, WorldModel
+from xew.model.memory import kept_bytes
 
 pytestmark = pytest.mark.usefixtures("strict_types")
 CHANNELS = 3
@@ -393,3 +394,29 @@ def test_flops_are_those_that_xla_counts(inputs: tuple[jax.Array, jax.Array, jax
     compiled = jax.jit(lambda params, *inputs: nnx.merge(graph, params)(*inputs)).lower(*shapes).compile()
     counted = compiled.cost_analysis()["flops"]
     assert dit.flops(size, [(4, 8, 8)] * 2, 16, batch=2, channels=CHANNELS) == pytest.approx(counted, rel=0.1)
+
+
+@pytest.mark.parametrize("remat", ["none", "dots", "attention", "full"])
+@pytest.mark.parametrize(
+    ("dtype", "residual"), [(jnp.float32, jnp.float32), (jnp.bfloat16, jnp.float32), (jnp.bfloat16, jnp.bfloat16)]
+)
+def test_what_blocks_keep_is_what_the_memory_estimate_says(remat: dit.RematName, dtype: jnp.dtype, residual: jnp.dtype) -> None:
+    """Counted in the traced gradient: what the loop over blocks hands from its forward to its backward pass."""
+    size, tokens = dit.ModelSize(dim=512, depth=3, heads=4, ffn_dim=2048, text_dim=16, text_tokens=7), 3 * 8 * 8
+    options = {"dtype": dtype, "residual": residual, "remat": remat}
+    graph, params = nnx.split(nnx.eval_shape(lambda: WorldModel(size, CHANNELS, rngs=nnx.Rngs(0), **options)), nnx.Param)
+    params = jax.eval_shape(lambda params: dit.compute_params(graph, params), params)
+
+    def loss(params: nnx.State, latents: jax.Array, sigma: jax.Array, text: jax.Array) -> jax.Array:
+        return nnx.merge(graph, params)(latents, {}, sigma, text).sum()
+
+    shapes = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in ((1, 3, 16, 16, CHANNELS), (1,), (1, 7, 16))]
+    with jax.numpy_dtype_promotion("standard"):
+        traced = jax.make_jaxpr(jax.grad(loss))(params, *shapes)
+    forward = next(equation for equation in traced.eqns if equation.primitive.name == "scan")
+    kept = [variable.aval for variable in forward.outvars[forward.params["num_carry"] :]]
+    pairs = [array for array in kept if array.shape[-2] == tokens and array.shape[-1] in (tokens, size.text_tokens)]
+    assert bool(pairs) == (remat == "none")
+    of_tokens = sum(array.size * array.dtype.itemsize for array in kept if tokens in array.shape and array not in pairs)
+    estimate = kept_bytes(size, remat, jnp.dtype(dtype).itemsize, jnp.dtype(residual).itemsize)
+    assert of_tokens / size.depth / tokens == pytest.approx(estimate, rel=0.05)
