@@ -52,7 +52,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with data of two tasks and two training seeds, config.yaml and a trained run; latents are encoded."""
     root = tmp_path_factory.mktemp("training")
     tasks = ("place_empty_cup", "shake_bottle")
-    synthetic.write_synthetic_data(root / "data", tasks, seeds=(0, 1), frames=FRAMES)
+    synthetic.write_synthetic_data(root / "data", tasks, seeds=(0, 1, 1_000_000), frames=FRAMES)
     (root / "config.yaml").write_text(f"data: {root / 'data'}\nout: {root / 'run'}\n{CONFIG}")
     latents.main([str(root / "config.yaml")])
     train.main([str(root / "config.yaml")])

@@ -40,11 +40,13 @@ class Command:
     """[4 4] world to camera."""
     render_path: Path
     """The stored robot-only video, posed by `action` on a white ground."""
+    rendered: np.ndarray | None = None
+    """The same [t h w 3] uint8, where it is at hand."""
 
     @cached_property
     def render(self) -> np.ndarray:
-        """uint8 [t h w 3], the stored robot-only video."""
-        return read_video(self.render_path)
+        """uint8 [t h w 3], the robot-only video."""
+        return read_video(self.render_path) if self.rendered is None else self.rendered
 
     @cached_property
     def streams(self) -> "CommandStreams":
@@ -52,6 +54,16 @@ class Command:
         from xew.sim_warp.streams import command_streams
 
         return command_streams(self.robot, self.action, self.camera)
+
+    @cached_property
+    def tools(self) -> np.ndarray:
+        """float64 [t 2 7], commanded world poses of the left and right tool, x y z w quaternions, by forward kinematics."""
+        from xew.sim_warp.kinematics import tool_pose
+        from xew.sim_warp.robots import get_robot
+
+        robot = get_robot(self.robot)
+        joints = [self.action[:, arm_joints][:, : robot.arm_joint_count] for arm_joints, _ in ARMS]
+        return np.stack([tool_pose(robot, arm, arm_pos) for arm, arm_pos in enumerate(joints)], axis=1)
 
     @property
     def camera(self) -> "Camera":
@@ -108,9 +120,9 @@ def clip_numbers(condition: Condition, numbers: np.ndarray, start: int, frames: 
     return np.concatenate([told(start + np.asarray(history)), rows]) if condition.with_history and len(history) else rows
 
 
-def command_of(folder: Path, record: Record, states: States) -> Command:
+def command_of(folder: Path, record: Record, states: States, rendered: np.ndarray | None = None) -> Command:
     """The part of an episode that conditions may see."""
-    return Command(record.robot, states.action, states.intrinsics, states.extrinsics, folder / "robot.mkv")
+    return Command(record.robot, states.action, states.intrinsics, states.extrinsics, folder / "robot.mkv", rendered)
 
 
 def joints(command: Command) -> np.ndarray:
@@ -172,12 +184,8 @@ def tool_poses(command: Command) -> np.ndarray:
 
     The angles are those of the turn from `POINTING_DOWN`, where tools mostly are: there none of them jumps.
     """
-    from xew.sim_warp.kinematics import tool_pose
-    from xew.sim_warp.robots import get_robot
-
-    robot, sides = get_robot(command.robot), []
-    for arm, (joints, gripper) in enumerate(ARMS):
-        pose = tool_pose(robot, arm, command.action[:, joints][:, : robot.arm_joint_count])
+    sides = []
+    for pose, (_, gripper) in zip(command.tools.swapaxes(0, 1), ARMS, strict=True):
         angles = (Rotation.from_quat(pose[:, 3:]) * POINTING_DOWN.inv()).as_euler("xyz")
         sides += [pose[:, :3], angles, command.action[:, gripper, None]]
     return np.concatenate(sides, axis=1).astype(np.float32)

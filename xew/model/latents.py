@@ -14,7 +14,7 @@ import itertools
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,13 +23,14 @@ import numpy as np
 from tqdm import tqdm
 
 from xew.config import ConfigError, digest, user_errors
-from xew.episode import Record, complete_folder, episode_folder, find_accepted, read_states, read_video
+from xew.episode import Record, complete_folder, episode_folder, find_accepted, read_states
 from xew.model.ceiling import measure_ceiling, spread
 from xew.model.checkpoint import load_run
-from xew.model.codec import CODECS, Codec
-from xew.model.conditions import Command, Condition, clip_numbers, command_of
+from xew.model.codec import CODECS, Codec, check_clip_shape, encode_pictures
+from xew.model.conditions import Command, Condition, clip_numbers, command_of, robot_render
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.frames import to_model_size
+from xew.model.pixels import Pixels, PixelSource, ahead, rendered_pixels, stored_pixels
 from xew.model.scales import Scale, fit_scales, load_run_scales, read_scales, save_scales
 from xew.protocol import seed_split
 
@@ -82,21 +83,54 @@ class LatentCache:
             command = f"python -m xew.model.latents CONFIG --data {self.experiment.data}"
             raise ConfigError(f"{path.parent}: the stream {stream} {found}; encode it with `{command}`.") from None
 
-    def encode(self, episode: Episode) -> int:
-        """Encode what is missing of one episode; returns the number of bytes written."""
-        folder, record = episode
-        missing = [name for name in self.streams if not self.path(record, name).exists()]
-        if not missing:
-            return 0
-        starts = self.starts(record)
-        videos = stream_videos(self.experiment, folder, record, missing)
-        return sum(_write(self.path(record, name), self._encode_stream(name, video, starts)) for name, video in videos.items())
+    def missing(self, record: Record) -> list[str]:
+        """Streams of an episode that are not encoded yet."""
+        return [name for name in self.streams if not self.path(record, name).exists()]
 
-    def _encode_stream(self, name: str, video: np.ndarray, starts: Sequence[int]) -> np.ndarray:
+    def encode(self, episodes: Sequence[Episode], source: PixelSource = stored_pixels, batch: int = 4) -> int:
+        """Encode what is missing of some episodes; returns the number of bytes written.
+
+        Args:
+            source: where their pixels come from; stored videos are read ahead in threads.
+            batch: clips that the codec encodes at once.
+        """
+        pending = [episode for episode in episodes if self.missing(episode[1])]
+        done = len(episodes) - len(pending)
+        progress = tqdm(total=len(episodes), initial=done, desc="encode", unit="episode", file=sys.stderr)
+        written = 0
+        for episode, pixels in self._pixels(pending, source):
+            written += self._encode_episode(*episode, pixels, batch)
+            progress.update()
+        progress.close()
+        return written
+
+    def _pixels(self, episodes: Sequence[Episode], source: PixelSource) -> Iterable[tuple[Episode, Pixels]]:
+        """Each episode with the pixels that it lacks streams of."""
+
+        def load(episode: Episode) -> Pixels:
+            return source(*episode, needed_pixels(self.experiment, self.missing(episode[1])))
+
+        if source is stored_pixels:
+            return ahead(load, episodes)
+        return ((episode, load(episode)) for episode in episodes)  # a renderer serves one thread
+
+    def _encode_episode(self, folder: Path, record: Record, pixels: Pixels, batch: int) -> int:
+        """Encode the missing streams of one episode and write each as a whole."""
+        videos = stream_videos(self.experiment, folder, record, self.missing(record), pixels)
+        parts = {name: self._cut(name, video, self.starts(record)) for name, video in videos.items()}
+        pictures = [clip for clips in parts.values() for part in clips for clip in part if clip.dtype == np.uint8]
+        encoded = iter(encode_many(self.codec, pictures, batch))
+        sizes = []
+        for name, clips in parts.items():
+            arrays = [np.concatenate([next(encoded) if c.dtype == np.uint8 else c for c in part]) for part in clips]
+            sizes.append(_write(self.path(record, name), np.stack(arrays)))
+        return sum(sizes)
+
+    def _cut(self, name: str, video: np.ndarray, starts: Sequence[int]) -> list[list[np.ndarray]]:
         condition = self.streams[name]
         starts = starts if condition is None or condition.aligned else (0,)
         frames, history = self.experiment.clip.frames, self.experiment.model.history
-        return np.stack([encode_clip(self.codec, condition, video, start, frames, history) for start in starts])
+        return [cut_clip(condition, video, start, frames, history) for start in starts]
 
 
 def sample_starts(frame_count: int, frames: int, chunks: int = 1) -> tuple[tuple[int, ...], ...]:
@@ -118,48 +152,79 @@ def clip_starts(frame_count: int, frames: int, chunks: int = 1) -> tuple[int, ..
     return tuple(sorted({start for sample in samples for start in sample}))
 
 
-def stream_videos(experiment: Experiment, folder: Path, record: Record, streams: Sequence[str]) -> dict[str, np.ndarray]:
-    """Whole-episode input of the named streams: uint8 [t h w 3] at the model's size, or float32 [t n]."""
+def needed_pixels(experiment: Experiment, streams: Sequence[str]) -> list[str]:
+    """Which videos of an episode the named streams are made from, among rgb and robot."""
+    conditions = experiment.conditions
+    scene = any(name == "rgb" or conditions[name].make is None for name in streams)
+    robot = any(name in conditions and conditions[name].make is robot_render for name in streams)
+    return [name for name, needed in (("rgb", scene), ("robot", robot)) if needed]
+
+
+def stream_videos(
+    experiment: Experiment, folder: Path, record: Record, streams: Sequence[str], pixels: Pixels | None = None
+) -> dict[str, np.ndarray]:
+    """Whole-episode input of the named streams: uint8 [t h w 3] at the model's size, or float32 [t n].
+
+    Args:
+        pixels: the episode's own, where they are at hand (`needed_pixels`); else its videos are read.
+    """
+    if pixels is None:
+        pixels = stored_pixels(folder, record, needed_pixels(experiment, streams))
     conditions = {name: condition for name, condition in experiment.conditions.items() if name in streams}
-    of_scene = [name for name in streams if name == "rgb" or conditions[name].make is None]
-    videos = dict.fromkeys(of_scene, read_video(folder / "rgb.mkv")) if of_scene else {}
-    if len(of_scene) < len(streams):
-        command = episode_command(experiment, folder, record)
+    videos = {name: pixels["rgb"] for name in streams if name == "rgb" or conditions[name].make is None}
+    if len(videos) < len(streams):
+        command = episode_command(experiment.data, folder, record, pixels.get("robot"))
         videos |= {name: condition.make(command) for name, condition in conditions.items() if condition.make is not None}
     clip = experiment.clip
     return {name: to_model_size(v, clip.height, clip.width) if v.ndim == 4 else v for name, v in videos.items()}
 
 
-def episode_command(experiment: Experiment, folder: Path, record: Record) -> Command:
-    """What conditions may be made from, of an episode of the experiment's data."""
+def episode_command(data: Path, folder: Path, record: Record, rendered: np.ndarray | None = None) -> Command:
+    """What conditions may be made from, of an episode of a data set."""
     from xew.sim_warp.robots import use_robots_of
 
-    use_robots_of(experiment.data)  # a robot of a user's own is kept beside its data
-    return command_of(folder, record, read_states(folder))
+    use_robots_of(data)  # a robot of a user's own is kept beside its data
+    return command_of(folder, record, read_states(folder), rendered)
 
 
-def encode_clip(
-    codec: Codec,
-    condition: Condition | None,
-    video: np.ndarray,
-    start: int,
-    frames: int,
-    history: Sequence[int] = (),
-) -> np.ndarray:
-    """One clip of one stream as the network takes it: latents [t' h' w' c] or numbers [t' n], not scaled yet.
+def cut_clip(
+    condition: Condition | None, video: np.ndarray, start: int, frames: int, history: Sequence[int] = ()
+) -> list[np.ndarray]:
+    """What one clip of one stream is made from: uint8 clips [t h w 3] to be encoded and joined, or numbers [t' n].
 
     Past the end the last frame is repeated. A condition that is not aligned is encoded whole. Earlier frames are encoded one
     by one (`history`, counted from the clip's first frame); before the start the first is repeated.
     """
     if condition is not None and condition.make is None:
-        earlier = np.maximum(start + np.asarray(history), 0)
-        return np.concatenate([codec.encode(video[frame : frame + 1]) for frame in earlier])
+        return [video[frame : frame + 1] for frame in np.maximum(start + np.asarray(history), 0)]
     if video.ndim == 2:
         assert condition is not None
-        return clip_numbers(condition, video, start, frames, history)
+        return [clip_numbers(condition, video, start, frames, history)]
     if condition is None or condition.aligned:
         video = video[np.minimum(np.arange(start, start + frames), len(video) - 1)]
-    return codec.encode(video)
+    return [video]
+
+
+def encode_clip(
+    codec: Codec, condition: Condition | None, video: np.ndarray, start: int, frames: int, history: Sequence[int] = ()
+) -> np.ndarray:
+    """`cut_clip` as the network takes it: latents [t' h' w' c] or numbers [t' n], not scaled yet."""
+    parts = cut_clip(condition, video, start, frames, history)
+    return np.concatenate([codec.encode(part) if part.dtype == np.uint8 else part for part in parts])
+
+
+def encode_many(codec: Codec, clips: Sequence[np.ndarray], batch: int) -> list[np.ndarray]:
+    """uint8 clips [t h w 3] to float32 latents [t' h' w' c], `batch` of equal shape at once (the last batch is filled up)."""
+    encoded: dict[int, np.ndarray] = {}
+    shapes = sorted({clip.shape for clip in clips})
+    for shape in shapes:
+        check_clip_shape(shape, codec.spatial_factor)
+        same = [index for index, clip in enumerate(clips) if clip.shape == shape]
+        for group in (same[first : first + batch] for first in range(0, len(same), batch)):
+            filled = group + group[-1:] * (batch - len(group))
+            latents = np.asarray(encode_pictures(codec, np.stack([clips[index] for index in filled])))
+            encoded |= dict(zip(group, latents, strict=False))
+    return [encoded[index] for index in range(len(clips))]
 
 
 def training_episodes(experiment: Experiment) -> list[Episode]:
@@ -263,20 +328,20 @@ def keep_scales(experiment: Experiment, episodes: Sequence[Episode]) -> None:
     path = scales_path(experiment, episodes)
     needed = any(condition.scale != "none" for condition in experiment.conditions.values())
     if needed and experiment.adapt.start_from is None and not path.exists():
-        commands = (episode_command(experiment, folder, record) for folder, record in episodes)
+        commands = (episode_command(experiment.data, folder, record) for folder, record in episodes)
         save_scales(path, fit_scales(experiment.conditions.values(), commands))
 
 
-def fit_codec(experiment: Experiment, episodes: Sequence[Episode]) -> Codec:
+def fit_codec(experiment: Experiment, episodes: Sequence[Episode], source: PixelSource = stored_pixels) -> Codec:
     """Fit the codec on clips of training episodes, and keep it."""
-    codec = CODECS[experiment.codec.name].prepare(experiment.codec, lambda: _clips_to_fit(experiment, episodes))
+    codec = CODECS[experiment.codec.name].prepare(experiment.codec, lambda: _clips_to_fit(experiment, episodes, source))
     path = codec_path(experiment, episodes)
     with complete_folder(path) as unfinished:
         codec.save(unfinished)
     return codec
 
 
-def _clips_to_fit(experiment: Experiment, episodes: Sequence[Episode]) -> list[np.ndarray]:
+def _clips_to_fit(experiment: Experiment, episodes: Sequence[Episode], source: PixelSource) -> list[np.ndarray]:
     """Evenly chosen clips, scene and robot-only, uint8 [t h w 3] at the model's size."""
     settings, clip = experiment.codec, experiment.clip
     chosen = [episodes[i] for i in np.linspace(0, len(episodes) - 1, min(len(episodes), settings.fit_clips // 2)).astype(int)]
@@ -284,18 +349,19 @@ def _clips_to_fit(experiment: Experiment, episodes: Sequence[Episode]) -> list[n
     for number, (folder, record) in enumerate(tqdm(chosen, desc="fit codec", disable=not sys.stderr.isatty())):
         starts = clip_starts(record.frame_count, clip.frames)
         start = starts[number % len(starts)]
+        pixels = source(folder, record, ("rgb", "robot"))
         for name in ("rgb", "robot"):
-            video = read_video(folder / f"{name}.mkv")[start : start + clip.frames]
+            video = pixels[name][start : start + clip.frames]
             video = video[np.minimum(np.arange(clip.frames), len(video) - 1)]
             clips.append(to_model_size(video, clip.height, clip.width))
     return clips
 
 
-def ceiling(experiment: Experiment, codec: Codec, episodes: Sequence[Episode]) -> dict[str, Any]:
+def ceiling(experiment: Experiment, codec: Codec, episodes: Sequence[Episode], source: PixelSource) -> dict[str, Any]:
     """The codec's reconstruction of clips of held-out robots and test seeds, or of training data where there are none."""
     held_out = test_episodes(experiment.data, experiment.robots.held_out_robots)
     chosen = spread(held_out or episodes, CEILING_CLIPS)
-    videos = (read_video(folder / "rgb.mkv") for folder, _ in chosen)
+    videos = (source(folder, record, ("rgb",))["rgb"] for folder, record in chosen)
     measured = measure_ceiling(codec, videos, **asdict(experiment.clip))
     on = "held-out robots" if held_out else "training episodes, for there are none of held-out robots"
     print(f"codec ceiling: {measured}, of {on}")
@@ -317,19 +383,20 @@ def _write(path: Path, array: np.ndarray) -> int:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m xew.model.latents", description=__doc__.splitlines()[0])
     parser.add_argument("config", type=Path, help="a YAML file such as configs/debug.yaml")
+    parser.add_argument("--from-states", action="store_true", help="render the episodes anew; no video needs to be there")
+    parser.add_argument("--batch", type=int, default=4, help="clips that the codec encodes at once (default: 4)")
     args, overrides = parser.parse_known_args(arguments)
     experiment = load_experiment(args.config, overrides)
     episodes = training_episodes(experiment)
+    source = rendered_pixels() if args.from_states else stored_pixels
     adapts = experiment.adapt.start_from is not None
     to_fit = CODECS[experiment.codec.name].fitted and not adapts and not codec_path(experiment, episodes).exists()
-    codec = fit_codec(experiment, episodes) if to_fit else load_codec(experiment, episodes)
+    codec = fit_codec(experiment, episodes, source) if to_fit else load_codec(experiment, episodes)
     keep_scales(experiment, episodes)
     cache = LatentCache(experiment, codec)
-    written = sum(
-        cache.encode(episode) for episode in tqdm([*episodes, *replay_episodes(experiment)], desc="encode", unit="episode")
-    )
+    written = cache.encode([*episodes, *replay_episodes(experiment)], source, args.batch)
     header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip), "streams": list(cache.streams)}
-    header |= {"episodes": len(episodes), "ceiling": ceiling(experiment, codec, episodes)}
+    header |= {"episodes": len(episodes), "ceiling": ceiling(experiment, codec, episodes, source)}
     (experiment.cache_folder / "header.json").write_text(json.dumps(header, indent=1) + "\n")
     print(
         f"{experiment.cache_folder}: {len(episodes)} episodes, streams {', '.join(cache.streams)}, {written / 1e6:.1f} MB new"

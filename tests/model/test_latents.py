@@ -1,0 +1,138 @@
+"""The latent cache: straight from states as from video, batches, threads, wrong frame counts."""
+
+import json
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+
+from xew.episode import EpisodeError, read_record, write_video
+from xew.model import latents
+from xew.model.codec import PatchCodec
+from xew.model.conditions import Command
+from xew.model.experiment import load_experiment
+from xew.model.latents import encode_many, needed_pixels
+from xew.model.pixels import ahead, stored_pixels
+
+CONFIG = """
+clip: {frames: 17, height: 64, width: 80}
+codec: {spatial_factor: 8, channels: 4}
+model: {size: tiny, action: optical_flow, embodiment: robot_render}
+train: {steps: 1, batch: 1}
+"""
+
+
+def write_config(root: Path) -> str:
+    path = root / "config.yaml"
+    path.write_text(f"data: {root / 'data'}\nout: {root / 'run'}\n{CONFIG}")
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one simulated episode in data, the same without its videos in bare, and a config."""
+    from xew.sim_warp import generate
+
+    root = tmp_path_factory.mktemp("latents")
+    chosen = ["--tasks", "place_empty_cup", "--robots", "aloha_agilex", "--train-seeds", "1", "--test-seeds", "0"]
+    generate.main([*chosen, "--out", str(root / "data")])
+    shutil.copytree(root / "data", root / "bare")
+    for video in (root / "bare").rglob("*.mkv"):
+        video.unlink()
+    for path in (root / "bare").rglob("episode.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"videos": False}))
+    write_config(root)
+    return root
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_latents_from_states_are_those_from_video(simulated: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = str(simulated / "config.yaml")
+    latents.main([config])
+    bare = [config, "--data", str(simulated / "bare")]
+    with pytest.raises(SystemExit):
+        latents.main(bare)
+    assert "made with --states-only" in capsys.readouterr().err
+    latents.main([*bare, "--from-states"])
+    from_video, from_states = files(simulated / "data-latents"), files(simulated / "bare-latents")
+    assert len([name for name in from_video if name.endswith(".npy")]) == 3
+    assert from_states == from_video
+    assert not list((simulated / "bare").rglob("*.mkv"))
+
+
+@pytest.fixture(scope="module")
+def codec() -> PatchCodec:
+    rng = np.random.default_rng(0)
+    return PatchCodec.fit([rng.integers(0, 255, (5, 32, 32, 3), np.uint8) for _ in range(2)], 8, 4)
+
+
+def test_batches_encode_as_single_clips_do(codec: PatchCodec) -> None:
+    rng = np.random.default_rng(1)
+    clips = [rng.integers(0, 255, (frames, 32, 32, 3), np.uint8) for frames in (5, 1, 5, 5, 9, 1, 5, 5)]
+    for batch in (1, 4):
+        for clip, encoded in zip(clips, encode_many(codec, clips, batch), strict=True):
+            np.testing.assert_allclose(encoded, codec.encode(clip), atol=1e-5)
+
+
+def test_clip_of_a_wrong_length_is_told(codec: PatchCodec) -> None:
+    with pytest.raises(ValueError, match="needs 4 k \\+ 1 frames"):
+        encode_many(codec, [np.zeros((6, 32, 32, 3), np.uint8)], 4)
+
+
+def test_video_that_is_not_as_long_as_its_episode_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder,) = synthetic.write_synthetic_data(tmp_path / "data", seeds=(0,), robots=("arx_x5",), frames=7)
+    video = stored_pixels(folder, read_record(folder), ("rgb",))["rgb"]
+    write_video(folder / "rgb.mkv", video[:5])
+    with pytest.raises(EpisodeError, match=r"rgb.mkv has 5 frames, episode.json says 7; delete the episode"):
+        stored_pixels(folder, read_record(folder), ("rgb",))
+    with pytest.raises(SystemExit) as stop:
+        latents.main([write_config(tmp_path)])
+    assert stop.value.code == 2
+    assert "has 5 frames" in capsys.readouterr().err
+
+
+def test_only_what_is_needed_is_read(simulated: Path) -> None:
+    experiment = load_experiment(simulated / "config.yaml")
+    assert needed_pixels(experiment, ["rgb", "action", "embodiment"]) == ["rgb", "robot"]
+    assert needed_pixels(experiment, ["action"]) == []
+    joints = load_experiment(simulated / "config.yaml", ["--model.action", "joints", "--model.embodiment", "none"])
+    assert needed_pixels(joints, ["rgb", "joints"]) == ["rgb"]
+
+
+def test_results_come_in_order_and_not_too_far_ahead() -> None:
+    begun: list[int] = []
+
+    def slow_at_first(number: int) -> int:
+        begun.append(number)
+        time.sleep(0.02 if number == 0 else 0)
+        return 10 * number
+
+    pairs = ahead(slow_at_first, range(100))
+    assert next(pairs) == (0, 0)
+    assert len(begun) < 100
+    assert list(pairs) == [(number, 10 * number) for number in range(1, 100)]
+
+
+def test_failure_ahead_is_raised_where_it_belongs() -> None:
+    def fail_at_three(number: int) -> int:
+        if number == 3:
+            raise EpisodeError("three")
+        return number
+
+    pairs: Iterator[tuple[int, int]] = ahead(fail_at_three, range(9))
+    assert [next(pairs)[0] for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(EpisodeError, match="three"):
+        next(pairs)
+
+
+def test_a_render_at_hand_is_not_read_again() -> None:
+    video = np.zeros((1, 2, 2, 3), np.uint8)
+    command = Command("piper", np.zeros((1, 16), np.float32), np.eye(3), np.eye(4), Path("nowhere.mkv"), video)
+    assert command.render is video
