@@ -7,12 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
-from safetensors.numpy import load_file
+from safetensors.numpy import load_file, save_file
 
-from xew.model import export
+from xew.config import ConfigError
+from xew.model import export, train
 from xew.model.checkpoint import TrainState, open_checkpoints, save_state
 from xew.model.dit_layouts import load_dit
 from xew.model.experiment import create_model, load_experiment
+from xew.model.sharding import make_mesh
 from xew.model.weights import read_tensors
 
 CONFIG = """
@@ -74,3 +76,32 @@ def test_what_cannot_be_exported(
     assert stop.value.code == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_training_starts_from_published_weights(run: Path, tmp_path: Path) -> None:
+    """Found to fit before a run is begun, then placed on the mesh; what Wan lacks starts from what it has."""
+    export.export(run, tmp_path / "wan.safetensors", "official")
+    tensors = dict(read_tensors(tmp_path / "wan.safetensors"))
+    only_wan = {key: array for key, array in tensors.items() if not key.startswith("stream")}
+    save_file(only_wan, tmp_path / "wan.safetensors")
+    experiment = load_experiment(run / "config.yaml", ["--model.weights", str(tmp_path / "wan.safetensors")])
+    train.check_network(experiment)
+    params = train.start_params(experiment, make_mesh(experiment.mesh))
+    expected = nnx.state(create_model(experiment), nnx.Param)
+    np.testing.assert_array_equal(
+        params["blocks"]["ffn"]["first"]["kernel"][...], expected["blocks"]["ffn"]["first"]["kernel"][...] + 2
+    )
+    copied = params["stream_inputs"]["embodiment"]["kernel"][...]
+    np.testing.assert_array_equal(copied, params["patch_embedding"]["kernel"][...])
+
+
+def test_networks_that_cannot_be_trained_are_told_first(run: Path, tmp_path: Path) -> None:
+    export.export(run, tmp_path / "wan.safetensors", "official")
+    foreign = ["--model.weights", str(tmp_path / "wan.safetensors"), "--model.size", "debug"]
+    with pytest.raises(ConfigError, match=r"wan\.safetensors does not fit the model: .* missing"):
+        train.check_network(load_experiment(run / "config.yaml", foreign))
+    with pytest.raises(ConfigError, match="there are no weights at nowhere"):
+        train.check_network(load_experiment(run / "config.yaml", ["--model.weights", "nowhere"]))
+    if jax.default_backend() == "cpu":
+        with pytest.raises(ConfigError, match="cudnn cannot be used: it needs a CUDA GPU and JAX runs on cpu"):
+            train.check_network(load_experiment(run / "config.yaml", ["--model.attention", "cudnn"]))

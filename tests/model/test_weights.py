@@ -16,7 +16,16 @@ from safetensors.numpy import load_file, save_file
 from xew.config import ConfigError
 from xew.model import weights
 from xew.model.dit import MODELS, WorldModel
-from xew.model.dit_layouts import dit_layout, flowwam_layout, load_dit, load_dit_params, naming_of, save_dit, wan_layout
+from xew.model.dit_layouts import (
+    check_dit,
+    dit_layout,
+    flowwam_layout,
+    load_dit,
+    load_dit_params,
+    naming_of,
+    save_dit,
+    wan_layout,
+)
 from xew.model.mechanisms import MECHANISMS
 from xew.model.weights import Source, checkpoint_shapes, load_weights, read_tensors, save_weights
 
@@ -396,9 +405,11 @@ def test_flowwam_checkpoint(lacks: tuple[str, ...], tmp_path: Path) -> None:
 def test_another_size_is_told(tmp_path: Path) -> None:
     arrays = wan_arrays()
     save_file(arrays, tmp_path / "in.safetensors")
+    check_dit(nnx.eval_shape(lambda: wan(*STREAMS)), tmp_path / "in.safetensors")
     larger = nnx.eval_shape(lambda: WorldModel(MODELS["debug"], CHANNELS, rngs=nnx.Rngs(0)))
-    with pytest.raises(ConfigError, match=r"blocks\.2\.self_attn\.q\.weight \(for blocks.*and 48 more.*another shape"):
-        load_dit(larger, tmp_path / "in.safetensors")
+    for refuses in (check_dit, load_dit):
+        with pytest.raises(ConfigError, match=r"blocks\.2\.self_attn\.q\.weight \(for blocks.*and 48 more.*another shape"):
+            refuses(larger, tmp_path / "in.safetensors")
     arrays["blocks.1.ffn.2.weight"] = arrays["blocks.1.ffn.2.weight"][:, :-1].copy()
     save_file(arrays, tmp_path / "in.safetensors")
     expected = r"1 of another shape: blocks\.1\.ffn\.2\.weight is \[32, 63\], the model's blocks\.ffn\.second\.kernel"

@@ -16,7 +16,7 @@ from flax import nnx
 from xew.model.blocks import EPSILON
 from xew.model.dit import STREAMS, WorldModel
 from xew.model.tokens import PATCH, TIME_FREQUENCIES
-from xew.model.weights import Layout, Source, Tensors, fill, read_tensors, save_weights
+from xew.model.weights import Layout, Source, Tensors, check_fit, fill, read_tensors, save_weights
 
 Naming = Literal["official", "diffusers"]
 COLUMN = {"official": 0, "diffusers": 1}
@@ -120,15 +120,26 @@ def load_dit(model: WorldModel, path: Path) -> None:
         ConfigError: tensors are missing, left over or of another shape.
     """
     tensors = read_tensors(path)
-    naming = naming_of(tensors)
-    layout = dit_layout(model, naming)
-    fill(model, tensors, layout, optional=(*(layout.keys() - wan_layout(model, naming).keys()), *NOT_OURS))
+    layout = dit_layout(model, naming_of(tensors))
+    fill(model, tensors, layout, optional=_may_differ(model, tensors))
     for name in model.condition_streams:
         if STREAMS[name].source == "latents" and layout[f"stream_inputs.{name}.kernel"].keys[0] not in tensors:
             model.stream_inputs[name] = jax.tree.map(jnp.copy, model.patch_embedding)
         elif name == FLOW_STREAM and layout[f"stream_embeddings.{name}"].keys[0] not in tensors:
             embedding = model.stream_embeddings[name]
             embedding.set_value(jnp.zeros_like(embedding.get_value()))
+
+
+def check_dit(model: WorldModel, path: Path) -> None:
+    """Raises what `load_dit` would, without reading a tensor; `model` may be of `nnx.eval_shape`."""
+    tensors = read_tensors(path)
+    check_fit(model, tensors, dit_layout(model, naming_of(tensors)), optional=_may_differ(model, tensors))
+
+
+def _may_differ(model: WorldModel, tensors: Tensors) -> tuple[str, ...]:
+    """Leaves that a checkpoint may lack (all that Wan does not have) and keys that it may have beside."""
+    naming = naming_of(tensors)
+    return (*(dit_layout(model, naming).keys() - wan_layout(model, naming).keys()), *NOT_OURS)
 
 
 def load_dit_params(graph: nnx.GraphDef, params: Any, path: Path) -> Any:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax.experimental import multihost_utils
@@ -26,6 +27,7 @@ from tqdm import tqdm
 
 from xew.config import user_errors
 from xew.model.adaptation import corrected
+from xew.model.blocks import choose_attention
 from xew.model.checkpoint import (
     TrainState,
     check_start,
@@ -38,8 +40,8 @@ from xew.model.checkpoint import (
 )
 from xew.model.codec import Codec
 from xew.model.data import ClipSource, fake_batch, make_dataset
-from xew.model.dit_layouts import load_dit_params
-from xew.model.experiment import Experiment, compile_cache, load_experiment
+from xew.model.dit_layouts import check_dit, load_dit_params
+from xew.model.experiment import Experiment, compile_cache, create_model, load_experiment
 from xew.model.latents import LatentCache, load_codec, replay_episodes, training_episodes
 from xew.model.memory import check_memory, estimate_memory, flops_of_step, peak_flops
 from xew.model.optimizer import learning_rate, make_optimizer, with_steps
@@ -177,6 +179,7 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     # Everything that can be missing or too small is found before a run folder is made.
     mesh = make_mesh(experiment.mesh)
     check_batch(experiment.train.batch, experiment.train.accumulate, mesh.size)
+    check_network(experiment)
     source, codec = open_data(experiment)
     experiment, asked = with_steps(experiment, source.fresh), experiment
     check_memory(estimate_memory(experiment, mesh.size, mesh.shape["fsdp"]), ignore=ignore_memory)
@@ -230,6 +233,14 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     if log:
         log.close()
     checkpoints.close()
+
+
+def check_network(experiment: Experiment) -> None:
+    """Raises ConfigError if the network cannot be computed here as asked, or its published weights do not fit."""
+    settings = experiment.model
+    choose_attention(settings.attention, experiment.size.head_dim, jnp.dtype(settings.dtype))
+    if settings.weights is not None:
+        check_dit(nnx.eval_shape(lambda: create_model(experiment)), settings.weights)
 
 
 def open_data(experiment: Experiment) -> tuple[ClipSource, Codec]:

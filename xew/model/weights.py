@@ -137,13 +137,19 @@ def load_weights(module: nnx.Module, path: Path, layout: Layout, *, optional: Co
 
 def fill(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Collection[str] = ()) -> None:
     """`load_weights` of tensors that have been opened already."""
+    wanted = check_fit(module, tensors, layout, optional=optional)
     leaves = _leaves(module, layout)
-    wanted = {path: source for path, source in layout.items() if not _may_lack(path, source, tensors, optional)}
-    _check(leaves, tensors, wanted, _foreign(tensors, layout, optional))
     for path, source in wanted.items():
         variable = leaves[path]
         value = _leaf_value(tensors, source, variable.shape, np.dtype(variable.dtype))
         variable.set_value(_placed(value, variable.get_value()))
+
+
+def check_fit(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Collection[str] = ()) -> Layout:
+    """The leaves that `fill` would fill; raises its errors without reading a tensor."""
+    wanted = {path: source for path, source in layout.items() if not _may_lack(path, source, tensors, optional)}
+    _check(_leaves(module, layout), tensors, wanted, _foreign(tensors, layout, optional))
+    return wanted
 
 
 def save_weights(module: nnx.Module, path: Path, layout: Layout) -> None:
