@@ -25,6 +25,8 @@ from xew.model.frames import to_model_size
 
 Episode = tuple[Path, Record]
 
+PASSES = 1_000_000
+"""Over the videos: without end, and yet a number that Grain can count with."""
 STORED = {"rgb": "rgb.mkv", "robot_render": "robot.mkv"}
 """Streams that every episode has as a file."""
 DRAWN = {"optical_flow": optical_flow, "mask": robot_mask, "ray_map": ray_map}
@@ -91,7 +93,7 @@ def make_dataset(files: Sequence[tuple[Path, int]], cut: Cut, batch: int, seed: 
     def load(file: tuple[Path, int], rng: np.random.Generator) -> np.ndarray:
         return random_clips(*file, cut, rng)
 
-    order = grain.MapDataset.source(files).seed(seed).shuffle().repeat()
+    order = grain.MapDataset.source(files).seed(seed).shuffle().repeat(PASSES)
     dataset = order.random_map(load).batch(batch // cut.clips, batch_fn=np.concatenate)
     threads = min(16, os.cpu_count() or 1)
     return dataset.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=2 * threads))
