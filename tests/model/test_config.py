@@ -12,7 +12,7 @@ from xew.model.experiment import load_experiment
 
 REPOSITORY = Path(__file__).parents[2]
 CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
-MODEL_CONFIGS = [REPOSITORY / "configs" / name for name in ("debug.yaml", "fixed.yaml")]
+MODEL_CONFIGS = [REPOSITORY / "configs" / name for name in ("debug.yaml", "fixed.yaml", "one_way.yaml")]
 
 
 @dataclass(frozen=True)
