@@ -1,6 +1,6 @@
 # The ground floor. A newcomer needs python3 (3.11 to 3.13) with venv, and make; everything else is set up here.
 #   make demo    the whole system at debug size, from a seed to a report page
-#   make test    every room's tests
+#   make test    every room's tests, with PyTorch, diffusers and transformers beside to compare with
 #   make lint    ruff and mypy
 #   make setup   only the environment (.venv, at the versions of requirements/test.txt)
 
@@ -9,6 +9,7 @@ WORKERS ?= 2
 DEMO ?= demo
 BIN := .venv/bin
 STAMP := .venv/.installed
+REFERENCE := .venv/.reference
 
 .PHONY: setup demo test lint clean
 .DELETE_ON_ERROR:
@@ -22,8 +23,12 @@ $(STAMP): pyproject.toml requirements/test.txt
 	$(BIN)/python -m pip install --disable-pip-version-check -c requirements/test.txt -e '.[dev]'
 	touch $@
 
+$(REFERENCE): $(STAMP)
+	$(BIN)/python -m pip install --disable-pip-version-check -c requirements/test.txt -e '.[dev,reference]'
+	touch $@
+
 # One thread a worker in the numerical libraries: two workers with a pool each only wait for one another.
-test: $(STAMP)
+test: $(REFERENCE)
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 lint: $(STAMP)
