@@ -64,9 +64,7 @@ def load_predictor(run: Path, step: int | None = None, overrides: Sequence[str] 
     try:
         experiment, codec = load_run(run)
     except FileNotFoundError as error:
-        raise ConfigError(
-            f"{run} lacks its codec ({error.filename}); copy the whole folder of the run, or train again."
-        ) from error
+        raise ConfigError(f"{run} lacks its codec ({error.filename}); copy the whole run, or train again.") from error
     _check_overrides(overrides)
     chosen = load_experiment(run / "config.yaml", list(overrides)).rollout
     mesh = make_mesh(MeshSettings())
@@ -165,21 +163,25 @@ class RolloutWriter:
     Args:
         out: root of the rollout tree.
         done: called, in the caller's thread, after each rollout that is on disk.
+        resize: what brings a video to the size in which it is written, if anything.
     """
 
-    def __init__(self, out: Path, done: Callable[[], Any]) -> None:
-        self.out, self.done = out, done
+    def __init__(
+        self, out: Path, done: Callable[[], Any], resize: Callable[[np.ndarray], np.ndarray] | None = to_camera_size
+    ) -> None:
+        self.out, self.done, self.resize = out, done, resize
         self.threads = ThreadPoolExecutor(WRITERS)
         self.waiting: deque[Future[Path]] = deque()
 
     def write(self, record: Record, video: np.ndarray, header: dict[str, Any]) -> None:
-        """Hand over uint8 [t h w 3] of any size that `frames.to_model_size` gives; it is brought to the camera's."""
+        """Hand over uint8 [t h w 3]."""
         self.waiting.append(self.threads.submit(self._write, record, video, header))
         while len(self.waiting) > WAITING or (self.waiting and self.waiting[0].done()):
             self._settle()
 
     def _write(self, record: Record, video: np.ndarray, header: dict[str, Any]) -> Path:
-        return write_rollout(self.out, record.task, record.seed, record.robot, to_camera_size(video), header)
+        resized = video if self.resize is None else self.resize(video)
+        return write_rollout(self.out, record.task, record.seed, record.robot, resized, header)
 
     def _settle(self) -> None:
         self.waiting.popleft().result()

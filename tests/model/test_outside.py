@@ -1,0 +1,122 @@
+"""Models from outside: what they are told, how their rollouts are written and resumed, and what a wrong one is told."""
+
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+
+from xew.episode import find_records, read_video
+from xew.model import outside
+from xew.model.outside import read_inputs
+from xew.rollout import find_rollouts, read_rollout_video
+
+FRAMES = 9
+MODELS = """
+import numpy as np
+
+def small(inputs):
+    return inputs.first_frame[None, ::2, ::2].repeat(inputs.frame_count, 0)
+
+def floats(inputs):
+    return small(inputs) / 255
+
+def short(inputs):
+    return small(inputs)[1:]
+
+number = 3
+"""
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("data")
+    synthetic.write_synthetic_data(root, seeds=(0, 1_000_000), robots=("piper", "arx_x5"), frames=FRAMES)
+    return root
+
+
+@pytest.fixture(autouse=True)
+def importable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_models_of_test.py").write_text(MODELS)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
+    sys.modules.pop("own_models_of_test", None)
+
+
+def truth(data: Path, made: object) -> np.ndarray:
+    return read_video(data / made.task / f"{made.seed:07d}" / made.robot / "rgb.mkv")
+
+
+def test_the_examples_run_and_pasting_beats_freezing(data: Path, tmp_path: Path) -> None:
+    errors = {}
+    for name in ("freeze", "PasteRender"):
+        outside.main([f"examples.own_model:{name}", "--data", str(data), "--out", str(tmp_path / name)])
+        made = find_rollouts(tmp_path / name)
+        assert {(r.seed, r.robot) for r in made} == {(1_000_000, "piper"), (1_000_000, "arx_x5")}
+        assert {r.model for r in made} == {name} and {r.frame_count for r in made} == {FRAMES}
+        videos = [(read_rollout_video(r).astype(float), truth(data, r)) for r in made]
+        np.testing.assert_array_equal(videos[0][0][0], videos[0][1][0])
+        errors[name] = np.mean([np.square(video - real).mean() for video, real in videos])
+    assert errors["PasteRender"] < errors["freeze"] / 2
+
+
+def test_a_model_is_told_commands_only(data: Path) -> None:
+    from xew.sim_warp.kinematics import tool_pose
+    from xew.sim_warp.robots import ROBOTS
+
+    folder, record = next((f, r) for f, r in find_records(data) if r.robot == "arx_x5")
+    inputs = read_inputs(data, (folder, record), max_frames=5)
+    assert (inputs.task, inputs.seed, inputs.robot, inputs.frame_count) == (record.task, record.seed, "arx_x5", 5)
+    assert inputs.instruction == record.instruction and inputs.first_frame.shape == (240, 320, 3)
+    assert inputs.joints.shape == (5, 16) and inputs.grippers.shape == (5, 2)
+    assert inputs.intrinsics.shape == (3, 3) and inputs.extrinsics.shape == (4, 4)
+    assert inputs.robot_render.shape == (5, 240, 320, 3)
+    right = tool_pose(ROBOTS["arx_x5"], 1, inputs.joints[:, 8 : 8 + ROBOTS["arx_x5"].arm_joint_count])
+    np.testing.assert_allclose(inputs.tool_poses[:, 1], right)
+    assert inputs.tool_poses.shape == (5, 2, 7)
+    assert not {"joint_pos", "object_pose", "states", "contact"} & set(dir(inputs))
+
+
+def test_masks_and_flow_are_rendered_from_the_commands(data: Path) -> None:
+    from xew.sim_warp.camera import HEAD_CAMERA
+
+    folder, record = next((f, r) for f, r in find_records(data) if r.robot == "arx_x5")
+    told = read_inputs(data, (folder, record), max_frames=2)
+    real = replace(told.command, intrinsics=HEAD_CAMERA.intrinsics, extrinsics=HEAD_CAMERA.extrinsics)
+    inputs = replace(told, command=real)
+    assert inputs.robot_mask.shape == (2, 240, 320) and inputs.robot_mask.dtype == bool and inputs.robot_mask.any()
+    assert inputs.optical_flow.shape == (2, 240, 320, 2)
+
+
+def test_rollouts_resume_in_the_models_own_size(data: Path, tmp_path: Path) -> None:
+    arguments = ["own_models_of_test:small", "--data", str(data), "--out", str(tmp_path / "out"), "--condition", "none"]
+    outside.main(arguments)
+    first, second = find_rollouts(tmp_path / "out")
+    assert read_rollout_video(first).shape == (FRAMES, 120, 160, 3) and first.condition == "none"
+    before = second.video[0].stat().st_mtime_ns
+    shutil.rmtree(first.folder)
+    outside.main(arguments)
+    assert len(find_rollouts(tmp_path / "out")) == 2 and second.video[0].stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("nothing_there:model", "cannot import the model 'nothing_there:model'"),
+        ("own_models_of_test:other", "has no attribute 'other'"),
+        ("freeze", "expected module:NAME"),
+        ("own_models_of_test:number", "is a int; expected a function"),
+        ("own_models_of_test:floats", "gave float64 [9, 120, 160, 3]"),
+        ("own_models_of_test:short", "gave uint8 [8, 120, 160, 3]"),
+    ],
+)
+def test_a_wrong_model_is_told_what_is_wrong(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, said: str
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        outside.main([name, "--data", str(data), "--out", str(tmp_path / "out")])
+    assert stop.value.code == 2
+    assert said in capsys.readouterr().err

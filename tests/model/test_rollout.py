@@ -1,0 +1,248 @@
+"""Predicting: batches, devices, guidance, one-way streams and published weights; the command's writing and its mistakes."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import synthetic
+from flax import nnx
+
+from xew.episode import EpisodeError, read_video
+from xew.model import latents, rollout
+from xew.model.codec import encode_pictures
+from xew.model.dit_layouts import save_dit
+from xew.model.experiment import Experiment, create_model, load_experiment
+from xew.model.latents import load_codec, training_episodes
+from xew.model.predict import ChunkInputs, Predictor, guided_velocity
+from xew.model.rollout import RolloutWriter
+from xew.protocol import ROBOT_NAMES
+from xew.rollout import find_rollouts, read_rollout_video
+
+FRAMES = 12
+CONFIG = """
+data: {root}/data
+out: {root}/run
+clip: {{frames: 5, height: 64, width: 80}}
+codec: {{spatial_factor: 8, channels: 4}}
+model: {{size: tiny, action: joints, embodiment: robot_render, history: [-4]}}
+train: {{steps: 1, batch: 2}}
+rollout: {{steps: 2, batch: 3}}
+"""
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("world")
+    synthetic.write_synthetic_data(root / "data", seeds=(0, 1_000_000), frames=FRAMES)
+    (root / "config.yaml").write_text(CONFIG.format(root=root))
+    latents.main([str(root / "config.yaml")])
+    return root
+
+
+@pytest.fixture(scope="module")
+def predictor(world: Path) -> Predictor:
+    return make_predictor(load_experiment(world / "config.yaml"))
+
+
+def make_predictor(experiment: Experiment) -> Predictor:
+    """A network whose output depends on all that it is given: nothing of it is zero."""
+    codec = load_codec(experiment, training_episodes(experiment))
+    graph, params = nnx.split(create_model(experiment), nnx.Param)
+    keys = iter(jax.random.split(jax.random.key(3), 200))
+    noisy = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(next(keys), leaf.shape, leaf.dtype), params)
+    return Predictor(experiment, codec, graph, noisy)
+
+
+def near(found: np.ndarray, expected: np.ndarray) -> bool:
+    """Equal but for a step of rounding here and there: float32 sums are in another order for another batch."""
+    difference = np.abs(found.astype(int) - expected)
+    return difference.max() <= 2 and difference.mean() < 0.01
+
+
+def test_an_episode_does_not_depend_on_its_batch(predictor: Predictor) -> None:
+    episodes = latents.test_episodes(predictor.experiment.data, ROBOT_NAMES)[:3]
+    together = predictor.predict(episodes, FRAMES)
+    assert together.shape == (3, FRAMES, 64, 80, 3) and together.dtype == np.uint8
+    assert np.abs(together[0].astype(int) - together[1]).mean() > 1
+    for episode, expected in zip(episodes, together, strict=True):
+        assert near(predictor.predict([episode], FRAMES)[0], expected)
+
+
+def test_later_chunks_continue_the_predicted_and_never_read_the_recorded(
+    predictor: Predictor, world: Path, tmp_path: Path
+) -> None:
+    """All but the first frame of the scene is replaced: the prediction stays."""
+    episode = latents.test_episodes(predictor.experiment.data, ROBOT_NAMES)[0]
+    before = predictor.predict([episode], FRAMES)
+    folder, record = episode
+    video = read_video(folder / "rgb.mkv")
+    video[1:] = 255 - video[1:]
+    for name in ("states.npz", "episode.json", "robot.mkv"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    from xew.episode import write_video
+
+    write_video(tmp_path / "rgb.mkv", video)
+    np.testing.assert_array_equal(predictor.predict([(tmp_path, record)], FRAMES), before)
+    chunks = predictor.begin([episode], FRAMES).chunks
+    assert len(chunks) == 3
+    reference = encode_pictures(predictor.codec, np.asarray(chunks[0])[:, -1:])
+    decoded = predictor.codec.decode(np.asarray(encode_pictures(predictor.codec, np.asarray(chunks[1])))[0])
+    assert np.abs(decoded[0].astype(int) - predictor.codec.decode(np.asarray(reference)[0])[0]).mean() < 1
+
+
+def test_guidance_of_one_is_none_and_more_goes_away_from_the_negative(predictor: Predictor) -> None:
+    model = nnx.merge(predictor.graph, predictor.params)
+    shape = predictor.experiment.latent_shape
+    latents_, level = jax.random.normal(jax.random.key(0), (1, *shape)), jnp.array([0.7], jnp.float32)
+    conditions = {
+        name: jax.random.normal(jax.random.key(1), (1, *predictor.experiment.condition_shape(name)))
+        for name in predictor.experiment.conditions
+    }
+    text, negative = jnp.array([[5, 6, 0, 0, 0, 0, 0, 0]]), jnp.array([[9, 0, 0, 0, 0, 0, 0, 0]])
+    forward = jax.jit(lambda words: model(latents_, conditions, level, words))
+    of = {"wanted": forward(text), "unwanted": forward(negative)}
+    inputs = ChunkInputs(jnp.zeros(()), conditions, text, negative, jnp.zeros(()))
+    for guidance in (1.0, 3.0):
+        expected = of["unwanted"] + guidance * (of["wanted"] - of["unwanted"])
+        found = jax.jit(lambda guidance=guidance: guided_velocity(model, inputs, guidance)(latents_, level))()
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert np.abs(of["wanted"] - of["unwanted"]).max() > 1e-3
+
+
+def test_guidance_reaches_the_rollout(predictor: Predictor) -> None:
+    episodes = latents.test_episodes(predictor.experiment.data, ROBOT_NAMES)[:1]
+    plain = predictor.predict(episodes, 5)
+    settings = replace(predictor.experiment.rollout, guidance=6.0, negative_prompt="blurred")
+    guided = replace(predictor, experiment=replace(predictor.experiment, rollout=settings))
+    assert np.abs(guided.predict(episodes, 5).astype(int) - plain).max() > 0
+
+
+def test_one_way_streams_are_computed_once_with_the_same_result(world: Path) -> None:
+    options = ["--model.visibility", "one_way", "--model.history"]
+    one_way = make_predictor(load_experiment(world / "config.yaml", options))
+    model = nnx.merge(one_way.graph, one_way.params)
+    shape = one_way.experiment.latent_shape
+    conditions = {
+        name: jax.random.normal(jax.random.key(1), (1, *one_way.experiment.condition_shape(name)))
+        for name in one_way.experiment.conditions
+    }
+    inputs = ChunkInputs(jnp.zeros(()), conditions, jnp.array([[5, 6, 0, 0, 0, 0, 0, 0]]), None, jnp.zeros(()))
+    latents_, level = jax.random.normal(jax.random.key(0), (1, *shape)), jnp.array([0.7], jnp.float32)
+    cached = jax.jit(lambda: guided_velocity(model, inputs, 1.0)(latents_, level))()
+    whole = jax.jit(lambda: model(latents_, conditions, level, inputs.text))()
+    np.testing.assert_allclose(cached, whole, atol=1e-5)
+    episode = latents.test_episodes(one_way.experiment.data, ROBOT_NAMES)[:1]
+    assert one_way.predict(episode, FRAMES).shape == (1, FRAMES, 64, 80, 3)
+
+
+@pytest.mark.parametrize("sampler", [("unipc", "wan_official"), ("unipc", "diffusers_unipc"), ("euler", "diffusers_euler")])
+def test_sampler_and_grid_are_chosen_by_name(predictor: Predictor, sampler: tuple[str, str]) -> None:
+    settings = replace(predictor.experiment.rollout, sampler=sampler[0], grid=sampler[1])
+    other = replace(predictor, experiment=replace(predictor.experiment, rollout=settings))
+    episodes = latents.test_episodes(predictor.experiment.data, ROBOT_NAMES)[:1]
+    assert np.abs(other.predict(episodes, 5).astype(int) - predictor.predict(episodes, 5)).max() > 0
+
+
+DEVICES = """
+import sys
+sys.path[:0] = {path!r}
+import jax, numpy as np
+from pathlib import Path
+from test_rollout import FRAMES, ROBOT_NAMES, load_experiment, make_predictor, latents
+from xew.model.sharding import MeshSettings, make_mesh, replicated
+from dataclasses import replace
+assert len(jax.devices()) == 2
+predictor = make_predictor(load_experiment({config!r}))
+mesh = make_mesh(MeshSettings())
+predictor = replace(predictor, params=jax.device_put(predictor.params, replicated(mesh)))
+episodes = latents.test_episodes(predictor.experiment.data, ROBOT_NAMES)[:3]
+begun = predictor.begin(episodes, FRAMES)
+assert len(begun.chunks[0].sharding.device_set) == 2 and begun.chunks[0].shape[0] == 4
+np.save({out!r}, begun.fetch())
+"""
+
+
+def test_two_devices_share_a_batch_and_give_the_same(predictor: Predictor, world: Path, tmp_path: Path) -> None:
+    """Three episodes on two devices: the batch is filled up, cut, and what filled it is left out."""
+    path = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
+    script = DEVICES.format(path=path, config=str(world / "config.yaml"), out=str(tmp_path / "frames.npy"))
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    episodes = latents.test_episodes(predictor.experiment.data, ROBOT_NAMES)[:3]
+    assert near(np.load(tmp_path / "frames.npy"), predictor.predict(episodes, FRAMES))
+
+
+@pytest.fixture(scope="module")
+def published(world: Path) -> Path:
+    """A config with published weights, and no run."""
+    experiment = load_experiment(world / "config.yaml")
+    save_dit(
+        create_model(replace(experiment, model=replace(experiment.model, text="learned"))),
+        world / "dit.safetensors",
+        "official",
+    )
+    weights = f"weights: {world / 'dit.safetensors'}, action: joints"
+    (world / "published.yaml").write_text((world / "config.yaml").read_text().replace("action: joints", weights))
+    return world / "published.yaml"
+
+
+def test_published_weights_are_rolled_out_untrained(published: Path, tmp_path: Path) -> None:
+    arguments = [str(published), "--robots", "piper", "--out", str(tmp_path), "--rollout.max-frames", "5"]
+    rollout.main(arguments)
+    (made,) = find_rollouts(tmp_path)
+    assert read_rollout_video(made).shape == (5, 240, 320, 3)
+    assert made.header["checkpoint_step"] is None and made.header["config"]["model"]["weights"]
+    touched = made.video[0].stat().st_mtime_ns
+    rollout.main([*arguments, "--rollout.batch", "2"])
+    assert made.video[0].stat().st_mtime_ns == touched
+    rollout.main([*arguments, "--rollout.seed", "1"])
+    assert find_rollouts(tmp_path)[0].video[0].stat().st_mtime_ns != touched
+
+
+def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as stop:
+        rollout.main(arguments)
+    assert stop.value.code == 2
+    return capsys.readouterr().err
+
+
+def test_mistakes_end_in_one_clear_error(
+    world: Path, published: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "names no model.weights" in fails([str(world / "config.yaml")], capsys)
+    assert "did you mean 'piper'" in fails([str(published), "--robots", "pipr"], capsys)
+    assert "did you mean 'unipc'" in fails([str(published), "--rollout.sampler", "unipcc"], capsys)
+    assert "did you mean 'flowwam'" in fails([str(published), "--rollout.grid", "flowam"], capsys)
+    assert "xew.sim_warp.generate" in fails([str(published), "--data", str(tmp_path)], capsys)
+
+
+def test_a_run_allows_rollout_overrides_only(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from xew.model import train
+
+    run = str(tmp_path / "run")
+    train.main([str(world / "config.yaml"), "--out", run, "--train.sample-every", "0"])
+    capsys.readouterr()
+    assert "--model.action" in fails([run, "--model.action", "none"], capsys)
+    assert "has no checkpoint of step 9" in fails([run, "--checkpoint", "9"], capsys)
+    out = tmp_path / "out"
+    rollout.main([run, "--checkpoint", "1", "--out", str(out), "--robots", "piper", "--rollout.steps", "3"])
+    header = json.loads(next(out.glob("*/*/*/rollout.json")).read_text())
+    assert header["config"]["rollout"]["steps"] == 3 and header["checkpoint_step"] == 1
+    for file in (tmp_path / "run" / "codec").iterdir():
+        file.unlink()
+    assert "lacks its codec" in fails([run], capsys)
+
+
+def test_a_failed_write_is_told(world: Path, tmp_path: Path) -> None:
+    _, record = latents.test_episodes(world / "data", ROBOT_NAMES)[0]
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(EpisodeError, match="cannot write the rollout"), RolloutWriter(tmp_path / "file", list) as writer:
+        writer.write(record, np.zeros((2, 64, 80, 3), np.uint8), {})

@@ -1,0 +1,183 @@
+"""Models from outside: anybody's video model predicts the study's episodes, and its rollouts are graded like ours.
+
+Reads  episodes: of each what a model may know (`EpisodeInputs`)
+Writes <out>/<task>/<seed>/<robot>/rgb.mkv (lossless, the model's own size) and rollout.json
+
+A model is anything that can be called with an `EpisodeInputs` and returns its video; it is named by `module:NAME`. Where NAME
+is a class it is made once, without arguments: there weights are loaded. Models that cannot run in this environment need none
+of this: `python -m xew.metrics.evaluate` grades any folder tree of their videos (`xew.rollout`).
+Command: python -m xew.model.outside module:NAME --data DATA --split test --out rollouts/NAME
+"""
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from tqdm import tqdm
+
+from xew.config import ConfigError, user_errors
+from xew.episode import Record, read_video
+from xew.model.conditions import Command
+from xew.model.latents import Episode, episode_command
+from xew.model.rollout import RolloutWriter, common_header, is_done, select_episodes
+from xew.protocol import LEFT_GRIPPER, RIGHT_GRIPPER
+
+
+@dataclass(frozen=True)
+class EpisodeInputs:
+    """What a model may know of an episode: its first frame, the instruction, the commands and the camera; nothing measured.
+
+    Arrays are made when they are first asked for. Whatever a system wants to be told (relative poses, deltas, trajectory maps,
+    ray maps) follows from these.
+    """
+
+    episode: Episode
+    command: Command
+    frame_count: int
+    """Frames to predict, the given first one included."""
+
+    @property
+    def record(self) -> Record:
+        return self.episode[1]
+
+    @property
+    def task(self) -> str:
+        return self.record.task
+
+    @property
+    def seed(self) -> int:
+        return self.record.seed
+
+    @property
+    def robot(self) -> str:
+        return self.record.robot
+
+    @property
+    def instruction(self) -> str:
+        return self.record.instruction
+
+    @property
+    def frame_rate(self) -> float:
+        """Frames a second."""
+        return self.record.frame_rate
+
+    @cached_property
+    def first_frame(self) -> np.ndarray:
+        """uint8 [240 320 3], the head camera's."""
+        return read_video(self.episode[0] / "rgb.mkv")[0]
+
+    @property
+    def joints(self) -> np.ndarray:
+        """float32 [t 16], commanded joints [rad] and grippers [0 closed, 1 open] (`xew.protocol`)."""
+        return self.command.action[: self.frame_count]
+
+    @property
+    def tool_poses(self) -> np.ndarray:
+        """float64 [t 2 7], commanded world poses of the left and right tool: x y z [m] and quaternion x y z w."""
+        return self.command.tools[: self.frame_count]
+
+    @property
+    def grippers(self) -> np.ndarray:
+        """float32 [t 2], commanded, left and right: 0 closed, 1 open."""
+        return self.joints[:, [LEFT_GRIPPER, RIGHT_GRIPPER]]
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """float64 [3 3], the camera's K [pixels of 320x240]."""
+        return self.command.intrinsics
+
+    @property
+    def extrinsics(self) -> np.ndarray:
+        """float64 [4 4], world to camera (x right, y down, z forward)."""
+        return self.command.extrinsics
+
+    @property
+    def robot_render(self) -> np.ndarray:
+        """uint8 [t 240 320 3], the robot alone on white, posed by the commands."""
+        return self.command.render[: self.frame_count]
+
+    @property
+    def robot_mask(self) -> np.ndarray:
+        """bool [t 240 320], where that robot is; rendered here (needs Warp)."""
+        return self.command.streams.mask[: self.frame_count]
+
+    @property
+    def optical_flow(self) -> np.ndarray:
+        """float32 [t 240 320 2], that robot's exact motion to the next frame [pixels]; rendered here (needs Warp)."""
+        return self.command.streams.optical_flow[: self.frame_count]
+
+
+class OutsideModel(Protocol):
+    """What an outside model is to this room."""
+
+    def __call__(self, inputs: EpisodeInputs) -> np.ndarray:
+        """uint8 [t h w 3] with t = inputs.frame_count, frame 0 the given one as the model sees it; any h and w of 4:3."""
+
+
+def load_model(name: str) -> OutsideModel:
+    """The model `module:NAME`, made where it is a class. Raises ConfigError if there is none."""
+    module, _, attribute = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(
+            f"cannot import the model {name!r}: {error}; expected module:NAME, as examples.own_model:freeze."
+        ) from error
+    model = found() if isinstance(found, type) else found
+    if not callable(model):
+        raise ConfigError(f"the model {name!r} is a {type(model).__name__}; expected a function, or a class with __call__.")
+    return model
+
+
+def read_inputs(data: Path, episode: Episode, max_frames: int = 0) -> EpisodeInputs:
+    """What a model may know of an episode, or of its first `max_frames` frames."""
+    folder, record = episode
+    frames = min(record.frame_count, max_frames) if max_frames else record.frame_count
+    return EpisodeInputs(episode, episode_command(data, folder, record), frames)
+
+
+def predict(model: OutsideModel, name: str, inputs: EpisodeInputs) -> np.ndarray:
+    """The model's video of an episode. Raises ConfigError if it is none or of another length."""
+    video = np.asarray(model(inputs))
+    if video.dtype != np.uint8 or video.ndim != 4 or video.shape[-1] != 3 or len(video) != inputs.frame_count:
+        raise ConfigError(
+            f"{name} gave {video.dtype} {list(video.shape)} for {inputs.task}/{inputs.seed}/{inputs.robot}; "
+            f"expected uint8 [{inputs.frame_count} h w 3] (frame_count frames, the given first one included)."
+        )
+    return video
+
+
+@user_errors
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m xew.model.outside", description=__doc__.splitlines()[0])
+    parser.add_argument("model", metavar="module:NAME", help="a function or class, such as examples.own_model:freeze")
+    parser.add_argument("--data", type=Path, required=True, help="episodes")
+    parser.add_argument("--split", choices=("test", "train"), default="test", help="seed family (default: test)")
+    parser.add_argument("--robots", nargs="+", metavar="ROBOT", help="default: all of the data")
+    parser.add_argument("--max-frames", type=int, default=0, help="predict only the first so many frames")
+    parser.add_argument("--condition", default="", help="what the model is told of the robot, for the tables")
+    parser.add_argument("--out", type=Path, help="default: rollouts/NAME")
+    args = parser.parse_args(arguments)
+    name = args.model.rpartition(":")[2]
+    out = args.out or Path("rollouts") / name
+    episodes = select_episodes(args.data, args.split, args.robots)
+    told = [(e, common_header(name, args.condition, e[1], args.max_frames) | {"outside": args.model}) for e in episodes]
+    pending = [item for item in told if not is_done(out, *item)]
+    model = load_model(args.model)
+    with (
+        tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
+        RolloutWriter(out, progress.update, resize=None) as writer,
+    ):
+        for episode, header in pending:
+            writer.write(episode[1], predict(model, args.model, read_inputs(args.data, episode, args.max_frames)), header)
+    print(f"{out}: {len(pending)} rollouts new, {len(told) - len(pending)} there before, {args.model}")
+
+
+if __name__ == "__main__":
+    main()
