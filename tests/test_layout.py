@@ -14,7 +14,7 @@ FILES = sorted(ROOT.rglob("*.py"))
 
 FORBIDDEN = {
     "sim_warp": {"jax", "flax", "optax", "orbax", "grain", "xew.model", "xew.metrics", "xew.analysis"},
-    "model": {"warp", "newton", "mujoco", "mujoco_warp", "xew.metrics", "xew.analysis"},
+    "model": {"warp", "newton", "mujoco", "mujoco_warp", "torch", "diffusers", "transformers", "xew.metrics", "xew.analysis"},
     "metrics": {"warp", "newton", "mujoco", "flax", "xew.model", "xew.sim_warp", "xew.analysis"},
     "exchange": {"jax", "flax", "optax", "orbax", "grain", "torch", "xew.model", "xew.metrics", "xew.analysis"},
     "analysis": {"jax", "flax", "warp", "newton", "mujoco", "xew.model", "xew.metrics"},
