@@ -27,8 +27,8 @@ BASELINES = Path(__file__).parents[2] / "configs" / "baselines"
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}
 codec: {spatial_factor: 8, channels: 4}
-train: {steps: 2, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, sample_every: 2, history_noise: 0.3}
-rollout: {steps: 2, batch: 2}
+train: {steps: 2, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, sample_every: 0, history_noise: 0.3}
+rollout: {steps: 1, batch: 1}
 """
 
 
