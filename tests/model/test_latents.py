@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,7 +40,9 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     root = tmp_path_factory.mktemp("latents")
     chosen = ["--tasks", "place_empty_cup", "--robots", "aloha_agilex", "--train-seeds", "1", "--test-seeds", "0"]
-    generate.main([*chosen, "--out", str(root / "data")])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["generate", *chosen, "--out", str(root / "data")])
+        generate.main()
     shutil.copytree(root / "data", root / "bare")
     for video in (root / "bare").rglob("*.mkv"):
         video.unlink()

@@ -15,7 +15,7 @@ import pytest
 import synthetic
 from flax import nnx
 
-from xew.config import ConfigError
+from xew.config import ConfigError, save
 from xew.model import checkpoint, data, latents, memory, train
 from xew.model.adaptation import corrected, init_corrections
 from xew.model.checkpoint import TrainState
@@ -23,6 +23,7 @@ from xew.model.data import Batch, ClipSource, fake_batch, make_dataset
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.flow_matching import sample_losses
 from xew.model.latents import LatentCache, first_of_each, load_codec, replay_episodes, training_episodes
+from xew.model.memory import estimate_memory
 from xew.model.optimizer import with_steps
 from xew.model.samples import sample_episodes
 from xew.model.sharding import make_mesh, place_batch
@@ -35,6 +36,7 @@ from xew.model.training_step import (
     make_train_step,
     sample_pairs,
 )
+from xew.protocol import HELD_OUT_ROBOTS
 
 FRAMES = 12
 CONFIG = """
@@ -45,6 +47,11 @@ train: {steps: 2, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 1, sa
 rollout: {steps: 2, batch: 3}
 """
 ADAPT = ("--adapt.robots", "piper", "--adapt.episodes", "2")
+
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+WAN5B = CONFIGS / "wan5b" / "fixed.yaml"
+FEWSHOT = [CONFIGS / "wan5b" / "fewshot.yaml", *sorted((CONFIGS / "fewshot").glob("*.yaml"))]
 
 
 @pytest.fixture(scope="module")
@@ -254,6 +261,68 @@ def test_log_lines_hold_what_a_run_is_watched_by(world: Path) -> None:
     assert lines(run, "train/learning_rate") == pytest.approx([1e-3, 1e-3])
 
 
+def test_projection_is_that_of_the_arithmetic() -> None:
+    """5.0e9 parameters on 8 devices: 4 bytes each and 8 for the moments, cut in 8; 2 for the copy; 2 + 4 for gradients."""
+    experiment = load_experiment(WAN5B)
+    whole, cut = estimate_memory(experiment, 1, 1).parts, estimate_memory(experiment, 8, 8).parts
+    numbers = whole["parameters"] / 4
+    assert numbers == pytest.approx(5.0e9, rel=0.01)
+    for name, bytes_each in (("parameters", 4), ("optimizer", 8), ("rounded to bfloat16", 2), ("gradients", 6)):
+        assert whole[name] == pytest.approx(bytes_each * numbers, rel=1e-3), name
+        assert cut[name] == pytest.approx(bytes_each * numbers / 8, rel=0.01), name
+    assert whole["activations"] == pytest.approx(8 * cut["activations"])
+    assert whole["layers gathered"] == 0 < cut["layers gathered"] < 1e9
+    assert 2.8e9 < cut["autoencoder"] < 10e9
+    half = estimate_memory(changed(experiment, mu_dtype="bfloat16", chunks=1), 1, 1).parts
+    assert half["optimizer"] == pytest.approx(6 * numbers, rel=1e-3)
+    assert half["gradients"] == pytest.approx(2 * numbers, rel=0.01)
+    assert half["autoencoder"] == 0
+
+
+def test_estimate_is_printed_without_a_device(capsys: pytest.CaptureFixture[str]) -> None:
+    train.main([str(WAN5B), "--estimate", "--devices", "8", "--memory-gb", "80"])
+    said = capsys.readouterr().out
+    assert "8 devices, state in 8 parts, 1 samples at once on each, remat full" in said
+    assert "fits in 80 GB a device" in said
+    train.main([str(WAN5B), "--estimate", "--devices", "1", "--memory-gb", "80"])
+    assert "does not fit in 80 GB" in capsys.readouterr().out
+
+
+# Configs.
+
+
+@pytest.mark.parametrize("path", [WAN5B, *FEWSHOT], ids=lambda path: path.stem)
+def test_shipped_configs_load_and_survive_saving(path: Path, tmp_path: Path) -> None:
+    experiment = load_experiment(path)
+    save(experiment, tmp_path / "saved.yaml")
+    assert load_experiment(tmp_path / "saved.yaml") == experiment
+
+
+@pytest.mark.parametrize("path", FEWSHOT, ids=lambda path: path.stem)
+def test_adaptations_have_the_network_of_the_run_they_start_from(path: Path) -> None:
+    adapted, trained = (
+        load_experiment(path),
+        load_experiment(CONFIGS / ("wan5b" if "wan5b" in str(path) else "") / "fixed.yaml"),
+    )
+    assert adapted.adapt.start_from == trained.out
+    assert (adapted.clip, adapted.codec) == (trained.clip, trained.codec)
+    assert replace(adapted.model, weights=None) == replace(trained.model, weights=None)
+    assert set(adapted.adapt.robots) <= set(HELD_OUT_ROBOTS)
+    assert adapted.train.epochs == 20
+
+
+def test_step_of_the_full_size_is_made_from_shapes() -> None:
+    """The whole program of wan5b, two chunks of 121 frames in three streams, without one of its weights."""
+    experiment = load_experiment(WAN5B, ["--model.attention", "xla"])
+    mesh = make_mesh(experiment.mesh)
+    graph, shapes = abstract_state(experiment)
+    step = make_train_step(experiment, graph, mesh, LastFrame())
+    batch = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, fake_batch(experiment, 8)))
+    state, result = step.lower(train.placed(shapes, mesh), batch).out_info
+    assert result.losses.shape == (8, 2)
+    assert jax.tree.map(lambda leaf: leaf.shape, state) == jax.tree.map(lambda leaf: leaf.shape, shapes)
+
+
 # Length and settings.
 
 
@@ -315,7 +384,7 @@ def test_adapted_run_starts_from_the_trained_weights(world: Path, tmp_path: Path
 
 
 def test_samples_of_an_adapted_run_are_named_by_role(experiment: Experiment) -> None:
-    adapted = replace(experiment, adapt=replace(experiment.adapt, robots=("piper",)))
+    adapted = replace(experiment, adapt=replace(experiment.adapt, start_from=Path("runs/x"), robots=("piper",)))
     names = sample_episodes(SimpleNamespace(experiment=adapted))
     assert set(names) == {"seen/aloha_agilex", "seen/arx_x5", "seen/ur5_wsg", "target/piper"}
 

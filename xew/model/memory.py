@@ -13,13 +13,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from flax import nnx
 
 from xew.config import ConfigError
+from xew.model.codec import TEMPORAL_FACTOR, latent_frames
 from xew.model.data import fake_batch
 from xew.model.dit import STREAMS, ModelSize, RematName, flops, token_grid
 from xew.model.experiment import Experiment
 from xew.model.sharding import parameter_spec, path_names
 from xew.model.training_step import abstract_state
+from xew.model.vae import VAES, abstract_vae
 
 MARGIN = 1.1
 """Room for what the estimate does not see."""
@@ -68,6 +71,7 @@ def estimate_memory(experiment: Experiment, devices: int, fsdp: int) -> Memory:
         "gradients": weights * compute + (weights * 4 if summed else 0.0),
         "layers gathered": 2 * compute * cut_bytes(network, 1, 1) / experiment.size.depth if fsdp > 1 else 0.0,
         "activations": samples * activation_bytes(experiment),
+        "autoencoder": codec_bytes(experiment, samples) if settings.chunks == 2 else 0.0,
     }
     layout = f"{devices} devices, state in {fsdp} parts, {samples:g} samples at once on each, remat {experiment.model.remat}"
     return Memory(parts, layout)
@@ -91,6 +95,17 @@ def activation_bytes(experiment: Experiment) -> float:
     logits = logits_bytes(experiment, tokens)
     kept = tokens * kept_bytes(size, settings.remat, compute, residual) + (logits if settings.remat == "none" else 0.0)
     return size.depth * kept + 2 * (tokens * work_bytes(size, compute, residual) + logits)
+
+
+def codec_bytes(experiment: Experiment, samples: float) -> float:
+    """Of the codec that decodes and encodes between two chunks: weights, and four of its widest arrays for each sample."""
+    settings, clip = experiment.codec, experiment.clip
+    if settings.name != "wan_vae":
+        return 0.0
+    size = VAES[settings.vae]
+    frames = TEMPORAL_FACTOR * min(settings.chunk or latent_frames(clip.frames), latent_frames(clip.frames))
+    widest = size.decoder_widths[-1] * frames * (clip.height * clip.width // size.patch**2) * jnp.dtype(settings.dtype).itemsize
+    return cut_bytes(nnx.state(abstract_vae(size), nnx.Param), 1) + 4 * samples * widest
 
 
 def kept_bytes(size: ModelSize, remat: RematName, compute: int, residual: int) -> float:

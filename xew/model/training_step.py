@@ -8,12 +8,12 @@ along `fsdp`, so that the traffic and the gradients have that dtype too; the num
 rounded its own.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import nnx
 from jax import Array
@@ -31,7 +31,6 @@ from xew.model.sharding import gathered, replicated, state_shardings
 
 HISTORY_KEY = 7
 """Folded into a sample's key for the noise of its earlier frames, which `training_pair` does not know of."""
-TrainStep = Callable[[TrainState, Batch], tuple[TrainState, "StepResult"]]
 
 
 class StepResult(NamedTuple):
@@ -111,13 +110,27 @@ def make_train_step(experiment: Experiment, graph: nnx.GraphDef, mesh: Mesh, cod
         return TrainState(state.step + 1, learned, moments, ema, state.base), result
 
     shardings = state_shardings(abstract_state(experiment)[1], mesh)
-    compiled = jax.jit(step, donate_argnums=0, out_shardings=(shardings, replicated(mesh)))
+    jitted = jax.jit(step, donate_argnums=0, out_shardings=(shardings, replicated(mesh)))
+    everywhere = jax.device_put(jax.tree.map(np.asarray, codec), replicated(mesh)) if settings.chunks == 2 else None
+    return TrainStep(jitted, mesh, everywhere)
 
-    def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, StepResult]:
-        with jax.set_mesh(mesh):
-            return compiled(state, batch, codec)
 
-    return train_step
+@dataclass(frozen=True)
+class TrainStep:
+    """The compiled step: (state, batch on the mesh) -> (next state, result). The given state is used up."""
+
+    jitted: Any
+    mesh: Mesh
+    codec: Codec | None
+
+    def __call__(self, state: TrainState, batch: Batch) -> tuple[TrainState, StepResult]:
+        with jax.set_mesh(self.mesh):
+            return self.jitted(state, batch, self.codec)
+
+    def lower(self, state: TrainState, batch: Batch) -> jax.stages.Lowered:
+        """The program for arrays or for their shapes and shardings, to compile without running and to look at its memory."""
+        with jax.set_mesh(self.mesh):
+            return self.jitted.lower(state, batch, self.codec)
 
 
 class Rows(NamedTuple):
