@@ -84,6 +84,24 @@ def random_params(experiment: Experiment, mesh: Mesh) -> tuple[nnx.GraphDef, Any
     return graph, init()
 
 
+@dataclass(frozen=True)
+class TrainStep:
+    """The compiled step: (state, batch on the mesh) -> (next state, result). The given state is used up."""
+
+    jitted: Any
+    mesh: Mesh
+    codec: Codec | None
+
+    def __call__(self, state: TrainState, batch: Batch) -> tuple[TrainState, StepResult]:
+        with jax.set_mesh(self.mesh):
+            return self.jitted(state, batch, self.codec)
+
+    def lower(self, state: TrainState, batch: Batch) -> jax.stages.Lowered:
+        """The program for arrays or for their shapes and shardings, to compile without running and to look at its memory."""
+        with jax.set_mesh(self.mesh):
+            return self.jitted.lower(state, batch, self.codec)
+
+
 def make_train_step(experiment: Experiment, graph: nnx.GraphDef, mesh: Mesh, codec: Codec | None = None) -> TrainStep:
     """The compiled step; its noise depends on the seed, the step and the place in the batch only, so a resumed run repeats it.
 
@@ -113,24 +131,6 @@ def make_train_step(experiment: Experiment, graph: nnx.GraphDef, mesh: Mesh, cod
     jitted = jax.jit(step, donate_argnums=0, out_shardings=(shardings, replicated(mesh)))
     everywhere = jax.device_put(jax.tree.map(np.asarray, codec), replicated(mesh)) if settings.chunks == 2 else None
     return TrainStep(jitted, mesh, everywhere)
-
-
-@dataclass(frozen=True)
-class TrainStep:
-    """The compiled step: (state, batch on the mesh) -> (next state, result). The given state is used up."""
-
-    jitted: Any
-    mesh: Mesh
-    codec: Codec | None
-
-    def __call__(self, state: TrainState, batch: Batch) -> tuple[TrainState, StepResult]:
-        with jax.set_mesh(self.mesh):
-            return self.jitted(state, batch, self.codec)
-
-    def lower(self, state: TrainState, batch: Batch) -> jax.stages.Lowered:
-        """The program for arrays or for their shapes and shardings, to compile without running and to look at its memory."""
-        with jax.set_mesh(self.mesh):
-            return self.jitted.lower(state, batch, self.codec)
 
 
 class Rows(NamedTuple):
