@@ -72,6 +72,7 @@ class VaeTrainSettings:
     log_every: int = 20
     save_every: int = 500
     sample_every: int = 500
+    """0 draws no samples."""
     keep_checkpoints: int = 1
 
 
@@ -166,16 +167,12 @@ def vae_losses(vae: VideoVae, frames: jax.Array, key: jax.Array, settings: VaeTr
     decoded = vae.decode_moments(latents)
     l1 = jnp.abs(decoded - frames).mean()
     made, true = ((jnp.clip(x, -1, 1).reshape(-1, *x.shape[2:]) + 1) / 2 for x in (decoded, frames))
-    perceptual = lpips(made, true, chunk=_lpips_chunk(len(made))).mean() if settings.lpips else jnp.float32(0)
+    at_once = len(made) if jax.default_backend() == "gpu" else frames.shape[1]
+    perceptual = lpips(made, true, chunk=at_once).mean() if settings.lpips else jnp.float32(0)
     kl = 0.5 * (jnp.square(mean) + jnp.exp(log_variance) - 1 - log_variance).mean()
     psnr = -10 * jnp.log10(jnp.square(made - true).mean() + 1e-10)
     total = l1 + settings.lpips * perceptual + settings.kl * kl
     return Losses(total, l1, perceptual, kl, psnr, jnp.float32(0))
-
-
-def _lpips_chunk(frames: int) -> int:
-    """Frames of LPIPS at once: all where there is a GPU to fill."""
-    return frames if jax.default_backend() == "gpu" else 8
 
 
 def make_vae_step(graph: nnx.GraphDef, statistics: Any, experiment: VaeExperiment) -> Callable[..., tuple[TrainState, Losses]]:
@@ -205,8 +202,10 @@ def make_vae_step(graph: nnx.GraphDef, statistics: Any, experiment: VaeExperimen
 def init_vae_state(experiment: VaeExperiment) -> tuple[nnx.GraphDef, Any, TrainState]:
     """Structure, statistics of the latents (0 and 1 until the end) and the state of step 0."""
 
+    key = jax.random.key(experiment.train.seed, impl="unsafe_rbg")  # the other kinds take a minute to compile
+
     def create() -> VideoVae:
-        return VideoVae(experiment.size, dtype=jnp.dtype(experiment.dtype), rngs=nnx.Rngs(experiment.train.seed))
+        return VideoVae(experiment.size, dtype=jnp.dtype(experiment.dtype), rngs=nnx.Rngs(key))
 
     graph: nnx.GraphDef = nnx.split(nnx.eval_shape(create))[0]
     optimizer = make_optimizer(experiment.optimizer)
@@ -267,7 +266,7 @@ def train_vae(experiment: VaeExperiment, *, resume: bool = False, overwrite: boo
                 sys.exit(f"error: the loss is not finite by step {number}; nothing of it was saved. Lower train.learning_rate.")
         if saves:
             save_state(checkpoints, state, batches.get_state())
-        if number % settings.sample_every == 0 or last:
+        if settings.sample_every and (number % settings.sample_every == 0 or last):
             codec = WanVaeCodec.of(nnx.merge(graph, state.ema, statistics))
             log.image(number, "sample/unseen", strip(sample, codec.decode(codec.encode(sample))))
         if stop.received and not last:
