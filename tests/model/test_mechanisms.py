@@ -1,24 +1,31 @@
 """The ways into the network beside streams, each against a naive form of itself, and the systems made of them."""
 
+import re
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import synthetic
 from flax import nnx
 from safetensors.numpy import save_file
 from test_dit import tiny
 
 from xew.config import ConfigError
-from xew.episode import HEIGHT, WIDTH
+from xew.episode import HEIGHT, WIDTH, read_record, read_states
 from xew.model import dit
-from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition
+from xew.model.codec import CODECS
+from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition, command_of
 from xew.model.dit import MODELS, STREAMS, WorldModel
 from xew.model.dit_layouts import dit_layout, load_dit
+from xew.model.experiment import load_experiment
 from xew.model.mechanisms import MECHANISMS, frames_of_groups, ray_maps
+from xew.model.samplers import GRIDS, SAMPLERS
+from xew.model.vae import VAES
 from xew.model.weights import checkpoint_shapes
 
+ROOT = Path(__file__).parents[2]
 CHANNELS = 3
 SHAPE = (2, 3, 4, 6, CHANNELS)
 EARLIER = (-2.5, -1.0)
@@ -314,3 +321,32 @@ def test_conditions_of_a_system_are_all_of_one_kind() -> None:
                 condition.group,
                 condition.scale,
             )
+
+
+PAGE = (ROOT / "docs" / "models.md").read_text()
+
+
+def test_the_page_names_all_that_can_be_chosen() -> None:
+    registries = (MODELS, STREAMS, ACTIONS, CONDITIONS, MECHANISMS, CODECS, VAES, SAMPLERS, GRIDS)
+    absent = [name for registry in registries for name in registry if f"`{name}`" not in PAGE]
+    assert not absent
+    assert all((ROOT / path).is_file() for path in re.findall(r"configs/[\w/]+\.yaml", PAGE))
+    modules = set(re.findall(r"python -m (xew[\w.]+)", PAGE))
+    assert len(modules) > 5 and all((ROOT / f"{module.replace('.', '/')}.py").is_file() for module in modules)
+
+
+def test_the_page_s_condition_from_outside_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (code,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    (tmp_path / "my_conditions.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    chosen = ["--model.embodiment", "my_conditions:STILL"]
+    experiment = load_experiment(ROOT / "configs" / "fixed.yaml", chosen)
+    assert experiment.conditions["embodiment"].name == "still_render"
+    folder = synthetic.write_cell(tmp_path / "data", "place_empty_cup", 0, "piper", frames=3)
+    command = command_of(folder, read_record(folder), read_states(folder))
+    made = experiment.conditions["embodiment"].make(command)
+    np.testing.assert_array_equal(made, np.repeat(command.render[:1], 3, axis=0))
+    system = load_experiment(
+        ROOT / "configs" / "fixed.yaml", ["--model.action", "my_conditions:SYSTEM", "--model.embodiment", "none"]
+    )
+    assert set(system.conditions) == {"embodiment", "joints"}
