@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
-from jax.sharding import NamedSharding
+from jax.sharding import Mesh, NamedSharding
 
 from xew import config
 from xew.config import ConfigError
@@ -254,7 +254,7 @@ def _saved_at(run: Path, step: int) -> int | None:
 def _placed_beside(shapes: Any, like: Any) -> Any:
     """Shapes with places: on the mesh of `like`, or on its device."""
     sharding = jax.tree.leaves(like)[0].sharding
-    if isinstance(sharding, NamedSharding):
+    if isinstance(sharding, NamedSharding) and isinstance(sharding.mesh, Mesh):
         places = state_shardings(shapes, sharding.mesh)
     else:
         places = jax.tree.map(lambda leaf: sharding, shapes)

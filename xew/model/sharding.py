@@ -50,7 +50,7 @@ def start_processes(force: bool = False, environment: Mapping[str, str] = os.env
         return
     try:
         named = {"num_processes": "JAX_NUM_PROCESSES", "process_id": "JAX_PROCESS_ID"}
-        numbers = {key: int(environment[name]) for key, name in named.items() if name in environment}
+        numbers: dict[str, Any] = {key: int(environment[name]) for key, name in named.items() if name in environment}
         jax.distributed.initialize(coordinator, **numbers)
     except (ValueError, RuntimeError) as error:
         raise ConfigError(

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -184,36 +184,53 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     experiment, asked = with_steps(experiment, source.fresh), experiment
     check_memory(estimate_memory(experiment, mesh.size, mesh.shape["fsdp"]), ignore=ignore_memory)
     begin_run(asked, codec, resume=resume, overwrite=overwrite)
-    source.scales = run_scales(experiment, source.scales)
+    source.scales = dict(run_scales(experiment, source.scales))
 
     # State: step 0, or where the run was left.
     settings = experiment.train
     rows = process_rows(mesh, settings.batch)
     batches = iter(make_dataset(source, settings.batch, settings.seed, experiment.adapt.replay, rows))
-    checkpoints = open_checkpoints(experiment.out, settings.keep_checkpoints)
-    if checkpoints.latest_step() is None:
-        graph, state = init_train_state(experiment, mesh, start_params(experiment, mesh))
-    else:
-        graph, state, position = left_state(experiment, mesh, checkpoints)
-        batches.set_state(position)
-    train_step = make_train_step(experiment, graph, mesh, codec)
+    with open_checkpoints(experiment.out, settings.keep_checkpoints) as checkpoints:  # what is being written is finished
+        if checkpoints.latest_step() is None:
+            graph, state = init_train_state(experiment, mesh, start_params(experiment, mesh))
+        else:
+            graph, state, position = left_state(experiment, mesh, checkpoints)
+            batches.set_state(position)
+        run_steps(experiment, Run(mesh, codec, graph, checkpoints), state, batches)
 
-    # Steps.
+
+class Run(NamedTuple):
+    """What stays the same over the steps of a run."""
+
+    mesh: Mesh
+    codec: Codec
+    graph: nnx.GraphDef
+    checkpoints: Any
+
+
+def run_steps(experiment: Experiment, run: Run, state: TrainState, batches: Any) -> None:
+    """From the given state to the last step; logs, saves and draws samples as the settings say.
+
+    Args:
+        batches: an iterator of this process's batches, with its position.
+    """
+    settings, train_step = experiment.train, make_train_step(experiment, run.graph, run.mesh, run.codec)
     log = RunLog(experiment.out) if jax.process_index() == 0 else None
     stop, schedule = StopSignal(), learning_rate(settings)
     meter = Meter(flops_of_step(experiment), settings.batch)
-    begin = int(state.step)
+    begin, draws = int(state.step), settings.sample_every and jax.process_count() == 1
     progress = tqdm(range(begin, settings.steps), desc="train", initial=begin, total=settings.steps, file=sys.stderr)
     for step in (number + 1 for number in progress):
-        last = step == settings.steps
         asking = time.perf_counter()
-        batch = place_batch(next(batches), mesh)
+        batch = place_batch(next(batches), run.mesh)
         wait_s = time.perf_counter() - asking
         state, result = train_step(state, batch)
         meter.add(result, wait_s)
+        last = step == settings.steps
         logs = step % settings.log_every == 0 or last
-        stops = stop.agreed() if logs or jax.process_count() == 1 else False
-        if logs or stops or step % settings.save_every == 0:
+        stops = (logs or jax.process_count() == 1) and stop.agreed()
+        saves = step % settings.save_every == 0 or last or stops
+        if logs or saves:
             meter.demand_finite()
         if logs:
             values = meter.take() | {"train/learning_rate": float(schedule(step - 1))}
@@ -221,18 +238,17 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
             if log:
                 log.scalars(step, values)
             stops = stops or stop.agreed()
-        if step % settings.save_every == 0 or last or stops:
-            save_state(checkpoints, state, batches.get_state())
-        if settings.sample_every and (step % settings.sample_every == 0 or last):
+        if saves or stops:
+            save_state(run.checkpoints, state, batches.get_state())
+        if draws and (step % settings.sample_every == 0 or last):
             with meter.paused():
-                draw_samples(log, experiment, codec, graph, state, mesh, step)
+                draw_samples(log, experiment, run, state, step)
         if stops:
             print(f"stopped at step {step} and saved; continue with --resume", file=sys.stderr)
             break
     stop.release()
     if log:
         log.close()
-    checkpoints.close()
 
 
 def check_network(experiment: Experiment) -> None:
@@ -304,14 +320,12 @@ def left_state(experiment: Experiment, mesh: Mesh, checkpoints: Any) -> tuple[nn
     return graph, replace(state, base=base), position
 
 
-def draw_samples(
-    log: RunLog | None, experiment: Experiment, codec: Codec, graph: nnx.GraphDef, state: TrainState, mesh: Mesh, step: int
-) -> None:
+def draw_samples(log: RunLog | None, experiment: Experiment, run: Run, state: TrainState, step: int) -> None:
     """Predict clips of seen and unseen robots beside the truth."""
-    with jax.set_mesh(mesh):
+    with jax.set_mesh(run.mesh):
         params = jax.jit(corrected)(state.base, state.params if state.ema is None else state.ema)
-        scales = load_run_scales(experiment, experiment.out)
-        log_samples(log, Predictor(experiment, codec, graph, params, scales), step)
+    scales = load_run_scales(experiment, experiment.out)
+    log_samples(log, Predictor(experiment, run.codec, run.graph, params, scales), step)
 
 
 if __name__ == "__main__":
