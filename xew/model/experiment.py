@@ -96,7 +96,7 @@ class TrainSettings:
     log_every: int = 20
     save_every: int = 1000
     sample_every: int = 1000
-    """0 draws no samples."""
+    """0 draws no samples, and neither do several processes."""
     keep_checkpoints: int = 2
 
 
@@ -127,9 +127,11 @@ class RolloutSettings:
     shift: float | None = None
     """Of the noise levels; that of training where left out."""
     guidance: float = 1.0
-    """Classifier-free guidance against `negative_prompt`; 1 is none and costs nothing. Wan's own sampling has 5."""
+    """Classifier-free guidance against `negative_prompt`; 1 is none and costs nothing. Wan's own sampling has 5; networks
+    trained here have never gone without their instruction."""
     negative_prompt: str = ""
     batch: int = 4
+    """Episodes at once over all devices."""
     max_frames: int = 0
     """Predict only the first so many frames of an episode; 0 predicts all."""
     seed: int = 0
