@@ -191,7 +191,7 @@ class WorldModel(nnx.Module):
         graph, layers = nnx.split(self.blocks)
 
         def block(carry: Array, layer: nnx.State) -> tuple[Array, ConditionCache]:
-            module = nnx.merge(graph, layer)
+            module, carry = nnx.merge(graph, gathered(layer, layer=True)), cut_over_batch(carry)
             read = ConditionCache(*module.keys_values(carry, modulation, rows, rotary))
             return module(carry, modulation, rows, rotary, context), read
 
