@@ -56,7 +56,7 @@ def test_a_file_imports_only_what_its_room_may(path: Path) -> None:
 def test_only_latents_asks_the_simulation_to_render() -> None:
     """The one door between model and simulation; it stands inside functions, so that a model loads without Warp."""
     users = {path.stem for path in FILES if room(path) == "model" and touches(imports(path), "xew.sim_warp")}
-    assert users <= {"latents", "conditions"}
+    assert users <= {"latents", "pixels", "conditions"}
 
 
 def test_metric_functions_know_nothing_of_ours_but_metrics() -> None:
