@@ -93,10 +93,17 @@ class Predictor:
         """
         return self.begin(episodes, frame_count).fetch()
 
-    def begin(self, episodes: Sequence[Episode], frame_count: int) -> Prediction:
-        """Read what `predict` needs and set the devices to work, without waiting for them."""
-        whole = [*episodes, *[episodes[-1]] * (-len(episodes) % self._devices)]
-        streams = [self._read(episode) for episode in whole]
+    def begin(self, episodes: Sequence[Episode], frame_count: int, batch: int = 1) -> Prediction:
+        """Read what `predict` needs and set the devices to work, without waiting for them.
+
+        Fewer episodes than `batch` are filled up by repeating the last, so that nothing is compiled for a smaller batch; so
+        are those that do not cover the devices evenly.
+        """
+        filled = max(len(episodes), batch)
+        filled += -filled % self._devices
+        whole = [*episodes, *[episodes[-1]] * (filled - len(episodes))]
+        streams = [self._read(episode) for episode in episodes]
+        streams += streams[-1:] * (filled - len(episodes))
         text, negative = self._text(whole)
         given = self._place(np.stack([stream["rgb"][:1] for stream in streams]))
         standing = self._standing(streams)

@@ -11,7 +11,7 @@ import argparse
 import json
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -209,12 +209,13 @@ class _Begun:
             writer.write(record, video[: header["frame_count"]], header)
 
 
-def predict_and_write(predictor: Predictor, groups: Iterable[list[Item]], writer: RolloutWriter) -> None:
-    """Roll out groups of episodes and write each as long as its header says; reads one group ahead of the devices."""
+def predict_and_write(predictor: Predictor, pending: Sequence[Item], writer: RolloutWriter) -> None:
+    """Roll out episodes and write each as long as its header says; reads one batch ahead of the devices."""
+    size = max(min(predictor.experiment.rollout.batch, len(pending)), 1)
     begun: _Begun | None = None
-    for items in groups:
+    for items in batches(pending, size):
         longest = max(header["frame_count"] for _, header in items)
-        following = _Begun(items, predictor.begin([episode for episode, _ in items], longest))
+        following = _Begun(items, predictor.begin([episode for episode, _ in items], longest, size))
         if begun is not None:
             begun.hand_over(writer)
         begun = following
@@ -240,12 +241,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     headers = [(episode, rollout_header(experiment, step, episode)) for episode in episodes]
     pending = [item for item in headers if not is_done(out, *item)]
     encode_instructions(experiment, [record.instruction for (_, record), _ in pending])  # all at once, where that costs
-    size = max(experiment.rollout.batch, 1)
     with (
         tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
         RolloutWriter(out, progress.update) as writer,
     ):
-        predict_and_write(predictor, batches(pending, size), writer)
+        predict_and_write(predictor, pending, writer)
     shown = "published weights" if step is None else f"checkpoint {step}"
     print(f"{out}: {len(pending)} rollouts new, {len(headers) - len(pending)} there before, {shown}")
 
