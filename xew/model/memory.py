@@ -168,5 +168,6 @@ def check_memory(memory: Memory, ignore: bool = False) -> None:
         raise ConfigError(
             f"training needs about {memory.total / 1e9:.1f} GB a device, there is {there / 1e9:.1f} GB ({memory.layout}). "
             "Use more devices with a larger mesh.fsdp, --model.remat full, a smaller --train.batch, a larger "
-            "--train.accumulate or --train.mu-dtype bfloat16; --ignore-memory starts all the same."
+            "--train.accumulate or --train.mu-dtype bfloat16; on a GPU the variable XLA_PYTHON_CLIENT_MEM_FRACTION=0.95 lets "
+            "JAX have more than its usual three quarters; --ignore-memory starts all the same."
         )
