@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from xew.model.vae import VAES, VaeSize, VideoVae, abstract_vae, double_sides, patchify, unpatchify
+from xew.model.vae import VAES, VaeSize, VideoVae, abstract_vae, double_sides, even_chunk, patchify, unpatchify
 
 CHANNELS = VAES["tiny"].channels
 FOUR_STAGES = VaeSize(4, encoder_dim=8, decoder_dim=8, multipliers=(1, 2, 4, 4), halve_time=(False, True, True), blocks=1)
@@ -52,6 +52,11 @@ def test_encoding_in_chunks_is_encoding_at_once(vae: VideoVae, chunk: int) -> No
     whole, parts = encode(vae, video), encode(vae, video, chunk)
     assert whole.shape == (2, 4, 3, 2, CHANNELS) and np.std(whole) > 0.1
     np.testing.assert_allclose(parts, whole, atol=1e-5)
+
+
+def test_chunks_are_even_where_that_is_cheap() -> None:
+    assert [even_chunk(30, most) for most in (0, 1, 4, 8, 40)] == [0, 1, 3, 6, 30]
+    assert even_chunk(7, 5) == 5 and even_chunk(0, 8) == 8
 
 
 def test_the_last_frame_alone(vae: VideoVae) -> None:

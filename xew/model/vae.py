@@ -108,7 +108,7 @@ class VideoVae(nnx.Module):
 
         Args:
             frames: [b t h w 3] in [-1, 1]; t = 4 k + 1, sides multiples of the size's factor.
-            chunk: latent frames computed at once, which bounds the memory; 0 computes all.
+            chunk: latent frames computed at once, at most, which bounds the memory; 0 computes all.
 
         Returns:
             Two of [b k+1 h' w' c] float32.
@@ -118,7 +118,7 @@ class VideoVae(nnx.Module):
         def step(part: Array, history: History) -> Array:
             return self.encoder(patchify(part, self.size.patch), history)
 
-        encoded = in_chunks(step, frames.astype(self.dtype), 4 * chunk)
+        encoded = in_chunks(step, frames.astype(self.dtype), 4 * even_chunk(frames.shape[1] // 4, chunk))
         mean, log_variance = jnp.split(self.quant(encoded).astype(jnp.float32), 2, axis=-1)
         return mean, jnp.clip(log_variance, *LOG_VARIANCE_RANGE)
 
@@ -131,7 +131,8 @@ class VideoVae(nnx.Module):
 
         Args:
             latents: [b t' h' w' c].
-            chunk: latent frames computed at once; 0 computes all.
+            chunk: latent frames computed at once, at most; 0 computes all, which at Wan2.2's size and 121 frames of
+                320x256 makes tensors of more than 2^31 numbers, where not every convolution of cuDNN follows.
             last_only: give the last frame alone; with a small `chunk` the others never lie in memory together.
 
         Returns:
@@ -146,6 +147,7 @@ class VideoVae(nnx.Module):
             frames = unpatchify(self.decoder(part, history), self.size.patch)
             return frames[:, -1:] if last_only else frames
 
+        chunk = even_chunk(latents.shape[1] - 1, chunk)
         decoded = in_chunks(step, self.post_quant(latents.astype(self.dtype)), chunk)
         return (decoded[:, -1:] if last_only else decoded).astype(jnp.float32)
 
@@ -241,6 +243,15 @@ def in_chunks(step: Callable[[Array, History], Array], video: Array, size: int) 
     if rest.shape[1] % size:
         parts.append(step(rest[:, count * size :], History(kept)))
     return jnp.concatenate(parts, axis=1)
+
+
+def even_chunk(count: int, most: int) -> int:
+    """The largest chunk up to `most` that divides `count`, so that no shorter one is compiled beside it.
+
+    Where that is less than half of `most`, `most` itself; 0 stays 0.
+    """
+    even = next((size for size in range(min(most, count), 0, -1) if count % size == 0), most)
+    return even if 2 * even >= most else most
 
 
 # Stages.
