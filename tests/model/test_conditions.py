@@ -37,7 +37,9 @@ def episode(tmp_path: Path) -> Path:
 
 
 def test_a_command_holds_nothing_measured() -> None:
-    assert {field.name for field in fields(Command)} == {"robot", "action", "intrinsics", "extrinsics", "render_path"}
+    """`rendered` is the video at `render_path`, at hand or rendered anew from the commands (pixels.py)."""
+    named = {"robot", "action", "intrinsics", "extrinsics", "render_path", "rendered"}
+    assert {field.name for field in fields(Command)} == named
 
 
 @pytest.mark.parametrize("condition", [*STORED, *NUMBERS], ids=lambda condition: condition.name)
