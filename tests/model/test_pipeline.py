@@ -4,9 +4,10 @@ import json
 import os
 import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import synthetic
@@ -28,6 +29,14 @@ model: {size: tiny, action: joints, embodiment: robot_render}
 train: {steps: 4, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, ema_decay: 0.5}
 rollout: {steps: 2, batch: 3}
 """
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compile() -> Iterator[None]:
+    """Most of the time of these tests is compiling: leave out what makes programs fast."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -52,6 +52,14 @@ ADAPT = ("--adapt.robots", "piper", "--adapt.episodes", "2")
 CONFIGS = Path(__file__).parents[2] / "configs"
 WAN5B = CONFIGS / "wan5b" / "fixed.yaml"
 FEWSHOT = [CONFIGS / "wan5b" / "fewshot.yaml", *sorted((CONFIGS / "fewshot").glob("*.yaml"))]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compile() -> Iterator[None]:
+    """Most of the time of these tests is compiling: leave out what makes programs fast."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(scope="module")
