@@ -96,7 +96,7 @@ class TrainSettings:
     log_every: int = 20
     save_every: int = 1000
     sample_every: int = 1000
-    """0 draws no samples, and neither do several processes."""
+    """0 draws no samples."""
     keep_checkpoints: int = 2
 
 

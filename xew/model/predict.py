@@ -48,7 +48,7 @@ class ChunkInputs(NamedTuple):
     negative: Array | None
     """The same of the negative prompt, where there is guidance."""
     keys: Array
-    """[b] random keys, of the episode and the chunk."""
+    """[b 2] uint32, data of random keys, of the episode and the chunk."""
 
 
 class Sampling(NamedTuple):
@@ -110,7 +110,7 @@ class Predictor:
         chunks: list[Array] = []
         for number, start in enumerate(range(0, max(frame_count - 1, 1), self.experiment.clip.frames - 1)):
             conditions = self._conditions(streams, start) | standing | self._history(given, chunks, start)
-            keys = self._place(jnp.stack([self._key(episode, number) for episode in whole]))
+            keys = self._place(np.stack([self._key(episode, number) for episode in whole]))
             reference = chunks[-1][:, -1:] if chunks else given
             inputs = ChunkInputs(reference, conditions, text, negative, keys)
             with jax.set_mesh(self._mesh) if self._mesh is not None else nullcontext():
@@ -171,10 +171,11 @@ class Predictor:
         encoded = [encode_pictures(self.codec, past[:, frame : frame + 1]) for frame in earlier]
         return dict.fromkeys(names, jnp.concatenate(encoded, axis=1))
 
-    def _key(self, episode: Episode, chunk: int) -> Array:
+    def _key(self, episode: Episode, chunk: int) -> np.ndarray:
         _, record = episode
         name = zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode())
-        return jax.random.fold_in(jax.random.fold_in(jax.random.key(self.experiment.rollout.seed), name), chunk)
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.experiment.rollout.seed), name), chunk)
+        return np.asarray(jax.random.key_data(key))
 
     @property
     def _mesh(self) -> Mesh | None:
@@ -199,7 +200,8 @@ def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInp
     """One chunk of every episode of a batch, from its reference on: uint8 [b t h w 3]."""
     model = nnx.merge(graph, compute_params(graph, params))
     reference = codec.encode_batch(to_signed(inputs.reference))
-    noise = jax.vmap(lambda key: jax.random.normal(key, sampling.latent_shape, jnp.float32))(inputs.keys)
+    keys = jax.random.wrap_key_data(inputs.keys)
+    noise = jax.vmap(lambda key: jax.random.normal(key, sampling.latent_shape, jnp.float32))(keys)
     velocity = guided_velocity(model, inputs, sampling.guidance)
     frames = to_pictures(codec.decode_batch(SAMPLERS[sampling.sampler](velocity, reference, noise, sampling.grid)))
     return jax.lax.with_sharding_constraint(frames, PartitionSpec()) if jax.process_count() > 1 else frames

@@ -218,7 +218,7 @@ def run_steps(experiment: Experiment, run: Run, state: TrainState, batches: Any)
     log = RunLog(experiment.out) if jax.process_index() == 0 else None
     stop, schedule = StopSignal(), learning_rate(settings)
     meter = Meter(flops_of_step(experiment), settings.batch)
-    begin, draws = int(state.step), settings.sample_every and jax.process_count() == 1
+    begin = int(state.step)
     progress = tqdm(range(begin, settings.steps), desc="train", initial=begin, total=settings.steps, file=sys.stderr)
     for step in (number + 1 for number in progress):
         asking = time.perf_counter()
@@ -240,7 +240,7 @@ def run_steps(experiment: Experiment, run: Run, state: TrainState, batches: Any)
             stops = stops or stop.agreed()
         if saves or stops:
             save_state(run.checkpoints, state, batches.get_state())
-        if draws and (step % settings.sample_every == 0 or last):
+        if settings.sample_every and (step % settings.sample_every == 0 or last):
             with meter.paused():
                 draw_samples(log, experiment, run, state, step)
         if stops:
