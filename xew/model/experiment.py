@@ -54,7 +54,7 @@ class ModelSettings:
     residual: Literal["float32", "bfloat16"] = "float32"
     """Of the tokens between blocks; their sums are float32 either way."""
     remat: RematName = "none"
-    """What the backward pass computes again: nothing, all but the attention or matrix products, or everything (blocks.REMAT)."""
+    """What the backward pass computes again: nothing, all but attention or matrix products, or everything (blocks.REMAT)."""
     unroll: int = 1
     """Blocks compiled as one loop body."""
     attention: AttentionName = "auto"
