@@ -32,10 +32,11 @@ train:
   learning_rate: 2e-3
   warmup_steps: 0
   decay_to: 1.0
+  lpips: 0.0
   statistics_clips: 4
   log_every: 1
   save_every: 2
-  sample_every: 4
+  sample_every: 0
 """
 
 
@@ -111,17 +112,18 @@ train: {{steps: 1, batch: 1}}
 
 def test_steps_learn(world: Path) -> None:
     """One batch again and again is reconstructed better."""
-    experiment = load_vae_experiment(world / "vae.yaml", ["--train.steps", "100"])
+    experiment = load_vae_experiment(world / "vae.yaml", ["--train.steps", "100", "--train.lpips", "0.2"])
     graph, statistics, state = init_vae_state(experiment)
     step = make_vae_step(graph, statistics, experiment)
     files = video_files(("rgb",), training_episodes(experiment), experiment.cache_folder)
     pictures = next(iter(make_dataset(files, experiment.cut(), 2, 0)))
-    psnr = []
+    psnr, perceptual = [], []
     for _ in range(25):
         state, losses = step(state, pictures)
         psnr.append(float(losses.psnr))
-    assert np.isfinite(psnr).all()
-    assert psnr[-1] > psnr[0] + 3
+        perceptual.append(float(losses.lpips))
+    assert np.isfinite(psnr).all() and np.isfinite(perceptual).all()
+    assert psnr[-1] > psnr[0] + 3 and perceptual[-1] < perceptual[0]
     behind = [np.abs(a - b).mean() for a, b in zip(*map(jax.tree.leaves, (state.params, state.ema)), strict=True)]
     assert max(behind) > 0
 
