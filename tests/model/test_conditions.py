@@ -24,7 +24,7 @@ from xew.model.conditions import (
     tool_poses,
 )
 from xew.model.scales import apply_scales, fit_scales, read_scales, save_scales
-from xew.protocol import ACTION_DIM
+from xew.protocol import ACTION_DIM, ROBOT_NAMES
 
 STORED = [condition for condition in (ACTIONS["joints"], CONDITIONS["robot_render"]) if isinstance(condition, Condition)]
 SYSTEMS = {name: entry for name, entry in ACTIONS.items() if isinstance(entry, tuple)}
@@ -111,8 +111,19 @@ def test_tool_poses_are_forward_kinematics_of_commands(tmp_path: Path, robot: st
 
 
 def test_a_tool_that_points_down_has_no_angles() -> None:
-    """x, the approach, goes down; y, along which the fingers open, to the right."""
-    np.testing.assert_allclose(POINTING_DOWN.apply([[1, 0, 0], [0, 1, 0]]), [[0, 0, -1], [1, 0, 0]], atol=1e-12)
+    """x, the approach, goes down; y, along which the fingers open, to the left."""
+    np.testing.assert_allclose(POINTING_DOWN.apply([[1, 0, 0], [0, 1, 0]]), [[0, 0, -1], [-1, 0, 0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("robot", ROBOT_NAMES)
+def test_no_angle_is_near_a_jump_where_tools_rest(tmp_path: Path, robot: str) -> None:
+    """Angles wrap at pi and are ambiguous at a pitch of pi / 2."""
+    from xew.sim_warp.robots import ROBOTS
+    from xew.sim_warp.streams import home_action
+
+    home = home_action(ROBOTS[robot])[None].astype(np.float32)
+    poses = tool_poses(Command(robot, home, np.eye(3), np.eye(4), tmp_path))[0]
+    assert np.abs(poses[[3, 4, 5, 10, 11, 12]]).max() < 1
 
 
 def test_relative_poses_lead_from_frame_to_frame() -> None:

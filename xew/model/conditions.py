@@ -175,8 +175,9 @@ def articulation_clip(command: Command) -> np.ndarray:
     return streams.articulation_clip(command.robot)
 
 
-POINTING_DOWN = Rotation.from_matrix([[0, 1, 0], [0, 0, -1], [-1, 0, 0]])
-"""A tool frame whose approach (x) points to the ground and whose fingers open (y) along the world's x."""
+POINTING_DOWN = Rotation.from_matrix([[0, -1, 0], [0, 0, 1], [-1, 0, 0]])
+"""A tool frame whose approach (x) points to the ground and whose y axis points to the left, as at home: its z axis points
+away from the robot, so that yaw is the heading."""
 
 
 def tool_poses(command: Command) -> np.ndarray:
