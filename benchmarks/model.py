@@ -34,7 +34,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-CONFIG = Path(__file__).parent.parent / "configs" / "fixed.yaml"
+CONFIG = Path(__file__).parent.parent / "configs" / "wan5b" / "fixed.yaml"
 WARMUP, ROUNDS = 2, 5
 STEPS_SENT = 5
 """Denoising steps that are sent off before the device is waited for, as a sampler does."""
@@ -156,7 +156,7 @@ def experiment_of(args: Args, streams: int, batch: int, remat: str, residual: st
     embodiment = f"--model.embodiment={'robot_render' if streams == 3 else 'none'}"
     precision = [f"--model.remat={remat}", f"--model.residual={residual}"]
     mesh = [f"--mesh.data={args.mesh.data}", f"--mesh.fsdp={args.mesh.fsdp}"]
-    return load_experiment(CONFIG, [*size, embodiment, *precision, *mesh, "--train.chunks=1", "--codec.channels=48", *more])
+    return load_experiment(CONFIG, [*size, embodiment, *precision, *mesh, "--train.chunks=1", *more])
 
 
 def forward_flops(experiment: Any, samples: int, **options: Any) -> float:
