@@ -107,14 +107,22 @@ def flow_to_rgb(flow: np.ndarray, clip: float = FLOW_LIMIT) -> np.ndarray:
     Returns:
         [t h w 3] uint8.
     """
-    length = np.linalg.norm(flow, axis=-1)
-    hue = (np.arctan2(flow[..., 1], flow[..., 0]) + np.pi) / (2 * np.pi) * 179
-    saturation = np.where(length < STILL, 0, np.minimum(length / clip, 1) * 255)
-    hsv = np.stack([hue, saturation, np.full_like(hue, 255)], -1).astype(np.uint8)
+    wheel = color_wheel()
     video = np.full((*flow.shape[:3], 3), 255, np.uint8)
-    for frame, wheel in enumerate(hsv[:-1], start=1):
-        video[frame] = cv2.cvtColor(wheel, cv2.COLOR_HSV2RGB)
+    x, y = flow[:-1, ..., 0], flow[:-1, ..., 1]
+    moving = x * x + y * y >= STILL * STILL  # little of a picture moves
+    x, y = x[moving], y[moving]
+    hue = (np.arctan2(y, x) + np.pi) / (2 * np.pi) * 179
+    saturation = np.minimum(np.sqrt(x * x + y * y) / clip, 1) * 255
+    video[1:][moving] = wheel[hue.astype(np.uint8), saturation.astype(np.uint8)]
     return video
+
+
+@cache
+def color_wheel() -> np.ndarray:
+    """RGB of each hue and saturation at full value, as OpenCV has them: uint8 [180 256 3]."""
+    hue, saturation = np.mgrid[:180, :256].astype(np.uint8)
+    return cv2.cvtColor(np.stack([hue, saturation, np.full_like(hue, 255)], -1), cv2.COLOR_HSV2RGB)
 
 
 def ray_map(robot_key: str, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> np.ndarray:
