@@ -1,5 +1,6 @@
 """Streams from commands, keypoints from states: for every robot of the registry."""
 
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
 
@@ -278,3 +279,14 @@ def test_unknown_robots_and_odd_commands_are_refused() -> None:
         command_streams("piperr", np.zeros((1, 16)))
     with pytest.raises(ValueError, match=r"expected \(frames, 16\)"):
         ray_map("piper", np.zeros((3, 14)))
+
+
+def test_threads_that_share_the_renderer_get_what_one_alone_gets():
+    """Latents draw their conditions in as many threads as there are cores."""
+    robots = list(ROBOTS) * 2
+    alone = [command_streams(robot, in_view(robot)) for robot in robots]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda robot: command_streams(robot, in_view(robot)), robots))
+    for one, other in zip(alone, together, strict=True):
+        assert one.render.tobytes() == other.render.tobytes()
+        assert one.optical_flow.tobytes() == other.optical_flow.tobytes()

@@ -14,7 +14,7 @@ import itertools
 import json
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -92,32 +92,27 @@ class LatentCache:
         """Encode what is missing of some episodes; returns the number of bytes written.
 
         Args:
-            source: where their pixels come from; stored videos are read ahead in threads.
+            source: where their pixels come from; they are read or rendered, and conditions drawn, ahead in threads.
             batch: clips that the codec encodes at once.
         """
         pending = [episode for episode in episodes if self.missing(episode[1])]
         done = len(episodes) - len(pending)
         progress = tqdm(total=len(episodes), initial=done, desc="encode", unit="episode", file=sys.stderr)
         written = 0
-        for episode, pixels in self._pixels(pending, source):
-            written += self._encode_episode(*episode, pixels, batch)
+
+        def load(episode: Episode) -> dict[str, np.ndarray]:
+            missing = self.missing(episode[1])
+            pixels = source(*episode, needed_pixels(self.experiment, missing))
+            return stream_videos(self.experiment, *episode, missing, pixels)
+
+        for (_, record), videos in ahead(load, pending):
+            written += self._encode_videos(record, videos, batch)
             progress.update()
         progress.close()
         return written
 
-    def _pixels(self, episodes: Sequence[Episode], source: PixelSource) -> Iterable[tuple[Episode, Pixels]]:
-        """Each episode with the pixels that it lacks streams of."""
-
-        def load(episode: Episode) -> Pixels:
-            return source(*episode, needed_pixels(self.experiment, self.missing(episode[1])))
-
-        if source is stored_pixels:
-            return ahead(load, episodes)
-        return ((episode, load(episode)) for episode in episodes)  # a renderer serves one thread
-
-    def _encode_episode(self, folder: Path, record: Record, pixels: Pixels, batch: int) -> int:
-        """Encode the missing streams of one episode and write each as a whole."""
-        videos = stream_videos(self.experiment, folder, record, self.missing(record), pixels)
+    def _encode_videos(self, record: Record, videos: dict[str, np.ndarray], batch: int) -> int:
+        """Encode some streams of one episode and write each as a whole."""
         parts = {name: self._cut(name, video, self.starts(record)) for name, video in videos.items()}
         pictures = [clip for clips in parts.values() for part in clips for clip in part if clip.dtype == np.uint8]
         encoded = iter(encode_many(self.codec, pictures, batch))

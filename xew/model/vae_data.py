@@ -22,6 +22,7 @@ from xew.config import ConfigError, pick
 from xew.episode import EpisodeError, Record, episode_folder, read_states, write_video
 from xew.model.conditions import command_of, optical_flow, ray_map, robot_mask
 from xew.model.frames import to_model_size
+from xew.model.pixels import ahead
 
 Episode = tuple[Path, Record]
 
@@ -55,10 +56,13 @@ def check_streams(streams: Sequence[str]) -> None:
 
 def video_files(streams: Sequence[str], episodes: Sequence[Episode], cache: Path) -> list[tuple[Path, int]]:
     """The file of each stream of each episode, with its number of frames; a stream named twice comes twice as often."""
-    files = []
-    for folder, record in tqdm(episodes, desc="streams", unit="episode"):
-        files += [(_file(name, folder, record, cache), record.frame_count) for name in streams]
-    return files
+
+    def draw(episode: Episode) -> list[tuple[Path, int]]:
+        folder, record = episode
+        return [(_file(name, folder, record, cache), record.frame_count) for name in streams]
+
+    drawn = tqdm(ahead(draw, episodes), desc="streams", total=len(episodes), unit="episode")
+    return [file for _, files in drawn for file in files]
 
 
 def _file(name: str, folder: Path, record: Record, cache: Path) -> Path:

@@ -8,6 +8,7 @@ episode. Without it, it is the bodies alone on white. The kernels (raster_kernel
 same on CPU and GPU, and a frame's bytes do not depend on what else is rendered with it.
 """
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -33,6 +34,8 @@ from xew.sim_warp.waiting import wait_for
 
 __all__ = ["FLOW_LIMIT", "Body", "Frames", "Renderer", "World"]
 
+ONE_AT_A_TIME = threading.Lock()
+"""Threads may share a renderer or have their own; they take turns at the device, whose buffers and modules are shared."""
 FLOW_LIMIT = 25.0
 """Longest optical flow [pixels], the paper's clip."""
 SHADOW_SIZE = 512
@@ -132,6 +135,14 @@ class Renderer:
         if not worlds:
             return []
         wishes = {"depth": depth, "body": body, "optical_flow": optical_flow}
+        wanted = frozenset(name for name, wish in wishes.items() if wish)
+        with ONE_AT_A_TIME:
+            return _split(self._render_worlds(worlds, camera, ground, wanted), worlds)
+
+    def _render_worlds(
+        self, worlds: Sequence[World], camera: Camera, ground: bool, wanted: frozenset[str]
+    ) -> dict[str, np.ndarray]:
+        """Images of all frames of all worlds on the host, by the names of `Frames`."""
         kinds, kind = distinct_worlds(worlds)
         table, pose = pack_frames(worlds, kind)
         job = _Job(
@@ -141,7 +152,7 @@ class Renderer:
             view=_camera_view(camera),
             stage=self._stage(camera, ground),
             shadows=len(stage.LIGHTS) if ground else 0,
-            wanted=frozenset(name for name, wish in wishes.items() if wish),
+            wanted=wanted,
         )
         pixel = _nearest_pixel(camera, pack_points(worlds))
         chunks = [slice(i, i + self._frames_per_chunk) for i in range(0, len(table.world), self._frames_per_chunk)]
@@ -149,7 +160,7 @@ class Renderer:
         for chunk in chunks:
             for name, image in self._render_chunk(job, table.rows(chunk), pixel[chunk]).items():
                 self._fetch(image, host, name, chunk, len(table.world))
-        return _split(host, worlds)
+        return host
 
     def _fetch(self, image: wp.array, host: dict[str, np.ndarray], name: str, chunk: slice, count: int) -> None:
         """Copy a chunk's image to its place among all frames of a call.
