@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from xew.analysis.correlation import loeo_correlation
+from xew.analysis.correlation import dof_correlation, loeo_correlation
 
 # Aloha, ARX, Franka, Piper, UR5; from the study's tables.
 APPEARANCE = [0.175, 0.063, 0.107, 0.052, 0.058]
@@ -75,3 +75,33 @@ def test_a_straight_line_and_its_turned_sign() -> None:
 def test_what_has_no_correlation_is_an_error(score: list[float]) -> None:
     with pytest.raises(ValueError, match="score is"):
         loeo_correlation(APPEARANCE, score)
+
+
+def test_spearman_asks_for_order_only() -> None:
+    curved = loeo_correlation([1, 2, 3, 4, 5], [1, 10, 100, 1000, 10000])
+    assert curved.spearman == pytest.approx(1) and curved.r < 0.9
+    rng = np.random.default_rng(2)
+    x, y = rng.normal(size=5), np.array([1.0, 1.0, 2.0, 3.0, 0.0])  # a tie
+    assert loeo_correlation(x, y).spearman == pytest.approx(stats.spearmanr(x, y).statistic)
+    assert loeo_correlation(x, y, higher_is_better=True).spearman == pytest.approx(-stats.spearmanr(x, y).statistic)
+
+
+def test_the_bootstrap_is_that_of_drawn_resamples() -> None:
+    """All resamples at once give what many drawn ones tend to."""
+    rng = np.random.default_rng(3)
+    x, y = np.array(KINEMATIC), np.array(SCORES["lpips"][0])
+    drawn = [d for d in rng.integers(0, 5, (20000, 5)) if len(set(d)) > 2]
+    expected = np.quantile([np.corrcoef(x[d], y[d])[0, 1] for d in drawn], [0.025, 0.975])
+    result = loeo_correlation(x, y)
+    assert (result.bootstrap_low, result.bootstrap_high) == pytest.approx(expected, abs=0.03)
+    assert result.bootstrap_low < result.r < result.bootstrap_high
+
+
+def test_joints_are_a_diagnostic_though_one_robot_alone_differs() -> None:
+    dof, (score, _) = [6, 6, 7, 6, 6], SCORES["lpips"]
+    assert dof_correlation(dof, score) == pytest.approx(stats.pearsonr(dof, score).statistic)
+    assert dof_correlation(dof, score, higher_is_better=True) == -dof_correlation(dof, score)
+    with pytest.raises(ValueError, match="dof is"):
+        dof_correlation([6] * 5, score)
+    with pytest.raises(ValueError, match="score is"):
+        dof_correlation(dof, [1.0] * 5)

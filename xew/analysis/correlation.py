@@ -2,11 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import permutations, product
 
 import numpy as np
+from scipy.stats import rankdata
 
 FOLDS = 5
+ORDERS = np.array(list(permutations(range(FOLDS))))
+"""All pairings of five distances with five scores [120 5]."""
+RESAMPLES = np.array([drawn for drawn in product(range(FOLDS), repeat=FOLDS) if len(set(drawn)) > 2])
+"""All draws of five robots with replacement [2820 5] but those of one or two robots, where r is undefined or always +-1."""
+LEVEL = 0.95
 
 
 @dataclass(frozen=True)
@@ -20,6 +26,12 @@ class Correlation:
     """Largest r when one robot is left out."""
     p_value: float
     """Exact and two-sided: the share of all pairings of distances with scores whose |r| is as large."""
+    spearman: float
+    """The same of ranks: it asks for order only. Not in the paper."""
+    bootstrap_low: float
+    """2.5 % of r over all resamples of the robots. Not in the paper."""
+    bootstrap_high: float
+    """97.5 % of them."""
 
     @property
     def stable(self) -> bool:
@@ -38,24 +50,64 @@ def loeo_correlation(distance: Sequence[float], score: Sequence[float], higher_i
     Raises:
         ValueError: not five finite numbers each, or one of the two does not vary (also when one robot is left out).
     """
-    x, y = (np.asarray(values, np.float64) for values in (distance, score))
+    x, y = _folds(distance, score)
     for name, values in (("distance", x), ("score", y)):
-        if values.shape != (FOLDS,) or not np.isfinite(values).all():
-            raise ValueError(f"{name} is {values.tolist()}, expected {FOLDS} finite numbers, one for each fold.")
         if any(np.ptp(np.delete(values, i)) == 0 for i in range(FOLDS)):
             raise ValueError(f"{name} is {values.tolist()}: without one robot it does not vary, and r is not defined.")
     if higher_is_better:
         y = -y
-    r = _pearson(x, y)
-    without_one = [_pearson(np.delete(x, i), np.delete(y, i)) for i in range(FOLDS)]
-    return Correlation(r, min(without_one), max(without_one), _permutation_p(x, y, r))
+    low, high = leave_one_out(x, y)
+    spearman = float(pearson(rankdata(x), rankdata(y)))
+    return Correlation(float(pearson(x, y)), float(low), float(high), float(permutation_p(x, y)), spearman, *_bootstrap(x, y))
 
 
-def _pearson(x: np.ndarray, y: np.ndarray) -> float:
-    return float(np.corrcoef(x, y)[0, 1])
+def dof_correlation(dof: Sequence[float], score: Sequence[float], higher_is_better: bool = False) -> float:
+    """Pearson's r of the number of joints with the score, positive for: more joints, worse.
+
+    A diagnostic only: one robot of the five has another number than the rest, so without it nothing is left to correlate.
+
+    Raises:
+        ValueError: not five finite numbers each, or one of the two does not vary.
+    """
+    x, y = _folds(dof, score)
+    for name, values in (("dof", x), ("score", y)):
+        if np.ptp(values) == 0:
+            raise ValueError(f"{name} is {values.tolist()}: it does not vary, and r is not defined.")
+    return float(pearson(x, -y if higher_is_better else y))
 
 
-def _permutation_p(x: np.ndarray, y: np.ndarray, r: float) -> float:
-    """All 120 orders of the scores are equally likely if distance says nothing. Ties up to rounding count as as large."""
-    others = [abs(_pearson(x, y[list(order)])) for order in permutations(range(len(y)))]
-    return float(np.mean(np.array(others) >= abs(r) - 1e-12))
+def pearson(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Pearson's r over the last axis; other axes broadcast. NaN where one of the two does not vary."""
+    x, y = (values - values.mean(axis=-1, keepdims=True) for values in (x, y))
+    with np.errstate(invalid="ignore"):
+        return (x * y).sum(axis=-1) / np.sqrt((x**2).sum(axis=-1) * (y**2).sum(axis=-1))
+
+
+def leave_one_out(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest and largest r over the last axis [... 5] when one of the five is left out."""
+    rest = np.array([np.delete(np.arange(FOLDS), i) for i in range(FOLDS)])
+    r = pearson(x[..., rest], y[..., rest])
+    return r.min(axis=-1), r.max(axis=-1)
+
+
+def permutation_p(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Exact two-sided p over the last axis [... 5].
+
+    All 120 orders of the scores are equally likely if distance says nothing. Ties up to rounding count as as large.
+    """
+    others = np.abs(pearson(x[..., None, :], y[..., ORDERS]))
+    return (others >= np.abs(pearson(x, y))[..., None] - 1e-12).mean(axis=-1)
+
+
+def _bootstrap(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Percentile interval of r over all resamples; those in which something does not vary have no r."""
+    low, high = np.nanquantile(pearson(x[RESAMPLES], y[RESAMPLES]), [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return float(low), float(high)
+
+
+def _folds(distance: Sequence[float], score: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    x, y = (np.asarray(values, np.float64) for values in (distance, score))
+    for name, values in (("distance", x), ("score", y)):
+        if values.shape != (FOLDS,) or not np.isfinite(values).all():
+            raise ValueError(f"{name} is {values.tolist()}, expected {FOLDS} finite numbers, one for each fold.")
+    return x, y

@@ -1,0 +1,74 @@
+"""The paper's figures are those of its tables, and its distance table comes out of them."""
+
+import numpy as np
+import pytest
+
+from xew.analysis.correlation import loeo_correlation
+from xew.analysis.paper import AXES, mean_distance_cells, read_paper, rebuild
+from xew.protocol import ROBOT_NAMES
+
+PAPER = read_paper()
+
+
+def test_all_figures_are_there_for_all_robots() -> None:
+    assert tuple(PAPER.robots) == ROBOT_NAMES and len(PAPER.metrics) == 10
+    assert all(tuple(metric.scores) == ROBOT_NAMES for metric in PAPER.metrics.values())
+    for axis in AXES:
+        matrix = np.array(PAPER.distances[axis])
+        assert matrix.shape == (5, 5) and (matrix == matrix.T).all() and (np.diag(matrix) == 0).all()
+    assert [name for name, metric in PAPER.metrics.items() if metric.higher_is_better] == [
+        "psnr",
+        "ssim",
+        "mask_iou",
+        "boundary_f1",
+        "pck",
+    ]
+
+
+CELLS = rebuild(PAPER)
+
+
+@pytest.mark.parametrize("cell", CELLS, ids=lambda cell: f"{cell.metric}-{cell.axis}-{cell.quantity}")
+def test_every_published_figure_comes_out_within_the_rounding_of_its_inputs(cell) -> None:
+    assert cell.agrees
+    # Rounding is no excuse for anything: from the printed inputs themselves nothing is further off than this.
+    assert cell.ours == pytest.approx(cell.published, abs=0.02)
+
+
+def test_no_figure_is_left_out() -> None:
+    # Ten metrics with r, low and high on two axes and r with the joints; two p.
+    assert len(CELLS) == 10 * 7 + 2 and len({(c.metric, c.axis, c.quantity) for c in CELLS}) == 72
+
+
+def test_the_published_p_values() -> None:
+    p_values = {cell.axis: cell.ours for cell in CELLS if cell.quantity == "p_value"}
+    assert p_values == pytest.approx({"appearance": 9 / 120, "kinematic": 47 / 120})
+
+
+def test_the_range_holds_what_unrounded_inputs_give_and_is_not_wide_for_nothing() -> None:
+    """Draws inside the rounding cube stay between the ends that its corners give, and come near them."""
+    rng = np.random.default_rng(0)
+    cells = {cell.quantity: cell for cell in CELLS if (cell.metric, cell.axis) == ("lpips", "kinematic")}
+    x, y = PAPER.axis("kinematic"), PAPER.scores("lpips")
+    drawn = [loeo_correlation(*(v + rng.uniform(-5e-4, 5e-4, 5) for v in (x, y))) for _ in range(500)]
+    for quantity in ("r", "low", "high"):
+        values = [getattr(result, quantity) for result in drawn]
+        cell = cells[quantity]
+        assert cell.least <= min(values) and max(values) <= cell.most
+        assert np.ptp(values) > 0.4 * (cell.most - cell.least)
+
+
+def test_a_figure_that_does_not_belong_is_found() -> None:
+    """A figure of another row or axis, or a sign not turned, is outside of what rounding allows."""
+    cell = next(c for c in CELLS if (c.metric, c.axis, c.quantity) == ("psnr", "kinematic", "r"))
+    for wrong in (0.769, 0.549, -0.633):
+        assert not type(cell)(**{**vars(cell), "published": wrong}).agrees
+
+
+def test_mean_distances_are_those_of_the_matrices() -> None:
+    cells = mean_distance_cells(PAPER)
+    assert len(cells) == 10 and all(cell.agrees for cell in cells)
+
+
+def test_only_joints_of_one_robot_differ() -> None:
+    assert PAPER.axis("dof").tolist() == [6, 6, 6, 7, 6]
