@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
-from xew.analysis.correlation import loeo_correlation
+from xew.analysis.correlation import leave_one_out, loeo_correlation, pearson
 from xew.analysis.paper import AXES, mean_distance_cells, read_paper, rebuild
 from xew.protocol import ROBOT_NAMES
 
@@ -72,3 +73,23 @@ def test_mean_distances_are_those_of_the_matrices() -> None:
 
 def test_only_joints_of_one_robot_differ() -> None:
     assert PAPER.axis("dof").tolist() == [6, 6, 6, 7, 6]
+
+
+def test_one_set_of_unrounded_inputs_gives_all_correlations_at_once() -> None:
+    """Cell by cell each might ask for other inputs; together they are consistent too."""
+    half, signs = PAPER.half_digit, [-1 if metric.higher_is_better else 1 for metric in PAPER.metrics.values()]
+    printed_x = np.array([PAPER.axis(axis) for axis in AXES])
+    printed_y = np.array([PAPER.scores(metric) for metric in PAPER.metrics])
+    published = np.array([cell.published for cell in CELLS if cell.quantity != "p_value"]).reshape(10, 7)
+
+    def beyond_rounding(shifts: np.ndarray) -> np.ndarray:
+        """How far each of the 70 figures is from what prints like the paper's, in half digits."""
+        x = printed_x + half * shifts[:10].reshape(2, 5)
+        y = (printed_y + half * shifts[10:].reshape(10, 5)) * np.array(signs)[:, None]
+        columns = [part for axis in x for part in (pearson(axis, y), *leave_one_out(axis[None], y))]
+        difference = np.stack([*columns, pearson(PAPER.axis("dof"), y)], axis=1) - published
+        return (np.sign(difference) * np.maximum(np.abs(difference) / half - 0.9, 0)).ravel()
+
+    found = least_squares(beyond_rounding, np.zeros(60), bounds=(-0.999, 0.999))
+    assert np.abs(beyond_rounding(np.zeros(60))).max() > 10, "printed inputs alone are not enough"
+    assert np.abs(beyond_rounding(found.x)).max() < 0.1

@@ -2,12 +2,13 @@
 
 import base64
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import cv2
 import matplotlib
 import numpy as np
 import pandas as pd
+from matplotlib import patheffects
 from matplotlib.figure import Figure
 
 from xew.analysis.scores import COPY, TRUTH, MetricInfo
@@ -113,6 +114,30 @@ def _draw_models(panel: matplotlib.axes.Axes, curves: pd.DataFrame, metric: Metr
         else:
             dash, label = ("--", "frozen first frame") if key[0] == COPY else (":", "ground truth")
             panel.plot(mean.index, mean, color="#57606a", linewidth=1.3, linestyle=dash, label=label)
+
+
+def distance_scatter(axes: Mapping[str, np.ndarray], score: np.ndarray, title: str, robots: Sequence[str]) -> Figure:
+    """Score by distance, a panel for each axis: five points, the line through all, and thin ones without one of them."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    panels = figure.subplots(1, len(axes), sharey=True, squeeze=False)[0]
+    for panel, (name, distance) in zip(panels, axes.items(), strict=True):
+        ends = np.array([distance.min(), distance.max()])
+        for left_out in range(len(robots)):
+            rest = np.delete(np.arange(len(robots)), left_out)
+            panel.plot(ends, np.polyval(np.polyfit(distance[rest], score[rest], 1), ends), color="#8c959f", linewidth=0.8)
+        panel.plot(ends, np.polyval(np.polyfit(distance, score, 1), ends), color=COLOURS[0], linewidth=2)
+        panel.scatter(distance, score, color="#1f2328", s=24, zorder=3)
+        for x, y, robot in zip(distance, score, robots, strict=True):
+            # Words stand towards the middle, so that none leaves the panel.
+            side, shift = ("right", -7) if x > ends.mean() else ("left", 7)
+            text = panel.annotate(
+                robot, (x, y), xytext=(shift, 0), textcoords="offset points", ha=side, va="center", fontsize=9
+            )
+            text.set_path_effects([patheffects.withStroke(linewidth=3, foreground="white")])
+        panel.set_xlabel(name, fontsize=9)
+        _dress(panel)
+    panels[0].set_ylabel(title, fontsize=9)
+    return figure
 
 
 def _dress(panel: matplotlib.axes.Axes) -> None:

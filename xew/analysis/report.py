@@ -4,10 +4,14 @@ Reads  scores.parquet and its curves; the data set and the rollouts for pictures
 Writes <out>/index.html (self-contained), report.md with figures/, summary.csv
 
     python -m xew.analysis.report demo/scores.parquet --data demo/data --rollouts demo/rollouts --out demo/report
+
+With --paper it reads nothing: the paper's own figures come with the package, and its distance table is rebuilt from them.
+
+    python -m xew.analysis.report --paper --out paper_report
 """
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -18,7 +22,8 @@ import pandas as pd
 import tyro
 from tqdm import tqdm
 
-from xew.analysis import page, pictures
+from xew.analysis import page, paper_report, pictures
+from xew.analysis.paper import read_paper
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, read_scores
 from xew.analysis.summary import METRIC_TITLES, ROBOT_TITLES, RobotTable, finding, flat_summary, robot_table
 from xew.config import ConfigError, user_errors
@@ -37,8 +42,8 @@ SHEET_TASKS = 8
 class Args:
     """Turn a score table into one HTML page, with Markdown and CSV beside it."""
 
-    scores: Annotated[Path, tyro.conf.Positional]
-    """Made by python -m xew.metrics.evaluate."""
+    scores: Annotated[Path | None, tyro.conf.Positional] = None
+    """Made by python -m xew.metrics.evaluate; needed unless --paper is given."""
     data: Path | None = None
     """The data set, for pictures and for the number of episodes that a complete table has."""
     rollouts: tuple[Path, ...] = ()
@@ -47,6 +52,8 @@ class Args:
     """Folder to write."""
     held_out: tuple[str, ...] = HELD_OUT_ROBOTS
     """Robots that the models have not seen; each has a table of its own."""
+    paper: bool = False
+    """Instead of scores: rebuild the paper's distance table from the paper's own scores and distances."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +69,22 @@ class Picture:
 @user_errors
 def main(args: Args) -> None:
     """Read everything, then write the page."""
-    scores = read_scores(args.scores)
+    if args.paper:
+        _report_paper(args)
+    elif args.scores:
+        _report_scores(args, read_scores(args.scores))
+    else:
+        raise ConfigError("no score table was named: give the one that xew.metrics.evaluate wrote, or --paper.")
+    print(f"report: {args.out / 'index.html'}")
+
+
+def _report_paper(args: Args) -> None:
+    if args.scores or args.data or args.rollouts:
+        raise ConfigError("--paper reports on the paper's own figures; leave out scores, --data and --rollouts.")
+    _write(args.out, *paper_report.build(read_paper(), _footer({})))
+
+
+def _report_scores(args: Args, scores: Scores) -> None:
     for robot in args.held_out:
         if robot not in ROBOT_NAMES:
             raise ConfigError(f"--held-out names {robot!r}; known: {', '.join(ROBOT_NAMES)}.")
@@ -82,9 +104,9 @@ def main(args: Args) -> None:
         _method_section(scores, args),
     ]
     sentences = finding(held_out, seen, scores.metrics)
-    html = page.page(TITLE, sentences, [text for text in sections if text], _footer(scores))
-    _write(args.out, html, _markdown(sentences, held_out, seen, scores, [*strips, curves, *sheets]), held_out + seen)
-    print(f"report: {args.out / 'index.html'}")
+    html = page.page(TITLE, sentences, [text for text in sections if text], _footer(scores.versions))
+    markdown = _markdown(sentences, held_out, seen, scores, [*strips, curves, *sheets])
+    _write(args.out, html, markdown, flat_summary(held_out + seen))
 
 
 def _tables(scores: Scores, records: Sequence[Record], held_out: Sequence[str]) -> tuple[list[RobotTable], list[RobotTable]]:
@@ -233,9 +255,9 @@ def _task_row(data: Path, records: Sequence[Record], robots: Sequence[str]) -> l
     return [found.get(robot, blank) for robot in robots]
 
 
-def _footer(scores: Scores) -> str:
+def _footer(graded_with: Mapping[str, str]) -> str:
     packages = ("xew", "numpy", "scipy", "pandas", "opencv-python-headless")
-    versions = {name: metadata.version(name) for name in packages} | scores.versions
+    versions = {name: metadata.version(name) for name in packages} | dict(graded_with)
     text = " · ".join(f"{name} {version}" for name, version in versions.items())
     return page.escape(f"{text} · Python {platform.python_version()}")
 
@@ -258,14 +280,14 @@ def _markdown(
     return "\n".join(lines) + "\n", {figure.name: figure.image for figure in figures}
 
 
-def _write(out: Path, html: str, markdown: tuple[str, dict[str, bytes]], tables: Sequence[RobotTable]) -> None:
+def _write(out: Path, html: str, markdown: tuple[str, dict[str, bytes]], summary: pd.DataFrame) -> None:
     try:
         (out / "figures").mkdir(parents=True, exist_ok=True)
         text, figures = markdown
         for name, image in figures.items():
             (out / "figures" / name).write_bytes(image)
         (out / "report.md").write_text(text)
-        flat_summary(tables).to_csv(out / "summary.csv", index=False)
+        summary.to_csv(out / "summary.csv", index=False)
         (out / "index.html").write_text(html)
     except OSError as error:
         raise ConfigError(f"cannot write the report to {out}: {error}. Choose another --out.") from error

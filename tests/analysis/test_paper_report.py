@@ -1,0 +1,71 @@
+"""`report --paper`: one offline page with the paper's figures beside ours, and the same as Markdown and CSV."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import cv2
+import pandas as pd
+import pytest
+
+from tests.analysis.test_report import Page
+from xew.analysis import paper_report
+from xew.analysis.paper import read_paper
+from xew.analysis.report import Args, main
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("paper")
+    main(Args(paper=True, out=out))
+    return out
+
+
+def test_the_page_is_well_formed_and_opens_offline(written: Path) -> None:
+    text = (written / "index.html").read_text()
+    page = Page(text)
+    assert not page.open and len(page.images) == 1
+    assert str(page.images[0]["src"]).startswith("data:image/png") and page.images[0]["alt"]
+    assert not re.search(r"(src|href)\s*=\s*[\"'](?!data:)", text) and "url(" not in text and "<script" not in text
+    assert cv2.imread(str(written / "figures" / "distance.png")).std() > 0
+
+
+def test_the_finding_comes_first(written: Path) -> None:
+    text = (written / "index.html").read_text()
+    assert text.index("72 of 72 printed figures come out") < text.index("<table")
+    assert "p = 0.075; its sign survives" in text and "p = 0.392; its sign does not survive" in text
+
+
+def test_every_printed_figure_stands_beside_ours(written: Path) -> None:
+    page, markdown = (written / "index.html").read_text(), (written / "report.md").read_text()
+    for metric in read_paper().metrics.values():
+        for of in (metric.appearance, metric.kinematic):
+            low, high = paper_report.signed(of.low), paper_report.signed(of.high)
+            assert f"paper {low} to {high}<" in page and f"(paper {low} to {high}) ✓" in markdown
+            assert f"paper {paper_report.signed(of.r)}<" in page
+    # Ten rows of five cells, two p, five robots with two means.
+    assert page.count('<td class="agrees">') == markdown.count(") ✓ ") == 10 * 5 + 2 + 5 * 2
+    assert 'class="differs"' not in page
+
+
+def test_the_summary_has_a_row_for_each_figure(written: Path) -> None:
+    summary = pd.read_csv(written / "summary.csv")
+    assert len(summary) == 72 + 10 and summary["agrees"].all()
+    row = summary[(summary["row"] == "lpips") & (summary["axis"] == "kinematic") & (summary["quantity"] == "p_value")]
+    assert row["published"].item() == 0.392 and row["ours"].item() == pytest.approx(47 / 120)
+
+
+def test_a_figure_that_does_not_come_out_is_named() -> None:
+    paper = read_paper()
+    lpips = paper.metrics["lpips"]
+    wrong = dataclasses.replace(lpips, appearance=dataclasses.replace(lpips.appearance, r=0.712))
+    html, (markdown, _), summary = paper_report.build(dataclasses.replace(paper, metrics={**paper.metrics, "lpips": wrong}), "")
+    assert "71 of 72 printed figures" in html and "not LPIPS by appearance r." in html
+    assert html.count('class="differs"') == 1 and "(paper +0.712) ✗" in markdown and (~summary["agrees"]).sum() == 1
+
+
+@pytest.mark.parametrize("args", [Args(), Args(Path("scores.parquet"), paper=True), Args(paper=True, data=Path("data"))])
+def test_it_is_scores_or_paper(args: Args, capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(args)
+    assert exit_.value.code == 2 and "--paper" in capsys.readouterr().err
