@@ -1,0 +1,209 @@
+"""Estimators to choose from: who finds the robot, its points and its motion in a video that has no ground truth.
+
+Reads  local checkpoints, where an estimator has one; nothing is ever downloaded
+To add one: its file, and one line in MASKERS, TRACKERS or FLOWS; from outside the repo, `module:NAME` of a `Backend`.
+
+    masker = open_masker("sam2", Path("weights/sam2.1_hiera_large.pt"))
+    masks = masker(prediction, target, target_mask)
+"""
+
+import hashlib
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+
+from xew.config import ConfigError, pick
+from xew.metrics.estimate import Appearance, estimate_masks, learn_appearance
+
+T_co = TypeVar("T_co", covariant=True)
+
+
+class Masker(Protocol):
+    """Robot masks in a predicted video."""
+
+    def __call__(self, prediction: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:
+        """Masks bool [t h w] of a prediction [t h w 3] uint8, from the true video [t h w 3] uint8 and masks [t h w] bool."""
+
+
+class Tracker(Protocol):
+    """Where the true video's points are in a predicted video."""
+
+    def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        """Pixels float32 [t k 2] in the prediction, NaN where a point is lost.
+
+        Args:
+            prediction, target: [t h w 3] uint8, predicted and true video.
+            points: [t k 2] float32, true projections [pixels, x right, y down, centre of the first pixel at 0].
+            visible: [t k] bool, where a true point is seen.
+        """
+
+
+class Flow(Protocol):
+    """Optical flow between pairs of images."""
+
+    def __call__(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Where each pixel of `start` goes: float32 [n h w 2] pixels (x right, y down), of two [n h w 3] uint8."""
+
+
+@dataclass(frozen=True)
+class Backend(Generic[T_co]):
+    """One entry of a registry: an estimator that is opened once and then called for many videos."""
+
+    open: Callable[[Path | None], T_co]
+    """From its checkpoint; from None where it needs none. Raises ConfigError where something is missing."""
+    needs: str | None
+    """What checkpoint to get, from whom, under which licence; None: none."""
+    summary: str
+    """What it is, for the notes under a table."""
+
+
+def open_masker(name: str, checkpoint: Path | None = None, option: str = "--masks-checkpoint") -> Masker:
+    """The masker of a name in MASKERS (or `module:NAME`). Raises ConfigError if it or its checkpoint is missing."""
+    return _open(pick(MASKERS, name, "masker"), name, checkpoint, option)
+
+
+def open_tracker(name: str, checkpoint: Path | None = None, option: str = "--tracks-checkpoint") -> Tracker:
+    """The tracker of a name in TRACKERS (or `module:NAME`). Raises ConfigError if it or its checkpoint is missing."""
+    return _open(pick(TRACKERS, name, "tracker"), name, checkpoint, option)
+
+
+def open_flow(name: str, checkpoint: Path | None = None, option: str = "checkpoint") -> Flow:
+    """The optical flow of a name in FLOWS (or `module:NAME`). Raises ConfigError if it or its checkpoint is missing."""
+    return _open(pick(FLOWS, name, "optical flow"), name, checkpoint, option)
+
+
+def identity(name: str, checkpoint: Path | None = None) -> str:
+    """What a score table says of the estimator that it was made with: its name, and file name and digest of its checkpoint.
+
+    The same bytes give the same text wherever they lie.
+    """
+    return name if checkpoint is None else f"{name} {checkpoint.name} sha256:{checkpoint_digest(checkpoint)[:16]}"
+
+
+def checkpoint_digest(path: Path) -> str:
+    """SHA-256 of a file; of a folder, that of its files' names and digests."""
+    if not path.is_dir():
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    lines = [f"{checkpoint_digest(file)} {file.relative_to(path).as_posix()}" for file in files]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+T = TypeVar("T")
+
+
+def _open(backend: Backend[T], name: str, checkpoint: Path | None, option: str) -> T:
+    if backend.needs is None:
+        if checkpoint is not None:
+            raise ConfigError(f"{name} has no checkpoint, {option} names {checkpoint}; leave it out, or choose another.")
+        return backend.open(None)
+    if checkpoint is None:
+        raise ConfigError(f"{name} needs a checkpoint: {backend.needs}. Say where it lies: {option} PATH.")
+    if not checkpoint.exists():
+        raise ConfigError(f"there is no {checkpoint}; {name} needs a checkpoint: {backend.needs}. Put it there: {option}.")
+    return backend.open(checkpoint)
+
+
+def import_package(module: str, user: str, install: str) -> ModuleType:
+    """A package that only one estimator needs. Raises ConfigError that says who needs it and how it is installed."""
+    try:
+        return importlib.import_module(module)
+    except (ImportError, RuntimeError) as error:
+        raise ConfigError(f"{user} needs the package {module.partition('.')[0]} ({error}); {install}.") from error
+
+
+def _open_default_masker(_: Path | None) -> Masker:
+    return ReferenceMasker()
+
+
+class ReferenceMasker:
+    """`estimate_masks`; an episode's looks are learnt once while predictions of the same episode follow each other."""
+
+    def __init__(self) -> None:
+        self._learnt: tuple[np.ndarray, np.ndarray, Appearance] | None = None
+
+    def __call__(self, prediction: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:
+        if self._learnt is None or self._learnt[0] is not target or self._learnt[1] is not target_mask:
+            self._learnt = target, target_mask, learn_appearance(target, target_mask)
+        return estimate_masks(prediction, target, target_mask, self._learnt[2])
+
+
+def _open_default_tracker(_: Path | None) -> Tracker:
+    from xew.metrics.tracker import estimate_tracks
+
+    return estimate_tracks
+
+
+def _open_sam2(checkpoint: Path | None) -> Masker:
+    from xew.metrics.sam2 import open_sam2
+
+    return open_sam2(_given(checkpoint))
+
+
+def _open_cotracker(checkpoint: Path | None) -> Tracker:
+    from xew.metrics.cotracker import open_cotracker
+
+    return open_cotracker(_given(checkpoint))
+
+
+def _open_tapir(checkpoint: Path | None) -> Tracker:
+    from xew.metrics.tapir import open_tapir
+
+    return open_tapir(_given(checkpoint))
+
+
+def _open_dis(_: Path | None) -> Flow:
+    from xew.metrics.flow import dis_flow
+
+    return dis_flow
+
+
+def _open_raft(checkpoint: Path | None) -> Flow:
+    from xew.metrics.flow import open_raft
+
+    return open_raft(_given(checkpoint))
+
+
+def _given(checkpoint: Path | None) -> Path:
+    assert checkpoint is not None, "`needs` is set, so that there is one"
+    return checkpoint
+
+
+MASKERS: Mapping[str, Backend[Masker]] = {
+    "default": Backend(
+        _open_default_masker, None, "colour, background and gated flow against the true video (xew.metrics.estimate)"
+    ),
+    "sam2": Backend(
+        _open_sam2,
+        "sam2.1_hiera_{tiny,small,base_plus,large}.pt of github.com/facebookresearch/sam2, or a folder of Hugging Face's "
+        "facebook/sam2.1-hiera-{tiny,small,base-plus,large} (config.json, model.safetensors); Apache-2.0",
+        "SAM 2, prompted with the true mask of the frame where it is largest, propagated both ways",
+    ),
+}
+TRACKERS: Mapping[str, Backend[Tracker]] = {
+    "default": Backend(_open_default_tracker, None, "template search against the true video (xew.metrics.tracker)"),
+    "cotracker3": Backend(
+        _open_cotracker,
+        "scaled_offline.pth of Hugging Face's facebook/cotracker3; CC-BY-NC 4.0: not for commercial use",
+        "CoTracker3 offline, queried at the frame with most visible points, both ways",
+    ),
+    "tapir": Backend(
+        _open_tapir,
+        "tapir_checkpoint_panning.npy or bootstapir_checkpoint_v2.npy of github.com/google-deepmind/tapnet; Apache-2.0",
+        "TAPIR, queried at the frame with most visible points",
+    ),
+}
+FLOWS: Mapping[str, Backend[Flow]] = {
+    "dis": Backend(_open_dis, None, "dense inverse search, medium preset, of OpenCV"),
+    "raft": Backend(
+        _open_raft,
+        "raft_large_C_T_SKHT_V2-ff5fadd5.pth or raft_small_C_T_V2-01064c6d.pth of torchvision; BSD-3-Clause",
+        "RAFT of torchvision, 12 updates",
+    ),
+}
