@@ -1,15 +1,30 @@
-"""The paper's own numbers, and what this package makes of them: its distance table, rebuilt cell by cell.
+"""The paper's own numbers, and what this package makes of them: its distance table and its percentages, recomputed.
 
-The figures lie in `paper.json` with the table that each is from. They are printed with three decimals, so a recomputed
-value may differ from the printed one by what that rounding allows; `rebuild` says how much that is.
+The figures lie in `paper.json` with the table that each is from:
+
+    robots      robot -> dof, links, reach, volume and the mean distances to the other four
+    distances   axis -> symmetric matrix in the order of `robots`
+    metrics     metric -> direction and the printed correlations with distance
+    parts       part -> rows: key -> robot -> metric -> value, where `robot` may be 'seen', the pooled training robots
+        actions     by action representation: joints, ray_map, mask, optical_flow
+        ladder      by condition: none, reference_image, nine_views, articulation_clip, robot_render
+        loeo        by split: loeo_<held-out robot>
+        few_shot    <target>-<episodes a task>, and 'reference' for the seen robots before adaptation
+        forgetting  the same keys, graded on UR5; 'none' is before adaptation
+        baselines   by model: irasim, ctrl_world, enerverse_ac, reference
+    changes     percentages that the text prints, each with the two values that it compares
+
+They are printed with few decimals, so a recomputed value may differ from the printed one by what that rounding allows;
+`rebuild` and `recompute_changes` say how much that is.
 """
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import product
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -57,19 +72,46 @@ class PublishedCorrelation:
 
 @dataclass(frozen=True)
 class PublishedMetric:
-    """A metric of the leave-one-embodiment-out study."""
+    """A metric and how its scores in the leave-one-embodiment-out study go with distance."""
 
     higher_is_better: bool
-    scores: Mapping[str, float]
-    """By held-out robot."""
     appearance: PublishedCorrelation
     kinematic: PublishedCorrelation
     dof_r: float
 
 
 @dataclass(frozen=True)
+class PublishedPart:
+    """The absolute scores of one comparison: means over episodes."""
+
+    source: str
+    rows: Mapping[str, Mapping[str, Mapping[str, float]]]
+    """By key (see above), robot or 'seen', and metric."""
+    half_digits: Mapping[str, float] = field(default_factory=dict)
+    """Half a unit of the last printed decimal of metrics where it is not that of the paper's other tables."""
+
+
+@dataclass(frozen=True)
+class PublishedChange:
+    """A percentage of the text: by how much a score changes from one row to another, of the value before."""
+
+    source: str
+    """The section that prints it."""
+    metric: str
+    before: str
+    """part/key/robot of the value before, ..."""
+    after: str
+    """... and of the value after."""
+    percent: float
+    word: Literal["rounded", "about", "less than"] = "rounded"
+    """'about': the text rounds to tens ("roughly", "nearly"). 'less than': the change is smaller than that."""
+    toward: str | None = None
+    """part/key/robot of a goal: then `percent` is the share of the way from `before` to it."""
+
+
+@dataclass(frozen=True)
 class Paper:
-    """What the paper prints on distances between robots and on how well they predict errors."""
+    """What the paper prints."""
 
     title: str
     tables: Mapping[str, str]
@@ -80,14 +122,25 @@ class Paper:
     distances: Mapping[str, Sequence[Sequence[float]]]
     """By axis: symmetric matrix in the order of `robots`."""
     metrics: Mapping[str, PublishedMetric]
+    parts: Mapping[str, PublishedPart]
+    changes: Sequence[PublishedChange]
 
     def axis(self, name: str) -> np.ndarray:
         """A feature of all robots, such as 'appearance' or 'dof' [5]."""
         return np.array([getattr(robot, name) for robot in self.robots.values()], np.float64)
 
     def scores(self, metric: str) -> np.ndarray:
-        """A metric's scores in the order of `robots` [5]."""
-        return np.array([self.metrics[metric].scores[robot] for robot in self.robots])
+        """A metric's scores of held-out robots (LOEO) in the order of `robots` [5]."""
+        return np.array([self.parts["loeo"].rows[f"loeo_{robot}"][robot][metric] for robot in self.robots])
+
+    def score(self, part: str, key: str, robot: str, metric: str) -> float | None:
+        """A printed score; None where the paper prints none."""
+        rows = self.parts[part].rows if part in self.parts else {}
+        return rows.get(key, {}).get(robot, {}).get(metric)
+
+    def half_digit_of(self, part: str, metric: str) -> float:
+        """Half a unit of the last printed decimal of a metric in a part."""
+        return self.parts[part].half_digits.get(metric, self.half_digit)
 
     def correlation(self, metric: str, axis: str) -> Correlation:
         """What this package computes from the printed scores and distances."""
@@ -118,6 +171,27 @@ class Cell:
         return self.least - self.half_digit <= self.published <= self.most + self.half_digit
 
 
+@dataclass(frozen=True)
+class RecomputedChange:
+    """A percentage of the text and what the printed scores give for it."""
+
+    change: PublishedChange
+    ours: float
+    """From the printed scores as they are [%]."""
+    least: float
+    """Smallest value found with scores that print as the paper's do [%], ..."""
+    most: float
+    """... and the largest."""
+
+    @property
+    def agrees(self) -> bool:
+        """Could unrounded scores have given what the text says?"""
+        if self.change.word == "less than":
+            return min(abs(self.least), abs(self.most)) < abs(self.change.percent) or self.least < 0 < self.most
+        half = {"rounded": 0.5, "about": 5.0}[self.change.word]
+        return self.least - half <= self.change.percent <= self.most + half
+
+
 @cache
 def read_paper() -> Paper:
     """The figures that come with the package."""
@@ -138,6 +212,21 @@ def mean_distance_cells(paper: Paper) -> list[Cell]:
         for axis in AXES
         for robot, mean in zip(paper.robots, mean_distances(paper.distances[axis]).tolist(), strict=True)
     ]
+
+
+def recompute_changes(paper: Paper) -> list[RecomputedChange]:
+    """Every percentage of the text, recomputed from the scores that the tables print."""
+    return [_recomputed(paper, change) for change in paper.changes]
+
+
+def _recomputed(paper: Paper, change: PublishedChange) -> RecomputedChange:
+    places = [place.split("/") for place in (change.before, change.after, change.toward) if place is not None]
+    values = np.array([paper.parts[part].rows[key][robot][change.metric] for part, key, robot in places])
+    halves = [paper.half_digit_of(part, change.metric) for part, *_ in places]
+    signs = np.array(list(product((0, -1, 1), repeat=len(places))))
+    before, after, *goal = (values + halves * signs).T
+    percent = 100 * (after - before) / (goal[0] - before if goal else before)
+    return RecomputedChange(change, float(percent[0]), float(percent.min()), float(percent.max()))
 
 
 def _metric_cells(paper: Paper, name: str) -> Iterator[Cell]:

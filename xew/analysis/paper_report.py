@@ -152,7 +152,7 @@ def _robot_table(paper: Paper, means: Sequence[Cell]) -> page.ComparedTable:
 def _score_table(paper: Paper) -> page.ComparedTable:
     rows = {
         f"{METRIC_TITLES[name]} {'↑' if metric.higher_is_better else '↓'}": [
-            Compared(f"{metric.scores[robot]:.3f}") for robot in paper.robots
+            Compared(f"{score:.3f}") for score in paper.scores(name)
         ]
         for name, metric in paper.metrics.items()
     }
