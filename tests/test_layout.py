@@ -99,8 +99,8 @@ def test_the_registry_of_robots_is_complete() -> None:
 
 def test_the_registry_of_metrics_is_complete() -> None:
     metrics = importlib.import_module("xew.metrics")
-    named = {"psnr", "ssim", "lpips", "mask_iou", "boundary_f1", "region_lpips", "pck", "keypoint_error", "ndtw"}
-    assert set(metrics.METRICS) == named | {"trajectory_error"}
+    named = {"psnr", "ssim", "lpips", "mask_iou", "boundary_f1", "region_lpips", "pck", "pck_05", "keypoint_error", "ndtw"}
+    assert set(metrics.METRICS) == named | {"coverage", "trajectory_error", "object_coverage"}
     assert {metric.inputs for metric in metrics.METRICS.values()} <= set(importlib.import_module("xew.metrics.metric").INPUTS)
-    for name, metric in metrics.METRICS.items():
-        assert getattr(metrics, name) is metric.function
+    for metric in metrics.METRICS.values():
+        assert getattr(metrics, metric.function.__name__) is metric.function

@@ -12,7 +12,7 @@ from xew.metrics.image import psnr, ssim
 from xew.metrics.mask import boundary_f1, mask_iou
 from xew.metrics.metric import Metric
 from xew.metrics.perceptual import lpips, region_lpips, region_lpips_frames
-from xew.metrics.track import keypoint_error, ndtw, pck, trajectory_error
+from xew.metrics.track import coverage, keypoint_error, ndtw, pck, pck_05, trajectory_error
 
 INF = math.inf
 METRICS = {
@@ -25,9 +25,12 @@ METRICS = {
         region_lpips, region_lpips_frames, "morphology", "", (0, INF), False, "region", "LPIPS in the box of all robot masks"
     ),
     "pck": Metric(pck, None, "kinematics", "", (0, 1), True, "track", "share within 0.1 of the keypoints' box diagonal"),
+    "pck_05": Metric(pck_05, None, "kinematics", "", (0, 1), True, "track", "share within 0.05 of that diagonal"),
     "keypoint_error": Metric(keypoint_error, None, "kinematics", "px", (0, INF), False, "track", "mean keypoint distance"),
     "ndtw": Metric(ndtw, None, "kinematics", "", (0, INF), False, "track", "time warping / (lengths x mean box diagonal)"),
+    "coverage": Metric(coverage, None, "kinematics", "", (0, 1), True, "track", "share of visible keypoints that were found"),
     "trajectory_error": Metric(trajectory_error, None, "objects", "px", (0, INF), False, "track", "mean object distance"),
+    "object_coverage": Metric(coverage, None, "objects", "", (0, 1), True, "track", "share of visible objects that were found"),
 }
 """All metrics by name, in the order of the paper's dimensions."""
 
@@ -35,11 +38,13 @@ __all__ = [
     "METRICS",
     "Metric",
     "boundary_f1",
+    "coverage",
     "keypoint_error",
     "lpips",
     "mask_iou",
     "ndtw",
     "pck",
+    "pck_05",
     "psnr",
     "region_lpips",
     "ssim",

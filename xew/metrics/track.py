@@ -33,6 +33,28 @@ def pck(prediction: jax.Array, target: jax.Array, valid: jax.Array, alpha: float
 
 
 @jax.jit
+def pck_05(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Array:
+    """`pck` at alpha = 0.05, the second tolerance of the paper's evaluator."""
+    return pck(prediction, target, valid, alpha=0.05)
+
+
+@jax.jit
+def coverage(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Array:
+    """Share in [0, 1] of the valid points that the prediction has, higher is better.
+
+    Stands beside every error: an error over few points that were found says little.
+
+    Args:
+        prediction, target: [t k 2] pixels. valid: [t k] bool.
+
+    Returns:
+        Scalar float32; NaN where no point is valid.
+    """
+    check_tracks(prediction, target, valid)
+    return jnp.sum(valid & _found(prediction)) / jnp.sum(valid)
+
+
+@jax.jit
 def keypoint_error(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Array:
     """Mean distance [pixels] over the valid points that the prediction has, lower is better.
 
