@@ -1,0 +1,92 @@
+"""The protocol as data: counts of the paper's tables, roles, names, and that the model knows every word of it."""
+
+import re
+
+import pytest
+
+from xew.model.conditions import ACTIONS, CONDITIONS
+from xew.protocol import (
+    FORGETTING_ROBOT,
+    HELD_OUT_ROBOTS,
+    LOEO,
+    PAPER_PARTS,
+    PARTS,
+    ROBOT_NAMES,
+    SEEN_ROBOTS,
+    SHOTS,
+    SPLITS,
+    TASK_COUNT,
+    VARIANTS,
+    Variant,
+    expected_counts,
+    reference,
+    training_counts,
+)
+from xew.sim_warp.tasks import TASKS
+
+
+def count(variant: Variant, robots: tuple[str, ...]) -> int:
+    """Scored episodes of some robots at the paper's size."""
+    return sum(number for robot, number in expected_counts(variant).items() if robot in robots)
+
+
+def test_the_suite_has_25_tasks() -> None:
+    assert len(TASKS) == TASK_COUNT == 25
+
+
+@pytest.mark.parametrize("part", ["fixed", "actions", "ladder", "baselines"])
+def test_fixed_split_scores_1500_seen_and_500_of_each_held_out_robot(part: str) -> None:
+    for variant in PARTS[part]:
+        assert (variant.seen_robots, variant.held_out_robots) == (SEEN_ROBOTS, HELD_OUT_ROBOTS)
+        assert count(variant, variant.seen_robots) == 1500
+        assert [count(variant, (robot,)) for robot in variant.held_out_robots] == [500, 500]
+        assert sum(training_counts(variant).values()) == 3750
+
+
+def test_each_loeo_fold_scores_2000_seen_and_500_held_out_records() -> None:
+    assert [variant.held_out_robots for variant in PARTS["loeo"]] == [(robot,) for robot in ROBOT_NAMES]
+    for variant in PARTS["loeo"]:
+        assert set(SPLITS[variant.split].train_robots) | set(variant.held_out_robots) == set(ROBOT_NAMES)
+        assert count(variant, variant.seen_robots) == 2000
+        assert count(variant, variant.held_out_robots) == 500
+        assert sum(training_counts(variant).values()) == 5000
+
+
+def test_few_shot_adapts_with_25_50_75_episodes_and_forgets_on_the_same_500() -> None:
+    for target in HELD_OUT_ROBOTS:
+        rows = [variant for variant in PARTS["few_shot"] if variant.target == target]
+        assert [sum(training_counts(variant).values()) for variant in rows] == [25, 50, 75]
+        assert [variant.shots for variant in rows] == list(SHOTS)
+        for variant in rows:
+            assert variant in PARTS["forgetting"]
+            assert expected_counts(variant) == {FORGETTING_ROBOT: 500, target: 500}
+            assert variant.start == reference(embodiment="nine_views") == PARTS["few_shot"][0]
+
+
+def test_the_rows_of_the_papers_tables() -> None:
+    assert [variant.action for variant in PARTS["actions"]] == ["joints", "ray_map", "mask", "optical_flow"]
+    ladder = ["none", "reference_image", "nine_views", "articulation_clip", "robot_render"]
+    assert [variant.embodiment for variant in PARTS["ladder"]] == ladder
+    assert [variant.system for variant in PARTS["baselines"]] == ["irasim", "ctrl_world", "enerverse_ac", "reference"]
+    assert set(PAPER_PARTS) < set(PARTS)
+    assert len({variant.name for part in PAPER_PARTS for variant in PARTS[part]}) == 22
+
+
+def test_names_are_unique_and_fit_for_folders() -> None:
+    variants = {variant for part in PARTS.values() for variant in part}
+    assert len(VARIANTS) == len(variants)
+    assert all(re.fullmatch(r"[a-z0-9_]+(-[a-z0-9_]+)*", name) for name in VARIANTS)
+
+
+def test_the_model_knows_every_action_conditioning_and_split() -> None:
+    for variant in VARIANTS.values():
+        assert variant.action in ACTIONS and variant.embodiment in CONDITIONS and variant.split in SPLITS
+        assert variant.start is None or variant.start in VARIANTS.values()
+    assert set(SPLITS) == {"fixed", *(f"loeo_{robot}" for robot in LOEO)}
+
+
+def test_a_smaller_study_counts_what_it_has() -> None:
+    robots = ("ur5_wsg", "piper")
+    assert expected_counts(reference(), tasks=2, test_seeds=3, robots=robots) == {"ur5_wsg": 6, "piper": 6}
+    assert training_counts(reference(), tasks=2, train_seeds=4, robots=robots) == {"ur5_wsg": 8}
+    assert training_counts(VARIANTS["few_shot-franka_panda-2"], robots=robots) == {}
