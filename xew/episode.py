@@ -16,6 +16,7 @@ import json
 import os
 import shutil
 import tempfile
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
@@ -27,6 +28,9 @@ import numpy as np
 
 SCHEMA_VERSION = 2
 WIDTH, HEIGHT = 320, 240
+PARSING = threading.RLock()
+"""Held by whatever threads do that parses Python: reading .npy headers, building kernels. Python 3.11 counts the depth of all
+parsers in one place (github.com/python/cpython/issues/106905), and two at a time end in a SystemError now and then."""
 FAILURES = ("plan", "grasp", "slip", "timeout", "physics", "overflow")
 """plan: no joint path. grasp: never held. slip: held and lost. timeout: the plan ended short of success.
 physics: an object sank into something, fell off the table or crept in a hand. overflow: a physics buffer was too small."""
@@ -219,14 +223,19 @@ def read_states(folder: Path) -> States:
     """The recorded states of an accepted episode. Raises EpisodeError if they are missing or damaged."""
     path = Path(folder) / "states.npz"
     try:
-        with np.load(path) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+        arrays = read_npz(path)
         arrays["robot_mask"] = np.unpackbits(arrays["robot_mask"], axis=-1).astype(bool)
         return States(**arrays)
     except FileNotFoundError as error:
         raise EpisodeError(f"{path} does not exist: the cell was rejected or its folder is damaged.") from error
     except Exception as error:  # zipfile, zlib and NumPy each have their own
         raise EpisodeError(f"{path} is damaged ({error}); delete its folder and run generate again.") from error
+
+
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of an .npz by name; threads may call it. Raises what zipfile, zlib and NumPy raise."""
+    with PARSING, np.load(path) as stored:
+        return {name: stored[name] for name in stored.files}
 
 
 def write_video(path: Path, video: np.ndarray, frame_rate: float = 1000 / 60) -> None:

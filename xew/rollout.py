@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from xew.episode import EpisodeError, complete_folder, episode_folder, read_video, write_video
+from xew.episode import EpisodeError, complete_folder, episode_folder, read_npz, read_video, write_video
 
 VIDEO_SUFFIXES = (".mkv", ".mp4", ".npz")
 
@@ -161,8 +161,7 @@ def _read_pngs(paths: tuple[Path, ...]) -> np.ndarray:
 
 def _read_npz(path: Path) -> np.ndarray:
     try:
-        with np.load(path) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+        arrays = read_npz(path)
     except Exception as error:  # zipfile, zlib and NumPy each have their own
         raise RolloutError(f"{path} is damaged ({error}); make this rollout again.") from error
     if len(arrays) != 1:

@@ -65,7 +65,7 @@ def test_latents_from_states_are_those_from_video(simulated: Path, capsys: pytes
     assert "made with --states-only" in capsys.readouterr().err
     latents.main([*bare, "--from-states"])
     from_video, from_states = files(simulated / "data-latents"), files(simulated / "bare-latents")
-    assert len([name for name in from_video if name.endswith(".npy")]) == 3
+    assert len([name for name in from_video if name.endswith(".safetensors")]) == 3
     assert from_states == from_video
     assert not list((simulated / "bare").rglob("*.mkv"))
 

@@ -1,11 +1,14 @@
 """Latents, training, resuming and rollouts on synthetic data, end to end and tiny."""
 
+import ast
 import json
 import os
 import shutil
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -138,8 +141,8 @@ def test_stale_stream_is_an_error(
 ) -> None:
     """A stream encoded from an older recording has another key."""
     shutil.copytree(world / "data-latents", tmp_path / "cache")
-    victim = next((tmp_path / "cache").glob("*/*/arx_x5/rgb-*.npy"))
-    victim.rename(victim.with_name("rgb-000000000000.npy"))
+    victim = next((tmp_path / "cache").glob("*/*/arx_x5/rgb-*.safetensors"))
+    victim.rename(victim.with_name("rgb-000000000000.safetensors"))
     config = [str(world / "config.yaml"), "--cache", str(tmp_path / "cache"), "--out", str(tmp_path / "run")]
     assert "was encoded from other data" in fails(train.main, config, capsys)
 
@@ -151,9 +154,9 @@ def test_training_sees_training_robots_and_seeds_only(experiment: Experiment) ->
 
 
 def test_encoding_again_writes_nothing(world: Path, experiment: Experiment) -> None:
-    before = {path: path.stat().st_mtime_ns for path in (world / "data-latents").rglob("*.npy")}
+    before = {path: path.stat().st_mtime_ns for path in (world / "data-latents").rglob("*.safetensors")}
     latents.main([str(world / "config.yaml")])
-    assert {path: path.stat().st_mtime_ns for path in (world / "data-latents").rglob("*.npy")} == before
+    assert {path: path.stat().st_mtime_ns for path in (world / "data-latents").rglob("*.safetensors")} == before
     assert len(before) == len(SEEN_ROBOTS) * 3
 
 
@@ -171,6 +174,25 @@ def test_batches_have_the_declared_shapes_and_resume(experiment: Experiment) -> 
     continued = iter(make_dataset(source, 2, seed=0))
     continued.set_state(position)
     np.testing.assert_array_equal(next(continued).latents, second.latents)
+
+
+def test_threads_parse_no_python(experiment: Experiment, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two parsers at a time end in a SystemError now and then; loaders run beside all that the user does."""
+    parsed: list[str] = []
+    parse = ast.parse
+
+    def noted(*args: Any, **kwargs: Any) -> ast.AST:
+        parsed.append(threading.current_thread().name)
+        return parse(*args, **kwargs)
+
+    monkeypatch.setattr(ast, "parse", noted)
+    episodes = training_episodes(experiment)
+    source = ClipSource(LatentCache(experiment, load_codec(experiment, episodes)), episodes)
+    parsed.clear()
+    batches = iter(make_dataset(source, 2, seed=0))
+    for _ in range(3):
+        next(batches)
+    assert [name for name in parsed if name != threading.main_thread().name] == []
 
 
 @pytest.mark.parametrize(

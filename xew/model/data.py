@@ -67,7 +67,7 @@ class ClipSource:
         """Raise ConfigError unless every stream of every episode is in the cache and fits the data."""
         for record in {id(record): record for record, _ in self.samples}.values():
             for name in self.cache.streams:
-                self.cache.read(record, name)
+                self.cache.read(record, name, 0)
 
     def __getitem__(self, index: int) -> Batch:
         record, starts = self.samples[index]
@@ -81,8 +81,7 @@ class ClipSource:
     def _chunk(self, record: Record, start: int) -> Batch:
         experiment = self.cache.experiment
         clip = self.cache.starts(record).index(start)
-        streams = {name: self.cache.read(record, name) for name in self.cache.streams}
-        arrays = {name: stream[min(clip, len(stream) - 1)].astype(np.float32) for name, stream in streams.items()}
+        arrays = {name: self.cache.read(record, name, clip).astype(np.float32) for name in self.cache.streams}
         shown = shown_frames(record.frame_count - start, experiment.clip.frames)
         latents = arrays.pop("rgb")
         conditions = apply_scales(self.scales, experiment.conditions, arrays)

@@ -1,7 +1,7 @@
 """The latent cache: every stream of every training episode goes through the codec once, and no video is read in training.
 
 Reads  episodes
-Writes <cache>/<task>/<seed>/<robot>/<stream>-KEY.npy float16 [clips ...], <cache>/header.json,
+Writes <cache>/<task>/<seed>/<robot>/<stream>-KEY.safetensors float16 [clips ...], <cache>/header.json,
        <cache>/codec-KEY/ if the codec is one that is fitted, <cache>/text/ if a text encoder is used
 
 KEY names the codec, the source data and the cut into clips, so that what is stale is not found and never mistaken.
@@ -20,6 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from safetensors import safe_open
+from safetensors.numpy import save_file
 from tqdm import tqdm
 
 from xew.config import ConfigError, digest, user_errors
@@ -37,7 +39,9 @@ from xew.protocol import seed_split
 
 Episode = tuple[Path, Record]
 CEILING_CLIPS = 8
-CACHE_VERSION = 1
+CACHE_VERSION = 2
+CLIPS = "clips"
+"""Name of the one array of a cached stream. Safetensors and not .npy, whose headers no two threads may read at once."""
 
 
 @dataclass(frozen=True)
@@ -63,23 +67,27 @@ class LatentCache:
         cut = digest(self.experiment.clip) if self.experiment.train.chunks == 1 else (digest(self.experiment.clip), "chunks")
         content = (CACHE_VERSION, self.codec.hash, cut, name, *sources)
         key = hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]
-        return episode_folder(self.experiment.cache_folder, record.task, record.seed, record.robot) / f"{name}-{key}.npy"
+        return (
+            episode_folder(self.experiment.cache_folder, record.task, record.seed, record.robot) / f"{name}-{key}.safetensors"
+        )
 
     def starts(self, record: Record) -> tuple[int, ...]:
         """First frames of the clips of an episode."""
         return clip_starts(record.frame_count, self.experiment.clip.frames, self.experiment.train.chunks)
 
-    def read(self, record: Record, stream: str) -> np.ndarray:
-        """One stream of one episode, float16 [clips ...] memory-mapped, numbers float32; what is not aligned has one clip.
+    def read(self, record: Record, stream: str, clip: int) -> np.ndarray:
+        """One stream of one clip of an episode, float16, numbers float32; what is not aligned has one clip for all.
 
         Raises:
             ConfigError: it was never encoded, or from other data, codec or clips.
         """
         path = self.path(record, stream)
         try:
-            return np.load(path, mmap_mode="r")
+            with safe_open(path, framework="np") as stored:
+                clips = stored.get_slice(CLIPS)
+                return clips[min(clip, clips.get_shape()[0] - 1)]
         except FileNotFoundError:
-            stale = list(path.parent.glob(f"{path.stem.rpartition('-')[0]}-*.npy"))
+            stale = list(path.parent.glob(f"{path.stem.rpartition('-')[0]}-*.safetensors"))
             found = "was encoded from other data, with another codec or other clips" if stale else "is not in the cache"
             command = f"python -m xew.model.latents CONFIG --data {self.experiment.data}"
             raise ConfigError(f"{path.parent}: the stream {stream} {found}; encode it with `{command}`.") from None
@@ -369,8 +377,7 @@ def _write(path: Path, array: np.ndarray) -> int:
     array = array.astype(np.float32 if array.ndim == 3 else np.float16)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    with temporary.open("wb") as file:
-        np.save(file, array)
+    save_file({CLIPS: array}, temporary)
     os.replace(temporary, path)
     return array.nbytes
 

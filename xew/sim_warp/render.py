@@ -8,13 +8,13 @@ episode. Without it, it is the bodies alone on white. The kernels (raster_kernel
 same on CPU and GPU, and a frame's bytes do not depend on what else is rendered with it.
 """
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import warp as wp
 
+from xew.episode import PARSING
 from xew.sim_warp import raster_kernels as raster
 from xew.sim_warp import shading_kernels as shading
 from xew.sim_warp import stage
@@ -34,8 +34,6 @@ from xew.sim_warp.waiting import wait_for
 
 __all__ = ["FLOW_LIMIT", "Body", "Frames", "Renderer", "World"]
 
-ONE_AT_A_TIME = threading.Lock()
-"""Threads may share a renderer or have their own; they take turns at the device, whose buffers and modules are shared."""
 FLOW_LIMIT = 25.0
 """Longest optical flow [pixels], the paper's clip."""
 SHADOW_SIZE = 512
@@ -136,7 +134,7 @@ class Renderer:
             return []
         wishes = {"depth": depth, "body": body, "optical_flow": optical_flow}
         wanted = frozenset(name for name, wish in wishes.items() if wish)
-        with ONE_AT_A_TIME:
+        with PARSING:  # threads take turns at the device, whose buffers and modules are shared; the latter are parsed
             return _split(self._render_worlds(worlds, camera, ground, wanted), worlds)
 
     def _render_worlds(
