@@ -1,17 +1,31 @@
-"""Stage 11 of 11, its input: the score table, read and checked. Cells that are wrong are named, never averaged over."""
+"""Stage 11 of 11, its input: score tables, read, checked and merged. Cells that are wrong are named, never averaged over.
 
-from dataclasses import dataclass
+A study's table is several runs' tables as one: `merge_scores` adds the column `variant`, which names the trained model of
+each row (xew.protocol.Variant) and is empty for the two baselines, which belong to no model.
+"""
+
+import os
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from xew.config import ConfigError
 from xew.protocol import ROBOT_NAMES
 
-KEY = ["model", "condition", "task", "seed", "robot"]
+VARIANT = "variant"
+EPISODE = ["task", "seed", "robot"]
+KEY = ["model", "condition", *EPISODE]
 COLUMNS = [*KEY, "metric", "value", "frames", "exact_frames"]
 COPY, TRUTH = "copy_first_frame", "ground_truth"
 """The two models that every other is read against: a score of nothing, and the ceiling."""
+COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero")
+"""What a table says of how it was graded; tables that differ in it do not compare."""
+LISTED = 20
+"""Cells that an error names of each kind; it counts the others."""
 
 EVALUATE = "python -m xew.metrics.evaluate ROLLOUTS --data DATA --baselines --out {path}"
 
@@ -34,12 +48,25 @@ class Scores:
     """A checked score table."""
 
     rows: pd.DataFrame
-    """One row per model, condition, task, seed, robot and metric."""
+    """One row per model, condition, task, seed, robot and metric; of a study also per variant."""
     curves: pd.DataFrame
     """The same by frame."""
     metrics: tuple[MetricInfo, ...]
-    protocol: int
-    versions: dict[str, str]
+    attributes: Mapping[Hashable, Any]
+    """What the table says of itself: protocol, metrics, versions, estimators, frame_zero."""
+
+    @property
+    def protocol(self) -> int:
+        return self.attributes["protocol"]
+
+    @property
+    def versions(self) -> dict[str, str]:
+        return self.attributes.get("versions", {})
+
+    @property
+    def of_study(self) -> bool:
+        """Does the table hold several variants, or one ordinary run?"""
+        return VARIANT in self.rows
 
     @property
     def models(self) -> list[tuple[str, str]]:
@@ -48,24 +75,106 @@ class Scores:
         return [pair for pair in pairs if pair[0] not in (COPY, TRUTH)]
 
 
-def read_scores(path: Path) -> Scores:
+def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
     """Read and check a score table and its curves.
 
+    Args:
+        path: what `xew.metrics.evaluate` or `write_scores` wrote.
+        own_robots: names of robots that are not the paper's; a table may also name them itself (attribute `robots`).
+
     Raises:
-        ConfigError: a file is missing or damaged; rows are duplicate, NaN, of unknown robots, or of other metrics than said.
+        ConfigError: a file is missing or damaged; or cells are duplicate, not finite, of unknown robots, of other metrics
+            than described, out of a metric's range, or graded over different numbers of frames. All are named.
     """
-    rows = _read(path, EVALUATE.format(path=path))
-    curves = _read(path.with_suffix(".curves.parquet"), EVALUATE.format(path=path))
-    missing = [column for column in COLUMNS if column not in rows] + [
-        key for key in ("protocol", "metrics") if key not in rows.attrs
-    ]
+    command = EVALUATE.format(path=path)
+    rows, curves = _read(path, command), _read(path.with_suffix(".curves.parquet"), command)
+    missing = [column for column in COLUMNS if column not in rows]
+    missing += [key for key in ("protocol", "metrics") if key not in rows.attrs]
     if missing:
-        raise ConfigError(
-            f"{path} has no {', '.join(missing)}; it is no score table of xew. Make one: {EVALUATE.format(path=path)}"
-        )
-    _check_rows(path, rows)
-    metrics = tuple(MetricInfo(name=name, **info) for name, info in rows.attrs["metrics"].items())
-    return Scores(rows, curves, metrics, rows.attrs["protocol"], rows.attrs.get("versions", {}))
+        raise ConfigError(f"{path} has no {', '.join(missing)}; it is no score table of xew. Make one: {command}")
+    if rows.empty:
+        raise ConfigError(f"{path} holds no row. Grade some rollouts: {command}")
+    metrics = _described(path, rows.attrs["metrics"])
+    wrong = _wrong_cells(rows, metrics, {*ROBOT_NAMES, *rows.attrs.get("robots", ()), *own_robots})
+    if wrong:
+        raise ConfigError(f"{path} cannot be averaged over:\n{_listed(wrong)}\nGrade anew: {command} --overwrite")
+    return Scores(rows, curves, metrics, rows.attrs)
+
+
+def merge_scores(tables: Sequence[tuple[str, Path]], own_robots: Sequence[str] = ()) -> Scores:
+    """The score tables of a study's variants as one, with the column `variant` in front.
+
+    Baselines that several tables hold are kept once; they have no variant.
+
+    Args:
+        tables: variant and path of its score table; a variant may have several.
+        own_robots: as in `read_scores`.
+
+    Raises:
+        ConfigError: a table cannot be read; tables were graded by different protocols, metrics or estimators; or cells
+            occur twice in a variant or differ in frames between variants. All are named.
+    """
+    if not tables:
+        raise ConfigError("there is no score table to merge; grade at least one variant's rollouts first.")
+    read = [(variant, path, read_scores(path, own_robots)) for variant, path in tables]
+    for variant, path, scores in read:
+        if not variant or scores.of_study:
+            found = f"is a merged table of {scores.rows[VARIANT].nunique()} variants" if variant else "has no variant's name"
+            raise ConfigError(f"{path} {found}; expected the score table of one variant, and its name.")
+    attributes = _common_attributes([(path, scores.attributes) for _, path, scores in read])
+    rows = _stacked([(variant, scores.rows) for variant, _, scores in read])
+    curves = _stacked([(variant, scores.curves) for variant, _, scores in read])
+    baselines = rows["model"].isin((COPY, TRUTH))
+    same = rows.duplicated([*KEY, "metric", "content"]) if "content" in rows else rows.duplicated([*KEY, "metric", "value"])
+    rows = rows[~(baselines & same)].reset_index(drop=True)
+    curves = curves[~curves.duplicated([VARIANT, *KEY, "metric", "frame"])].reset_index(drop=True)
+    metrics = read[0][2].metrics
+    wrong = _wrong_cells(rows, metrics, set(rows["robot"]))
+    if wrong:
+        paths = ", ".join(str(path) for _, path, _ in read)
+        raise ConfigError(f"the score tables {paths} do not go together:\n{_listed(wrong)}\nGrade them anew from one data set.")
+    return Scores(rows, curves, metrics, attributes)
+
+
+def write_scores(scores: Scores, path: Path) -> None:
+    """Write a table and its curves so that `read_scores` reads them back; never half of one.
+
+    Raises:
+        ConfigError: they cannot be written there.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for frame, file in ((scores.curves, path.with_suffix(".curves.parquet")), (scores.rows, path)):
+            temporary, frame = file.with_name(f".{file.name}.partial"), frame.copy(deep=False)
+            frame.attrs = dict(scores.attributes)
+            frame.to_parquet(temporary, index=False)
+            os.replace(temporary, file)
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error}. Free some space or choose another place.") from error
+
+
+def missing_cells(rows: pd.DataFrame) -> pd.DataFrame:
+    """What some graded and others did not: means over such cells would compare different episodes.
+
+    A model (of a variant and condition) that has a score of a robot is expected to have all scores that any other has of
+    this robot. Whole robots that it was never asked for are the protocol's to count (xew.protocol).
+
+    Returns:
+        Columns [variant] model condition task seed robot metric, one row for each missing score, in order.
+    """
+    who = [column for column in (VARIANT, "model", "condition") if column in rows]
+    asked = rows[[*who, "robot"]].drop_duplicates()
+    expected = asked.merge(rows[[*EPISODE, "metric"]].drop_duplicates(), on="robot")[[*who, *EPISODE, "metric"]]
+    found = expected.merge(rows[[*who, *EPISODE, "metric"]].drop_duplicates(), how="left", indicator=True)
+    missing = found[found["_merge"] == "left_only"].drop(columns="_merge")
+    return missing.sort_values(list(missing.columns), ignore_index=True)
+
+
+def describe_cells(cells: pd.DataFrame, most: int = LISTED) -> str:
+    """Such as 'reference flow open_laptop 1000003 piper lpips; …', and how many more there are."""
+    columns = [column for column in (VARIANT, *KEY, "metric") if column in cells]
+    shown = "; ".join(" ".join(str(part) for part in cell if part != "") for cell in cells[columns].head(most).to_numpy())
+    return shown + (f"; and {len(cells) - most} more" if len(cells) > most else "")
 
 
 def _read(path: Path, command: str) -> pd.DataFrame:
@@ -77,18 +186,61 @@ def _read(path: Path, command: str) -> pd.DataFrame:
         raise ConfigError(f"{path} cannot be read ({error}); delete it and make it anew: {command}") from error
 
 
-def _check_rows(path: Path, rows: pd.DataFrame) -> None:
-    if rows.empty:
-        raise ConfigError(f"{path} holds no row. Grade some rollouts: {EVALUATE.format(path=path)}")
-    wrong = {
-        "the robot is unknown": rows[~rows["robot"].isin(ROBOT_NAMES)],
-        "the value is NaN": rows[rows["value"].isna()],
-        "a cell occurs more than once": rows[rows.duplicated([*KEY, "metric"], keep=False)],
-        "the metric is not described": rows[~rows["metric"].isin(list(rows.attrs["metrics"]))],
+def _described(path: Path, described: Mapping[str, Mapping[str, Any]]) -> tuple[MetricInfo, ...]:
+    """What a table says of its metrics; more than is asked for here is left alone."""
+    names = [field.name for field in fields(MetricInfo) if field.name != "name"]
+    for metric, info in described.items():
+        if missing := [name for name in names if name not in info]:
+            raise ConfigError(f"{path} does not say the {', '.join(missing)} of {metric}; it is no score table of this xew.")
+    return tuple(MetricInfo(name=metric, **{name: info[name] for name in names}) for metric, info in described.items())
+
+
+def _wrong_cells(rows: pd.DataFrame, metrics: Sequence[MetricInfo], robots: set[str]) -> dict[str, pd.DataFrame]:
+    """Rows that cannot be averaged over, by what is wrong with them."""
+    key = [column for column in (VARIANT, *KEY, "metric") if column in rows]
+    value = pd.to_numeric(rows["value"], errors="coerce")
+    low = rows["metric"].map({metric.name: -np.inf if metric.low is None else metric.low for metric in metrics})
+    high = rows["metric"].map({metric.name: np.inf if metric.high is None else metric.high for metric in metrics})
+    # Sums of float32 may pass an end of the range by their rounding.
+    out = (value < low - 1e-6) | (value > high + 1e-6)
+    found = {
+        "the robot is unknown": ~rows["robot"].isin(robots),
+        "the metric is not described": ~rows["metric"].isin([metric.name for metric in metrics]),
+        "the value is NaN": value.isna(),
+        "the value is outside of the metric's range": out | np.isinf(value),
+        "a cell occurs more than once": rows.duplicated(key, keep=False),
+        "an episode is graded over different numbers of frames": rows.groupby(EPISODE)["frames"].transform("nunique") > 1,
     }
-    for reason, found in wrong.items():
-        if len(found):
-            shown = "; ".join(" ".join(map(str, cell)) for cell in found.reindex(columns=[*KEY, "metric"]).head(5).to_numpy())
+    return {reason: rows[mask] for reason, mask in found.items() if mask.any()}
+
+
+def _listed(wrong: Mapping[str, pd.DataFrame]) -> str:
+    return "\n".join(f"  {reason}, {len(cells)} rows: {describe_cells(cells)}" for reason, cells in wrong.items())
+
+
+def _common_attributes(tables: Sequence[tuple[Path, Mapping[Hashable, Any]]]) -> dict[Hashable, Any]:
+    """Attributes that all tables share; versions of packages may differ and are all named."""
+    first = tables[0][1]
+    for key in COMPARABLE:
+        if any(attributes.get(key) != first.get(key) for _, attributes in tables):
+            found = "\n".join(f"  {path}: {attributes.get(key)}" for path, attributes in tables)
             raise ConfigError(
-                f"{path}: {reason} in {len(found)} rows ({shown}). Grade anew: {EVALUATE.format(path=path)} --overwrite"
+                f"the score tables differ in {key}, so their numbers do not compare:\n{found}\n"
+                f"Grade all by the same version and options: {EVALUATE.format(path='SCORES')} --overwrite"
             )
+    packages = dict.fromkeys(name for _, attributes in tables for name in attributes.get("versions", {}))
+    used = {name: {attributes.get("versions", {}).get(name, "none") for _, attributes in tables} for name in packages}
+    robots = sorted({robot for _, attributes in tables for robot in attributes.get("robots", ())})
+    merged = {**first, "versions": {name: ", ".join(sorted(versions)) for name, versions in used.items()}}
+    return merged | ({"robots": robots} if robots else {})
+
+
+def _stacked(tables: Sequence[tuple[str, pd.DataFrame]]) -> pd.DataFrame:
+    """All tables, one below the other, the variant in front."""
+    named = []
+    for variant, table in tables:
+        own = np.where(table["model"].isin((COPY, TRUTH)), "", variant)
+        table = table.copy(deep=False)
+        table.attrs = {}  # concat compares them
+        named.append(table.assign(**{VARIANT: own})[[VARIANT, *table.columns]])
+    return pd.concat(named, ignore_index=True)
