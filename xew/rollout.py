@@ -2,23 +2,32 @@
 
 A rollout tree mirrors the data set, `<rollouts>/<task>/<seed>/<robot>/`, and holds in each folder
     one video       rgb.mkv as our own model writes it (lossless), or any one *.mkv, *.mp4 or *.npz (one array
-                    [t h w 3] uint8), or PNG files whose sorted names are the frames; native size, frame 0 the given frame
+                    [t h w 3] uint8), or PNG files, frames in the order of the numbers in their names; RGB of 8 bits, native
+                    size, constant rate, frame 0 the given frame
     rollout.json    optional: model, condition, frame_count (frames that were asked for), source_hash (of the episode's rgb),
                     and what else the model wants to say
 Without rollout.json the model is named after the tree's folder and the video must be as long as its episode.
+Trees come from anybody: nothing outside them is read, and no video is read in part or otherwise than it says it is.
 """
 
 import json
+import re
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 
-from xew.episode import EpisodeError, complete_folder, episode_folder, read_npz, read_video, write_video
+from xew.episode import EpisodeError, complete_folder, episode_folder, read_npz, write_video
 
 VIDEO_SUFFIXES = (".mkv", ".mp4", ".npz")
+RATE_TOLERANCE = 0.01
+"""Relative; containers round times to a tick, and people 16.667 to two digits. 16 frames a second are another rate."""
+GAP_TOLERANCE = 0.1
+"""Relative, or a tick and a half of the container's clock: by how much one frame may come early in a constant rate."""
+PNG_END = b"IEND\xaeB`\x82"
 
 
 class RolloutError(EpisodeError):
@@ -65,8 +74,12 @@ def write_rollout(root: Path, task: str, seed: int, robot: str, video: np.ndarra
     return folder
 
 
-def find_rollouts(root: Path) -> list[Rollout]:
+def find_rollouts(root: Path, problems: list[str] | None = None) -> list[Rollout]:
     """All rollouts of a tree, sorted by task, seed and robot.
+
+    Args:
+        root: of the tree.
+        problems: where given, folders that cannot be understood are told here, one message each, and left out.
 
     Raises:
         RolloutError: there is none, or a folder cannot be understood.
@@ -77,16 +90,28 @@ def find_rollouts(root: Path) -> list[Rollout]:
         raise RolloutError(
             f"no rollout under {root}, expected <task>/<seed>/<robot>/; make some: python -m xew.model.rollout RUN --out {root}"
         )
-    return [read_rollout(folder) for folder in folders]
+    found = []
+    for folder in folders:
+        try:
+            found.append(read_rollout(folder))
+        except RolloutError as error:
+            if problems is None:
+                raise
+            problems.append(str(error))
+    return found
 
 
 def read_rollout(folder: Path) -> Rollout:
     """The rollout in a folder `<root>/<task>/<seed>/<robot>`, without its frames. Raises RolloutError as `find_rollouts`."""
     folder = Path(folder)
-    header = _read_header(folder / "rollout.json")
+    path = folder / "rollout.json"
+    video = _find_video(folder)
+    for file in (path, *video):
+        _check_inside(folder.parents[2], file)
+    header = _read_header(path)
     frame_count = header.get("frame_count")
-    if frame_count is not None and (not isinstance(frame_count, int) or frame_count < 1):
-        raise RolloutError(f"{folder / 'rollout.json'}: frame_count is {frame_count!r}, expected a positive whole number.")
+    if frame_count is not None and (not isinstance(frame_count, int) or isinstance(frame_count, bool) or frame_count < 1):
+        raise RolloutError(f"{path}: frame_count is {frame_count!r}, expected a positive whole number.")
     task, seed = folder.parts[-3:-1]
     if not seed.isdecimal():
         raise RolloutError(f"{folder}: the folder above it is {seed!r}, expected a seed; the tree is <task>/<seed>/<robot>/.")
@@ -95,29 +120,47 @@ def read_rollout(folder: Path) -> Rollout:
         task=task,
         seed=int(seed),
         robot=folder.name,
-        model=str(header.get("model", folder.parents[2].name)),
-        condition=str(header.get("condition", "")),
+        model=_name(path, "model", header.get("model", folder.parents[2].resolve().name)),
+        condition=_name(path, "condition", header.get("condition", "")),
         frame_count=frame_count,
-        video=_find_video(folder),
+        video=video,
         header=header,
     )
 
 
-def read_rollout_video(rollout: Rollout) -> np.ndarray:
-    """The frames, uint8 RGB [t h w 3]. Raises RolloutError if they cannot be read or are no RGB video."""
+def read_rollout_video(rollout: Rollout, frame_rate: float | None = None) -> np.ndarray:
+    """The frames, uint8 RGB [t h w 3].
+
+    Args:
+        rollout: as found.
+        frame_rate: what a container must say, in frames a second; None: whatever it says.
+
+    Raises:
+        RolloutError: they cannot all be read, are no RGB video of 8 bits, or come at another or a changing rate.
+    """
     first = rollout.video[0]
     if first.suffix == ".png":
         video = _read_pngs(rollout.video)
     elif first.suffix == ".npz":
         video = _read_npz(first)
     else:
-        try:
-            video = read_video(first)
-        except EpisodeError as error:
-            raise RolloutError(f"{first} holds no readable frame; make this rollout again.") from error
-    if video.dtype != np.uint8 or video.ndim != 4 or video.shape[-1] != 3:
-        raise RolloutError(f"{first}: found {video.dtype} {video.shape}, expected uint8 [t h w 3]; convert before grading.")
-    return video
+        video = _read_container(first, frame_rate)
+    return _checked(first, video)
+
+
+def _check_inside(root: Path, file: Path) -> None:
+    """Raise RolloutError where links lead out of the tree."""
+    if not file.resolve().is_relative_to(root.resolve()):
+        raise RolloutError(f"{file} leads to {file.resolve()}, out of the tree {root}; put the file itself there.")
+
+
+def _name(path: Path, key: str, name: object) -> str:
+    """A name that is fit to print and to name a file with."""
+    if not isinstance(name, str) or not name.isprintable():
+        raise RolloutError(f"{path}: {key} is {name!r}, expected printable text.")
+    if name.startswith(("/", "~")) or "\\" in name or ".." in PurePosixPath(name).parts:
+        raise RolloutError(f"{path}: {key} is {name!r}, which reads as a path to elsewhere; give it a plain name.")
+    return name
 
 
 def _read_header(path: Path) -> dict[str, Any]:
@@ -134,7 +177,7 @@ def _read_header(path: Path) -> dict[str, Any]:
 
 def _find_video(folder: Path) -> tuple[Path, ...]:
     files = sorted(file for file in folder.rglob("*") if file.suffix in VIDEO_SUFFIXES)
-    images = sorted(folder.rglob("*.png"))
+    images = sorted(folder.rglob("*.png"), key=_by_number)
     if len(files) == 1 and not images:
         return (files[0],)
     if images and not files:
@@ -145,18 +188,111 @@ def _find_video(folder: Path) -> tuple[Path, ...]:
     )
 
 
+def _by_number(path: Path) -> list[tuple[int, str]]:
+    """So that 2.png comes before 10.png."""
+    parts = re.split(r"([0-9]+)", str(path))
+    return [(int(part), "") if part.isdecimal() else (0, part) for part in parts]
+
+
+def _read_container(path: Path, frame_rate: float | None) -> np.ndarray:
+    """All frames of an mkv or mp4. Raises RolloutError where that is not what the file promises."""
+    frames: list[np.ndarray] = []
+    times: list[float] = []
+    try:
+        with av.open(str(path)) as container:
+            if len(container.streams.video) != 1:
+                raise RolloutError(f"{path} holds {len(container.streams.video)} videos, expected one.")
+            stream = container.streams.video[0]
+            _check_pixels(path, stream.codec_context.format)
+            stream.codec_context.thread_count = 1
+            stream.codec_context.options = {"err_detect": "explode"}  # else what is lost is painted over from its neighbours
+            for frame in container.decode(stream):
+                frames.append(_rgb(path, frame))
+                times.append(float(frame.pts * frame.time_base) if frame.pts is not None else np.nan)
+            tick, promised = float(stream.time_base), _promised_frames(container, stream, times)
+    except (av.FFmpegError, ValueError) as error:
+        after = f"breaks off after {len(frames)} frames" if frames else "holds no readable frame"
+        raise RolloutError(f"{path} {after} ({error}); make this rollout again.") from error
+    if not frames:
+        raise RolloutError(f"{path} holds no readable frame; make this rollout again.")
+    if len(frames) < promised:
+        raise RolloutError(f"{path} is cut off: {len(frames)} frames can be read of {promised}; make this rollout again.")
+    if len({frame.shape for frame in frames}) > 1:
+        raise RolloutError(f"{path} changes its size on the way; make this rollout again.")
+    if frame_rate is not None and len(frames) > 1:
+        _check_rate(path, np.array(times), tick, frame_rate)
+    return np.stack(frames)
+
+
+def _rgb(path: Path, frame: Any) -> np.ndarray:
+    """A decoded frame as RGB [h w 3]. OpenCV writes FFV1 with an alpha channel that hides nothing; any other is an error."""
+    if not any(component.is_alpha for component in frame.format.components):
+        return frame.to_ndarray(format="rgb24")
+    image = frame.to_ndarray(format="rgba")
+    if image[..., 3].min() < 255:
+        raise RolloutError(f"{path} has an alpha channel ({frame.format.name}) that hides something; convert before grading.")
+    return image[..., :3]
+
+
+def _check_pixels(path: Path, pixels: Any) -> None:
+    """Raise RolloutError unless the format is colour with 8 bits a channel."""
+    components = pixels.components if pixels else ()  # None where so little can be read that there is no format
+    kind = ""
+    if len(components) == 1 and not pixels.has_palette:
+        kind = "grey frames"
+    elif any(component.bits > 8 for component in components):
+        kind = f"{max(component.bits for component in components)} bits a channel"
+    if kind:
+        raise RolloutError(f"{path} holds {kind} ({pixels.name}), expected RGB of 8 bits; convert before grading.")
+
+
+def _promised_frames(container: Any, stream: Any, times: list[float]) -> int:
+    """How many frames the container says that it holds; 0 where it does not say."""
+    if stream.frames:
+        return int(stream.frames)
+    if container.duration is None or len(container.streams) != 1 or len(times) < 2 or times[-1] <= times[0]:
+        return 0
+    gap = (times[-1] - times[0]) / (len(times) - 1)
+    return round((container.duration / av.time_base - times[0]) / gap)
+
+
+def _check_rate(path: Path, times: np.ndarray, tick: float, frame_rate: float) -> None:
+    """Raise RolloutError unless frames come at a constant rate, and at this one."""
+    gaps = np.diff(times)
+    middle = float(np.median(gaps))
+    if not np.all(np.abs(gaps - middle) <= max(1.5 * tick, GAP_TOLERANCE * middle)):
+        raise RolloutError(
+            f"{path} has a variable frame rate (from frame to frame {1000 * gaps.min():.0f} to {1000 * gaps.max():.0f} ms), "
+            "expected a constant one; where its frames are the episode's one by one all the same: --allow rate."
+        )
+    rate = 1 / float(np.mean(gaps))
+    if abs(rate / frame_rate - 1) > RATE_TOLERANCE:
+        raise RolloutError(
+            f"{path} has {rate:.2f} frames a second, its episode {frame_rate:.2f}; write the episode's rate, or, where its "
+            "frames are the episode's one by one all the same: --allow rate."
+        )
+
+
 def _read_pngs(paths: tuple[Path, ...]) -> np.ndarray:
     frames: list[np.ndarray] = []
     for path in paths:
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        if image is None:
-            raise RolloutError(f"{path} is no readable PNG; make this rollout again.")
-        if frames and image.shape != frames[0].shape:
+        frame = _read_png(path)
+        if frames and frame.shape != frames[0].shape:
             raise RolloutError(
-                f"{path} is {image.shape[:2]}, the frames before it are {frames[0].shape[:2]}; sizes must be one."
+                f"{path} is {frame.shape[:2]}, the frames before it are {frames[0].shape[:2]}; sizes must be one."
             )
-        frames.append(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+        frames.append(frame)
     return np.stack(frames)
+
+
+def _read_png(path: Path) -> np.ndarray:
+    """RGB of 8 bits [h w 3]; what OpenCV would quietly convert or fill up is an error."""
+    content = path.read_bytes()
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
+    if image is None or not content.rstrip(b"\0").endswith(PNG_END):
+        raise RolloutError(f"{path} is no readable PNG or is cut off; make this rollout again.")
+    _checked(path, image[None])
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def _read_npz(path: Path) -> np.ndarray:
@@ -167,3 +303,19 @@ def _read_npz(path: Path) -> np.ndarray:
     if len(arrays) != 1:
         raise RolloutError(f"{path} holds the arrays {sorted(arrays)}, expected one: the video [t h w 3] uint8.")
     return next(iter(arrays.values()))
+
+
+def _checked(path: Path, video: np.ndarray) -> np.ndarray:
+    """The video. Raises RolloutError with what it is instead where it is not uint8 [t h w 3] with a frame."""
+    if video.dtype == np.uint8 and video.ndim == 4 and video.shape[-1] == 3 and video.size:
+        return video
+    kind = ""
+    if np.issubdtype(video.dtype, np.floating) and not np.isfinite(video).all():
+        kind = ", with NaN or infinite values"
+    elif video.ndim in (3, 4) and not video.size:
+        kind = ", no frame at all"
+    elif video.ndim == 3 or (video.ndim == 4 and video.shape[-1] == 1):
+        kind = ", grey"
+    elif video.ndim == 4 and video.shape[-1] == 4:
+        kind = ", with an alpha channel"
+    raise RolloutError(f"{path}: found {video.dtype} {video.shape}{kind}, expected uint8 [t h w 3]; convert before grading.")
