@@ -1,0 +1,265 @@
+"""Stage 11 of 11: the means that tables and findings are made of, with other values that they could as well have had.
+
+A mean has an address that is the same for our study and for the paper: (part, row, robots, metric), such as
+("actions", "optical_flow", "franka_panda", "lpips"). Parts and rows are named as in `paper.py`; robots are one robot, or
+'seen' for those that a row's model was trained on, pooled.
+
+`StudyGrades` reads a score table: its means vary over bootstrap resamples of the scenes, one resample for all cells, so that
+whatever is computed of several means stays paired by scene. `PaperGrades` reads the printed tables: its means vary over what
+prints the same. Whoever computes a difference or a ratio does it on all these values at once and looks where they lie.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, Protocol
+
+import numpy as np
+import pandas as pd
+
+from xew.analysis.paper import AXES, Paper
+from xew.analysis.scores import TRUTH, MetricInfo
+from xew.protocol import MULTI_VIEW, PARTS, ROBOT_NAMES, SPLITS, Variant
+
+TOGETHER = {
+    "few_shot": ("few_shot", "remedies"),
+    "forgetting": ("forgetting", "remedies"),
+    "baselines": ("baselines", "more_systems"),
+}
+"""Parts of the protocol that are ours and stand in a part of the paper's."""
+DRAWS = 2000
+LEVEL = 0.95
+MIN_SCENES = 6
+"""Fewer scenes give no interval: with six, all differences have one sign by chance in 3 % of cases, with five in 6 %."""
+SEEN = "seen"
+REFERENCE = "reference"
+"""The row of the few-shot part that stands for the model before adaptation, on the robots that it was trained on."""
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A mean over episodes."""
+
+    values: np.ndarray
+    """[1 + DRAWS] the mean itself, then what else it could have been."""
+    count: int
+    """Episodes; 0 where they are not known (the paper's)."""
+    scenes: int
+    """Scenes that these episodes are of, by which they are resampled; 0 as above."""
+
+    @property
+    def value(self) -> float:
+        return float(self.values[0])
+
+
+class Grades(Protocol):
+    """All means of a study."""
+
+    level: float
+    """Share of the drawn values that an interval holds."""
+    metrics: Mapping[str, MetricInfo]
+    """By name, in the paper's order."""
+
+    def mean(self, part: str, row: str, robots: str, metric: str, shared: bool = False) -> Mean | None:
+        """The mean at an address, None where nothing is measured; `shared`: over the cells that all rows of the part have."""
+
+    def floor(self, robots: str, metric: str) -> float:
+        """How far the estimators are from the truth on the true video: smaller differences say nothing."""
+
+    def axis(self, name: str) -> np.ndarray:
+        """Mean distance of each robot to the other four, 'appearance' or 'kinematic', in the order of ROBOT_NAMES: [5], or
+        [1 + DRAWS 5] where it is known to some digits only."""
+
+
+def interval(values: np.ndarray, level: float) -> tuple[float, float]:
+    """Ends of the share `level` of drawn values [1 + n]; the first is the point and does not count.
+
+    Values that do not exist (a resample without any cell) are left out.
+    """
+    return tuple(np.nanquantile(values[1:], [(1 - level) / 2, (1 + level) / 2]).tolist())
+
+
+def better(after: Mean, before: Mean, metric: MetricInfo) -> np.ndarray:
+    """By how much a mean is better than another, of the latter: 0.1 is 10 %; positive is better whatever the metric."""
+    sign = 1 if metric.higher_is_better else -1
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return sign * (after.values - before.values) / np.abs(before.values)
+
+
+def row_keys(part: str, variant: Variant) -> list[str]:
+    """The rows of a part that a variant of it fills."""
+    if variant.target is not None:
+        remedy = "" if variant.remedy == "full" else f"-{variant.remedy}"
+        return [f"{variant.target}-{variant.shots}{remedy}"]
+    if part == "forgetting":
+        return ["none"]
+    if part == "few_shot" and (variant.action, variant.embodiment) == MULTI_VIEW:
+        return [REFERENCE, *(f"{target}-0" for target in SPLITS[variant.split].held_out_robots)]
+    if part == "baselines":
+        return [variant.system]
+    if part in ("ladder", "few_shot"):
+        return [variant.embodiment]
+    return [variant.action if part == "actions" else variant.split]
+
+
+def variants_of(part: str) -> tuple[Variant, ...]:
+    """All variants that may fill a row of a part."""
+    return tuple(variant for name in TOGETHER.get(part, (part,)) for variant in PARTS[name])
+
+
+def find_variant(part: str, row: str) -> Variant:
+    """The variant that fills a row. Raises KeyError where the protocol knows none."""
+    for variant in variants_of(part):
+        if row in row_keys(part, variant):
+            return variant
+    raise KeyError(f"no variant of the protocol fills the row {row!r} of {part!r}")
+
+
+def pooled(variant: Variant, robots: str) -> tuple[str, ...]:
+    """The robots behind a name: 'seen' are those that the variant's split trains on."""
+    return SPLITS[variant.split].train_robots if robots == SEEN else (robots,)
+
+
+class StudyGrades:
+    """A study's score table with the column `variant`.
+
+    Args:
+        rows: columns variant, model, task, seed, robot, metric, value; each cell once.
+        metrics: what the table says of its metrics.
+        axes: mean distances by axis, for correlations; in the order of ROBOT_NAMES.
+    """
+
+    level = LEVEL
+
+    def __init__(self, rows: pd.DataFrame, metrics: Sequence[MetricInfo], axes: Mapping[str, np.ndarray]) -> None:
+        self.metrics = {metric.name: metric for metric in metrics}
+        self._axes = axes
+        # Baselines belong to no variant; they are found by the model's name.
+        named = rows.assign(variant=rows["variant"].where(rows["variant"] != "", rows["model"]))
+        self._cells = named.pivot(index=["task", "seed"], columns=["variant", "robot", "metric"], values="value").sort_index()
+        self._columns: dict[tuple[str, str, str], int] = {}
+        for i, column in enumerate(self._cells.columns):
+            variant, robot, metric = map(str, column)
+            self._columns[variant, robot, metric] = i
+        self._cache: dict[tuple[str, tuple[str, ...], str, str], Mean | None] = {}
+
+    @property
+    def scenes(self) -> list[tuple[str, int]]:
+        """(task, seed) of all that is graded."""
+        return self._cells.index.tolist()
+
+    def mean(self, part: str, row: str, robots: str, metric: str, shared: bool = False) -> Mean | None:
+        variant = find_variant(part, row)
+        return self.variant_mean(variant.name, pooled(variant, robots), metric, part if shared else "")
+
+    def has(self, variant: str) -> bool:
+        """Was anything of a variant graded?"""
+        return variant in self._variants
+
+    def baseline(self, model: str, robots: Sequence[str], metric: str) -> Mean | None:
+        """Mean of COPY or TRUTH."""
+        return self.variant_mean(model, tuple(robots), metric)
+
+    def variant_mean(self, variant: str, robots: tuple[str, ...], metric: str, shared_part: str = "") -> Mean | None:
+        """Mean over all episodes of some robots, or over those that every measured variant of a part has."""
+        key = (variant, robots, metric, shared_part)
+        if key not in self._cache:
+            values = self._block(variant, robots, metric)
+            if shared_part:
+                values = np.where(self._shared(shared_part, robots, metric), values, np.nan)
+            self._cache[key] = self._resample(values)
+        return self._cache[key]
+
+    def floor(self, robots: str, metric: str) -> float:
+        info = self.metrics[metric]
+        perfect = info.high if info.higher_is_better else info.low
+        truth = self.baseline(TRUTH, SPLITS["fixed"].train_robots if robots == SEEN else (robots,), metric)
+        if truth is None or perfect is None or not np.isfinite(perfect):
+            return 0.0
+        return abs(truth.value - perfect)
+
+    def axis(self, name: str) -> np.ndarray:
+        return self._axes[name]
+
+    def _block(self, variant: str, robots: tuple[str, ...], metric: str) -> np.ndarray:
+        """Scores [s r] of all scenes, NaN where there is none."""
+        empty = np.full(len(self._cells), np.nan)
+        columns = [self._columns.get((variant, robot, metric)) for robot in robots]
+        return np.stack([empty if i is None else self._values[:, i] for i in columns], axis=1)
+
+    def _shared(self, part: str, robots: tuple[str, ...], metric: str) -> np.ndarray:
+        """Which cells [s r] all variants of a part have that have any."""
+        blocks = [~np.isnan(self._block(variant.name, robots, metric)) for variant in variants_of(part)]
+        return np.logical_and.reduce([block for block in blocks if block.any()] or [np.ones_like(blocks[0])])
+
+    def _resample(self, values: np.ndarray) -> Mean | None:
+        held = ~np.isnan(values)
+        if not held.any():
+            return None
+        sums, counts = np.where(held, values, 0).sum(axis=1), held.sum(axis=1)
+        with np.errstate(invalid="ignore"):
+            means = (self._weights @ sums) / (self._weights @ counts)
+        return Mean(means, int(counts.sum()), int((counts > 0).sum()))
+
+    @cached_property
+    def _variants(self) -> set[str]:
+        return {variant for variant, _, _ in self._columns}
+
+    @cached_property
+    def _values(self) -> np.ndarray:
+        return self._cells.to_numpy(np.float64)
+
+    @cached_property
+    def _weights(self) -> np.ndarray:
+        """How often each scene is drawn [1 + DRAWS s]: once each in the first row, then at random with replacement."""
+        scenes = len(self._cells)
+        drawn = np.random.default_rng(0).multinomial(scenes, np.full(scenes, 1 / scenes), DRAWS)
+        return np.concatenate([np.ones((1, scenes)), drawn])
+
+
+class PaperGrades:
+    """The printed means. What prints the same is tried at the ends of its range, in DRAWS combinations drawn at random."""
+
+    level = 1.0
+    ALIASES: ClassVar = {
+        ("fixed", "fixed"): ("actions", "optical_flow"),
+        ("few_shot", "robot_render"): ("ladder", "robot_render"),
+    }
+    """Rows that it prints in another table."""
+
+    def __init__(self, paper: Paper, metrics: Sequence[MetricInfo]) -> None:
+        self.metrics = {metric.name: metric for metric in metrics}
+        self._paper = paper
+        self._rng = np.random.default_rng(0)
+        self._cache: dict[tuple[str, str, str, str], Mean] = {}
+
+    def mean(self, part: str, row: str, robots: str, metric: str, shared: bool = False) -> Mean | None:
+        part, row = self.ALIASES.get((part, row), (part, row))
+        key, printed = (part, row, robots, metric), self._paper.score(part, row, robots, metric)
+        if printed is None:
+            return None
+        if key not in self._cache:
+            ends = self._rng.choice([-1.0, 1.0], DRAWS) * self._paper.half_digit_of(part, metric)
+            self._cache[key] = Mean(np.concatenate([[printed], printed + ends]), 0, 0)
+        return self._cache[key]
+
+    def print(self, part: str, row: str, robots: str, metric: str) -> str:
+        """A value with as many decimals as the paper prints; '' where it prints none."""
+        part, row = self.ALIASES.get((part, row), (part, row))
+        printed = self._paper.score(part, row, robots, metric)
+        if printed is None:
+            return ""
+        return f"{printed:.{round(-np.log10(2 * self._paper.half_digit_of(part, metric)))}f}"
+
+    def floor(self, robots: str, metric: str) -> float:
+        return 0.0  # the paper prints none
+
+    def axis(self, name: str) -> np.ndarray:
+        printed = np.array([getattr(self._paper.robots[robot], name) for robot in ROBOT_NAMES])
+        ends = np.random.default_rng(0).choice([-1.0, 1.0], (DRAWS, len(printed))) * self._paper.half_digit
+        return np.concatenate([printed[None], printed + ends])
+
+
+def paper_axes(paper: Paper) -> dict[str, np.ndarray]:
+    """The printed mean distances by axis, in the order of ROBOT_NAMES."""
+    return {axis: np.array([getattr(paper.robots[robot], axis) for robot in ROBOT_NAMES]) for axis in AXES}
