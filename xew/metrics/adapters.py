@@ -1,0 +1,97 @@
+"""Metrics, ground of the adapters: the packages, checkpoints and queries that other projects' networks share.
+
+PyTorch is imported where it is first needed, so that nobody needs it who uses no adapter. Nothing is downloaded, and no file
+is unpickled freely.
+"""
+
+import importlib
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from xew.config import ConfigError
+
+
+def import_package(module: str, user: str, install: str) -> ModuleType:
+    """A package that only one adapter needs. Raises ConfigError that says who needs it and how it is installed."""
+    try:
+        return importlib.import_module(module)
+    except (ImportError, RuntimeError) as error:  # torchvision beside a PyTorch of another build raises RuntimeError
+        reason = str(error).splitlines()[0]
+        raise ConfigError(f"{user} needs the package {module.partition('.')[0]} ({reason}); {install}.") from error
+
+
+def import_torch(user: str) -> ModuleType:
+    """PyTorch. Raises ConfigError where it is not installed."""
+    return import_package("torch", user, "pip install torch (pytorch.org says which build fits the machine)")
+
+
+def read_state_dict(path: Path, user: str) -> Mapping[str, Any]:
+    """The tensors of a .pt or .pth by key, on the CPU; what wraps them (`model`, `state_dict`) is taken off.
+
+    Raises:
+        ConfigError: PyTorch is absent, or the file is damaged or holds anything but tensors.
+    """
+    torch = import_torch(user)
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, ValueError, KeyError) as error:
+        raise ConfigError(f"{path} is no whole checkpoint of {user} ({_first_line(error)}); download it again.") from error
+    for wrapper in ("model", "state_dict"):
+        if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
+            content = content[wrapper]
+    if not isinstance(content, Mapping) or not all(isinstance(value, torch.Tensor) for value in content.values()):
+        raise ConfigError(f"{path} holds a {type(content).__name__}, expected the tensors of {user} by name.")
+    return content
+
+
+def load_state_dict(network: Any, state: Mapping[str, Any], path: Path, user: str) -> None:
+    """Fill a PyTorch network. Raises ConfigError where tensors are missing, left over or misshapen."""
+    try:
+        network.load_state_dict(state)
+    except RuntimeError as error:
+        faults = [line.strip() for line in str(error).splitlines()[1:3]]
+        raise ConfigError(f"{path} is no checkpoint of {user}: {' '.join(faults)[:300]}") from error
+
+
+def torch_device() -> str:
+    """The first GPU that PyTorch sees, else the CPU."""
+    return "cuda" if importlib.import_module("torch").cuda.is_available() else "cpu"
+
+
+def query_frames(visible: np.ndarray) -> np.ndarray:
+    """The frame at which each point is given to a tracker: int [k], -1 for a point that is never seen.
+
+    It is the frame with most visible points, as in the paper; for a point that is hidden there, the one with most visible
+    points among those that show it. The earliest of equals.
+
+    Args:
+        visible: [t k] bool.
+    """
+    counts = visible.sum(axis=1)
+    frames = np.where(visible, counts[:, None], 0).argmax(axis=0)
+    return np.where(visible.any(axis=0), frames, -1)
+
+
+def lost(shape: tuple[int, ...]) -> np.ndarray:
+    """Tracks [t k 2] float32 of which nothing is known: NaN."""
+    return np.full((*shape, 2), np.nan, np.float32)
+
+
+def check_tracks(prediction: np.ndarray, points: np.ndarray, visible: np.ndarray) -> None:
+    """Raise ValueError unless video [t h w 3] uint8, points [t k 2] and visibility [t k] bool go together."""
+    if prediction.ndim != 4 or prediction.shape[-1] != 3 or prediction.dtype != np.uint8:
+        raise ValueError(f"the video is {prediction.dtype} {prediction.shape}, expected uint8 [t h w 3].")
+    if points.shape != (*visible.shape, 2) or visible.dtype != bool or len(points) != len(prediction):
+        raise ValueError(
+            f"points are {points.shape}, visibility {visible.dtype} {visible.shape}, the video has {len(prediction)} frames; "
+            "expected [t k 2] and bool [t k] of its frames."
+        )
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:160]
