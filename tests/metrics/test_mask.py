@@ -1,10 +1,13 @@
-"""IoU and boundary F1 against plain loops and SciPy's exact distance transform."""
+"""IoU and boundary F1 against plain loops, SciPy's exact distance transform and OpenCV's morphology."""
 
+import cv2
+import jax
 import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from xew.metrics import boundary_f1, mask_iou
+from xew.metrics.mask import mask_scores
 
 rng = np.random.default_rng(1)
 
@@ -32,12 +35,46 @@ def brute_f1(prediction: np.ndarray, target: np.ndarray, tolerance: float) -> fl
     return 0.0 if precision + recall == 0 else 2 * precision * recall / (precision + recall)
 
 
-@pytest.mark.parametrize("tolerance", [0, 1, 2, 2.5, 5])
+@pytest.mark.parametrize("tolerance", [0, 1, 2, 2.5, 5, 9, 17])
 @pytest.mark.parametrize("size", [(40, 53), (5, 5), (1, 9), (64, 31)])
 def test_boundary_f1_equals_brute_force(size: tuple[int, int], tolerance: float) -> None:
     prediction, target = blobs(4, *size, share=0.03), blobs(4, *size, share=0.03)
     expected = [brute_f1(p, t, tolerance) for p, t in zip(prediction, target, strict=True)]
     np.testing.assert_allclose(boundary_f1(prediction, target, tolerance=tolerance), expected, atol=1e-6)
+
+
+def opencv_scores(prediction: np.ndarray, target: np.ndarray) -> tuple[float, float]:
+    """As projects write it: contour = mask less its erosion, matched = inside the other contour's dilation."""
+    disc = np.uint8([[0, 0, 1, 0, 0], [0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 0, 1, 0, 0]])
+    p, t = prediction.astype(np.uint8), target.astype(np.uint8)
+    edge_p, edge_t = (mask - cv2.erode(mask, np.ones((3, 3), np.uint8)) for mask in (p, t))
+    precision = np.count_nonzero(edge_p & cv2.dilate(edge_t, disc)) / np.count_nonzero(edge_p)
+    recall = np.count_nonzero(edge_t & cv2.dilate(edge_p, disc)) / np.count_nonzero(edge_t)
+    return np.count_nonzero(p & t) / np.count_nonzero(p | t), 2 * precision * recall / (precision + recall)
+
+
+@pytest.mark.parametrize("size", [(240, 320), (61, 47), (300, 40)])
+def test_both_equal_opencv(size: tuple[int, int]) -> None:
+    target = blobs(2, *size)
+    prediction = target ^ blobs(2, *size, share=0.002)
+    iou, f1 = zip(*(opencv_scores(p, t) for p, t in zip(prediction, target, strict=True)), strict=True)
+    np.testing.assert_allclose(mask_iou(prediction, target), iou, atol=1e-6)
+    np.testing.assert_allclose(boundary_f1(prediction, target), f1, atol=1e-6)
+
+
+def test_both_at_once_and_inside_a_jit_are_the_same_numbers() -> None:
+    prediction, target = blobs(), blobs()
+    alone = mask_iou(prediction, target), boundary_f1(prediction, target)
+    for found in (mask_scores(prediction, target), jax.jit(mask_scores)(prediction, target)):
+        np.testing.assert_array_equal(found, alone)
+    stacked = jax.vmap(mask_scores)(np.stack([prediction, target]), np.stack([target, target]))
+    np.testing.assert_array_equal([scores[0] for scores in stacked], alone)
+
+
+def test_frames_do_not_depend_on_their_neighbours() -> None:
+    prediction, target, order = blobs(5), blobs(5), rng.permutation(5)
+    for metric in (mask_iou, boundary_f1):
+        np.testing.assert_array_equal(metric(prediction, target)[order], metric(prediction[order], target[order]))
 
 
 def test_mask_iou_equals_counting() -> None:
@@ -79,3 +116,5 @@ def test_masks_that_are_not_bool_are_an_error() -> None:
         mask_iou(blobs().astype(np.uint8), blobs())
     with pytest.raises(ValueError, match="one shape"):
         boundary_f1(blobs(2), blobs(3))
+    with pytest.raises(ValueError, match="at least 0"):
+        boundary_f1(blobs(), blobs(), tolerance=-1)
