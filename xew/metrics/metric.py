@@ -1,14 +1,20 @@
-"""Metrics, ground: what a metric is, and the checks on arrays that all of them share. Imports nothing of ours."""
+"""Metrics, ground: what a metric is, what all of them share: checks on arrays, frames by the chunk. Imports nothing of ours."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 INPUTS = ("video", "mask", "region", "track")
 """video: two [t h w 3]. mask: two [t h w]. region: two videos and the target's mask. track: two [t k 2], valid [t k]."""
+
+
+ACCELERATOR_CHUNK = 32
+"""Frames computed at once on a GPU or TPU; one is fastest on a CPU, where a frame's intermediates then stay in its cache."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,8 @@ def check_videos(prediction: jax.Array, target: jax.Array, smallest_side: int = 
         )
     if np.ndim(target) != 4 or np.shape(target)[-1] != 3:
         raise ValueError(f"videos are {np.shape(target)}, expected [t h w 3]; add the time axis, drop alpha.")
+    if not np.shape(target)[0]:
+        raise ValueError("the videos have no frames.")
     if min(np.shape(target)[1:3]) < smallest_side:
         raise ValueError(f"frames are {np.shape(target)[1:3]}, this metric needs sides of at least {smallest_side} pixels.")
     kinds = {jnp.result_type(video) for video in (prediction, target)}
@@ -72,3 +80,32 @@ def check_tracks(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> 
     if np.shape(valid) != np.shape(target)[:2]:
         raise ValueError(f"valid is {np.shape(valid)}, expected {np.shape(target)[:2]}, a flag for each point and frame.")
     check_bool("valid", valid)
+
+
+def map_frames(function: Callable[..., Any], frames: Any, chunk: int | None) -> Any:
+    """`function` of each frame, a chunk of frames at a time, so that memory does not grow with the video.
+
+    Chunks are of one size, so that there is one program to compile; the last is filled up with copies of the last frame.
+
+    Args:
+        function: of one frame: the leaves of `frames` without their time axis.
+        frames: arrays [t ...] in any tree.
+        chunk: most frames computed at once; None for 1 on a CPU and `ACCELERATOR_CHUNK` elsewhere.
+
+    Returns:
+        What the function returns, with a time axis [t ...].
+
+    Raises:
+        ValueError: the chunk is under 1.
+    """
+    chunk = (1 if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK) if chunk is None else chunk
+    if chunk < 1:
+        raise ValueError(f"chunk is {chunk}, expected at least 1 frame.")
+    if chunk == 1:
+        return lax.map(function, frames)
+    count = len(jax.tree.leaves(frames)[0])
+    chunks = -(-count // chunk)
+    size = -(-count // chunks)
+    order = np.minimum(np.arange(chunks * size), count - 1).reshape(chunks, size)
+    values = lax.map(lambda rows: jax.vmap(function)(jax.tree.map(lambda leaf: leaf[rows], frames)), order)
+    return jax.tree.map(lambda leaf: leaf.reshape(chunks * size, *leaf.shape[2:])[:count], values)
