@@ -8,11 +8,9 @@ To add one: its file, and one line in MASKERS, TRACKERS or FLOWS; from outside t
 """
 
 import hashlib
-import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -108,14 +106,6 @@ def _open(backend: Backend[T], name: str, checkpoint: Path | None, option: str) 
     if not checkpoint.exists():
         raise ConfigError(f"there is no {checkpoint}; {name} needs a checkpoint: {backend.needs}. Put it there: {option}.")
     return backend.open(checkpoint)
-
-
-def import_package(module: str, user: str, install: str) -> ModuleType:
-    """A package that only one estimator needs. Raises ConfigError that says who needs it and how it is installed."""
-    try:
-        return importlib.import_module(module)
-    except (ImportError, RuntimeError) as error:
-        raise ConfigError(f"{user} needs the package {module.partition('.')[0]} ({error}); {install}.") from error
 
 
 def _open_default_masker(_: Path | None) -> Masker:

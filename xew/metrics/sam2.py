@@ -91,11 +91,12 @@ class Frames:
 
 def _open_authors(checkpoint: Path, side: int) -> Sam2:
     state = read_state_dict(checkpoint, "SAM 2")
+    config = _config_name(state, checkpoint)
     install = "pip install sam2, or the sources of github.com/facebookresearch/sam2"
     build = import_package("sam2.build_sam", "SAM 2 from a .pt", install)
     module = import_package("sam2.sam2_video_predictor", "SAM 2 from a .pt", install)
     predictor = build.build_sam2_video_predictor(
-        _config_name(state, checkpoint), None, device=torch_device(), hydra_overrides_extra=[f"++model.image_size={side}"]
+        config, None, device=torch_device(), hydra_overrides_extra=[f"++model.image_size={side}"]
     )
     load_state_dict(predictor, state, checkpoint, "SAM 2")
     predictor.fill_hole_area = 0  # small holes are filled only where a CUDA extension was compiled; so they never are
