@@ -55,10 +55,13 @@ class Mean:
 class Grades(Protocol):
     """All means of a study."""
 
-    level: float
-    """Share of the drawn values that an interval holds."""
-    metrics: Mapping[str, MetricInfo]
-    """By name, in the paper's order."""
+    @property
+    def level(self) -> float:
+        """Share of the drawn values that an interval holds."""
+
+    @property
+    def metrics(self) -> Mapping[str, MetricInfo]:
+        """By name."""
 
     def mean(self, part: str, row: str, robots: str, metric: str, shared: bool = False) -> Mean | None:
         """The mean at an address, None where nothing is measured; `shared`: over the cells that all rows of the part have."""

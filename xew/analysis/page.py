@@ -8,8 +8,12 @@ from itertools import groupby
 from pathlib import Path
 from string import Template
 
+from xew.analysis.charts import Chart, Series, panel_svg, themed
+from xew.analysis.findings import Answer, Finding
 from xew.analysis.scores import COPY, TRUTH, MetricInfo
-from xew.analysis.summary import METRIC_TITLES, Interval, RobotTable, Row
+from xew.analysis.summary import Interval, RobotTable, Row
+from xew.analysis.tables import Block, Cell, Table, metric_title, number
+from xew.analysis.tables import Row as TableRow
 
 FOLDER = Path(__file__).parent
 SOFT = ' class="soft"'
@@ -48,7 +52,23 @@ def page(title: str, finding: Sequence[str], sections: Sequence[str], footer: st
 
 
 def section(title: str, *parts: str) -> str:
-    return "\n".join((f"<section>\n<h2>{escape(title)}</h2>", *parts, "</section>"))
+    return "\n".join((f'<section id="{anchor(title)}">\n<h2>{escape(title)}</h2>', *parts, "</section>"))
+
+
+def anchor(title: str) -> str:
+    """What a link to a section is named: letters, figures and hyphens."""
+    return "-".join("".join(c if c.isalnum() else " " for c in title.lower()).split())
+
+
+def contents(titles: Sequence[str]) -> str:
+    """Links to the page's sections."""
+    links = "".join(f'<a href="#{anchor(title)}">{escape(title)}</a>' for title in titles)
+    return f"<nav>{links}</nav>"
+
+
+def folded(title: str, *parts: str) -> str:
+    """Hidden until asked for."""
+    return "\n".join((f"<details><summary>{escape(title)}</summary>", *parts, "</details>"))
 
 
 def paragraph(text: str, soft: bool = False) -> str:
@@ -89,12 +109,6 @@ def _head(metric: MetricInfo) -> str:
     return f'<span title="{word}: {escape(metric.reference)}">{escape(metric_title(metric))}</span>'
 
 
-def metric_title(metric: MetricInfo) -> str:
-    """Such as 'PSNR [dB] ↑': the arrow points to better."""
-    unit = f" [{metric.unit}]" if metric.unit else ""
-    return f"{METRIC_TITLES.get(metric.name, metric.name)}{unit} {'↑' if metric.higher_is_better else '↓'}"
-
-
 def _table_row(row: Row, metrics: Sequence[MetricInfo]) -> str:
     kind = ' class="baseline"' if row.model in (COPY, TRUTH) else ""
     cells = "".join(_cell(row, metric) for metric in metrics)
@@ -111,11 +125,6 @@ def _cell(row: Row, metric: MetricInfo) -> str:
     return (
         f'<td class="{row.verdicts.get(metric.name, "")}"><span class="mean">{number(score.mean, metric)}</span>{interval}</td>'
     )
-
-
-def number(value: float, metric: MetricInfo) -> str:
-    """Digits that mean something: 0.01 dB, 0.1 px, else 0.001."""
-    return f"{value:.{ {'dB': 2, 'px': 1}.get(metric.unit, 3) }f}"
 
 
 def point_only(score: Interval) -> bool:
@@ -144,6 +153,103 @@ def _compared_cell(cell: Compared) -> str:
     return f'<td{kind}><span class="mean">{escape(cell.ours)}</span>{published}</td>'
 
 
+def table(shown: Table) -> str:
+    """Ours large, its interval and the paper's value small below it; what a block lacks stands above its rows."""
+    groups = [(title, len(list(members))) for title, members in groupby(shown.columns, key=lambda column: column.group)]
+    above = ""
+    if any(title for title, _ in groups):
+        titles = "".join(f'<th colspan="{count}">{escape(title)}</th>' for title, count in groups)
+        above = f'<tr class="dimension">{"<th></th>" * len(shown.stubs)}{titles}</tr>'
+    heads = "".join(f'<th class="stub">{escape(stub)}</th>' for stub in shown.stubs)
+    heads += "".join(f"<th>{escape(column.title)}</th>" for column in shown.columns)
+    width = len(shown.stubs) + len(shown.columns)
+    blocks = "\n".join(_block(block, width) for block in shown.blocks)
+    return (
+        f"<h3>{escape(shown.title)}</h3>\n{paragraph(shown.caption, soft=True) if shown.caption else ''}\n"
+        f'<div class="wide" tabindex="0"><table class="study"><thead>{above}<tr>{heads}</tr></thead>\n{blocks}</table></div>'
+    )
+
+
+def _block(block: Block, width: int) -> str:
+    title = f'<tr class="block"><th colspan="{width}"><span>{escape(block.title)}</span></th></tr>' if block.title else ""
+    lacks = f'<tr class="lacks"><td colspan="{width}"><span>{escape(block.note)}</span></td></tr>' if block.note else ""
+    return f"<tbody>{title}{lacks}{''.join(_block_row(block, i) for i in range(len(block.rows)))}</tbody>"
+
+
+def _block_row(block: Block, index: int) -> str:
+    row = block.rows[index]
+    stubs = [_stub(block.rows, index, place) for place in range(len(row.labels))]
+    cells = "".join(map(_value_cell, row.cells))
+    kind = ' class="baseline"' if row.baseline else ""
+    return f"<tr{kind}>{''.join(stubs)}{cells}</tr>"
+
+
+def _stub(rows: Sequence[TableRow], index: int, place: int) -> str:
+    """A row's label, once for all rows in a row that share it."""
+    label = rows[index].labels[place]
+    if place == len(rows[index].labels) - 1:
+        return f'<th class="stub">{escape(label)}</th>'
+    if index and rows[index - 1].labels[place] == label:
+        return ""
+    same = next((i for i, row in enumerate(rows[index:]) if row.labels[place] != label), len(rows) - index)
+    return f'<th class="stub" rowspan="{same}">{escape(label)}</th>'
+
+
+def _value_cell(cell: Cell) -> str:
+    marks = [cell.verdict, "best" * cell.best, {None: "", True: "agrees", False: "differs"}[cell.agrees]]
+    kinds = " ".join(filter(None, marks))
+    below = f'<span class="interval">{escape(cell.interval)}</span>' if cell.interval else ""
+    below += f'<span class="paper">{escape(cell.published)}</span>' if cell.published else ""
+    kind = f' class="{kinds}"' if kinds else ""
+    return f'<td{kind}><span class="mean">{escape(cell.text)}</span>{below}</td>'
+
+
+def chart(shown: Chart) -> str:
+    """A chart with its legend; panels stand beside or below one another, as there is room."""
+    legend = "".join(f"<span>{_swatch(series)}{escape(series.label)}</span>" for series in shown.legend)
+    panels = "".join(f'<div class="panel">{panel_svg(shown, panel)}</div>' for panel in shown.panels)
+    numbers = f'<span class="soft">Numbers: figures/{escape(shown.name)}.csv</span>'
+    return (
+        f'<figure class="chart"><figcaption>{escape(shown.caption)} {numbers}</figcaption>'
+        f'<div class="legend">{legend}</div><div class="panels">{panels}</div></figure>'
+    )
+
+
+def _swatch(series: Series) -> str:
+    kind = {"-": "line", "--": "dashed", ":": "dashed", "o": "ring"}[series.dash]
+    return f'<i class="{kind}" style="border-color: {themed(series.colour)}"></i>'
+
+
+def claims(findings: Sequence[Finding], papers: Sequence[Finding] | None) -> str:
+    """Each claim with its verdict here and, where given, on the paper's own figures; open for all numbers."""
+    items = []
+    for i, finding in enumerate(findings):
+        sides = [("here", finding)] + ([("the paper's own figures", papers[i])] if papers else [])
+        answers = "".join(_claim_side(title, side) for title, side in sides)
+        claim = finding.claim
+        items.append(
+            f'<article class="claim"><div><p><b>{escape(claim.says)}</b> <span class="soft">{escape(claim.where)}</span></p>'
+            f'<p class="soft">{escape(claim.test)}</p></div>{answers}</article>'
+        )
+    return f'<div class="claims{"" if papers else " alone"}">{"".join(items)}</div>'
+
+
+def _claim_side(title: str, finding: Finding) -> str:
+    kind = finding.verdict.replace(" ", "-")
+    pill = f'<span class="pill {kind}">{escape(finding.verdict)}</span> <span class="soft">{escape(title)}</span>'
+    if finding.missing:
+        return f'<div><p>{pill}</p><p class="soft">missing: {escape(finding.missing)}</p></div>'
+    ordered = sorted(finding.answers, key=lambda answer: answer.verdict == "holds")
+    shown, rest = (ordered, []) if len(ordered) <= 4 else (ordered[:3], ordered[3:])
+    more = f"<details><summary>{len(rest)} more</summary>{_answers(rest)}</details>" if rest else ""
+    return f"<div><p>{pill}</p>{_answers(shown)}{more}</div>"
+
+
+def _answers(answers: Sequence[Answer]) -> str:
+    items = "".join(f'<li class="{answer.verdict}">{escape(answer.text)}</li>' for answer in answers)
+    return f"<ul>{items}</ul>"
+
+
 def labelled_picture(source: str, caption: str, columns: Sequence[str], rows: Sequence[str]) -> str:
     """A sheet of pictures with the names of its columns above and of its rows at the left. The caption is HTML."""
     heads = "".join(f"<span>{escape(name)}</span>" for name in columns)
@@ -168,11 +274,7 @@ def definitions(pairs: Mapping[str, str]) -> str:
 def markdown_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> str:
     """The same table for report.md: mean [interval], and better, worse or unresolved against the frozen first frame."""
     shown = [metric for metric in metrics if any(metric.name in row.scores for row in table.rows)]
-    heads = [
-        f"{METRIC_TITLES.get(m.name, m.name)}{f' [{m.unit}]' if m.unit else ''} {'↑' if m.higher_is_better else '↓'}"
-        for m in shown
-    ]
-    lines = [f"| model | {' | '.join(heads)} |", f"|---|{'---:|' * len(shown)}"]
+    lines = [f"| model | {' | '.join(map(metric_title, shown))} |", f"|---|{'---:|' * len(shown)}"]
     lines += [f"| {row.title} | {' | '.join(_markdown_cell(row, metric) for metric in shown)} |" for row in table.rows]
     return "\n".join(lines)
 

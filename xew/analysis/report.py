@@ -1,7 +1,9 @@
 """Stage 11 of 11: report. A score table to one page that opens without a network.
 
 Reads  scores.parquet and its curves; the data set and the rollouts for pictures
-Writes <out>/index.html (self-contained), report.md with figures/, summary.csv
+Writes <out>/index.html (self-contained), report.md with figures/, summary.csv; of a study also tables/ and findings.csv
+
+A table with the column `variant` is a study's (xew.analysis.study writes it) and becomes the report of `report_study`.
 
     python -m xew.analysis.report demo/scores.parquet --data demo/data --rollouts demo/rollouts --out demo/report
 
@@ -22,7 +24,7 @@ import pandas as pd
 import tyro
 from tqdm import tqdm
 
-from xew.analysis import page, paper_report, pictures
+from xew.analysis import page, paper_report, pictures, report_study
 from xew.analysis.paper import read_paper
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, read_scores
 from xew.analysis.summary import METRIC_TITLES, ROBOT_TITLES, RobotTable, finding, flat_summary, robot_table
@@ -52,6 +54,8 @@ class Args:
     """Folder to write."""
     held_out: tuple[str, ...] = HELD_OUT_ROBOTS
     """Robots that the models have not seen; each has a table of its own."""
+    distances: Path | None = None
+    """Folder that python -m xew.analysis.distance wrote; for a study. Without it the paper's distances stand in."""
     paper: bool = False
     """Instead of scores: rebuild the paper's distance table from the paper's own scores and distances."""
 
@@ -72,7 +76,8 @@ def main(args: Args) -> None:
     if args.paper:
         _report_paper(args)
     elif args.scores:
-        _report_scores(args, read_scores(args.scores))
+        scores = read_scores(args.scores)
+        (_report_study if scores.of_study else _report_scores)(args, scores)
     else:
         raise ConfigError("no score table was named: give the one that xew.metrics.evaluate wrote, or --paper.")
     print(f"report: {args.out / 'index.html'}")
@@ -81,7 +86,15 @@ def main(args: Args) -> None:
 def _report_paper(args: Args) -> None:
     if args.scores or args.data or args.rollouts:
         raise ConfigError("--paper reports on the paper's own figures; leave out scores, --data and --rollouts.")
-    _write(args.out, *paper_report.build(read_paper(), _footer({})))
+    html, (markdown, figures), summary = paper_report.build(read_paper(), _footer({}))
+    _write(args.out, html, (markdown, {f"figures/{name}": image for name, image in figures.items()}), summary)
+
+
+def _report_study(args: Args, scores: Scores) -> None:
+    if args.data and not find_records(args.data):
+        raise ConfigError(f"{args.data} holds no episode; make some: python -m xew.sim_warp.generate --out {args.data}")
+    report = report_study.build(scores, args.data, args.rollouts, args.distances, _footer(scores.versions))
+    _write(args.out, report.html, (report.markdown, report.files), report.summary)
 
 
 def _report_scores(args: Args, scores: Scores) -> None:
@@ -277,15 +290,17 @@ def _markdown(
             state = "" if table.complete else f" (incomplete: {table.count} of {table.expected} test episodes)"
             lines += ["", f"### {table.title}{state}", "", page.markdown_table(table, scores.metrics)]
     lines += ["", "## Figures", "", *(f"![{figure.name}](figures/{figure.name})" for figure in figures)]
-    return "\n".join(lines) + "\n", {figure.name: figure.image for figure in figures}
+    return "\n".join(lines) + "\n", {f"figures/{figure.name}": figure.image for figure in figures}
 
 
-def _write(out: Path, html: str, markdown: tuple[str, dict[str, bytes]], summary: pd.DataFrame) -> None:
+def _write(out: Path, html: str, markdown: tuple[str, Mapping[str, bytes]], summary: pd.DataFrame) -> None:
+    """The page last, so that where it stands all that it speaks of stands too."""
+    text, files = markdown
     try:
-        (out / "figures").mkdir(parents=True, exist_ok=True)
-        text, figures = markdown
-        for name, image in figures.items():
-            (out / "figures" / name).write_bytes(image)
+        out.mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
+            (out / name).parent.mkdir(exist_ok=True)
+            (out / name).write_bytes(content)
         (out / "report.md").write_text(text)
         summary.to_csv(out / "summary.csv", index=False)
         (out / "index.html").write_text(html)

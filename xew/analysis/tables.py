@@ -4,8 +4,8 @@ Ours stands large, the paper's value beside it where it prints one. A row that w
 episodes than the protocol asks for says how many, and robots that were held out are never averaged.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -130,10 +130,17 @@ class Builder:
     Attributes:
         ours: what is reported on.
         paper: the printed values beside; None leaves them out.
+        planned: episodes that the study meant to grade, by variant and robot; the paper's where it does not say.
     """
 
     ours: Grades
     paper: PaperGrades | None
+    planned: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+
+    @property
+    def any_metric(self) -> str:
+        """The first metric, for counts."""
+        return next(iter(self.ours.metrics))
 
     def present(self, part: str) -> bool:
         """Was anything measured that only this part asks for? The models that comparisons start from do not count."""
@@ -181,18 +188,20 @@ class Builder:
         if not isinstance(self.ours, StudyGrades):
             return ""
         found: dict[str, list[str]] = {}
-        complete = True
+        as_planned, as_paper = True, True
         for key, robots, label in rows:
             variant = find_variant(part, key)
-            expected = sum(expected_counts(variant).get(robot, 0) for robot in pooled(variant, robots))
+            paper = sum(expected_counts(variant).get(robot, 0) for robot in pooled(variant, robots))
+            planned = sum(self.planned.get(variant.name, {}).get(robot, 0) for robot in pooled(variant, robots)) or paper
             counts = {mean.count for m in self.ours.metrics if (mean := self.ours.mean(part, key, robots, m))}
-            complete &= counts == {expected}
-            found.setdefault(_count_text(counts, expected), []).append(label)
-        if complete:
+            as_planned, as_paper = as_planned and counts == {planned}, as_paper and counts == {paper}
+            found.setdefault(_count_text(counts, paper if counts == {planned} else planned), []).append(label)
+        if as_paper:
             return ""
+        word = "As planned, but smaller than the paper's protocol" if as_planned else "Incomplete"
         if len(found) == 1:
-            return f"Incomplete: {next(iter(found))} in every row."
-        return "Incomplete: " + ". ".join(f"{text}: {'; '.join(names)}" for text, names in found.items()) + "."
+            return f"{word}: {next(iter(found))} in every row."
+        return f"{word}: " + ". ".join(f"{text}: {'; '.join(names)}" for text, names in found.items()) + "."
 
     def _baseline(self, model: str, robots: Sequence[str], metric: str) -> Cell:
         assert isinstance(self.ours, StudyGrades)
@@ -407,6 +416,41 @@ def loeo_full(builder: Builder) -> Table:
         ("held out",),
         metric_columns(builder.ours, metrics),
         (Block("", tuple(rows), note),),
+    )
+
+
+def count_table(builder: Builder) -> Table:
+    """The paper's numbers of scored episodes, and how many there are here."""
+    printed = {"actions": (1500, 500, 500), "ladder": (1500, 500, 500), "loeo": (2000, 500, 500), "few_shot": (500, 500, 500)}
+    titles = {"actions": "Action representation", "ladder": "Conditioning", "loeo": "One LOEO fold", "few_shot": "Few-shot"}
+    rows = [
+        Row((titles[part],), tuple(_count_cell(builder, part, i, number) for i, number in enumerate(numbers)))
+        for part, numbers in printed.items()
+    ]
+    return Table(
+        "counts",
+        "Numbers of scored episodes",
+        f"Of a row of each table; few-shot: {ROBOT_TITLES[FORGETTING_ROBOT]} for forgetting, and the target.",
+        ("experiment",),
+        (Column("seen / reference"), *(Column(SHORT_ROBOTS[robot]) for robot in HELD_OUT_ROBOTS)),
+        (Block("", tuple(rows)),),
+    )
+
+
+def _count_cell(builder: Builder, part: str, place: int, printed: int) -> Cell:
+    """Smallest and largest count over the variants of a part, in one of the columns seen, Franka, Piper."""
+    if not isinstance(builder.ours, StudyGrades):
+        return Cell(published=str(printed), printed=printed)
+    counts = set()
+    for variant in PARTS[part]:
+        seen = (FORGETTING_ROBOT,) if part == "few_shot" else variant.seen_robots
+        robots = (seen, *((robot,) for robot in HELD_OUT_ROBOTS))[place]
+        held_out = place == 0 or robots[0] in variant.held_out_robots
+        if held_out and (mean := builder.ours.variant_mean(variant.name, robots, builder.any_metric)):
+            counts.add(mean.count)
+    text = " to ".join(map(str, dict.fromkeys((min(counts), max(counts))))) if counts else "–"
+    return Cell(
+        text, published=str(printed), printed=printed, value=max(counts, default=np.nan), episodes=max(counts, default=0)
     )
 
 

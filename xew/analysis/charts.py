@@ -1,0 +1,194 @@
+"""Stage 11 of 11: the report's charts. A chart is panels beside one another, and the numbers that they draw.
+
+On the page each panel is an SVG of its own, so that they stand one below the other on a narrow screen, and takes its colours
+from the page, light or dark. For Markdown and LaTeX all panels are one PNG and one PDF.
+"""
+
+import io
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+INK, SOFT, LINE, GROUND = "#1f2328", "#57606a", "#d0d7de", "#ffffff"
+SERIES = ("#1f6feb", "#c2410c", "#15803d", "#7e22ce", "#a16207", "#0e7490")
+"""Of series in order; baselines are SOFT. The page has a lighter one for each in the dark."""
+THEME = {INK: "ink", SOFT: "soft", LINE: "line", GROUND: "page"} | {colour: f"c{i}" for i, colour in enumerate(SERIES)}
+"""The page's variable for each colour."""
+PANEL = (3.5, 2.5)
+"""Inches."""
+STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "font.size": 9,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": SOFT,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.titlecolor": INK,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": LINE,
+    "grid.linewidth": 0.6,
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "pdf.fonttype": 42,
+}
+
+
+@dataclass(frozen=True)
+class Series:
+    """A line of the legend."""
+
+    label: str
+    colour: str
+    dash: Literal["-", "--", ":", "o"] = "-"
+    """'-', '--' or ':'; 'o' is a hollow mark."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    title: str
+    draw: Callable[[Axes], None]
+    height: float = PANEL[1]
+    """Inches."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Panels with one legend."""
+
+    name: str
+    """For file names."""
+    caption: str
+    panels: Sequence[Panel]
+    data: pd.DataFrame
+    """What is drawn, tidy."""
+    legend: Sequence[Series] = ()
+    columns: int = 2
+
+
+def panel_svg(chart: Chart, panel: Panel) -> str:
+    """One panel as an <svg> element that takes its colours from the page."""
+    with matplotlib.rc_context({**STYLE, "svg.hashsalt": f"{chart.name} {panel.title}"}):
+        figure = Figure(figsize=(PANEL[0], panel.height), layout="constrained")
+        axes = figure.subplots()
+        panel.draw(axes)
+        axes.set_title(panel.title)
+        text = io.StringIO()
+        figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})
+    svg = text.getvalue()
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
+    svg = re.sub(r'<g id="[^"]*">', "<g>", svg)  # the same in every panel; nothing refers to them
+    svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg))
+    for colour in THEME:
+        svg = svg.replace(colour, themed(colour))
+    return svg.replace("<svg ", '<svg aria-hidden="true" ', 1)
+
+
+def themed(colour: str) -> str:
+    """The page's variable that stands for a colour."""
+    return f"var(--{THEME[colour]})"
+
+
+def chart_files(chart: Chart) -> dict[str, bytes]:
+    """<name>.png, <name>.pdf and <name>.csv."""
+    columns = min(chart.columns, len(chart.panels))
+    rows = -(-len(chart.panels) // columns)
+    size = PANEL[0] * columns, max(panel.height for panel in chart.panels) * rows + 0.5
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=size, layout="constrained")
+        for i, panel in enumerate(chart.panels):
+            axes = figure.add_subplot(rows, columns, i + 1)
+            panel.draw(axes)
+            axes.set_title(panel.title)
+        handles = [_handle(series) for series in chart.legend]
+        if handles:
+            figure.legend(handles=handles, loc="outside upper center", ncols=min(4, len(handles)), frameon=False)
+        png, pdf = io.BytesIO(), io.BytesIO()
+        figure.savefig(png, format="png", dpi=160)
+        figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
+    return {
+        f"{chart.name}.png": png.getvalue(),
+        f"{chart.name}.pdf": pdf.getvalue(),
+        f"{chart.name}.csv": chart.data.to_csv(index=False).encode(),
+    }
+
+
+def _handle(series: Series) -> Line2D:
+    if series.dash == "o":
+        return Line2D([], [], color=series.colour, marker="o", fillstyle="none", linestyle="", label=series.label)
+    return Line2D([], [], color=series.colour, linestyle=series.dash, linewidth=2, label=series.label)
+
+
+def bars(axes: Axes, labels: Sequence[str], groups: Sequence[tuple[str, np.ndarray, np.ndarray]], unit: str) -> None:
+    """Horizontal bars: for each label one bar of each group, whiskers, and the paper's value as a ring.
+
+    Args:
+        labels: from top to bottom.
+        groups: colour, [n 3] value and its interval's ends, [n] the paper's values; NaN where there is none.
+        unit: of the values.
+    """
+    height = 0.8 / len(groups)
+    for g, (colour, values, paper) in enumerate(groups):
+        y = np.arange(len(labels)) + (g - (len(groups) - 1) / 2) * height
+        axes.barh(y, np.nan_to_num(values[:, 0]), height * 0.9, color=colour)
+        known = ~np.isnan(values[:, 1])
+        axes.hlines(y[known], values[known, 1], values[known, 2], color=INK, linewidth=1)
+        axes.plot(paper, y, "o", color=INK, fillstyle="none", markersize=4, markeredgewidth=1)
+        for at, value in zip(y, values[:, 0], strict=True):
+            if np.isnan(value):
+                axes.text(0, at, " not run", va="center", color=SOFT, fontsize=7)
+    axes.axvline(0, color=SOFT, linewidth=0.8)
+    axes.set_yticks(range(len(labels)), labels)
+    axes.invert_yaxis()
+    axes.grid(visible=False, axis="y")
+    axes.set_xlabel(unit)
+
+
+def scatter(axes: Axes, distance: np.ndarray, score: np.ndarray, robots: Sequence[str], xlabel: str, ylabel: str) -> None:
+    """Score by distance: five points, the line through all, and thin ones without one of them."""
+    ends = np.array([distance.min(), distance.max()])
+    for left_out in range(len(robots)):
+        rest = np.delete(np.arange(len(robots)), left_out)
+        axes.plot(ends, np.polyval(np.polyfit(distance[rest], score[rest], 1), ends), color=SOFT, linewidth=0.8)
+    axes.plot(ends, np.polyval(np.polyfit(distance, score, 1), ends), color=SERIES[0], linewidth=2)
+    axes.scatter(distance, score, color=INK, s=24, zorder=3)
+    for x, y, robot in zip(distance, score, robots, strict=True):
+        # Words stand towards the middle, so that none leaves the panel.
+        side, shift = ("right", -7) if x > ends.mean() else ("left", 7)
+        text = axes.annotate(robot, (x, y), xytext=(shift, 0), textcoords="offset points", ha=side, va="center")
+        text.set_path_effects([patheffects.withStroke(linewidth=3, foreground=GROUND)])
+    axes.set_xlabel(xlabel)
+    axes.set_ylabel(ylabel)
+
+
+def lines(
+    axes: Axes, series: Sequence[tuple[Series, np.ndarray, np.ndarray, np.ndarray | None]], xlabel: str, ylabel: str
+) -> None:
+    """Lines with bands: each with x [n], y [n] and the band's ends [n 2] or None."""
+    for style, x, y, band in series:
+        if band is not None:
+            axes.fill_between(x, band[:, 0], band[:, 1], color=style.colour, alpha=0.15, linewidth=0)
+        marker = "o" if len(x) < 6 else None
+        axes.plot(x, y, style.dash, color=style.colour, linewidth=1.8, marker=marker, markersize=4)
+    axes.set_xlabel(xlabel)
+    axes.set_ylabel(ylabel)
+
+
+def colour_of(names: Sequence[str]) -> Mapping[str, str]:
+    """A colour for each name, in order."""
+    return {name: SERIES[i % len(SERIES)] for i, name in enumerate(names)}

@@ -1,0 +1,174 @@
+"""Stage 11 of 11: a `Table` as Markdown, LaTeX (booktabs) and CSV. HTML is in `page`."""
+
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+
+import pandas as pd
+
+from xew.analysis.findings import Finding
+from xew.analysis.tables import Cell, Row, Table
+
+MARK = {"better": "▲", "worse": "▼", "unresolved": "≈", "": ""}
+LATEX_MARK = {"better": r"$^{\blacktriangle}$", "worse": r"$^{\blacktriangledown}$", "unresolved": r"$^{\approx}$", "": ""}
+LATEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "−": "$-$", "–": "--",
+    "³": "$^3$", "ρ": r"$\rho$", "≈": r"$\approx$", "▲": r"$\blacktriangle$", "▼": r"$\blacktriangledown$", "…": r"\dots{}",
+    "·": r"$\cdot$", "×": r"$\times$", "±": r"$\pm$", "<": "$<$", ">": "$>$",
+}  # fmt: skip
+"""What stands for characters that LaTeX reads otherwise, or does not have."""
+
+
+def heads(table: Table) -> list[str]:
+    """Heads of all columns in one line each: 'Visual quality: PSNR [dB] ↑'."""
+    return [*table.stubs, *(": ".join(filter(None, (column.group, column.title))) for column in table.columns)]
+
+
+def markdown(table: Table) -> str:
+    """Ours [interval] mark (paper ...); what is missing stands in the table."""
+    width = len(table.stubs) + len(table.columns)
+    lines = [_markdown_line(heads(table)), f"|{'---|' * len(table.stubs)}{'---:|' * len(table.columns)}"]
+    for block in table.blocks:
+        above = [f"**{block.title}**"] * bool(block.title) + [f"*{block.note}*"] * bool(block.note)
+        lines += [_markdown_line([text, *[""] * (width - 1)]) for text in above]
+        lines += [_markdown_line([*row.labels, *map(_markdown_cell, row.cells)]) for row in block.rows]
+    return "\n".join(lines)
+
+
+def _markdown_line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def _markdown_cell(cell: Cell) -> str:
+    text = f"**{cell.text}**" if cell.best else cell.text
+    interval = f"[{cell.interval}]" if cell.interval else ""
+    agrees = "" if cell.agrees is None else "✓" if cell.agrees else "✗"
+    return " ".join(
+        filter(None, (text, interval, MARK[cell.verdict], f"(paper {cell.published})" if cell.published else "", agrees))
+    )
+
+
+def latex(table: Table) -> str:
+    """A table environment for the packages booktabs and amssymb; ours, the paper's small below it."""
+    stubs, width = len(table.stubs), len(table.stubs) + len(table.columns)
+    lines = [
+        r"% \usepackage{booktabs,amssymb,graphicx}",
+        r"\begin{table*}[t]",
+        r"\centering\footnotesize",
+        r"\resizebox{\textwidth}{!}{%",
+        rf"\begin{{tabular}}{{@{{}}{'l' * stubs}{'c' * len(table.columns)}@{{}}}}",
+        r"\toprule",
+        *_latex_groups(table),
+        _latex_line([*map(_escape, table.stubs), *(_escape(column.title) for column in table.columns)]),
+        r"\midrule",
+    ]
+    for i, block in enumerate(table.blocks):
+        lines += [r"\addlinespace"] if i else []
+        for text in filter(None, (block.title, block.note)):
+            lines.append(rf"\multicolumn{{{width}}}{{@{{}}l}}{{\textit{{{_escape(text)}}}}} \\")
+        lines += [line for row in block.rows for line in _latex_rows(row)]
+    caption = rf"\textbf{{{_escape(table.title)}.}} {_escape(table.caption)}"
+    lines += [r"\bottomrule", r"\end{tabular}}", rf"\caption{{{caption}}}", rf"\label{{tab:{table.name}}}", r"\end{table*}", ""]
+    return "\n".join(lines)
+
+
+def _latex_groups(table: Table) -> Iterator[str]:
+    if not any(column.group for column in table.columns):
+        return
+    cells, rules, at = [""] * len(table.stubs), [], len(table.stubs) + 1
+    for title, members in groupby(table.columns, key=lambda column: column.group):
+        count = len(list(members))
+        cells.append(rf"\multicolumn{{{count}}}{{c}}{{{_escape(title)}}}")
+        rules += [rf"\cmidrule(lr){{{at}-{at + count - 1}}}"] if title else []
+        at += count
+    yield _latex_line(cells)
+    yield "".join(rules)
+
+
+def _latex_rows(row: Row) -> Iterator[str]:
+    yield _latex_line([*map(_escape, row.labels), *map(_latex_cell, row.cells)])
+    if any(cell.published for cell in row.cells):
+        paper = [rf"{{\tiny ({_escape(cell.published)})}}" if cell.published else "" for cell in row.cells]
+        yield _latex_line([*[""] * len(row.labels), *paper])
+
+
+def _latex_cell(cell: Cell) -> str:
+    text = _escape(cell.text)
+    interval = rf" {{\tiny [{_escape(cell.interval)}]}}" if cell.interval else ""
+    return (rf"\textbf{{{text}}}" if cell.best else text) + LATEX_MARK[cell.verdict] + interval
+
+
+def _latex_line(cells: Sequence[str]) -> str:
+    return " & ".join(cells) + r" \\"
+
+
+def _escape(text: str) -> str:
+    return "".join(LATEX.get(character, character) for character in text)
+
+
+def frame(table: Table) -> pd.DataFrame:
+    """A tidy frame, one row a cell: table block note row column text value low high verdict paper episodes.
+
+    `note` says what the block lacks.
+    """
+    columns = heads(table)[len(table.stubs) :]
+    return pd.DataFrame(
+        {
+            "table": table.name,
+            "block": block.title,
+            "note": block.note,
+            "row": ", ".join(row.labels),
+            "column": column,
+            "text": cell.text,
+            "value": cell.value,
+            "low": cell.low,
+            "high": cell.high,
+            "verdict": cell.verdict,
+            "paper": cell.printed,
+            "episodes": cell.episodes,
+        }
+        for block in table.blocks
+        for row in block.rows
+        for column, cell in zip(columns, row.cells, strict=True)
+    )
+
+
+def tables_frame(tables: Sequence[Table]) -> pd.DataFrame:
+    """All tables, one below the other."""
+    return pd.concat([frame(table) for table in tables], ignore_index=True)
+
+
+def findings_markdown(findings: Sequence[Finding], papers: Sequence[Finding]) -> str:
+    """Claim, test, our verdict with numbers, the paper's own."""
+    lines = ["| claim | test | here | numbers | the paper's own figures |", "|---|---|---|---|---|"]
+    for ours, paper in zip(findings, papers, strict=True):
+        numbers = "; ".join(answer.text for answer in ours.answers) or f"missing: {ours.missing}"
+        cells = [f"{ours.claim.says} ({ours.claim.where})", ours.claim.test, f"**{ours.verdict}**", numbers, paper.verdict]
+        lines.append(_markdown_line(cells))
+    return "\n".join(lines)
+
+
+def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding]) -> str:
+    """The verdicts alone: claim, test, here, the paper's own figures."""
+    rows = [
+        _latex_line([_escape(text) for text in (f.claim.says, f.claim.test, f.verdict, p.verdict)])
+        for f, p in zip(findings, papers, strict=True)
+    ]
+    return "\n".join(
+        [
+            r"% \usepackage{booktabs,amssymb}",
+            r"\begin{table*}[t]",
+            r"\centering\footnotesize",
+            r"\begin{tabular}{@{}p{0.38\textwidth}p{0.38\textwidth}ll@{}}",
+            r"\toprule",
+            r"claim & test & here & paper \\",
+            r"\midrule",
+            *rows,
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\caption{\textbf{Findings.} Each claim as an inequality; the last column asks the paper's own figures.}",
+            r"\label{tab:findings}",
+            r"\end{table*}",
+            "",
+        ]
+    )
