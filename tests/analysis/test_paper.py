@@ -27,6 +27,14 @@ def test_all_figures_are_there_for_all_robots() -> None:
     ]
 
 
+def test_metrics_are_described_as_our_own() -> None:
+    from xew.metrics import METRICS
+
+    for info in PAPER.infos:
+        own = METRICS[info.name]
+        assert (own.dimension, own.unit, own.higher_is_better) == (info.dimension, info.unit, info.higher_is_better)
+
+
 EVERYWHERE = ("seen", "franka_panda", "piper")
 """Robots of the fixed split, as the paper groups them."""
 SHOTS = [f"{robot}-{shots}" for robot in ("franka_panda", "piper") for shots in (1, 2, 3)]

@@ -43,16 +43,38 @@ def test_every_printed_figure_stands_beside_ours(written: Path) -> None:
             low, high = paper_report.signed(of.low), paper_report.signed(of.high)
             assert f"paper {low} to {high}<" in page and f"(paper {low} to {high}) ✓" in markdown
             assert f"paper {paper_report.signed(of.r)}<" in page
-    # Ten rows of five cells, two p, five robots with two means.
-    assert page.count('<td class="agrees">') == markdown.count(") ✓ ") == 10 * 5 + 2 + 5 * 2
+    # Ten rows of five cells, two p, five robots with two means, 28 percentages.
+    assert page.count('<td class="agrees">') == markdown.count(") ✓ ") == 10 * 5 + 2 + 5 * 2 + 28
     assert 'class="differs"' not in page
 
 
 def test_the_summary_has_a_row_for_each_figure(written: Path) -> None:
     summary = pd.read_csv(written / "summary.csv")
-    assert len(summary) == 72 + 10 and summary["agrees"].all()
+    printed, own = summary[summary["published"].notna()], summary[summary["published"].isna()]
+    assert len(printed) == 72 + 10 + 28 and printed["agrees"].all()
+    assert len(own) == 10 * 4 and set(own["axis"]) == {"arm_base"} and own["agrees"].isna().all()
     row = summary[(summary["row"] == "lpips") & (summary["axis"] == "kinematic") & (summary["quantity"] == "p_value")]
     assert row["published"].item() == 0.392 and row["ours"].item() == pytest.approx(47 / 120)
+
+
+def test_the_frame_of_workspaces_is_named_and_what_it_changes(written: Path) -> None:
+    """In the paper's frame our clouds give the paper's r; in the arm's the sign of others is stable."""
+    summary = pd.read_csv(written / "summary.csv").set_index(["row", "axis", "quantity"])["ours"]
+    root = paper_report.frame_results(read_paper(), paper_report.frame_distances()["root"])
+    for metric, result in root.items():
+        assert result.r == pytest.approx(summary[metric, "kinematic", "r"], abs=0.05)
+    assert summary["keypoint_error", "kinematic", "r"] < 0 < summary["keypoint_error", "arm_base", "low"]
+    assert summary["lpips", "kinematic", "low"] < 0 < summary["lpips", "arm_base", "low"]
+    text = (written / "index.html").read_text()
+    assert "in its base frame (ours), LPIPS has r = +0.5" in text and "and its sign survives leaving out any one robot" in text
+
+
+def test_a_percentage_that_does_not_follow_is_named() -> None:
+    paper = read_paper()
+    wrong = dataclasses.replace(paper.changes[0], percent=-39)
+    html, (markdown, _), _ = paper_report.build(dataclasses.replace(paper, changes=[wrong, *paper.changes[1:]]), "")
+    assert "27 of 28 percentages of the text follow from the tables: not -39 % (sec:exp-actrep)." in html
+    assert "(paper −39 %) ✗" in markdown
 
 
 def test_a_figure_that_does_not_come_out_is_named() -> None:
@@ -61,7 +83,7 @@ def test_a_figure_that_does_not_come_out_is_named() -> None:
     wrong = dataclasses.replace(lpips, appearance=dataclasses.replace(lpips.appearance, r=0.712))
     html, (markdown, _), summary = paper_report.build(dataclasses.replace(paper, metrics={**paper.metrics, "lpips": wrong}), "")
     assert "71 of 72 printed figures" in html and "not LPIPS by appearance r." in html
-    assert html.count('class="differs"') == 1 and "(paper +0.712) ✗" in markdown and (~summary["agrees"]).sum() == 1
+    assert html.count('class="differs"') == 1 and "(paper +0.712) ✗" in markdown and (summary["agrees"] == False).sum() == 1  # noqa: E712
 
 
 @pytest.mark.parametrize("args", [Args(), Args(Path("scores.parquet"), paper=True), Args(paper=True, data=Path("data"))])

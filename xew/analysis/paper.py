@@ -4,7 +4,7 @@ The figures lie in `paper.json` with the table that each is from:
 
     robots      robot -> dof, links, reach, volume and the mean distances to the other four
     distances   axis -> symmetric matrix in the order of `robots`
-    metrics     metric -> direction and the printed correlations with distance
+    metrics     metric -> dimension, unit, direction and the printed correlations with distance
     parts       part -> rows: key -> robot -> metric -> value, where `robot` may be 'seen', the pooled training robots
         actions     by action representation: joints, ray_map, mask, optical_flow
         ladder      by condition: none, reference_image, nine_views, articulation_clip, robot_render
@@ -38,6 +38,7 @@ from xew.analysis.correlation import (
     permutation_p,
 )
 from xew.analysis.distance import mean_distances
+from xew.analysis.scores import MetricInfo
 from xew.config import parse
 
 PAPER = Path(__file__).with_name("paper.json")
@@ -74,6 +75,8 @@ class PublishedCorrelation:
 class PublishedMetric:
     """A metric and how its scores in the leave-one-embodiment-out study go with distance."""
 
+    dimension: str
+    unit: str
     higher_is_better: bool
     appearance: PublishedCorrelation
     kinematic: PublishedCorrelation
@@ -124,6 +127,14 @@ class Paper:
     metrics: Mapping[str, PublishedMetric]
     parts: Mapping[str, PublishedPart]
     changes: Sequence[PublishedChange]
+
+    @property
+    def infos(self) -> tuple[MetricInfo, ...]:
+        """The metrics as a score table describes them, in the paper's order."""
+        return tuple(
+            MetricInfo(name, metric.dimension, metric.unit, metric.higher_is_better, None, None, self.title)
+            for name, metric in self.metrics.items()
+        )
 
     def axis(self, name: str) -> np.ndarray:
         """A feature of all robots, such as 'appearance' or 'dof' [5]."""
