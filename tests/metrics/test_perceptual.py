@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from xew.metrics import lpips, region_lpips
+from xew.metrics import lpips, lpips_features, lpips_from_features, region_lpips, region_lpips_frames
 from xew.metrics.alexnet import read_alexnet, read_arrays
 from xew.metrics.perceptual import SMALLEST_SIDE, union_box
 
@@ -74,6 +74,30 @@ def test_the_region_equals_lpips_of_the_crop(box: tuple[int, int, int, int]) -> 
     crop = np.s_[:, top : top + height, left : left + width]
     expected = float(np.mean(lpips(prediction[crop], target[crop])))
     assert region_lpips(prediction, target, mask) == pytest.approx(expected, abs=1e-6)
+
+
+def test_features_of_a_target_serve_all_its_predictions() -> None:
+    target, mask = noise(2), np.zeros((2, 40, 56), bool)
+    mask[:, 3:37, 9:50] = True
+    whole, region = lpips_features(target), lpips_features(target, mask)
+    for prediction in (noise(2), noise(2), 255 - target):
+        np.testing.assert_allclose(lpips_from_features(prediction, whole), lpips(prediction, target), atol=1e-6)
+        expected = region_lpips_frames(prediction, target, mask)
+        np.testing.assert_allclose(lpips_from_features(prediction, region), expected, atol=1e-6)
+    np.testing.assert_allclose(lpips_from_features(target, whole), 0, atol=1e-7)
+
+
+def test_features_of_another_video_are_an_error() -> None:
+    with pytest.raises(ValueError, match=r"\(1, 40, 57, 3\), the features are of a target \(1, 40, 56, 3\)"):
+        lpips_from_features(noise(1, 40, 57), lpips_features(noise()))
+
+
+def test_a_part_of_a_video_is_compared_in_the_whole_videos_box() -> None:
+    prediction, target, mask = noise(3), noise(3), np.zeros((3, 40, 56), bool)
+    mask[0, 2, 1] = mask[2, 38, 50] = True
+    box = union_box(mask)
+    parts = [region_lpips_frames(prediction[s], target[s], mask[s], box=box) for s in (np.s_[:1], np.s_[1:])]
+    np.testing.assert_allclose(np.concatenate(parts), region_lpips_frames(prediction, target, mask), atol=1e-7)
 
 
 def test_a_region_without_room_for_the_network_is_an_error() -> None:

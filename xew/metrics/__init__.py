@@ -3,16 +3,17 @@
     from xew.metrics import psnr, METRICS
     psnr(prediction, target)          # uint8 [t h w 3] -> float32 [t]
 
-To add a metric: a function in the file of its family, one line in METRICS.
+docs/metrics.md shows each by an example. `xew.metrics.states` takes video in parts. To add a metric: a function in the
+file of its family, one line in METRICS.
 """
 
 import math
 
-from xew.metrics.image import psnr, ssim
-from xew.metrics.mask import boundary_f1, mask_iou
+from xew.metrics.image import exact_frames, psnr, ssim
+from xew.metrics.mask import boundary_f1, mask_iou, mask_scores
 from xew.metrics.metric import Metric
-from xew.metrics.perceptual import lpips, region_lpips, region_lpips_frames
-from xew.metrics.track import coverage, keypoint_error, ndtw, pck, pck_05, trajectory_error
+from xew.metrics.perceptual import lpips, lpips_features, lpips_from_features, region_lpips, region_lpips_frames
+from xew.metrics.track import contact_f1, coverage, keypoint_error, ndtw, pck, pck_05, trajectory_error
 
 INF = math.inf
 METRICS = {
@@ -38,15 +39,21 @@ __all__ = [
     "METRICS",
     "Metric",
     "boundary_f1",
+    "contact_f1",
     "coverage",
+    "exact_frames",
     "keypoint_error",
     "lpips",
+    "lpips_features",
+    "lpips_from_features",
     "mask_iou",
+    "mask_scores",
     "ndtw",
     "pck",
     "pck_05",
     "psnr",
     "region_lpips",
+    "region_lpips_frames",
     "ssim",
     "trajectory_error",
 ]

@@ -82,6 +82,14 @@ def check_tracks(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> 
     check_bool("valid", valid)
 
 
+def check_contacts(prediction: jax.Array, target: jax.Array) -> None:
+    """Raise ValueError or TypeError unless both are bool [t c] of one shape."""
+    if np.shape(prediction) != np.shape(target) or np.ndim(target) != 2:
+        raise ValueError(f"contacts are {np.shape(prediction)} and {np.shape(target)}, expected one shape [t c].")
+    for name, contact in (("prediction", prediction), ("target", target)):
+        check_bool(name, contact)
+
+
 def map_frames(function: Callable[..., Any], frames: Any, chunk: int | None) -> Any:
     """`function` of each frame, a chunk of frames at a time, so that memory does not grow with the video.
 

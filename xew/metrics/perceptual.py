@@ -6,6 +6,7 @@ HIGHEST precision: TF32, the default of some GPUs, changes the fourth digit.
 
 import functools
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ import numpy as np
 from jax import lax
 
 from xew.metrics.alexnet import read_alexnet
-from xew.metrics.metric import check_masks, check_videos
+from xew.metrics.metric import check_masks, check_videos, map_frames
 
 SMALLEST_SIDE = 31
 """Below it the second pooling has no window and the mean over nothing would be NaN."""
@@ -26,6 +27,24 @@ CONVOLUTIONS = ((4, 2, False), (1, 2, True), (1, 1, True), (1, 1, False), (1, 1,
 """Stride, zero padding, and whether a 3x3 pooling of stride 2 comes first. torchvision's AlexNet up to its fifth ReLU."""
 
 Weights = Mapping[str, jax.Array]
+Box = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+"""top, left, height, width; int32 [pixels]."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Features:
+    """What LPIPS knows of a video: make it once of a target that several predictions are compared with.
+
+    3.0 MB a frame of 320x240.
+    """
+
+    layers: tuple[jax.Array, ...]
+    """Five of [t h w d] float32: unit vectors, zero outside the box."""
+    box: Box
+    """The part of the frames that is compared."""
+    shape: tuple[int, ...] = field(metadata={"static": True})
+    """Of the video, [t h w 3]."""
 
 
 def lpips(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) -> jax.Array:
@@ -35,7 +54,7 @@ def lpips(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None)
 
     Args:
         prediction, target: [t h w 3] RGB, uint8, or floating in [0, 1]; sides of at least 31 pixels.
-        chunk: frames computed at once; by default 1 on a CPU, where that is fastest, and 16 elsewhere.
+        chunk: most frames computed at once; by default 1 on a CPU, where that is fastest, and 32 elsewhere.
 
     Returns:
         [t] float32.
@@ -45,11 +64,12 @@ def lpips(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None)
         FileNotFoundError: the weights are not installed.
     """
     check_videos(prediction, target, SMALLEST_SIDE)
-    region = tuple(jnp.int32(side) for side in (0, 0, *np.shape(target)[1:3]))
-    return _region_distance(_weights(), prediction, target, region, _chunk(chunk))
+    return _box_distance(_weights(), prediction, target, _whole(target), chunk)
 
 
-def region_lpips(prediction: jax.Array, target: jax.Array, target_mask: jax.Array, *, chunk: int | None = None) -> jax.Array:
+def region_lpips(
+    prediction: jax.Array, target: jax.Array, target_mask: jax.Array, *, box: Box | None = None, chunk: int | None = None
+) -> jax.Array:
     """LPIPS inside the bounding box of the union over time of the target's robot masks, mean over frames.
 
     The box is one for the whole video, and is cut out before the network, as if the video were no larger. Under a jit of
@@ -58,6 +78,7 @@ def region_lpips(prediction: jax.Array, target: jax.Array, target_mask: jax.Arra
     Args:
         prediction, target: [t h w 3] RGB, uint8, or floating in [0, 1].
         target_mask: [t h w] bool.
+        box: `union_box` of the whole video's masks, where these frames are a part of a video.
         chunk: as in `lpips`.
 
     Returns:
@@ -66,28 +87,57 @@ def region_lpips(prediction: jax.Array, target: jax.Array, target_mask: jax.Arra
     Raises:
         ValueError: shapes differ, no pixel is masked, or the box has a side under 31 pixels.
     """
-    return jnp.mean(region_lpips_frames(prediction, target, target_mask, chunk=chunk))
+    return jnp.mean(region_lpips_frames(prediction, target, target_mask, box=box, chunk=chunk))
 
 
 def region_lpips_frames(
-    prediction: jax.Array, target: jax.Array, target_mask: jax.Array, *, chunk: int | None = None
+    prediction: jax.Array, target: jax.Array, target_mask: jax.Array, *, box: Box | None = None, chunk: int | None = None
 ) -> jax.Array:
     """`region_lpips` before the mean over frames: [t] float32."""
     check_videos(prediction, target, SMALLEST_SIDE)
-    check_masks(target_mask, jnp.zeros(np.shape(target)[:3], bool))
-    region = union_box(target_mask)
-    if not isinstance(region[2], jax.core.Tracer):
-        height, width = int(region[2]), int(region[3])
-        if min(height, width) < SMALLEST_SIDE:
-            raise ValueError(
-                f"the robot's box is {height} x {width} pixels; region LPIPS needs sides of at least {SMALLEST_SIDE}. "
-                "Check that the masks belong to this video."
-            )
-    return _region_distance(_weights(), prediction, target, region, _chunk(chunk))
+    box = _mask_box(target, target_mask) if box is None else box
+    return _box_distance(_weights(), prediction, target, box, chunk)
+
+
+def lpips_features(target: jax.Array, target_mask: jax.Array | None = None, *, chunk: int | None = None) -> Features:
+    """What `lpips_from_features` needs of a target; half of the work of `lpips`, done once for all predictions.
+
+    Args:
+        target: [t h w 3] RGB, uint8, or floating in [0, 1]; sides of at least 31 pixels.
+        target_mask: [t h w] bool, to compare as `region_lpips` does; None for whole frames.
+        chunk: as in `lpips`.
+
+    Raises:
+        ValueError: as in `lpips` and `region_lpips`.
+        FileNotFoundError: the weights are not installed.
+    """
+    check_videos(target, target, SMALLEST_SIDE)
+    box = _whole(target) if target_mask is None else _mask_box(target, target_mask)
+    return Features(_box_features(_weights(), target, box, chunk), box, np.shape(target))
+
+
+def lpips_from_features(prediction: jax.Array, target: Features, *, chunk: int | None = None) -> jax.Array:
+    """`lpips`, or `region_lpips_frames`, of a prediction and a target that is given by its features.
+
+    Args:
+        prediction: [t h w 3] RGB, uint8, or floating in [0, 1], of the target's size.
+        target: by `lpips_features`.
+        chunk: as in `lpips`.
+
+    Returns:
+        [t] float32; within 1e-6 of what the two videos give.
+
+    Raises:
+        ValueError: the prediction has another size than the target.
+    """
+    check_videos(prediction, prediction, SMALLEST_SIDE)
+    if np.shape(prediction) != target.shape:
+        raise ValueError(f"prediction is {np.shape(prediction)}, the features are of a target {target.shape}.")
+    return _distance_from_features(_weights(), prediction, target.layers, target.box, chunk)
 
 
 @jax.jit
-def union_box(mask: jax.Array) -> tuple[jax.Array, ...]:
+def union_box(mask: jax.Array) -> Box:
     """Bounding box (top, left, height, width) int32 [pixels] of all that [t h w] covers at any time; zeros if nothing."""
     covered = jnp.any(mask, axis=0)
     rows, columns = jnp.any(covered, axis=1), jnp.any(covered, axis=0)
@@ -97,50 +147,87 @@ def union_box(mask: jax.Array) -> tuple[jax.Array, ...]:
     return top, left, height, width
 
 
+def _whole(video: jax.Array) -> Box:
+    height, width = np.shape(video)[1:3]
+    return jnp.int32(0), jnp.int32(0), jnp.int32(height), jnp.int32(width)
+
+
+def _mask_box(target: jax.Array, target_mask: jax.Array) -> Box:
+    """The box of the masks. Raises ValueError where it is too small, unless its size is not known yet, under a jit."""
+    check_masks(target_mask, jnp.zeros(np.shape(target)[:3], bool))
+    box = union_box(target_mask)
+    if not isinstance(box[2], jax.core.Tracer):
+        height, width = int(box[2]), int(box[3])
+        if min(height, width) < SMALLEST_SIDE:
+            raise ValueError(
+                f"the robot's box is {height} x {width} pixels; region LPIPS needs sides of at least {SMALLEST_SIDE}. "
+                "Check that the masks belong to this video."
+            )
+    return box
+
+
+@functools.cache
 def _weights() -> Weights:
-    return {name: jnp.asarray(array) for name, array in read_alexnet().items()}
-
-
-def _chunk(chunk: int | None) -> int:
-    return chunk or (1 if jax.default_backend() == "cpu" else 16)
+    """On the device, once; evaluated at once also under a jit of the caller's, so that no tracer is kept."""
+    with jax.ensure_compile_time_eval():
+        return {name: jnp.asarray(array) for name, array in read_alexnet().items()}
 
 
 @functools.partial(jax.jit, static_argnames="chunk")
-def _region_distance(
-    weights: Weights, prediction: jax.Array, target: jax.Array, region: tuple[jax.Array, ...], chunk: int
-) -> jax.Array:
-    """LPIPS [t] of the region (top, left, height, width) of both videos.
+def _box_distance(weights: Weights, prediction: jax.Array, target: jax.Array, box: Box, chunk: int | None) -> jax.Array:
+    """LPIPS [t] of the same box of both videos."""
 
-    The size is data, not shape: one program serves the whole frame and every box. The region is moved to the upper left
-    of a canvas of the frame's size, and what lies outside is set to zero before each layer, which is what a network on
-    the small image pads with.
-    """
-    top, left, height, width = region
+    def distance(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
+        layers = _features(weights, _input(jnp.stack(pair), box), *box[2:])
+        terms = [_layer_distance(weights[f"head{i}"], _unit(x), h, w) for i, (x, h, w) in enumerate(layers)]
+        return jnp.sum(jnp.stack(terms))
 
-    def distance(pair: jax.Array) -> jax.Array:
-        layers = _features(weights, pair, height, width)
-        return jnp.sum(jnp.stack([_layer_distance(weights[f"head{i}"], *layer) for i, layer in enumerate(layers)]))
-
-    def of_frames(frames: tuple[jax.Array, jax.Array]) -> jax.Array:
-        pair = (_signed(jnp.stack(frames)) - SHIFT.reshape(1, 1, 1, 3)) / SCALE.reshape(1, 1, 1, 3)
-        pair = _keep(jnp.roll(pair, -jnp.stack((top, left)), axis=(1, 2)), height, width)
-        # Equal images are at distance 0, though the compiler may round the two halves of a pair differently.
+    def of_frames(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
+        # Exactly 0 for equal frames: a convolution may round the two images of a pair differently.
         return lax.cond(jnp.all(pair[0] == pair[1]), lambda _: jnp.float32(0), distance, pair)
 
-    return lax.map(of_frames, (prediction, target), batch_size=chunk if chunk > 1 else None)
+    return map_frames(of_frames, (prediction, target), chunk)
 
 
-def _signed(frames: jax.Array) -> jax.Array:
-    """RGB in [-1, 1] float32."""
+@functools.partial(jax.jit, static_argnames="chunk")
+def _box_features(weights: Weights, video: jax.Array, box: Box, chunk: int | None) -> tuple[jax.Array, ...]:
+    """Unit vectors of the five layers [t h w d] of a video's box."""
+
+    def of_frame(frame: jax.Array) -> tuple[jax.Array, ...]:
+        return tuple(_unit(x)[0] for x, _, _ in _features(weights, _input(frame[None], box), *box[2:]))
+
+    return map_frames(of_frame, video, chunk)
+
+
+@functools.partial(jax.jit, static_argnames="chunk")
+def _distance_from_features(
+    weights: Weights, prediction: jax.Array, target: tuple[jax.Array, ...], box: Box, chunk: int | None
+) -> jax.Array:
+    def of_frame(pair: tuple[jax.Array, tuple[jax.Array, ...]]) -> jax.Array:
+        layers = _features(weights, _input(pair[0][None], box), *box[2:])
+        both = [(jnp.stack([_unit(x)[0], y]), h, w) for (x, h, w), y in zip(layers, pair[1], strict=True)]
+        return jnp.sum(jnp.stack([_layer_distance(weights[f"head{i}"], *layer) for i, layer in enumerate(both)]))
+
+    return map_frames(of_frame, (prediction, target), chunk)
+
+
+def _input(frames: jax.Array, box: Box) -> jax.Array:
+    """The box of frames [n h w 3] moved to the upper left of a canvas that is zero elsewhere, scaled as AlexNet takes it.
+
+    The box is data, not shape: one program serves the whole frame and every box. What lies outside is set to zero before
+    each layer too, which is what a network on the small image pads with.
+    """
+    top, left, height, width = box
     unit = frames.astype(jnp.float32) / 255 if frames.dtype == jnp.uint8 else frames.astype(jnp.float32)
-    return unit * 2 - 1
+    scaled = ((unit * 2 - 1) - SHIFT.reshape(1, 1, 1, 3)) / SCALE.reshape(1, 1, 1, 3)
+    return _keep(jnp.roll(scaled, -jnp.stack((top, left)), axis=(1, 2)), height, width)
 
 
 def _features(
-    weights: Weights, pair: jax.Array, height: jax.Array, width: jax.Array
+    weights: Weights, x: jax.Array, height: jax.Array, width: jax.Array
 ) -> list[tuple[jax.Array, jax.Array, jax.Array]]:
-    """Five ReLU outputs [2 h w d] of two images [2 h w 3] that are zero beyond height x width, each with its valid size."""
-    layers, x = [], pair
+    """Five ReLU outputs [n h w d] of images [n h w 3] that are zero beyond height x width, each with its valid size."""
+    layers = []
     for i, (stride, padding, pool_first) in enumerate(CONVOLUTIONS):
         if pool_first:
             x = lax.reduce_window(x, -jnp.inf, lax.max, (1, 3, 3, 1), (1, 2, 2, 1), "valid")
@@ -162,14 +249,13 @@ def _features(
 
 
 def _keep(x: jax.Array, height: jax.Array, width: jax.Array) -> jax.Array:
-    """Zero outside the upper left height x width of [2 h w d]."""
+    """Zero outside the upper left height x width of [n h w d]."""
     rows, columns = jnp.arange(x.shape[1]) < height, jnp.arange(x.shape[2]) < width
     return jnp.where((rows[:, None] & columns[None, :])[None, :, :, None], x, 0)
 
 
-def _layer_distance(head: jax.Array, pair: jax.Array, height: jax.Array, width: jax.Array) -> jax.Array:
-    """Squared difference of unit feature vectors [2 h w d], weighted by the head [d], mean over the valid part."""
-    unit = _unit(pair)
+def _layer_distance(head: jax.Array, unit: jax.Array, height: jax.Array, width: jax.Array) -> jax.Array:
+    """Squared difference of two images' unit vectors [2 h w d], weighted by the head [d], mean over the valid part."""
     weighted = jnp.einsum("hwd,d->hw", jnp.square(unit[0] - unit[1]), head, precision=lax.Precision.HIGHEST)
     return jnp.sum(jnp.sum(weighted, axis=1)) / (height * width).astype(jnp.float32)
 

@@ -4,11 +4,13 @@ Tracks are float [t k 2] pixels (x right, y down), validity bool [t k]: the poin
 that lost a point holds NaN there: a miss for PCK, left out of the errors, so look at coverage beside them.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from xew.metrics.metric import check_tracks
+from xew.metrics.metric import check_contacts, check_tracks
 
 
 @jax.jit
@@ -83,6 +85,36 @@ def trajectory_error(prediction: jax.Array, target: jax.Array, valid: jax.Array)
     tracked = valid & _found(prediction)
     per_object = _masked_mean(_distance(prediction, target), tracked, axis=0)
     return _masked_mean(per_object, jnp.any(tracked, axis=0))
+
+
+@functools.partial(jax.jit, static_argnames="tolerance")
+def contact_f1(prediction: jax.Array, target: jax.Array, tolerance: int = 0) -> jax.Array:
+    """F1 of frames in contact, over all pairs of bodies; a diagnostic outside the suite, higher is better.
+
+    The paper computes one and does not report it, because its calibration found contact timing in predicted video too
+    unreliable. Precision is the share of the predicted contacts (frame and pair) with a true one of the same pair within
+    the tolerance, recall the share of true ones with a predicted one.
+
+    Args:
+        prediction, target: [t c] bool, which of c pairs touch.
+        tolerance: frames.
+
+    Returns:
+        Scalar float32 in [0, 1]; 1 where neither has any contact, 0 where one has none.
+    """
+    check_contacts(prediction, target)
+    counts = jnp.sum(prediction), jnp.sum(target)
+    hits = jnp.sum(prediction & _widened(target, tolerance)), jnp.sum(target & _widened(prediction, tolerance))
+    precision, recall = (hit / jnp.maximum(count, 1) for hit, count in zip(hits, counts, strict=True))
+    total = precision + recall
+    score = jnp.where(total > 0, 2 * precision * recall / jnp.where(total > 0, total, 1), 0)
+    return jnp.where(counts[0] + counts[1] > 0, score, 1).astype(jnp.float32)
+
+
+def _widened(contact: jax.Array, frames: int) -> jax.Array:
+    """[t c] true within so many frames of a true one."""
+    shifted = jnp.pad(contact, ((frames, frames), (0, 0)))
+    return functools.reduce(jnp.logical_or, (shifted[i : i + len(contact)] for i in range(2 * frames + 1)))
 
 
 @jax.jit
