@@ -7,6 +7,7 @@ Hugging Face; which one is used follows from the checkpoint.
 """
 
 import contextlib
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,13 @@ from PIL import Image
 from xew.config import ConfigError
 from xew.metrics.adapters import import_package, import_torch, load_state_dict, read_state_dict, torch_device
 
-MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+MEAN, DEVIATION = np.array([(0.485, 0.456, 0.406), (0.229, 0.224, 0.225)], np.float32)
 """Of ImageNet's colours in [0, 1], by which SAM 2 normalises."""
 SIZES = {(96, 12): "t", (96, 16): "s", (112, 24): "b+", (144, 48): "l"}
 """Names of the authors' configs, by the width of the trunk's first layer and the number of its blocks."""
 ROBOT = 1
 """The one object's number."""
+REPLACING = threading.Lock()
 
 Propagate = Callable[["Frames", int, np.ndarray, bool], dict[int, np.ndarray]]
 """(frames, prompted frame, its mask, backwards) -> mask [h w] bool of each frame on the way, by its number."""
@@ -82,7 +84,7 @@ class Frames:
 
     def __getitem__(self, frame: int) -> Any:
         image = Image.fromarray(self.video[frame]).resize((self.side, self.side))
-        pixels = (np.asarray(image, np.float32) / 255 - np.float32(MEAN)) / np.float32(DEVIATION)
+        pixels = (np.asarray(image, np.float32) / 255 - MEAN) / DEVIATION
         return self._torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
 
 
@@ -128,13 +130,14 @@ def _config_name(state: Mapping[str, Any], checkpoint: Path) -> str:
 
 @contextlib.contextmanager
 def _replaced(module: Any, names: Mapping[str, Any]) -> Iterator[None]:
-    """The module's names hold other things for a while."""
-    before = {name: getattr(module, name) for name in names}
-    vars(module).update(names)
-    try:
-        yield
-    finally:
-        vars(module).update(before)
+    """The module's names hold other things for a while, for one thread at a time."""
+    with REPLACING:
+        before = {name: getattr(module, name) for name in names}
+        vars(module).update(names)
+        try:
+            yield
+        finally:
+            vars(module).update(before)
 
 
 # Hugging Face's implementation.
@@ -162,6 +165,8 @@ def _open_folder(folder: Path) -> Sam2:
             for output in network.propagate_in_video_iterator(session, start_frame_idx=start, reverse=backwards):
                 logits = torch.nn.functional.interpolate(output.pred_masks.float(), mask.shape, mode="bilinear")
                 found[output.frame_idx] = (logits[0, 0] > 0).cpu().numpy()
+                # Kept for every frame and read by none: 4 MB each.
+                session.output_dict_per_obj[0]["non_cond_frame_outputs"].get(output.frame_idx, {}).pop("high_res_masks", None)
         return found
 
     return Sam2(propagate, side)
