@@ -29,3 +29,11 @@ def own_compile_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     """The session compiles equal programs once and leaves the user's cache alone."""
     jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("jax")))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+@pytest.fixture(scope="module")
+def quick_compile() -> Iterator[None]:
+    """For modules most of whose time is compiling: leave out what makes programs fast."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)

@@ -25,6 +25,8 @@ from xew.model.frames import to_camera_size, to_model_size
 from xew.model.vae import VAES, abstract_vae
 from xew.model.vae_layouts import save_vae
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
 
 def smooth_clip(seed: int, frames: int = 9) -> np.ndarray:
     """A few moving plane waves, uint8 [t 32 48 3]."""

@@ -6,11 +6,10 @@ import os
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 import synthetic
@@ -24,6 +23,7 @@ from xew.model.tensorboard import RunLog
 from xew.protocol import SEEN_ROBOTS
 from xew.rollout import find_rollouts, read_rollout_video
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
 FRAMES = 12
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}
@@ -32,14 +32,6 @@ model: {size: tiny, action: joints, embodiment: robot_render}
 train: {steps: 4, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, ema_decay: 0.5}
 rollout: {steps: 2, batch: 3}
 """
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick_compile() -> Iterator[None]:
-    """Most of the time of these tests is compiling: leave out what makes programs fast."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(scope="module")

@@ -25,6 +25,8 @@ from xew.model.rollout import RolloutWriter
 from xew.protocol import ROBOT_NAMES
 from xew.rollout import find_rollouts, read_rollout_video
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
 FRAMES = 12
 CONFIG = """
 data: {root}/data

@@ -20,6 +20,7 @@ from xew.model.latents import LatentCache, load_codec, load_scales, scales_path,
 from xew.model.predict import Predictor
 from xew.rollout import find_rollouts
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
 FRAMES = 9
 ROBOTS = ("aloha_agilex", "arx_x5", "piper")
 SYSTEMS = [name for name, entry in ACTIONS.items() if isinstance(entry, tuple)]

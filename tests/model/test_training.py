@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,6 +38,7 @@ from xew.model.training_step import (
 )
 from xew.protocol import HELD_OUT_ROBOTS
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
 FRAMES = 12
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}
@@ -52,14 +53,6 @@ ADAPT = ("--adapt.robots", "piper", "--adapt.episodes", "2")
 CONFIGS = Path(__file__).parents[2] / "configs"
 WAN5B = CONFIGS / "wan5b" / "fixed.yaml"
 FEWSHOT = [CONFIGS / "wan5b" / "fewshot.yaml", *sorted((CONFIGS / "fewshot").glob("*.yaml"))]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick_compile() -> Iterator[None]:
-    """Most of the time of these tests is compiling: leave out what makes programs fast."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(scope="module")
