@@ -4,12 +4,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from tests.metrics.torch_ops import make_torchvision_importable
+from tests.synthetic import write_synthetic_data
 from xew.config import ConfigError
-from xew.metrics.backends import Masker, open_masker
+from xew.episode import episode_folder, read_states, read_video
+from xew.metrics import mask_iou
+from xew.metrics.backends import Masker, identity, open_masker
+from xew.metrics.evaluate import Args, main
 from xew.metrics.sam2 import Frames, open_sam2
+from xew.rollout import write_rollout
 
 SIDE = 128
 PROMPTED = 1
@@ -208,3 +214,18 @@ class Malice:
 
     def __reduce__(self) -> tuple[Any, tuple[str]]:
         return (open, (str(self.path), "w"))
+
+
+def test_the_command_grades_with_it(folder: Path, tmp_path: Path) -> None:
+    """From a checkpoint on disk to a score, and the table says which checkpoint it was."""
+    write_synthetic_data(tmp_path / "data", seeds=(1_000_000,), robots=("piper",), frames=4)
+    episode = episode_folder(tmp_path / "data", "place_empty_cup", 1_000_000, "piper")
+    video, states = read_video(episode / "rgb.mkv"), read_states(episode)
+    write_rollout(tmp_path / "mine", "place_empty_cup", 1_000_000, "piper", video[::-1], {"model": "backwards"})
+    out = tmp_path / "scores.parquet"
+    main(Args((tmp_path / "mine",), tmp_path / "data", out, metrics=("mask_iou",), masks="sam2", masks_checkpoint=folder))
+    table = pd.read_parquet(out)
+    found = open_sam2(folder)(video[::-1], video, states.robot_mask)
+    expected = float(mask_iou(found[1:], states.robot_mask[1:]).mean())
+    assert table.loc[table["model"] == "backwards", "value"].tolist() == [pytest.approx(expected, rel=1e-6)]
+    assert table.attrs["estimators"]["masks"] == identity("sam2", folder)
