@@ -70,7 +70,7 @@ def open_tracker(name: str, checkpoint: Path | None = None, option: str = "--tra
     return _open(pick(TRACKERS, name, "tracker"), name, checkpoint, option)
 
 
-def open_flow(name: str, checkpoint: Path | None = None, option: str = "checkpoint") -> Flow:
+def open_flow(name: str, checkpoint: Path | None = None, option: str = "the argument checkpoint") -> Flow:
     """The optical flow of a name in FLOWS (or `module:NAME`). Raises ConfigError if it or its checkpoint is missing."""
     return _open(pick(FLOWS, name, "optical flow"), name, checkpoint, option)
 
@@ -102,9 +102,11 @@ def _open(backend: Backend[T], name: str, checkpoint: Path | None, option: str) 
             raise ConfigError(f"{name} has no checkpoint, {option} names {checkpoint}; leave it out, or choose another.")
         return backend.open(None)
     if checkpoint is None:
-        raise ConfigError(f"{name} needs a checkpoint: {backend.needs}. Say where it lies: {option} PATH.")
+        raise ConfigError(f"{name} needs a checkpoint: {backend.needs}. Name its path with {option}.")
     if not checkpoint.exists():
-        raise ConfigError(f"there is no {checkpoint}; {name} needs a checkpoint: {backend.needs}. Put it there: {option}.")
+        raise ConfigError(
+            f"there is no {checkpoint}; {name} needs a checkpoint: {backend.needs}. Put it there, or name one with {option}."
+        )
     return backend.open(checkpoint)
 
 

@@ -94,7 +94,7 @@ class Frames:
 def _open_authors(checkpoint: Path, side: int) -> Sam2:
     state = read_state_dict(checkpoint, "SAM 2")
     config = _config_name(state, checkpoint)
-    install = "pip install sam2, or the sources of github.com/facebookresearch/sam2"
+    install = "pip install sam2 hydra-core iopath, or the sources of github.com/facebookresearch/sam2"
     build = import_package("sam2.build_sam", "SAM 2 from a .pt", install)
     module = import_package("sam2.sam2_video_predictor", "SAM 2 from a .pt", install)
     predictor = build.build_sam2_video_predictor(
@@ -145,9 +145,8 @@ def _replaced(module: Any, names: Mapping[str, Any]) -> Iterator[None]:
 
 def _open_folder(folder: Path) -> Sam2:
     torch = import_torch("SAM 2")
-    transformers = import_package(
-        "transformers.models.sam2_video.modeling_sam2_video", "SAM 2 from a folder", "pip install transformers"
-    )
+    install = "pip install transformers; a torchvision beside it must be the one that belongs to the installed torch"
+    transformers = import_package("transformers.models.sam2_video.modeling_sam2_video", "SAM 2 from a folder", install)
     network = _read_folder(transformers, folder).eval().to(torch_device())
     side = int(network.config.image_size)
 

@@ -21,7 +21,7 @@ SIDE = 256
 """Of the square for which the networks were trained [pixels]."""
 CHUNK = 64
 """Points at once."""
-INSTALL = "install it from the sources of github.com/google-deepmind/tapnet, with dm-haiku and einshape (it is not on PyPI)"
+INSTALL = "install it from the sources of github.com/google-deepmind/tapnet, with all that they ask for (it is not on PyPI)"
 TAPIR = {"bilinear_interp_with_depthwise_conv": False, "pyramid_level": 0}
 BOOTSTAPIR = {
     "bilinear_interp_with_depthwise_conv": False, "pyramid_level": 1, "extra_convs": True, "softmax_temperature": 10.0
