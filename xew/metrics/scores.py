@@ -2,34 +2,47 @@
 
 scores.parquet         model condition task seed robot metric value | frames exact_frames content
 scores.curves.parquet  model condition task seed robot metric frame value
-The table's attributes (pandas `attrs`) hold protocol, versions, and each metric's unit, direction, range and definition,
-so that the analysis needs no import of this room.
+scores.cells/          one small file for each graded video, from which the tables are put together
+A metric that a video has no value of has no row. The tables' attributes (pandas `attrs`) hold protocol, versions,
+estimators, what became of frame 0, and each metric's unit, direction, range and definition, so that the analysis needs no
+import of this room. The tables are a function of what was graded alone: the same bytes whatever was done first, in how
+many threads, and how often it was stopped on the way.
 """
 
 import hashlib
+import json
 import math
 import os
-import time
-from collections.abc import Hashable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 import xew
 from xew.config import ConfigError
 from xew.metrics import METRICS
+from xew.metrics.grade import Grades
 
 KEY = ["model", "condition", "task", "seed", "robot"]
-SAVE_EVERY_S = 30.0
+ROW_GROUP = 64
+"""Cells in a row group, the most that is in memory at once."""
+
+_KEY_FIELDS = [(name, pa.int64() if name == "seed" else pa.string()) for name in KEY] + [("metric", pa.string())]
+ROWS = pa.schema(
+    [*_KEY_FIELDS, ("value", pa.float64()), ("frames", pa.int64()), ("exact_frames", pa.int64()), ("content", pa.string())]
+)
+CURVES = pa.schema([*_KEY_FIELDS, ("frame", pa.int64()), ("value", pa.float32())])
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One graded video."""
+    """One video to grade, and all that its scores depend on."""
 
     model: str
     condition: str
@@ -38,142 +51,178 @@ class Cell:
     robot: str
     frames: int
     """Frames compared, the given one included."""
-    content: str
-    """Digest of all that the scores depend on: the video, the truth, the number of frames."""
+    prediction: str
+    """SHA-256 of the video (`file_digest`); '' for a baseline, which is made of the truth."""
+    rgb: str
+    """SHA-256 of the true video, as its episode says."""
+    states: str
+    """SHA-256 of the true states, as their episode says."""
+    settings: str
+    """The protocol, the estimators and what else was chosen, as text."""
 
     @property
-    def identity(self) -> tuple[str | int, ...]:
-        return (*(getattr(self, name) for name in KEY), self.content)
+    def key(self) -> tuple[str | int, ...]:
+        return tuple(getattr(self, name) for name in KEY)
 
-    def with_content(self, *parts: str) -> "Cell":
-        digest = hashlib.sha256("\n".join((*parts, str(self.frames))).encode()).hexdigest()
-        return replace(self, content=digest[:16])
+    @cached_property
+    def content(self) -> str:
+        """Digest of all that the scores depend on."""
+        parts = (self.rgb, self.states, self.prediction, str(self.frames), self.settings)
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
-class ScoreTable:
-    """Scores and curves in memory, saved now and then, so that a killed run loses half a minute."""
+class CellStore:
+    """Graded videos, a file each, complete or not there: whoever is stopped goes on from what stands."""
 
-    def __init__(self, path: Path, attributes: dict[Hashable, Any], rows: pd.DataFrame, curves: pd.DataFrame) -> None:
-        self.path, self.attributes = path, attributes
-        self._rows, self._curves = [rows], [curves]
-        self._done = set(_identities(rows))
-        self._saved_at = time.monotonic()
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
 
-    @classmethod
-    def open(cls, path: Path, protocol: int, metrics: tuple[str, ...], overwrite: bool = False) -> "ScoreTable":
-        """The table at a path as far as it was graded for the same protocol and metrics, else an empty one.
-
-        Raises:
-            ConfigError: the path cannot be a score table, or holds a damaged one.
-        """
-        attributes = describe(protocol, metrics)
-        if path.suffix != ".parquet":
-            raise ConfigError(f"--out is {path}, expected a name that ends in .parquet.")
-        empty = pd.DataFrame(columns=[*KEY, "metric", "value", "frames", "exact_frames", "content"])
-        empty_curves = pd.DataFrame(columns=[*KEY, "metric", "frame", "value"])
-        if overwrite or not path.exists():
-            return cls(path, attributes, empty, empty_curves)
+    def read(self, cell: Cell) -> Grades | None:
+        """What a cell was graded with; None where it was not, or where anything that it depends on has changed."""
         try:
-            rows, curves = pd.read_parquet(path), pd.read_parquet(_curves_path(path))
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"{path} cannot be read ({error}); delete it, or grade anew: --overwrite.") from error
-        same = all(rows.attrs.get(key) == attributes[key] for key in ("protocol", "metrics"))
-        return cls(path, attributes, rows, curves) if same else cls(path, attributes, empty, empty_curves)
+            stored = json.loads(self._path(cell).read_text())
+            if stored["content"] != cell.content:
+                return None
+            values = {name: math.nan if value is None else value for name, value in stored["values"].items()}
+            curves = {name: np.array(curve, np.float32) for name, curve in stored["curves"].items()}  # null becomes NaN
+            return Grades(values, curves, stored["exact_frames"])
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return None
 
-    @property
-    def curves_path(self) -> Path:
-        return _curves_path(self.path)
+    def missing(self, cell: Cell, metrics: Iterable[str]) -> tuple[str, ...]:
+        """Which of the metrics are still to be graded."""
+        grades = self.read(cell)
+        return tuple(name for name in metrics if grades is None or name not in grades.values)
 
-    def has(self, cell: Cell) -> bool:
-        return cell.identity in self._done
+    def write(self, cell: Cell, grades: Grades) -> None:
+        """Enter grades, beside those that a cell already has. Raises ConfigError if the disk does not take them."""
+        before = self.read(cell)
+        values = (before.values if before else {}) | grades.values
+        curves = (before.curves if before else {}) | grades.curves
+        content = {name: getattr(cell, name) for name in KEY} | {
+            "content": cell.content,
+            "exact_frames": grades.exact_frames,
+            "values": {name: _finite(value) for name, value in values.items()},
+            "curves": {name: [_finite(value) for value in curve.tolist()] for name, curve in curves.items()},
+        }
+        write_whole(self._path(cell), json.dumps(content).encode())
 
-    def add(self, cell: Cell, curves: dict[str, np.ndarray], exact_frames: int) -> None:
-        """Enter per-frame scores (frame 1 on) of a cell; its score is their mean."""
-        key = {name: getattr(cell, name) for name in KEY}
-        for metric, curve in curves.items():
-            score = {"metric": metric, "value": float(np.mean(curve, dtype=np.float64))}
-            rest = {"frames": cell.frames, "exact_frames": exact_frames, "content": cell.content}
-            self._rows.append(pd.DataFrame([key | score | rest]))
-            frames = np.arange(1, len(curve) + 1)
-            self._curves.append(pd.DataFrame(key | {"metric": metric, "frame": frames, "value": curve}))
-        self._done.add(cell.identity)
-
-    def keep_only(self, cells: list[Cell]) -> None:
-        """Drop what is not among the cells, for example of rollouts that were made anew."""
-        wanted = {cell.identity for cell in cells}
-        rows, curves = _concat(self._rows), _concat(self._curves)
-        rows = rows[[identity in wanted for identity in _identities(rows)]]
-        kept = set(rows[KEY].itertuples(index=False, name=None))
-        self._rows = [rows]
-        self._curves = [curves[[key in kept for key in curves[KEY].itertuples(index=False, name=None)]]]
-
-    def save_now_and_then(self) -> None:
-        if time.monotonic() - self._saved_at > SAVE_EVERY_S:
-            self.save()
-
-    def save(self) -> None:
-        """Write both files, sorted, so that the order of work leaves no trace. Raises ConfigError if that is impossible."""
-        rows, curves = _concat(self._rows), _concat(self._curves)
-        self._rows, self._curves = [rows], [curves]
-        order = {name: i for i, name in enumerate(METRICS)}
-
-        def rank(column: pd.Series) -> pd.Series:
-            return column.map(order) if column.name == "metric" else column
-
-        rows = rows.sort_values([*KEY, "metric"], key=rank, ignore_index=True)
-        curves = curves.sort_values([*KEY, "metric", "frame"], key=rank, ignore_index=True)
-        rows.attrs, curves.attrs = self.attributes, self.attributes
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            # The curves first: a table that counts a cell as done always has its curves.
-            for frame, path in ((curves, self.curves_path), (rows, self.path)):
-                temporary = path.with_name(f".{path.name}.partial")
-                frame.to_parquet(temporary, index=False)
-                os.replace(temporary, path)
-        except OSError as error:
-            raise ConfigError(f"cannot write {self.path}: {error}. Free some space or choose another --out.") from error
-        self._saved_at = time.monotonic()
-
-    def summary(self, robots_apart: tuple[str, ...]) -> str:
-        """Means as text, a line per robot and model, held-out robots first."""
-        rows = _concat(self._rows)
-        if rows.empty:
-            return "no scores"
-        table = rows.pivot_table(index=["robot", "model", "condition"], columns="metric", values="value", aggfunc="mean")
-        names = [name for name in METRICS if name in table]
-        order = sorted(table.index, key=lambda key: (key[0] not in robots_apart, *key))
-        return table.loc[order, names].to_string(float_format=lambda value: f"{value:.4f}")
+    def _path(self, cell: Cell) -> Path:
+        name = hashlib.sha256(f"{cell.model}\n{cell.condition}".encode()).hexdigest()[:16]
+        return self.folder / cell.task / f"{cell.seed:07d}" / cell.robot / f"{name}.json"
 
 
-def describe(protocol: int, metrics: tuple[str, ...]) -> dict[Hashable, Any]:
-    """The table's attributes: plain JSON."""
+def check_out(path: Path) -> None:
+    """Raise ConfigError if a path cannot be that of a score table."""
+    if path.suffix != ".parquet":
+        raise ConfigError(f"--out is {path}, expected a name that ends in .parquet.")
+
+
+def beside(path: Path, ending: str) -> Path:
+    """The name of what lies beside a score table, such as scores.curves.parquet."""
+    return path.with_suffix(f".{ending}")
+
+
+def write_tables(path: Path, attributes: dict[str, Any], cells: Sequence[Cell], store: CellStore) -> None:
+    """Write both tables of the cells that are graded, sorted, so that the order of work leaves no trace.
+
+    Raises:
+        ConfigError: the disk does not take them; what stood there before still stands.
+    """
+    metrics = list(attributes["metrics"])
+    graded = sorted((cell for cell in cells if not store.missing(cell, metrics)), key=lambda cell: cell.key)
+    # The curves first: what is in the table always has its curves.
+    for target, schema, tabulate in ((beside(path, "curves.parquet"), CURVES, _curve_table), (path, ROWS, _row_table)):
+        tables = (tabulate(cell, _demand(store, cell), metrics) for cell in graded)
+        _write_parquet(target, schema.with_metadata({"PANDAS_ATTRS": json.dumps(attributes)}), tables)
+
+
+def _demand(store: CellStore, cell: Cell) -> Grades:
+    grades = store.read(cell)
+    if grades is None:
+        raise ConfigError(f"the scores of {cell.key} in {store.folder} were changed while the table was written; try again.")
+    return grades
+
+
+def _row_table(cell: Cell, grades: Grades, metrics: Sequence[str]) -> pa.Table:
+    names = [name for name in metrics if math.isfinite(grades.values[name])]
+    count = len(names)
+    columns = [*_repeated(cell, count), pa.array(names, pa.string()), pa.array([grades.values[name] for name in names])]
+    columns += [pa.repeat(pa.scalar(number, pa.int64()), count) for number in (cell.frames, grades.exact_frames)]
+    return pa.table([*columns, pa.repeat(cell.content, count)], names=ROWS.names).cast(ROWS)
+
+
+def _curve_table(cell: Cell, grades: Grades, metrics: Sequence[str]) -> pa.Table:
+    tables = []
+    for name in (name for name in metrics if name in grades.curves and math.isfinite(grades.values[name])):
+        curve = grades.curves[name]
+        frames = np.arange(cell.frames - len(curve), cell.frames)
+        finite = np.isfinite(curve)
+        count = int(finite.sum())
+        columns = [*_repeated(cell, count), pa.repeat(name, count), pa.array(frames[finite]), pa.array(curve[finite])]
+        tables.append(pa.table(columns, names=CURVES.names).cast(CURVES))
+    return pa.concat_tables(tables) if tables else CURVES.empty_table()
+
+
+def _repeated(cell: Cell, count: int) -> list[pa.Array]:
+    return [pa.repeat(pa.scalar(getattr(cell, name), kind), count) for name, kind in _KEY_FIELDS[: len(KEY)]]
+
+
+def _write_parquet(path: Path, schema: pa.Schema, tables: Iterator[pa.Table]) -> None:
+    temporary = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with pq.ParquetWriter(temporary, schema) as writer:
+            for group in _groups(tables, ROW_GROUP):
+                writer.write_table(pa.concat_tables(group).replace_schema_metadata(schema.metadata))
+        os.replace(temporary, path)
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error}. Free some space or choose another --out.") from error
+
+
+def _groups(items: Iterator[pa.Table], size: int) -> Iterator[list[pa.Table]]:
+    group: list[pa.Table] = []
+    for item in items:
+        group.append(item)
+        if len(group) == size:
+            yield group
+            group = []
+    if group:
+        yield group
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file that is there complete or not at all. Raises ConfigError if the disk does not take it."""
+    temporary = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(content)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error}. Free some space or choose another --out.") from error
+
+
+def describe(settings: dict[str, Any], metrics: tuple[str, ...]) -> dict[str, Any]:
+    """The tables' attributes, plain JSON: the settings (protocol, estimators, frame_zero …), versions, and each metric."""
     described = {}
     for name in (name for name in METRICS if name in metrics):
         metric = METRICS[name]
         low, high = (bound if math.isfinite(bound) else None for bound in metric.range)
         fields = {key: getattr(metric, key) for key in ("dimension", "unit", "higher_is_better", "reference")}
         described[name] = fields | {"low": low, "high": high}
-    return {"protocol": protocol, "metrics": described, "versions": {"xew": xew.__version__, "jax": jax.__version__}}
+    return settings | {"metrics": described, "versions": {"xew": xew.__version__, "jax": jax.__version__}}
 
 
-def _identities(rows: pd.DataFrame) -> list[tuple[str | int, ...]]:
-    """Cell.identity of each row."""
-    return list(rows[[*KEY, "content"]].itertuples(index=False, name=None))
-
-
-def file_digest(paths: tuple[Path, ...]) -> str:
-    digest = hashlib.sha256()
+def file_digest(paths: Sequence[Path]) -> str:
+    """SHA-256 of a file; of several, that of their digests in order."""
+    digests = []
     for path in paths:
         with path.open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
-    return digest.hexdigest()
+            digests.append(hashlib.file_digest(file, "sha256"))
+    if len(digests) == 1:
+        return digests[0].hexdigest()
+    return hashlib.sha256(b"".join(digest.digest() for digest in digests)).hexdigest()
 
 
-def _curves_path(path: Path) -> Path:
-    return path.with_suffix(".curves.parquet")
-
-
-def _concat(frames: list[pd.DataFrame]) -> pd.DataFrame:
-    """All of them as one; empty ones are left out, whose columns have no type."""
-    filled = [frame for frame in frames if len(frame)]
-    return pd.concat(filled, ignore_index=True) if filled else frames[0]
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

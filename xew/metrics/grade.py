@@ -1,0 +1,148 @@
+"""Metrics, one video: a prediction and the episode that it predicts to scores. Estimators first, then metrics.
+
+Frames and points go through the compiler in blocks of one size, so that a few programs serve episodes of all lengths.
+"""
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from xew.metrics import METRICS
+from xew.metrics.backends import Masker, Tracker
+from xew.metrics.metric import Metric
+from xew.metrics.perceptual import SMALLEST_SIDE, union_box
+from xew.metrics.truth import Truth
+
+FRAME_BLOCK = 16
+POINT_BLOCK = 8
+WHOLE_VIDEO = ("psnr",)
+"""Metrics in which a frame's score depends on the others (the cap of exact frames); all others are computed block by block."""
+
+ESTIMATED = ("mask", "track")
+"""Inputs that have to be estimated in a prediction, so that even the true video does not get the best score."""
+
+
+@dataclass(frozen=True)
+class Grades:
+    """The scores of one video."""
+
+    values: dict[str, float]
+    """By metric; NaN where it is not defined, such as the error of keypoints of which none is ever seen."""
+    curves: dict[str, np.ndarray]
+    """By metric, [t] float32 by graded frame, NaN where a frame has no value; nothing for metrics of whole paths."""
+    exact_frames: int
+    """How many graded frames equal the truth in every byte (their PSNR is the cap's)."""
+
+
+def compared(metric: Metric) -> str:
+    """What a metric compares, a key of `truth.NEEDS`."""
+    if metric.inputs != "track":
+        return metric.inputs
+    return "objects" if metric.dimension == "objects" else "keypoints"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A prediction, the truth, and who finds robot and points in the prediction (they see all frames)."""
+
+    prediction: np.ndarray
+    """[t h w 3] uint8, of the truth's shape."""
+    truth: Truth
+    masker: Masker
+    tracker: Tracker
+    first: int = 1
+    """The first graded frame; those before it were given to the model."""
+
+
+def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
+    """Scores of one predicted video by the metrics of these names."""
+    inputs = {kind: INPUTS[kind](comparison) for kind in {compared(METRICS[name]) for name in metrics}}
+    values: dict[str, float] = {}
+    curves: dict[str, np.ndarray] = {}
+    for name in metrics:
+        metric, arrays = METRICS[name], inputs[compared(METRICS[name])]
+        if arrays is None:
+            values[name] = float("nan")
+        elif metric.inputs == "track":
+            values[name], curve = _grade_tracks(metric, arrays)
+            curves |= {} if curve is None else {name: curve}
+        else:
+            curves[name] = _curve(name, arrays)
+            values[name] = float(np.mean(curves[name], dtype=np.float64))
+    prediction, target = _video(comparison)
+    return Grades(values, curves, int(np.all(prediction == target, axis=(1, 2, 3)).sum()))
+
+
+Arrays = tuple[np.ndarray, ...]
+
+
+def _video(c: Comparison) -> Arrays:
+    return c.prediction[c.first :], c.truth.rgb[c.first :]
+
+
+def _mask(c: Comparison) -> Arrays:
+    return c.masker(c.prediction, c.truth.rgb, c.truth.mask)[c.first :], c.truth.mask[c.first :]
+
+
+def _region(c: Comparison) -> Arrays | None:
+    """The two videos and, for each frame, all pixels that show the robot at any time; None where its box is too small."""
+    covered = np.any(c.truth.mask[c.first :], axis=0)
+    _, _, height, width = union_box(np.expand_dims(covered, 0))
+    if min(int(height), int(width)) < SMALLEST_SIDE:
+        return None
+    return *_video(c), np.broadcast_to(covered, c.truth.mask[c.first :].shape)
+
+
+def _keypoints(c: Comparison) -> Arrays | None:
+    return _tracks(c, c.truth.keypoints, c.truth.keypoint_visible)
+
+
+def _objects(c: Comparison) -> Arrays | None:
+    return _tracks(c, c.truth.objects, c.truth.object_visible)
+
+
+INPUTS: dict[str, Callable[[Comparison], Arrays | None]] = {
+    "video": _video,
+    "mask": _mask,
+    "region": _region,
+    "keypoints": _keypoints,
+    "objects": _objects,
+}
+"""What the functions of metrics take, by `compared`; None where the truth has nothing to compare."""
+
+
+def _tracks(c: Comparison, points: np.ndarray, visible: np.ndarray) -> Arrays | None:
+    """Tracked points, true points, visibility; points that are never seen are left out."""
+    if not visible[c.first :].any():
+        return None
+    seen = visible.any(axis=0)
+    points, visible = np.where(visible[..., None], points, 0)[:, seen].astype(np.float32), visible[:, seen]
+    found = c.tracker(c.prediction, c.truth.rgb, points, visible)
+    return found[c.first :].astype(np.float32), points[c.first :], visible[c.first :]
+
+
+def _grade_tracks(metric: Metric, arrays: Arrays) -> tuple[float, np.ndarray | None]:
+    """A score and its curve. What is filled up is not valid, which no metric of tracks looks at."""
+    padded = [_fill(_fill(array, 0, FRAME_BLOCK, 0), 1, POINT_BLOCK, 0) for array in arrays]
+    value = float(metric.function(*padded))
+    return value, None if metric.curve is None else np.asarray(metric.curve(*padded))[: len(arrays[0])]
+
+
+def _curve(name: str, arrays: Arrays) -> np.ndarray:
+    """[t] float32."""
+    curve = METRICS[name].curve
+    assert curve is not None, "metrics of frames have one"
+    count = len(arrays[0])
+    padded = [_fill(array, 0, FRAME_BLOCK, "last") for array in arrays]
+    size = len(padded[0]) if name in WHOLE_VIDEO else FRAME_BLOCK
+    blocks = [curve(*(array[i : i + size] for array in padded)) for i in range(0, len(padded[0]), size)]
+    return np.concatenate(jax.device_get(blocks))[:count].astype(np.float32)
+
+
+def _fill(array: np.ndarray, axis: int, block: int, value: str | int) -> np.ndarray:
+    """Up to a multiple of `block` along an axis, with a value or with what is last."""
+    missing = -array.shape[axis] % block
+    widths = [(0, missing if i == axis else 0) for i in range(array.ndim)]
+    return np.pad(array, widths, mode="edge") if value == "last" else np.pad(array, widths, constant_values=value)
