@@ -11,7 +11,7 @@ from flax import nnx
 
 from xew.config import ConfigError
 from xew.model.experiment import Experiment, create_model, load_experiment
-from xew.model.text import VOCABULARY, clean, encode_instructions, load_tokenizer, token_ids
+from xew.model.text import VOCABULARY, clean, load_tokenizer, token_ids
 from xew.model.umt5 import UMT5S, Umt5Encoder, official_layout
 from xew.model.weights import save_weights
 
@@ -72,7 +72,7 @@ def test_tokens_are_those_of_transformers(files: Path, tokens: int) -> None:
 
 def test_embeddings_are_the_encoders_and_zero_past_the_end(files: Path, tmp_path: Path) -> None:
     asked = umt5(files, tmp_path)
-    found = encode_instructions(asked, TEXTS)
+    found = asked.encode_instructions(TEXTS)
     encoder, tokenizer = Umt5Encoder(UMT5S["tiny"], rngs=nnx.Rngs(0)), load_tokenizer(files)
     for text, embedding in found.items():
         assert embedding.shape == (asked.size.text_tokens, asked.size.text_dim) and embedding.dtype == np.float32
@@ -92,36 +92,36 @@ def test_embeddings_are_computed_once_and_outlive_the_files(
     for name in ("w.safetensors", "tokenizer.json"):
         (copy / name).write_bytes((files / name).read_bytes())
     asked = umt5(copy, tmp_path)
-    first = encode_instructions(asked, TEXTS[:2])
+    first = asked.encode_instructions(TEXTS[:2])
     monkeypatch.setattr("xew.model.text.load_umt5", None)
-    again = encode_instructions(asked, TEXTS[:2])
+    again = asked.encode_instructions(TEXTS[:2])
     for path in copy.iterdir():
         path.unlink()
     copy.rmdir()
-    without = encode_instructions(asked, TEXTS[:2])
+    without = asked.encode_instructions(TEXTS[:2])
     for text in TEXTS[:2]:
         np.testing.assert_array_equal(first[text], again[text])
         np.testing.assert_array_equal(first[text], without[text])
     with pytest.raises(ConfigError, match="no tokenizer"):
-        encode_instructions(asked, TEXTS)
+        asked.encode_instructions(TEXTS)
 
 
 def test_other_weights_are_another_cache(files: Path, tmp_path: Path) -> None:
-    before = encode_instructions(umt5(files, tmp_path), TEXTS[:1])[TEXTS[0]]
+    before = umt5(files, tmp_path).encode_instructions(TEXTS[:1])[TEXTS[0]]
     other = tmp_path / "other"
     other.mkdir()
     (other / "tokenizer.json").write_bytes((files / "tokenizer.json").read_bytes())
     save_weights(Umt5Encoder(UMT5S["tiny"], rngs=nnx.Rngs(7)), other / "w.safetensors", official_layout(UMT5S["tiny"]))
-    after = encode_instructions(umt5(other, tmp_path), TEXTS[:1])[TEXTS[0]]
+    after = umt5(other, tmp_path).encode_instructions(TEXTS[:1])[TEXTS[0]]
     assert np.abs(before - after).max() > 0.1
 
 
 def test_missing_files_say_what_to_do(files: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"model\.text_weights and model\.text_tokenizer not set"):
-        encode_instructions(experiment(tmp_path, "text: umt5"), TEXTS)
+        experiment(tmp_path, "text: umt5").encode_instructions(TEXTS)
     gone = f"text: umt5_tiny, text_weights: {tmp_path / 'none.pth'}, text_tokenizer: {files}"
     with pytest.raises(ConfigError, match=r"none\.pth"):
-        encode_instructions(experiment(tmp_path, gone), TEXTS)
+        experiment(tmp_path, gone).encode_instructions(TEXTS)
     (tmp_path / "tokenizer.json").write_text("{}")
     with pytest.raises(ConfigError, match="is no tokenizer"):
         load_tokenizer(tmp_path)
@@ -129,7 +129,7 @@ def test_missing_files_say_what_to_do(files: Path, tmp_path: Path) -> None:
 
 def test_words_are_rows_of_a_table_that_is_learned(tmp_path: Path) -> None:
     asked = experiment(tmp_path, "text: learned")
-    found = encode_instructions(asked, ("Stack three bowls!", "stack the bowls", "a b c d e f g h i j k", ""))
+    found = asked.encode_instructions(("Stack three bowls!", "stack the bowls", "a b c d e f g h i j k", ""))
     stack = found["Stack three bowls!"]
     assert stack.dtype == np.int32 and stack.shape == (asked.size.text_tokens,)
     assert stack[0] == found["stack the bowls"][0] and stack[2] == found["stack the bowls"][2]
@@ -148,6 +148,6 @@ def test_words_are_rows_of_a_table_that_is_learned(tmp_path: Path) -> None:
 
 
 def test_an_instruction_may_have_a_prefix(tmp_path: Path) -> None:
-    plain = encode_instructions(experiment(tmp_path, "text: learned"), ("the arm lifts",))["the arm lifts"]
-    prefixed = encode_instructions(experiment(tmp_path, "text: learned, text_prefix: 'the arm '"), ("lifts",))["lifts"]
+    plain = experiment(tmp_path, "text: learned").encode_instructions(("the arm lifts",))["the arm lifts"]
+    prefixed = experiment(tmp_path, "text: learned, text_prefix: 'the arm '").encode_instructions(("lifts",))["lifts"]
     np.testing.assert_array_equal(plain, prefixed)

@@ -17,7 +17,7 @@ from xew.model.codec import TEMPORAL_FACTOR, latent_frames
 from xew.model.experiment import Experiment, replayed
 from xew.model.latents import Episode, LatentCache, load_scales, sample_starts
 from xew.model.scales import apply_scales
-from xew.model.text import VOCABULARY, encode_instructions
+from xew.model.text import VOCABULARY
 
 
 @jax.tree_util.register_dataclass
@@ -53,7 +53,7 @@ class ClipSource:
         self.samples += [sample for _, record in replay for sample in self._samples(record)]
         every = [record for _, record in (*episodes, *replay)]
         self.scales = load_scales(cache.experiment, episodes)
-        self.text = encode_instructions(cache.experiment, (record.instruction for record in every))
+        self.text = cache.experiment.encode_instructions(record.instruction for record in every)
 
     def _samples(self, record: Record) -> list[tuple[Record, tuple[int, ...]]]:
         experiment = self.cache.experiment

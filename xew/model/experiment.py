@@ -1,12 +1,14 @@
 """The config of a world-model experiment: what configs/*.yaml hold. Fields without a default must be given."""
 
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 from xew.config import ConfigError, load, pick, suggestion
@@ -16,7 +18,7 @@ from xew.model.dit import MODELS, PATCH, AttentionName, ModelSize, RematName, Ti
 from xew.model.mechanisms import MECHANISMS
 from xew.model.samplers import GRIDS, SAMPLERS
 from xew.model.sharding import MeshSettings
-from xew.model.text import TEXT_ENCODERS, VOCABULARY, TextEncoder
+from xew.model.text import TEXT_ENCODERS, VOCABULARY, TextEncoder, TextSource, encode_instructions
 from xew.protocol import ACTION_DIM, ROBOT_NAMES, SPLITS, Split
 
 
@@ -180,6 +182,12 @@ class Experiment:
     @property
     def text_encoder(self) -> TextEncoder:
         return pick(TEXT_ENCODERS, self.model.text, "text encoder")
+
+    def encode_instructions(self, instructions: Iterable[str]) -> dict[str, np.ndarray]:
+        """Every distinct instruction as the network takes it: int32 [l] where the table is learned, else float32 [l e]."""
+        settings = self.model
+        source = TextSource(self.size.text_tokens, settings.text_weights, settings.text_tokenizer, self.cache_folder / "text")
+        return encode_instructions(self.text_encoder, source, instructions, settings.text_prefix)
 
     def condition_shape(self, stream: str) -> tuple[int, ...]:
         """Of what one stream or mechanism is told of a clip: latents [t h w c] or numbers [t n]."""

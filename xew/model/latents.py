@@ -34,7 +34,6 @@ from xew.model.experiment import Experiment, load_experiment
 from xew.model.frames import to_model_size
 from xew.model.pixels import Pixels, PixelSource, ahead, rendered_pixels, stored_pixels
 from xew.model.scales import Scale, fit_scales, load_run_scales, read_scales, save_scales
-from xew.model.text import encode_instructions
 from xew.protocol import seed_split
 
 Episode = tuple[Path, Record]
@@ -396,7 +395,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     to_fit = CODECS[experiment.codec.name].fitted and not adapts and not codec_path(experiment, episodes).exists()
     codec = fit_codec(experiment, episodes, source) if to_fit else load_codec(experiment, episodes)
     keep_scales(experiment, episodes)
-    encode_instructions(experiment, (record.instruction for _, record in find_accepted(experiment.data)))
+    experiment.encode_instructions((record.instruction for _, record in find_accepted(experiment.data)))
     cache = LatentCache(experiment, codec)
     written = cache.encode([*episodes, *replay_episodes(experiment)], source, args.batch)
     header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip), "streams": list(cache.streams)}

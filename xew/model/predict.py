@@ -30,7 +30,6 @@ from xew.model.latents import Episode, stream_videos
 from xew.model.samplers import GRIDS, SAMPLERS, Grid
 from xew.model.scales import Scale, apply_scales
 from xew.model.sharding import batch_sharding, replicated
-from xew.model.text import encode_instructions
 
 Streams = dict[str, np.ndarray]
 """Of one whole episode, by stream: uint8 [t h w 3] or float32 [t n]."""
@@ -131,11 +130,11 @@ class Predictor:
         """The instructions and, where there is guidance, as many negative prompts."""
         settings = self.experiment.rollout
         spoken = [record.instruction for _, record in episodes]
-        encoded = encode_instructions(self.experiment, spoken)
+        encoded = self.experiment.encode_instructions(spoken)
         text = self._place(np.stack([encoded[instruction] for instruction in spoken]))
         if settings.guidance == 1:
             return text, None
-        negative = encode_instructions(self.experiment, [settings.negative_prompt])[settings.negative_prompt]
+        negative = self.experiment.encode_instructions([settings.negative_prompt])[settings.negative_prompt]
         return text, self._place(np.stack([negative] * len(episodes)))
 
     def _standing(self, streams: Sequence[Streams]) -> dict[str, Array]:

@@ -35,7 +35,6 @@ from xew.model.latents import Episode, load_codec, training_episodes
 from xew.model.predict import Prediction, Predictor
 from xew.model.scales import load_run_scales
 from xew.model.sharding import MeshSettings, make_mesh, replicated
-from xew.model.text import encode_instructions
 from xew.model.training_step import random_params
 from xew.protocol import seed_split
 from xew.rollout import write_rollout
@@ -240,7 +239,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     episodes = select_episodes(args.data or experiment.data, args.split, args.robots)
     headers = [(episode, rollout_header(experiment, step, episode)) for episode in episodes]
     pending = [item for item in headers if not is_done(out, *item)]
-    encode_instructions(experiment, [record.instruction for (_, record), _ in pending])  # all at once, where that costs
+    experiment.encode_instructions([record.instruction for (_, record), _ in pending])  # all at once, where that costs
     with (
         tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
         RolloutWriter(out, progress.update) as writer,

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import ftfy
 import jax
@@ -27,9 +27,6 @@ from flax import nnx
 from xew.config import ConfigError
 from xew.model.umt5 import UMT5S, load_umt5
 
-if TYPE_CHECKING:
-    from xew.model.experiment import Experiment
-
 VOCABULARY = 8192
 """Rows of the learned table; row 0 is that of no word and stays zero."""
 END, PAD = "</s>", "<pad>"
@@ -39,19 +36,33 @@ LENGTH_STEP = 32
 
 
 @dataclass(frozen=True)
+class TextSource:
+    """What an experiment gives its encoder to work with."""
+
+    tokens: int
+    """Most that the network takes."""
+    weights: Path | None
+    tokenizer: Path | None
+    cache: Path
+    """Folder for embeddings, made where one is written."""
+
+
+@dataclass(frozen=True)
 class TextEncoder:
     """One way to turn instructions into what the network takes."""
 
-    encode: Callable[["Experiment", Sequence[str]], list[np.ndarray]]
-    """Instructions to int32 [n] (learned) or float32 [n width], n at most the tokens of the model's size."""
+    encode: Callable[[TextSource, Sequence[str]], list[np.ndarray]]
+    """Instructions to int32 [n] (learned) or float32 [n width]; what is longer than the network takes is cut."""
     width: int | None = None
     """Of the embeddings; None where it is as the model's size says."""
     learned: bool = False
     """The network itself has the table that these numbers are rows of."""
 
 
-def encode_instructions(experiment: "Experiment", instructions: Iterable[str]) -> dict[str, np.ndarray]:
-    """Every distinct instruction as the network takes it.
+def encode_instructions(
+    encoder: TextEncoder, source: TextSource, instructions: Iterable[str], prefix: str = ""
+) -> dict[str, np.ndarray]:
+    """Every distinct instruction as the network takes it; `Experiment.encode_instructions` knows encoder and source.
 
     Returns:
         By instruction, int32 [l] where the table is learned, else float32 [l e]; zero past the end of the text.
@@ -60,12 +71,8 @@ def encode_instructions(experiment: "Experiment", instructions: Iterable[str]) -
         ConfigError: an encoder's files are missing or do not fit.
     """
     distinct = list(dict.fromkeys(instructions))
-    encoded = experiment.text_encoder.encode(
-        experiment, [experiment.model.text_prefix + instruction for instruction in distinct]
-    )
-    return {
-        instruction: _padded(array, experiment.size.text_tokens) for instruction, array in zip(distinct, encoded, strict=True)
-    }
+    encoded = encoder.encode(source, [prefix + instruction for instruction in distinct])
+    return {instruction: _padded(array, source.tokens) for instruction, array in zip(distinct, encoded, strict=True)}
 
 
 def _padded(array: np.ndarray, tokens: int) -> np.ndarray:
@@ -75,7 +82,7 @@ def _padded(array: np.ndarray, tokens: int) -> np.ndarray:
 # A table that the network learns: needs no files.
 
 
-def learned(experiment: "Experiment", instructions: Sequence[str]) -> list[np.ndarray]:
+def learned(source: TextSource, instructions: Sequence[str]) -> list[np.ndarray]:
     """Each word is a row of the network's table, found by its hash: an unknown word has one too, which means nothing yet."""
     return [np.array([_row(word) for word in _words(instruction)], np.int32) for instruction in instructions]
 
@@ -125,25 +132,25 @@ def token_ids(tokenizer: tokenizers.Tokenizer, text: str, tokens: int) -> np.nda
     return np.array([*ids[: tokens - 1], tokenizer.token_to_id(END)], np.int32)
 
 
-def umt5(name: str) -> Callable[["Experiment", Sequence[str]], list[np.ndarray]]:
+def umt5(name: str) -> Callable[[TextSource, Sequence[str]], list[np.ndarray]]:
     """`TextEncoder.encode` of an encoder in `UMT5S`: what has been embedded before is read, the rest computed and kept."""
 
-    def encode(experiment: "Experiment", instructions: Sequence[str]) -> list[np.ndarray]:
-        cache = _EmbeddingCache(experiment, name)
+    def encode(source: TextSource, instructions: Sequence[str]) -> list[np.ndarray]:
+        cache = _EmbeddingCache(source, name)
         missing = [instruction for instruction in instructions if not cache.path(instruction).exists()]
         if missing:
-            for instruction, embedding in zip(missing, _embed(experiment, name, missing), strict=True):
+            for instruction, embedding in zip(missing, _embed(source, name, missing), strict=True):
                 cache.write(instruction, embedding)
         return [np.load(cache.path(instruction)) for instruction in instructions]
 
     return encode
 
 
-def _embed(experiment: "Experiment", name: str, instructions: Sequence[str]) -> Iterator[np.ndarray]:
+def _embed(source: TextSource, name: str, instructions: Sequence[str]) -> Iterator[np.ndarray]:
     """UMT5's embeddings [n width] float32 of instructions, in batches, in bfloat16 as Wan computes them."""
-    weights, folder = _files(experiment)
+    weights, folder = _files(source)
     tokenizer = load_tokenizer(folder)
-    ids = [token_ids(tokenizer, instruction, experiment.size.text_tokens) for instruction in instructions]
+    ids = [token_ids(tokenizer, instruction, source.tokens) for instruction in instructions]
     graph, params = nnx.split(load_umt5(weights, UMT5S[name]))
 
     @jax.jit
@@ -158,17 +165,16 @@ def _embed(experiment: "Experiment", name: str, instructions: Sequence[str]) -> 
         yield from (embedding[:n] for embedding, n in zip(embedded, lengths, strict=True))
 
 
-def _files(experiment: "Experiment") -> tuple[Path, Path]:
+def _files(source: TextSource) -> tuple[Path, Path]:
     """Weights and tokenizer that the config names."""
-    settings = experiment.model
-    named = {"text_weights": settings.text_weights, "text_tokenizer": settings.text_tokenizer}
+    named = {"text_weights": source.weights, "text_tokenizer": source.tokenizer}
     lacking = [f"model.{field}" for field, path in named.items() if path is None]
-    if settings.text_weights is None or settings.text_tokenizer is None:
+    if source.weights is None or source.tokenizer is None:
         raise ConfigError(
-            f"model.text is {settings.text} and {' and '.join(lacking)} not set; give the paths of "
+            f"the text encoder needs its files, and {' and '.join(lacking)} not set; give the paths of "
             "models_t5_umt5-xxl-enc-bf16.pth (or its safetensors) and of google/umt5-xxl, or choose model.text: learned."
         )
-    return settings.text_weights, settings.text_tokenizer
+    return source.weights, source.tokenizer
 
 
 class _EmbeddingCache:
@@ -177,10 +183,10 @@ class _EmbeddingCache:
     What the files held is noted too, so that where they are not at hand the embeddings still are.
     """
 
-    def __init__(self, experiment: "Experiment", name: str) -> None:
-        self.folder = experiment.cache_folder / "text"
+    def __init__(self, source: TextSource, name: str) -> None:
+        self.folder = source.cache
         self.notes = self.folder / "sources.json"
-        self.source = [name, experiment.size.text_tokens, *(self._fingerprint(path) for path in _files(experiment))]
+        self.source = [name, source.tokens, *(self._fingerprint(path) for path in _files(source))]
 
     def path(self, instruction: str) -> Path:
         key = hashlib.sha256(json.dumps([*self.source, instruction]).encode()).hexdigest()[:16]
