@@ -1,0 +1,109 @@
+"""The end of a study: the score tables of its variants as one, and the report on it.
+
+Reads  <study>/study.yaml, scores/<variant>.parquet, data, rollouts
+Writes <study>/scores.parquet with the column `variant`, its curves, and report/
+
+    python -m xew.analysis.study_analyse STUDY [VARIANT ...]
+
+The merged table says in its attribute `study` what was planned, so that whoever reads it can tell what is missing.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from xew.analysis import report
+from xew.analysis.scores import VARIANT, Scores, merge_scores, write_scores
+from xew.analysis.study_config import Study, load_study
+from xew.config import ConfigError, user_errors
+from xew.protocol import TASK_COUNT, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expected_counts
+
+
+@dataclass(frozen=True)
+class Args:
+    """Merge the scores of a study's variants and write its report."""
+
+    study: Annotated[Path, tyro.conf.Positional]
+    """Folder of the study."""
+    variants: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Those that are graded; all that have scores where left out."""
+
+
+@user_errors
+def main(args: Args) -> None:
+    """Merge, write, report."""
+    study = load_study(args.study / "study.yaml")
+    study = replace(study, out=args.study)
+    graded = args.variants or tuple(v.name for v in study.planned if (args.study / "scores" / f"{v.name}.parquet").exists())
+    if not graded:
+        raise ConfigError(f"{args.study} has no graded variant yet; run python -m xew.analysis.study {args.study}/study.yaml")
+    merged = merge_scores([(name, args.study / "scores" / f"{name}.parquet") for name in graded])
+    scores = replace(merged, attributes={**merged.attributes, "study": describe(study, merged)})
+    write_scores(scores, args.study / "scores.parquet")
+    print(coverage(scores.attributes["study"]))
+    rollouts = tuple(args.study / "rollouts" / name for name in graded)
+    report.main(
+        report.Args(scores=args.study / "scores.parquet", data=study.data_folder, rollouts=rollouts, out=args.study / "report")
+    )
+
+
+def describe(study: Study, scores: Scores) -> dict[str, Any]:
+    """What the merged table says of its study, plain JSON.
+
+    Returns:
+        `parts`, `tasks` (number), `robots`, `train_seeds`, `test_seeds`, `shots`: the extent; `of_paper`: whether it is the
+        paper's; `variants`: for each planned one, `expected` and `found` scored episodes of each robot; `incomplete`: names
+        of those that lack any, against the study's own extent.
+    """
+    episodes = scores.rows[[VARIANT, "task", "seed", "robot"]].drop_duplicates()
+    found = episodes.groupby([VARIANT, "robot"]).size().to_dict()
+    variants = {
+        variant.name: {
+            "expected": study.graded(variant),
+            "found": {robot: int(found.get((variant.name, robot), 0)) for robot in study.graded(variant)},
+        }
+        for variant in study.planned
+    }
+    return {
+        "parts": list(study.parts),
+        "tasks": study.task_count,
+        "robots": list(study.robots),
+        "train_seeds": study.train_seeds,
+        "test_seeds": study.test_seeds,
+        "shots": list(study.shots),
+        "of_paper": is_of_paper(study),
+        "variants": variants,
+        "incomplete": [name for name, counts in variants.items() if counts["expected"] != counts["found"]],
+    }
+
+
+def is_of_paper(study: Study) -> bool:
+    """Whether every variant is trained and graded on as many episodes as in the paper."""
+    seeds = (study.train_seeds, study.test_seeds) == (TRAIN_SEEDS_PER_TASK, TEST_SEEDS_PER_TASK)
+    counts = all(study.graded(variant) == expected_counts(variant) for variant in study.planned)
+    return seeds and counts and study.task_count == TASK_COUNT
+
+
+def coverage(described: dict[str, Any]) -> str:
+    """Whether the table is complete, in a line for each variant that is not."""
+    lines = [
+        f"{name}: " + ", ".join(f"{robot} {counts['found'][robot]} of {count}" for robot, count in counts["expected"].items())
+        for name, counts in described["variants"].items()
+        if name in described["incomplete"]
+    ]
+    if not lines:
+        return f"all {len(described['variants'])} variants are complete"
+    return "\n".join(
+        [f"INCOMPLETE, {len(lines)} of {len(described['variants'])} variants lack scored episodes:", *_indented(lines)]
+    )
+
+
+def _indented(lines: Sequence[str]) -> list[str]:
+    return [f"  {line}" for line in lines]
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, prog="python -m xew.analysis.study_analyse"))

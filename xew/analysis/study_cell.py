@@ -1,0 +1,133 @@
+"""One cell of a study as a process: a command of this package, its output in a log, its end noticed.
+
+A cell's process leaves when the study is killed (training saves first), and waits while one that was left behind still works
+on the same cell, so that two never write to the same place. On one machine processes are forked from one that has already
+imported JAX and the model (multiprocessing's forkserver): starting costs a fraction of a second instead of several.
+"""
+
+import contextlib
+import fcntl
+import multiprocessing
+import os
+import resource
+import runpy
+import signal
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from multiprocessing.context import ForkServerContext, SpawnContext
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Literal
+
+PRELOADED = ("xew.model.train", "xew.model.rollout", "xew.metrics.evaluate")
+"""What the fork server imports. None of them may start a thread or a JAX backend at import, which forks would not survive."""
+
+CONTEXTS: dict[str, ForkServerContext | SpawnContext] = {
+    "forkserver": multiprocessing.get_context("forkserver"),
+    "spawn": multiprocessing.get_context("spawn"),
+}
+
+
+def start_cell(
+    command: Sequence[str],
+    log: Path,
+    environment: Mapping[str, str],
+    method: Literal["forkserver", "spawn"] = "forkserver",
+    launcher: Sequence[str] = (),
+) -> BaseProcess:
+    """Start `python -m command...` as a process of its own; `.exitcode` is the command's.
+
+    Args:
+        command: module and arguments.
+        log: file that its output is appended to; a lock file of the same name lies beside it.
+        environment: variables set for it beside the study's own.
+        method: forkserver is quick; spawn starts from a fresh interpreter.
+        launcher: a program and its arguments that start the command instead, such as srun.
+    """
+    if method == "forkserver":
+        multiprocessing.set_forkserver_preload(list(PRELOADED))
+    context = CONTEXTS[method]
+    log.parent.mkdir(parents=True, exist_ok=True)
+    process = context.Process(target=_run, args=(tuple(command), log, dict(environment), tuple(launcher)), name=log.stem)
+    process.start()
+    return process
+
+
+def shown(command: Sequence[str]) -> str:
+    """A command as it is typed."""
+    return f"python -m {' '.join(command)}"
+
+
+def last_lines(log: Path, count: int = 3) -> str:
+    """The end of a log, without progress bars."""
+    try:
+        text = log.read_text(errors="replace")
+    except OSError:
+        return ""
+    lines = [line.rpartition("\r")[2].strip() for line in text.splitlines()]
+    return "\n".join([line for line in lines if line][-count:])
+
+
+def _run(command: tuple[str, ...], log: Path, environment: dict[str, str], launcher: tuple[str, ...]) -> None:
+    """In the new process: the module as `__main__`, as `python -m` would run it, or the launcher's process."""
+    os.environ.update(environment)
+    os.setpgrp()  # Ctrl-C reaches the study only, which asks its cells to stop
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    with log.open("a", buffering=1) as file, _alone(log.with_suffix(".lock")):
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+        print("$", " ".join([*launcher, shown(command)]), flush=True)
+        try:
+            code = _launch([*launcher, sys.executable, "-m", *command]) if launcher else _run_module(*command)
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+        print(f"exit status {code}, {_cpu_seconds():.1f} s of CPU", flush=True)
+    raise SystemExit(code)
+
+
+def _run_module(module: str, *arguments: str) -> int:
+    """The exit status of a module that is run as `python -m` runs it."""
+    sys.argv[1:] = arguments
+    sys.modules.pop(module, None)  # the fork server has imported it under its own name
+    try:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    except SystemExit as stop:
+        if isinstance(stop.code, str):
+            print(stop.code, file=sys.stderr)
+        return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    except BaseException:
+        traceback.print_exc()
+        return 1
+    return 0
+
+
+def _cpu_seconds() -> float:
+    """Of this process and of those that it has started and waited for."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in used)
+
+
+def _launch(command: Sequence[str]) -> int:
+    """The exit status of a program that hears of this process's end."""
+    process = subprocess.Popen(command)
+    signal.signal(signal.SIGTERM, lambda *_: process.terminate())
+    return process.wait()
+
+
+@contextlib.contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Waits until no other process holds this file's lock; it is let go with the block or the process."""
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _leave_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
