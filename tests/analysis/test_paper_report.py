@@ -10,7 +10,9 @@ import pytest
 
 from tests.analysis.test_report import Page
 from xew.analysis import paper_report
+from xew.analysis.distance_tables import signed
 from xew.analysis.paper import read_paper
+from xew.analysis.paper_tables import frame_distances, frame_results
 from xew.analysis.report import Args, main
 
 
@@ -24,9 +26,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_page_is_well_formed_and_opens_offline(written: Path) -> None:
     text = (written / "index.html").read_text()
     page = Page(text)
-    assert not page.open and len(page.images) == 1
-    assert str(page.images[0]["src"]).startswith("data:image/png") and page.images[0]["alt"]
-    assert not re.search(r"(src|href)\s*=\s*[\"'](?!data:)", text) and "url(" not in text and "<script" not in text
+    assert not page.open and not page.images and text.count("<svg") == 3
+    assert not re.search(r"(src|href)\s*=\s*[\"'](?!data:|#)", text) and "url(http" not in text and "<script" not in text
     assert cv2.imread(str(written / "figures" / "distance.png")).std() > 0
 
 
@@ -40,12 +41,36 @@ def test_every_printed_figure_stands_beside_ours(written: Path) -> None:
     page, markdown = (written / "index.html").read_text(), (written / "report.md").read_text()
     for metric in read_paper().metrics.values():
         for of in (metric.appearance, metric.kinematic):
-            low, high = paper_report.signed(of.low), paper_report.signed(of.high)
-            assert f"paper {low} to {high}<" in page and f"(paper {low} to {high}) ✓" in markdown
-            assert f"paper {paper_report.signed(of.r)}<" in page
+            low, high = signed(of.low), signed(of.high)
+            assert f">{low} to {high}<" in page and f"(paper {low} to {high}) ✓" in markdown
+            assert f">{signed(of.r)}<" in page
     # Ten rows of five cells, two p, five robots with two means, 28 percentages.
-    assert page.count('<td class="agrees">') == markdown.count(") ✓ ") == 10 * 5 + 2 + 5 * 2 + 28
+    assert page.count('class="agrees"') == markdown.count(") ✓ ") == 10 * 5 + 2 + 5 * 2 + 28
     assert 'class="differs"' not in page
+
+
+def test_all_tables_of_the_paper_are_there_as_printed(written: Path) -> None:
+    page = (written / "index.html").read_text()
+    for part in read_paper().parts.values():
+        for row in part.rows.values():
+            for scores in row.values():
+                for metric, value in scores.items():
+                    digits = 1 if metric == "trajectory_error" and "tab:baseline" in part.source else 3
+                    assert f">{value:.{digits}f}<" in page, (part.source, metric, value)
+    names = {path.stem for path in (written / "tables").iterdir()}
+    assert {"actions_full", "ladder_full", "few_shot_full", "forgetting_full", "baselines", "loeo_full", "changes"} <= names
+    for name in names:
+        text = (written / "tables" / f"{name}.tex").read_text()
+        assert text.count(r"\begin{") == text.count(r"\end{") > 1
+        assert len(pd.read_csv(written / "tables" / f"{name}.csv"))
+
+
+def test_the_papers_claims_are_asked_of_its_own_figures(written: Path) -> None:
+    found = pd.read_csv(written / "findings.csv").drop_duplicates("claim")
+    papers = found[found["where"] != "ours"]
+    assert len(papers) > 20 and not (papers["verdict"] == "fails").any()
+    text = (written / "index.html").read_text()
+    assert f"of the paper&#x27;s {len(papers)} claims: hold {(papers['verdict'] == 'holds').sum()}, fail 0," in text
 
 
 def test_the_summary_has_a_row_for_each_figure(written: Path) -> None:
@@ -60,7 +85,7 @@ def test_the_summary_has_a_row_for_each_figure(written: Path) -> None:
 def test_the_frame_of_workspaces_is_named_and_what_it_changes(written: Path) -> None:
     """In the paper's frame our clouds give the paper's r; in the arm's the sign of others is stable."""
     summary = pd.read_csv(written / "summary.csv").set_index(["row", "axis", "quantity"])["ours"]
-    root = paper_report.frame_results(read_paper(), paper_report.frame_distances()["root"])
+    root = frame_results(read_paper(), frame_distances()["root"])
     for metric, result in root.items():
         assert result.r == pytest.approx(summary[metric, "kinematic", "r"], abs=0.05)
     assert summary["keypoint_error", "kinematic", "r"] < 0 < summary["keypoint_error", "arm_base", "low"]
@@ -69,21 +94,16 @@ def test_the_frame_of_workspaces_is_named_and_what_it_changes(written: Path) -> 
     assert "in its base frame (ours), LPIPS has r = +0.5" in text and "and its sign survives leaving out any one robot" in text
 
 
-def test_a_percentage_that_does_not_follow_is_named() -> None:
-    paper = read_paper()
-    wrong = dataclasses.replace(paper.changes[0], percent=-39)
-    html, (markdown, _), _ = paper_report.build(dataclasses.replace(paper, changes=[wrong, *paper.changes[1:]]), "")
-    assert "27 of 28 percentages of the text follow from the tables: not -39 % (sec:exp-actrep)." in html
-    assert "(paper −39 %) ✗" in markdown
-
-
-def test_a_figure_that_does_not_come_out_is_named() -> None:
+def test_what_does_not_come_out_is_named() -> None:
     paper = read_paper()
     lpips = paper.metrics["lpips"]
     wrong = dataclasses.replace(lpips, appearance=dataclasses.replace(lpips.appearance, r=0.712))
-    html, (markdown, _), summary = paper_report.build(dataclasses.replace(paper, metrics={**paper.metrics, "lpips": wrong}), "")
-    assert "71 of 72 printed figures" in html and "not LPIPS by appearance r." in html
-    assert html.count('class="differs"') == 1 and "(paper +0.712) ✗" in markdown and (summary["agrees"] == False).sum() == 1  # noqa: E712
+    changes = [dataclasses.replace(paper.changes[0], percent=-39), *paper.changes[1:]]
+    report = paper_report.build(dataclasses.replace(paper, metrics={**paper.metrics, "lpips": wrong}, changes=changes), "")
+    assert "71 of 72 printed figures" in report.html and "not LPIPS by appearance r." in report.html
+    assert "27 of 28 percentages of the text follow from the tables: not −39 % (sec:exp-actrep)." in report.html
+    assert report.html.count('class="differs"') == 2 and (report.summary["agrees"] == False).sum() == 2  # noqa: E712
+    assert "(paper +0.712) ✗" in report.markdown and "(paper −39 %) ✗" in report.markdown
 
 
 @pytest.mark.parametrize("args", [Args(), Args(Path("scores.parquet"), paper=True), Args(paper=True, data=Path("data"))])

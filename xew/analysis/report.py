@@ -86,8 +86,8 @@ def main(args: Args) -> None:
 def _report_paper(args: Args) -> None:
     if args.scores or args.data or args.rollouts:
         raise ConfigError("--paper reports on the paper's own figures; leave out scores, --data and --rollouts.")
-    html, (markdown, figures), summary = paper_report.build(read_paper(), _footer({}))
-    _write(args.out, html, (markdown, {f"figures/{name}": image for name, image in figures.items()}), summary)
+    report = paper_report.build(read_paper(), _footer({}))
+    _write(args.out, report.html, (report.markdown, report.files), report.summary)
 
 
 def _report_study(args: Args, scores: Scores) -> None:
