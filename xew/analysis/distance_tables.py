@@ -107,7 +107,8 @@ def correlate(grades: Grades, distances: Distances) -> dict[tuple[str, str], Cor
 def distance_tables(distances: Distances) -> list[Table]:
     """Mean distances, features and both matrices."""
     origin = "" if distances.measured else " These are the paper's figures: none of our own were given (--distances)."
-    spread = " ± is the standard deviation of one draw of configurations." if (distances.robots["spread"] > 0).any() else ""
+    drawn = (distances.robots["spread"] > 0).any()
+    spread = " ±: deviation of one draw of configurations; of looks, the jackknife over views." if drawn else ""
     return [
         _robot_table(
             distances,
@@ -151,7 +152,7 @@ def correlation_table(grades: Grades, distances: Distances, paper: Paper | None)
     shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
     return Table(
         "correlations",
-        "Does distance predict difficulty?",
+        "Correlation of distance with scores",
         "r of each robot's mean distance with its score when it was held out, and its range when one robot is left out. "
         f"Positive: farther is worse. LPIPS is the paper's primary outcome, all else exploratory.{_standing_in(distances)}",
         ("metric",),

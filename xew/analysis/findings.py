@@ -60,11 +60,16 @@ class Answer:
     """One comparison, answered."""
 
     label: str
+    numbers: str
+    """Value and interval, and what speaks against an answer."""
     value: float
     low: float
     high: float
     verdict: str
-    text: str
+
+    @property
+    def text(self) -> str:
+        return f"{self.label} {self.numbers}"
 
 
 @dataclass(frozen=True)
@@ -76,6 +81,12 @@ class Finding:
     answers: tuple[Answer, ...]
     """Empty where something was not measured."""
     missing: str = ""
+
+    def span(self) -> str:
+        """Smallest and largest number of those that are alike."""
+        numbers = sorted(self.answers, key=lambda answer: answer.value)
+        first, last = (answer.numbers.partition(" [")[0] for answer in (numbers[0], numbers[-1]))
+        return f"{len(numbers)} comparisons, {first} to {last}"
 
 
 class Reader:
@@ -162,11 +173,12 @@ def _answer(comparison: Comparison, level: float) -> Answer:
     show = _percent if comparison.percent else _plain
     ends = "" if low == high or comparison.doubt.startswith("fewer") else f" [{show(low)}, {show(high)}]"
     doubt = f" ({comparison.doubt})" if comparison.doubt else ""
-    return Answer(comparison.label, value, low, high, verdict, f"{comparison.label} {show(value)}{ends}{doubt}")
+    return Answer(comparison.label, f"{show(value)}{ends}{doubt}", value, low, high, verdict)
 
 
 def _percent(value: float) -> str:
-    return f"{100 * value:.3g} %".replace("-", "−") if abs(value) < 0.01 else f"{100 * value:.0f} %".replace("-", "−")
+    digits = 1 if abs(value) < 0.0995 else 0
+    return f"{100 * value:.{digits}f}\u00a0%".replace("-", "−")
 
 
 def _plain(value: float) -> str:
@@ -179,7 +191,7 @@ def findings_frame(findings: Sequence[Finding], of: str) -> pd.DataFrame:
     rows = [
         (of, f.claim.name, f.claim.where, f.claim.says, f.claim.test, f.verdict, a.label, a.value, a.low, a.high, a.verdict)
         for f in findings
-        for a in f.answers or (Answer(f.missing, np.nan, np.nan, np.nan, UNMEASURED, ""),)
+        for a in f.answers or (Answer(f.missing, "", np.nan, np.nan, np.nan, UNMEASURED),)
     ]
     return pd.DataFrame(rows, columns=columns)
 

@@ -138,35 +138,37 @@ def tables_frame(tables: Sequence[Table]) -> pd.DataFrame:
     return pd.concat([frame(table) for table in tables], ignore_index=True)
 
 
-def findings_markdown(findings: Sequence[Finding], papers: Sequence[Finding]) -> str:
-    """Claim, test, our verdict with numbers, the paper's own."""
-    lines = ["| claim | test | here | numbers | the paper's own figures |", "|---|---|---|---|---|"]
-    for ours, paper in zip(findings, papers, strict=True):
-        numbers = "; ".join(answer.text for answer in ours.answers) or f"missing: {ours.missing}"
-        cells = [f"{ours.claim.says} ({ours.claim.where})", ours.claim.test, f"**{ours.verdict}**", numbers, paper.verdict]
-        lines.append(_markdown_line(cells))
+def findings_markdown(findings: Sequence[Finding], papers: Sequence[Finding] = ()) -> str:
+    """Claim, test, verdict with numbers, and where given the verdict on the paper's own figures."""
+    beside = [["the paper's own figures"], *([paper.verdict] for paper in papers)] if papers else [[]] * (len(findings) + 1)
+    lines = [_markdown_line(["claim", "test", "verdict", "numbers", *beside[0]]), "|---" * (4 + bool(papers)) + "|"]
+    for finding, last in zip(findings, beside[1:], strict=True):
+        numbers = "; ".join(answer.text for answer in finding.answers) or f"missing: {finding.missing}"
+        claim = finding.claim
+        lines.append(_markdown_line([f"{claim.says} ({claim.where})", claim.test, f"**{finding.verdict}**", numbers, *last]))
     return "\n".join(lines)
 
 
-def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding]) -> str:
-    """The verdicts alone: claim, test, here, the paper's own figures."""
+def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = ()) -> str:
+    """The verdicts alone: claim, test, here, and where given the paper's own figures."""
+    beside = [["paper"], *([paper.verdict] for paper in papers)] if papers else [[]] * (len(findings) + 1)
     rows = [
-        _latex_line([_escape(text) for text in (f.claim.says, f.claim.test, f.verdict, p.verdict)])
-        for f, p in zip(findings, papers, strict=True)
+        _latex_line([_escape(text) for text in (finding.claim.says, finding.claim.test, finding.verdict, *last)])
+        for finding, last in zip(findings, beside[1:], strict=True)
     ]
     return "\n".join(
         [
             r"% \usepackage{booktabs,amssymb}",
             r"\begin{table*}[t]",
             r"\centering\footnotesize",
-            r"\begin{tabular}{@{}p{0.38\textwidth}p{0.38\textwidth}ll@{}}",
+            rf"\begin{{tabular}}{{@{{}}p{{0.38\textwidth}}p{{0.38\textwidth}}l{'l' * bool(papers)}@{{}}}}",
             r"\toprule",
-            r"claim & test & here & paper \\",
+            _latex_line(["claim", "test", "verdict", *beside[0]]),
             r"\midrule",
             *rows,
             r"\bottomrule",
             r"\end{tabular}",
-            r"\caption{\textbf{Findings.} Each claim as an inequality; the last column asks the paper's own figures.}",
+            r"\caption{\textbf{Findings.} Each claim as an inequality.}",
             r"\label{tab:findings}",
             r"\end{table*}",
             "",

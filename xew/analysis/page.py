@@ -95,7 +95,7 @@ def score_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> str:
 
 
 def _count_note(table: RobotTable) -> str:
-    counts = sorted({score.count for row in table.rows for score in row.scores.values()})
+    counts = sorted(table.counts)
     found = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1]))) if counts else "0"
     if table.expected is None:
         return paragraph(f"{found} episodes.", soft=True)
@@ -239,15 +239,18 @@ def _claim_side(title: str, finding: Finding) -> str:
     pill = f'<span class="pill {kind}">{escape(finding.verdict)}</span> <span class="soft">{escape(title)}</span>'
     if finding.missing:
         return f'<div><p>{pill}</p><p class="soft">missing: {escape(finding.missing)}</p></div>'
-    ordered = sorted(finding.answers, key=lambda answer: answer.verdict == "holds")
-    shown, rest = (ordered, []) if len(ordered) <= 4 else (ordered[:3], ordered[3:])
-    more = f"<details><summary>{len(rest)} more</summary>{_answers(rest)}</details>" if rest else ""
-    return f"<div><p>{pill}</p>{_answers(shown)}{more}</div>"
+    doubtful = [answer for answer in finding.answers if answer.verdict != "holds"]
+    if len(finding.answers) <= 4:
+        return f"<div><p>{pill}</p>{_answers(finding.answers)}</div>"
+    all_of_them = f"<details><summary>{escape(finding.span())}</summary>{_answers(finding.answers)}</details>"
+    return f"<div><p>{pill}</p>{_answers(doubtful[:4])}{all_of_them}</div>"
 
 
 def _answers(answers: Sequence[Answer]) -> str:
-    items = "".join(f'<li class="{answer.verdict}">{escape(answer.text)}</li>' for answer in answers)
-    return f"<ul>{items}</ul>"
+    items = "".join(
+        f'<li class="{answer.verdict}">{escape(answer.label)} <span>{escape(answer.numbers)}</span></li>' for answer in answers
+    )
+    return f"<ul>{items}</ul>" if answers else ""
 
 
 def labelled_picture(source: str, caption: str, columns: Sequence[str], rows: Sequence[str]) -> str:

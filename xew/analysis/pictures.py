@@ -7,12 +7,8 @@ from collections.abc import Mapping, Sequence
 import cv2
 import matplotlib
 import numpy as np
-import pandas as pd
 from matplotlib import patheffects
 from matplotlib.figure import Figure
-
-from xew.analysis.scores import COPY, TRUTH, MetricInfo
-from xew.analysis.summary import METRIC_TITLES, ROBOT_TITLES
 
 GAP = 4
 """White pixels between the pictures of a sheet."""
@@ -75,45 +71,6 @@ def figure_png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=200)
     return buffer.getvalue()
-
-
-def error_curves(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Sequence[str]) -> Figure:
-    """Mean over episodes by frame, a row of panels for each metric and a column for each robot; bands are quartiles."""
-    robots = [robot for robot in robots if (curves["robot"] == robot).any()]
-    figure = Figure(figsize=(10, 0.5 + 2.1 * len(metrics)), layout="constrained")
-    panels = figure.subplots(len(metrics), len(robots), sharex=True, sharey="row", squeeze=False)
-    for line, metric in zip(panels, metrics, strict=True):
-        for panel, robot in zip(line, robots, strict=True):
-            chosen = curves[(curves["robot"] == robot) & (curves["metric"] == metric.name)]
-            _draw_models(panel, chosen, metric)
-            _dress(panel)
-        arrow = "higher is better" if metric.higher_is_better else "lower is better"
-        unit = f" [{metric.unit}]" if metric.unit else ""
-        line[0].set_ylabel(f"{METRIC_TITLES.get(metric.name, metric.name)}{unit}\n{arrow}", fontsize=9)
-    for panel, robot in zip(panels[0], robots, strict=True):
-        panel.set_title(ROBOT_TITLES.get(robot, robot), fontsize=11, loc="left", fontweight="bold")
-    for panel in panels[-1]:
-        panel.set_xlabel("frame", fontsize=9)
-    named = {label: handle for panel in panels.flat for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)}
-    figure.legend(named.values(), named, loc="outside upper right", ncols=len(named), frameon=False, fontsize=9)
-    return figure
-
-
-def _draw_models(panel: matplotlib.axes.Axes, curves: pd.DataFrame, metric: MetricInfo) -> None:
-    models = list(dict.fromkeys(zip(curves["model"], curves["condition"], strict=True)))
-    own = [key for key in models if key[0] not in (COPY, TRUTH)]
-    # The truth's PSNR is a cap, not a measurement, and would squeeze everything else flat.
-    baselines = [key for key in models if key[0] == COPY or (key[0] == TRUTH and metric.name != "psnr")]
-    for key in own + baselines:
-        group = curves[(curves["model"] == key[0]) & (curves["condition"] == key[1])].groupby("frame")["value"]
-        mean, low, high = group.mean(), group.quantile(0.25), group.quantile(0.75)
-        if key in own:
-            colour = COLOURS[own.index(key) % len(COLOURS)]
-            panel.fill_between(mean.index, low, high, color=colour, alpha=0.15, linewidth=0)
-            panel.plot(mean.index, mean, color=colour, linewidth=2, label=" · ".join(filter(None, key)))
-        else:
-            dash, label = ("--", "frozen first frame") if key[0] == COPY else (":", "ground truth")
-            panel.plot(mean.index, mean, color="#57606a", linewidth=1.3, linestyle=dash, label=label)
 
 
 def distance_scatter(axes: Mapping[str, np.ndarray], score: np.ndarray, title: str, robots: Sequence[str]) -> Figure:

@@ -25,7 +25,9 @@ import tyro
 from tqdm import tqdm
 
 from xew.analysis import page, paper_report, pictures, report_study
+from xew.analysis.charts import Chart, chart_files
 from xew.analysis.paper import read_paper
+from xew.analysis.report_charts import run_chart
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, read_scores
 from xew.analysis.summary import METRIC_TITLES, ROBOT_TITLES, RobotTable, finding, flat_summary, robot_table
 from xew.config import ConfigError, user_errors
@@ -111,14 +113,14 @@ def _report_scores(args: Args, scores: Scores) -> None:
     sections = [
         _held_out_section(held_out, scores.metrics),
         _strip_section(strips),
-        page.section("How the error grows with time", curves.html),
+        page.section("How the error grows with time", page.chart(curves)),
         _seen_section(seen, scores.metrics),
         _data_section(sheets, records),
         _method_section(scores, args),
     ]
     sentences = finding(held_out, seen, scores.metrics)
     html = page.page(TITLE, sentences, [text for text in sections if text], _footer(scores.versions))
-    markdown = _markdown(sentences, held_out, seen, scores, [*strips, curves, *sheets])
+    markdown = _markdown(sentences, held_out, seen, scores, [*strips, *sheets], chart_files(curves))
     _write(args.out, html, markdown, flat_summary(held_out + seen))
 
 
@@ -233,12 +235,10 @@ def _strip(row: pd.Series, word: str, rollouts: dict[tuple[str, str, str, int, s
     return Picture("_".join((*map(str, key[:5]), word)).replace("/", "-") + ".png", image, html)
 
 
-def _curves(scores: Scores, held_out: Sequence[str]) -> Picture:
+def _curves(scores: Scores, held_out: Sequence[str]) -> Chart:
     metrics = [metric for metric in scores.metrics if metric.name in CURVE_METRICS] or list(scores.metrics[:3])
     robots = [robot for robot in held_out if robot in set(scores.rows["robot"])] or sorted(set(scores.rows["robot"]))
-    image = pictures.figure_png(pictures.error_curves(scores.curves, metrics, robots))
-    caption = "Mean over episodes frame by frame; bands hold the middle half of the episodes."
-    return Picture("curves.png", image, page.picture(pictures.data_uri(image), caption, "error curves"))
+    return run_chart(scores.curves, metrics, robots)
 
 
 def _contact_sheet(data: Path, records: Sequence[Record]) -> Picture:
@@ -281,6 +281,7 @@ def _markdown(
     seen: Sequence[RobotTable],
     scores: Scores,
     figures: Sequence[Picture],
+    charts: Mapping[str, bytes],
 ) -> tuple[str, dict[str, bytes]]:
     """report.md and the files that it shows."""
     lines = [f"# {TITLE}", "", *(f"- {sentence}" for sentence in sentences)]
@@ -289,8 +290,9 @@ def _markdown(
         for table in tables:
             state = "" if table.complete else f" (incomplete: {table.count} of {table.expected} test episodes)"
             lines += ["", f"### {table.title}{state}", "", page.markdown_table(table, scores.metrics)]
-    lines += ["", "## Figures", "", *(f"![{figure.name}](figures/{figure.name})" for figure in figures)]
-    return "\n".join(lines) + "\n", {f"figures/{figure.name}": figure.image for figure in figures}
+    files = {figure.name: figure.image for figure in figures} | dict(charts)
+    lines += ["", "## Figures", "", *(f"![{name}](figures/{name})" for name in files if name.endswith(".png"))]
+    return "\n".join(lines) + "\n", {f"figures/{name}": content for name, content in files.items()}
 
 
 def _write(out: Path, html: str, markdown: tuple[str, Mapping[str, bytes]], summary: pd.DataFrame) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -12,13 +13,14 @@ from xew.analysis import charts
 from xew.analysis.charts import SERIES, SOFT, Chart, Panel, Series
 from xew.analysis.distance_tables import AXIS_TITLES, Distances
 from xew.analysis.grades import MIN_SCENES, Grades, Mean, PaperGrades, better, find_variant, interval
-from xew.analysis.scores import COPY, VARIANT
+from xew.analysis.scores import COPY, TRUTH, VARIANT, MetricInfo
 from xew.analysis.summary import METRIC_TITLES, ROBOT_TITLES
 from xew.analysis.tables import ACTIONS, LADDER, REMEDIES, SHORT_ROBOTS, Builder, metric_title
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS
 
 BAR_METRICS = ("lpips", "region_lpips", "mask_iou", "pck")
 CURVE_METRIC = "lpips"
+BASELINE_STYLES = {COPY: "frozen first frame", TRUTH: "ground truth"}
 ROBOT_COLOURS = dict(zip(HELD_OUT_ROBOTS, SERIES, strict=False))
 
 
@@ -198,6 +200,42 @@ def frame_chart(curves: pd.DataFrame, part: str, labels: Mapping[str, str]) -> C
     ]
     caption = "LPIPS by frame, mean over episodes; bands hold the middle half of them."
     return Chart(f"frames_{part}", caption, panels, data, styles)
+
+
+def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Sequence[str]) -> Chart:
+    """Of one ordinary run: mean over episodes by frame, a panel for each metric and robot; bands hold the middle half."""
+    robots = [robot for robot in robots if (curves["robot"] == robot).any()]
+    shown = curves[curves["robot"].isin(robots) & curves["metric"].isin([metric.name for metric in metrics])]
+    # The truth's PSNR is a cap, not a measurement, and would squeeze everything else flat.
+    shown = shown[~((shown["model"] == TRUTH) & (shown["metric"] == "psnr"))]
+    shown = shown.assign(row=[_run_label(*key) for key in zip(shown["model"], shown["condition"], strict=True)])
+    grouped = shown.groupby(["metric", "robot", "row", "frame"], sort=False)["value"]
+    data = pd.DataFrame({"mean": grouped.mean(), "low": grouped.quantile(0.25), "high": grouped.quantile(0.75)}).reset_index()
+    own = [row for row in dict.fromkeys(shown["row"]) if row not in BASELINE_STYLES.values()]
+    styles = [Series(label, colour) for label, colour in charts.colour_of(own).items()]
+    dashes: Mapping[str, Literal["--", ":"]] = {COPY: "--", TRUTH: ":"}
+    styles += [Series(BASELINE_STYLES[m], SOFT, dash) for m, dash in dashes.items() if BASELINE_STYLES[m] in set(data["row"])]
+
+    def draw(axes: Axes, metric: MetricInfo, robot: str) -> None:
+        lines = []
+        for style in styles:
+            line = data[(data["metric"] == metric.name) & (data["robot"] == robot) & (data["row"] == style.label)]
+            if len(line):
+                band = line[["low", "high"]].to_numpy() if style.colour != SOFT else None
+                lines.append((style, line["frame"].to_numpy(), line["mean"].to_numpy(), band))
+        charts.lines(axes, lines, "frame", metric_title(metric))
+
+    panels = [
+        Panel(ROBOT_TITLES.get(robot, robot), partial(draw, metric=metric, robot=robot))
+        for metric in metrics
+        for robot in robots
+    ]
+    caption = "Mean over episodes frame by frame; bands hold the middle half of the episodes."
+    return Chart("curves", caption, panels, data, styles, columns=len(robots))
+
+
+def _run_label(model: str, condition: str) -> str:
+    return BASELINE_STYLES.get(model) or " · ".join(filter(None, (model, condition)))
 
 
 def _gain(builder: Builder, steps: Steps, row: str, robot: str, metric: str) -> dict[str, float]:

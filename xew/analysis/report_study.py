@@ -129,9 +129,11 @@ def _verdict_sentence(findings: Sequence[Finding]) -> str:
     claims = [finding for finding in findings if finding.claim.where != "ours"]
     counts = {word: sum(finding.verdict == word for finding in claims) for word in (HOLDS, FAILS, UNRESOLVED, UNMEASURED)}
     measured = len(claims) - counts[UNMEASURED]
+    asked = "all" if measured == len(claims) else str(measured)
     text = (
-        f"Of the paper's {len(claims)} claims {measured} could be asked here: {counts[HOLDS]} hold, {counts[FAILS]} fail, "
-        f"{counts[UNRESOLVED]} are not resolved."
+        f"Of {len(claims)} claims of the paper {asked} could be asked here: {counts[HOLDS]} hold, "
+        f"{counts[FAILS] or 'none'} fail{'s' * (counts[FAILS] < 2)}, {counts[UNRESOLVED] or 'none'} "
+        f"{'is' if counts[UNRESOLVED] < 2 else 'are'} unresolved."
     )
     failed = [finding.claim.says.strip("… ").rstrip(".") for finding in claims if finding.verdict == FAILS]
     return text + (f" What fails: {'; '.join(failed)}." if failed else "")
@@ -145,7 +147,7 @@ def _gap_sentence(grades: Grades) -> Iterator[str]:
         if mean and seen:
             worse = -better(mean, seen, grades.metrics["lpips"])
             low, high = interval(worse, grades.level)
-            parts.append(f"{worse[0]:+.0%} on {ROBOT_TITLES[robot]} ({low:+.0%} to {high:+.0%})".replace("-", "−"))
+            parts.append(f"{_change(worse[0])} on {ROBOT_TITLES[robot]} ({_change(low)} to {_change(high)})")
     if parts and seen:
         yield f"Told optical flow only, LPIPS is {seen.value:.3f} on robots seen in training; {' and '.join(parts)}."
 
@@ -159,7 +161,7 @@ def _best_sentences(grades: Grades) -> Iterator[str]:
             known = {row: gain for row, gain in gains.items() if gain is not None}
             if known:
                 best = max(known, key=lambda row: known[row])
-                found.append(f"{labels[best]} on {SHORT_ROBOTS[robot]} ({known[best]:+.0%})".replace("-", "−"))
+                found.append(f"{labels[best].removeprefix('+ ').lower()} on {SHORT_ROBOTS[robot]} ({_change(known[best])})")
         if found:
             yield f"Against {labels[base].lower()}, LPIPS improves most with {' and '.join(found)}."
 
@@ -170,9 +172,9 @@ def _adaptation_sentences(grades: Grades) -> Iterator[str]:
         loss = _gain(grades, "forgetting", f"{robot}-1", "none", FORGETTING_ROBOT)
         if gain is not None and loss is not None:
             yield (
-                f"One demonstration of each task changes LPIPS by {-gain:+.0%} on {ROBOT_TITLES[robot]} and by {-loss:+.0%} on "
-                f"{ROBOT_TITLES[FORGETTING_ROBOT]}, which it had seen."
-            ).replace("-", "−")
+                f"One demonstration of each task changes LPIPS by {_change(-gain)} on {ROBOT_TITLES[robot]}, and by "
+                f"{_change(-loss)} on {ROBOT_TITLES[FORGETTING_ROBOT]}, which the model had been trained on."
+            )
 
 
 def _distance_sentence(grades: Grades, distances: Distances) -> Iterator[str]:
@@ -185,6 +187,10 @@ def _distance_sentence(grades: Grades, distances: Distances) -> Iterator[str]:
     ]
     if parts:
         yield f"Over the five robots, each held out in turn, LPIPS goes with distance: {'; '.join(parts)}."
+
+
+def _change(share: float) -> str:
+    return f"{100 * share:+.0f}\u00a0%".replace("-", "−")
 
 
 def _gain(grades: Grades, part: str, row: str, base: str, robot: str) -> float | None:

@@ -27,9 +27,12 @@ METRIC_TITLES = {
     "boundary_f1": "Boundary F1",
     "region_lpips": "Region LPIPS",
     "pck": "PCK",
+    "pck_05": "PCK at 0.05",
     "keypoint_error": "Keypoint error",
     "ndtw": "nDTW",
+    "coverage": "Keypoints found",
     "trajectory_error": "Object error",
+    "object_coverage": "Objects found",
 }
 
 
@@ -71,13 +74,18 @@ class RobotTable:
     """Episodes that the protocol's data hold for a model; None where the data set was not given."""
 
     @property
+    def counts(self) -> list[int]:
+        """Episodes of each model. Metrics that are not defined for some, as of objects where there is none, lack these."""
+        return [max(score.count for score in row.scores.values()) for row in self.rows if row.scores]
+
+    @property
     def count(self) -> int:
         """Episodes of the model that has fewest."""
-        return min((score.count for row in self.rows for score in row.scores.values()), default=0)
+        return min(self.counts, default=0)
 
     @property
     def complete(self) -> bool:
-        return self.expected is None or all(score.count == self.expected for row in self.rows for score in row.scores.values())
+        return self.expected is None or all(count == self.expected for count in self.counts)
 
 
 def mean_interval(values: np.ndarray) -> Interval:

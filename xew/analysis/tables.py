@@ -193,9 +193,12 @@ class Builder:
             variant = find_variant(part, key)
             paper = sum(expected_counts(variant).get(robot, 0) for robot in pooled(variant, robots))
             planned = sum(self.planned.get(variant.name, {}).get(robot, 0) for robot in pooled(variant, robots)) or paper
-            counts = {mean.count for m in self.ours.metrics if (mean := self.ours.mean(part, key, robots, m))}
-            as_planned, as_paper = as_planned and counts == {planned}, as_paper and counts == {paper}
-            found.setdefault(_count_text(counts, paper if counts == {planned} else planned), []).append(label)
+            # A metric that is not defined for an episode lacks it; the episode is graded all the same.
+            means = (self.ours.mean(part, key, robots, metric) for metric in self.ours.metrics)
+            count = max((mean.count for mean in means if mean), default=0)
+            as_planned, as_paper = as_planned and count == planned, as_paper and count == paper
+            text = f"{count} of {paper if count == planned else planned} episodes" if count else "not run"
+            found.setdefault(text, []).append(label)
         if as_paper:
             return ""
         word = "As planned, but smaller than the paper's protocol" if as_planned else "Incomplete"
@@ -399,9 +402,17 @@ def baseline_table(builder: Builder) -> Table:
         for metric in metrics
         for robots in groups
     )
-    places = ((key, robots, f"{SYSTEMS[key]}, {SHORT_ROBOTS.get(robots, robots)}") for key in systems for robots in groups)
-    block = Block("", tuple(_best(rows, better_up)), builder.note("baselines", places))
-    return Table("baselines", "Other world models", "Bold is best.", ("model", "told of actions"), columns, (block,))
+    notes = {robots: builder.note("baselines", ((key, robots, SYSTEMS[key]) for key in systems)) for robots in groups}
+    note = " ".join(f"{SHORT_ROBOTS.get(robots, 'Seen robots')}: {text}" for robots, text in notes.items() if text)
+    block = Block("", tuple(_best(rows, better_up)), note)
+    return Table(
+        "baselines",
+        "Seen and unseen robots under other world models",
+        "Bold is best.",
+        ("model", "told of actions"),
+        columns,
+        (block,),
+    )
 
 
 def loeo_full(builder: Builder) -> Table:
@@ -501,11 +512,5 @@ def _ends(mean: Mean, level: float) -> tuple[float, float]:
 
 def _interval_text(ends: tuple[float, float], metric: MetricInfo) -> str:
     low, high = ends
-    return "" if np.isnan(low) or low == high else f"{number(low, metric)}–{number(high, metric)}"
-
-
-def _count_text(counts: set[int], expected: int) -> str:
-    if not counts:
-        return "not run"
-    found = str(min(counts)) if len(counts) == 1 else f"{min(counts)} to {max(counts)}"
-    return f"{found} of {expected} episodes"
+    first, last = number(low, metric), number(high, metric)
+    return "" if np.isnan(low) or first == last else f"{first}–{last}"
