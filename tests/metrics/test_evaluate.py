@@ -12,14 +12,29 @@ import pytest
 
 from tests.synthetic import write_synthetic_data
 from xew.episode import episode_folder, read_states, read_video
-from xew.metrics import mask_iou, psnr, ssim
-from xew.metrics.estimate import estimate_masks
+from xew.metrics import keypoint_error, mask_iou, psnr, ssim
+from xew.metrics.backends import Backend, Tracker, estimate_masks
 from xew.metrics.evaluate import Args, main
+from xew.metrics.truth import project
 from xew.rollout import write_rollout
 
 TASK, SEED, ROBOTS = "place_empty_cup", 1_000_000, ("franka_panda", "piper")
 FRAMES, ASKED = 9, 7
 CHEAP = ("psnr", "ssim", "mask_iou")
+
+
+def shifted(prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """A tracker whose answer is known: three pixels right of the truth where the frames differ, and never the last point."""
+    found = points + np.where((prediction != target).any(axis=(1, 2, 3))[:, None, None], np.float32([3, 0]), 0)
+    found[:, -1] = np.nan
+    return np.where(visible[..., None], found, np.nan).astype(np.float32)
+
+
+def open_shifted(_: Path | None) -> Tracker:
+    return shifted
+
+
+SHIFTED = Backend(open_shifted, None, "for tests")
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +64,7 @@ def rollouts(data: Path, tmp_path: Path) -> Path:
 
 def grade(rollouts: Path, data: Path, **settings: object) -> pd.DataFrame:
     out = settings.pop("out", rollouts.parent / "scores.parquet")
-    main(Args((rollouts,), data, out, **{"metrics": CHEAP} | settings))
+    main(Args((rollouts,), data, out, **{"metrics": CHEAP, "baselines": False, "workers": 2} | settings))
     return pd.read_parquet(out)
 
 
@@ -70,13 +85,15 @@ def test_every_score_is_the_mean_of_the_functions_without_the_given_frame(rollou
         expected = float(np.mean(mask_iou(estimate_masks(prediction, target, mask), mask)[1:]))
         assert value(scores, "late", robot, "mask_iou") == pytest.approx(expected, rel=1e-5)
     assert set(scores["frames"]) == {ASKED}
+    assert scores.attrs["estimators"] == {"masks": "default", "tracks": "default"} and scores.attrs["frame_zero"] == "given"
 
 
-def test_all_default_metrics_with_baselines(rollouts: Path, data: Path) -> None:
-    scores = grade(rollouts, data, metrics=Args.metrics, baselines=True)
-    assert len(scores) == 3 * len(ROBOTS) * len(Args.metrics)
+def test_visual_and_morphology_with_baselines(rollouts: Path, data: Path) -> None:
+    names = ("psnr", "ssim", "lpips", "mask_iou", "boundary_f1", "region_lpips")
+    scores = grade(rollouts, data, metrics=Args.metrics, dimensions=("visual", "morphology"), baselines=True)
+    assert len(scores) == 3 * len(ROBOTS) * len(names)
     described = scores.attrs["metrics"]
-    assert list(described) == list(Args.metrics)
+    assert tuple(described) == names
     for robot in ROBOTS:
         for name, info in described.items():
             frozen, model, perfect = (value(scores, m, robot, name) for m in ("copy_first_frame", "late", "ground_truth"))
@@ -89,6 +106,62 @@ def test_all_default_metrics_with_baselines(rollouts: Path, data: Path) -> None:
     assert set(exact) == {ASKED - 1}
 
 
+def test_tracks_are_compared_with_what_the_episode_holds(rollouts: Path, data: Path) -> None:
+    """With a tracker from outside whose error is known. The last keypoint, and the only object, it never finds."""
+    settings = {"metrics": Args.metrics, "dimensions": ("kinematics", "objects"), "tracks": f"{__name__}:SHIFTED"}
+    scores = grade(rollouts, data, baselines=True, **settings)
+    assert scores.attrs["estimators"]["tracks"] == settings["tracks"]
+    for robot in ROBOTS:
+        states = read_states(episode_folder(data, TASK, SEED, robot))
+        seen = states.keypoint_visible[1:ASKED]
+        found = seen[:, :-1].sum() / seen.sum()
+        assert value(scores, "ground_truth", robot, "coverage") == pytest.approx(found)
+        assert value(scores, "ground_truth", robot, "pck") == pytest.approx(found), "what is lost is a miss"
+        assert value(scores, "ground_truth", robot, "ndtw") == 0
+        shifts = (late(truth(data, robot)) != truth(data, robot)).any(axis=(1, 2, 3))[1:ASKED]
+        tracks = states.keypoints[1:ASKED] + np.where(shifts, 3, 0)[:, None, None] * np.float32([1, 0])
+        expected = float(keypoint_error(tracks[:, :-1], states.keypoints[1:ASKED, :-1], seen[:, :-1]))
+        assert value(scores, "late", robot, "keypoint_error") == pytest.approx(expected, rel=1e-5) and expected > 0
+        rows = scores[(scores["robot"] == robot) & (scores["metric"] == "trajectory_error")]
+        assert rows.empty, "an object that is never found has no error"
+        assert value(scores, "late", robot, "object_coverage") == 0
+
+
+def test_projected_objects_lie_where_they_are_drawn(data: Path) -> None:
+    """The disc is the one thing that moves besides the robot; its colour is at its projected centre wherever that is free."""
+    from xew.metrics.truth import read_truth
+
+    read = read_truth(episode_folder(data, TASK, SEED, "piper"), FRAMES, ("objects",))
+    assert read.objects.shape == (FRAMES, 1, 2) and read.object_visible[0, 0]
+    colours = [
+        read.rgb[t, round(float(y)), round(float(x))]
+        for t, ((x, y),) in enumerate(read.objects.tolist())
+        if read.object_visible[t, 0]
+    ]
+    assert len(colours) > 1 and (np.array(colours) == colours[0]).all()
+    assert not read.object_visible[-1, 0] and read.mask[-1][tuple(np.round(read.objects[-1, 0, ::-1]).astype(int))]
+    behind = project(np.array([[0.0, 0.0, -1.0]]), np.eye(3), np.eye(4))
+    assert np.isnan(behind).all()
+
+
+def test_an_undefined_metric_has_no_row_and_the_rest_stands(rollouts: Path, data: Path, tmp_path: Path) -> None:
+    """A robot that is hardly seen: its box is too small for LPIPS and no keypoint is visible."""
+    from dataclasses import replace
+
+    from xew.episode import read_record, write_episode
+
+    folder = episode_folder(data, TASK, SEED, "piper")
+    states = read_states(folder)
+    mask = np.zeros_like(states.robot_mask)
+    mask[:, :20, :20] = True
+    hidden = replace(states, robot_mask=mask, keypoint_visible=np.zeros_like(states.keypoint_visible))
+    write_episode(tmp_path / "data", read_record(folder), hidden, truth(data, "piper"), read_video(folder / "robot.mkv"))
+    shutil.rmtree(episode_folder(rollouts, TASK, SEED, "franka_panda"))
+    scores = grade(rollouts, tmp_path / "data", metrics=("psnr", "region_lpips", "pck", "coverage"))
+    assert scores["metric"].tolist() == ["psnr"]
+    assert scores["value"].notna().all()
+
+
 def test_curves_hold_every_predicted_frame_and_average_to_the_scores(rollouts: Path, data: Path) -> None:
     scores = grade(rollouts, data)
     curves = pd.read_parquet(rollouts.parent / "scores.curves.parquet")
@@ -98,69 +171,65 @@ def test_curves_hold_every_predicted_frame_and_average_to_the_scores(rollouts: P
         assert means[row.robot, row.metric] == pytest.approx(row.value, rel=1e-6)
 
 
-def as_mp4(folder: Path, video: np.ndarray) -> None:
+def as_mp4(folder: Path, video: np.ndarray, rate: float = 1000 / 60) -> None:
     height, width = video.shape[1:3]
-    writer = cv2.VideoWriter(str(folder / "video.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 16, (width, height))
+    writer = cv2.VideoWriter(str(folder / "video.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), rate, (width, height))
     for frame in video:
         writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
     writer.release()
 
 
 def as_pngs(folder: Path, video: np.ndarray) -> None:
+    """Their names do not sort as text: 10.png would come before 2.png."""
     (folder / "frames").mkdir()
     for i, frame in enumerate(video):
-        cv2.imwrite(str(folder / "frames" / f"{i:05d}.png"), cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+        cv2.imwrite(str(folder / "frames" / f"{i + 5}.png"), cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
 
 
 def as_npz(folder: Path, video: np.ndarray) -> None:
     np.savez_compressed(folder / "rgb.npz", rgb=video)
 
 
+def their_folder(tmp_path: Path) -> Path:
+    folder = episode_folder(tmp_path / "theirs", TASK, SEED, "piper")
+    folder.mkdir(parents=True)
+    return folder
+
+
 @pytest.mark.parametrize(("store", "lossless"), [(as_mp4, False), (as_pngs, True), (as_npz, True)])
 def test_any_models_video_in_the_tree_is_graded(store: Callable, lossless: bool, data: Path, tmp_path: Path) -> None:
-    folder = episode_folder(tmp_path / "their_model", TASK, SEED, "piper")
-    folder.mkdir(parents=True)
-    store(folder, late(truth(data, "piper")))
-    scores = grade(tmp_path / "their_model", data)
+    store(their_folder(tmp_path), late(truth(data, "piper")))
+    scores = grade(tmp_path / "theirs", data, metrics=("psnr",))
     target = truth(data, "piper")
     expected = float(np.mean(psnr(late(target)[1:], target[1:])))
-    assert value(scores, "their_model", "piper", "psnr") == pytest.approx(expected, rel=1e-5 if lossless else 0.2)
+    assert value(scores, "theirs", "piper", "psnr") == pytest.approx(expected, rel=1e-5 if lossless else 0.2)
 
 
-def test_a_second_run_grades_nothing_anew_and_writes_the_same(
-    rollouts: Path, data: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first = grade(rollouts, data, baselines=True)
-    import xew.metrics.evaluate as evaluate
+def test_what_becomes_of_frame_zero_is_said(data: Path, tmp_path: Path) -> None:
+    target = truth(data, "piper")
+    folder = their_folder(tmp_path)
+    as_npz(folder, late(target)[1:])
+    absent = grade(tmp_path / "theirs", data, metrics=("psnr",), frame_zero="absent")
+    assert absent.attrs["frame_zero"] == "absent"
+    expected = float(np.mean(psnr(late(target)[1:], target[1:])))
+    assert value(absent, "theirs", "piper", "psnr") == pytest.approx(expected, rel=1e-5)
+    noisy = target.copy()
+    noisy[0] //= 2
+    as_npz(folder, noisy)
+    predicted = grade(tmp_path / "theirs", data, metrics=("ssim",), frame_zero="predicted")
+    assert value(predicted, "theirs", "piper", "ssim") == pytest.approx(float(np.mean(ssim(noisy, target))), rel=1e-5)
+    curves = pd.read_parquet(tmp_path / "scores.curves.parquet")
+    assert curves["frame"].tolist() == list(range(FRAMES))
 
-    monkeypatch.setattr(evaluate, "grade", lambda *_: pytest.fail("graded again"))
-    pd.testing.assert_frame_equal(grade(rollouts, data, baselines=True), first)
 
-
-def test_killed_and_resumed_it_ends_in_the_same_table(
-    rollouts: Path, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import xew.metrics.evaluate as evaluate
-
-    whole = grade(rollouts, data, baselines=True, out=tmp_path / "whole.parquet")
-    monkeypatch.setattr(evaluate.ScoreTable, "save_now_and_then", evaluate.ScoreTable.save)
-    real, calls = evaluate.grade, []
-
-    def dies_at_the_third(*arguments: object) -> object:
-        calls.append(arguments)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return real(*arguments)
-
-    monkeypatch.setattr(evaluate, "grade", dies_at_the_third)
-    with pytest.raises(SystemExit, match="130"):
-        grade(rollouts, data, baselines=True, out=tmp_path / "parts.parquet")
-    assert len(pd.read_parquet(tmp_path / "parts.parquet")) == 2 * len(CHEAP)
-    resumed = grade(rollouts, data, baselines=True, out=tmp_path / "parts.parquet")
-    assert len(calls) == 3 + 4
-    pd.testing.assert_frame_equal(resumed, whole)
-    curves = [pd.read_parquet(tmp_path / f"{name}.curves.parquet") for name in ("parts", "whole")]
-    pd.testing.assert_frame_equal(*curves)
+def test_what_is_allowed_is_done_and_said(data: Path, tmp_path: Path) -> None:
+    target = truth(data, "piper")
+    large = np.repeat(np.repeat(np.concatenate([late(target), target[-1:]]), 2, axis=1), 2, axis=2)
+    as_mp4(their_folder(tmp_path), large, rate=24)
+    scores = grade(tmp_path / "theirs", data, metrics=("psnr",), allow=("trim", "resize", "rate"))
+    assert scores.attrs["allowed"] == ["rate", "resize", "trim"]
+    expected = float(np.mean(psnr(late(target)[1:], target[1:])))
+    assert value(scores, "theirs", "piper", "psnr") == pytest.approx(expected, rel=0.2)
 
 
 def test_a_rollout_made_anew_replaces_its_scores(rollouts: Path, data: Path) -> None:
@@ -172,65 +241,89 @@ def test_a_rollout_made_anew_replaces_its_scores(rollouts: Path, data: Path) -> 
     assert value(after, "late", "franka_panda", "ssim") == value(before, "late", "franka_panda", "ssim")
 
 
-def short(folder: Path, data: Path) -> None:
-    as_npz(folder, truth(data, "piper")[:-2])
+def short(folder: Path, video: np.ndarray) -> None:
+    as_npz(folder, video[:-2])
 
 
-def small(folder: Path, data: Path) -> None:
-    as_npz(folder, truth(data, "piper")[:, ::2, ::2])
+def long(folder: Path, video: np.ndarray) -> None:
+    as_npz(folder, np.concatenate([video, video[-1:]]))
 
 
-def floating(folder: Path, data: Path) -> None:
-    as_npz(folder, truth(data, "piper") / np.float32(255))
+def small(folder: Path, video: np.ndarray) -> None:
+    as_npz(folder, video[:, ::2, ::2])
 
 
-def two_videos(folder: Path, data: Path) -> None:
-    as_npz(folder, truth(data, "piper"))
-    as_mp4(folder, truth(data, "piper"))
+def not_numbers(folder: Path, video: np.ndarray) -> None:
+    as_npz(folder, np.where(video > 200, np.float32("nan"), video / np.float32(255)))
 
 
-def broken(folder: Path, data: Path) -> None:
+def other_rate(folder: Path, video: np.ndarray) -> None:
+    as_mp4(folder, video, rate=30)
+
+
+def two_videos(folder: Path, video: np.ndarray) -> None:
+    as_npz(folder, video)
+    as_mp4(folder, video)
+
+
+def broken(folder: Path, video: np.ndarray) -> None:
     (folder / "rgb.mkv").write_bytes(b"no video at all")
 
 
-def nothing(folder: Path, data: Path) -> None:
+def nothing(folder: Path, video: np.ndarray) -> None:
     (folder / "notes.txt").write_text("later")
 
 
-def other_source(folder: Path, data: Path) -> None:
-    as_npz(folder, truth(data, "piper"))
+def other_source(folder: Path, video: np.ndarray) -> None:
+    as_npz(folder, video)
     (folder / "rollout.json").write_text(json.dumps({"source_hash": "of another video"}))
 
 
-def too_long(folder: Path, data: Path) -> None:
-    as_npz(folder, truth(data, "piper"))
+def too_long(folder: Path, video: np.ndarray) -> None:
+    as_npz(folder, video)
     (folder / "rollout.json").write_text(json.dumps({"frame_count": FRAMES + 1}))
+
+
+def a_baselines_name(folder: Path, video: np.ndarray) -> None:
+    as_npz(folder, video)
+    (folder / "rollout.json").write_text(json.dumps({"model": "ground_truth"}))
 
 
 MISTAKES = [
     (short, "7 frames of 320x240, expected 9 frames"),
+    (long, "10 frames of 320x240, expected 9 frames"),
     (small, "9 frames of 160x120, expected 9 frames of 320x240"),
-    (floating, "float32"),
+    (not_numbers, "float32 (9, 240, 320, 3), with NaN"),
+    (other_rate, "30.00 frames a second, its episode 16.67"),
     (two_videos, "rgb.npz, video.mp4"),
     (broken, "no readable frame"),
     (nothing, "0 PNG files"),
     (other_source, "another video"),
     (too_long, "asks for 10 frames"),
+    (a_baselines_name, "is a baseline's"),
 ]
 
 
 @pytest.mark.parametrize(("spoil", "word"), MISTAKES, ids=[spoil.__name__ for spoil, _ in MISTAKES])
-def test_a_mistake_is_one_clear_error(
-    spoil: Callable, word: str, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+def test_a_mistake_is_one_clear_error_and_the_rest_is_graded_if_asked(
+    spoil: Callable, word: str, rollouts: Path, data: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    folder = episode_folder(tmp_path / "theirs", TASK, SEED, "piper")
-    folder.mkdir(parents=True)
-    spoil(folder, data)
-    with pytest.raises(SystemExit) as exit_:
-        grade(tmp_path / "theirs", data)
-    assert exit_.value.code == 2
-    message = capsys.readouterr().err
-    assert word in message and "piper" in message and "Traceback" not in message
+    folder = episode_folder(rollouts, TASK, SEED, "piper")
+    shutil.rmtree(folder)
+    folder.mkdir()
+    spoil(folder, truth(data, "piper"))
+    whole = episode_folder(rollouts, TASK, SEED, "franka_panda")
+    shutil.rmtree(whole)
+    whole.mkdir()
+    as_npz(whole, late(truth(data, "franka_panda")))
+    for keep_going in (False, True):
+        with pytest.raises(SystemExit) as exit_:
+            grade(rollouts, data, metrics=("psnr",), keep_going=keep_going)
+        message = capsys.readouterr().err
+        assert exit_.value.code == 2 and word in message and str(folder) in message and "Traceback" not in message
+        assert message.count(word) == 1
+    assert "1 of 2 could not be graded" in message
+    assert pd.read_parquet(rollouts.parent / "scores.parquet")["robot"].tolist() == ["franka_panda"]
 
 
 def test_missing_episodes_trees_and_metrics_are_named(
@@ -239,7 +332,13 @@ def test_missing_episodes_trees_and_metrics_are_named(
     for settings, word in (
         ({"data": tmp_path / "nowhere"}, "does not hold"),
         ({"metrics": ("psrn",)}, "did you mean 'psnr'"),
-        ({"metrics": ("pck",)}, "compares tracks"),
+        ({"dimensions": ("kinematic",)}, "did you mean 'kinematics'"),
+        ({"dimensions": ("objects",)}, "no metric of psnr, ssim, mask_iou"),
+        ({"masks": "sam3"}, "did you mean 'sam2'"),
+        ({"masks": "sam2"}, "--masks-checkpoint"),
+        ({"tracks_checkpoint": tmp_path / "none.pth"}, "does not exist"),
+        ({"frame_zero": "predicted", "baselines": True}, "--no-baselines"),
+        ({"workers": -1}, "--workers"),
         ({"out": tmp_path / "scores.csv"}, ".parquet"),
     ):
         arguments = {"rollouts": rollouts, "data": data} | settings
@@ -249,14 +348,6 @@ def test_missing_episodes_trees_and_metrics_are_named(
     with pytest.raises(SystemExit):
         grade(tmp_path / "empty", data)
     assert "xew.model.rollout" in capsys.readouterr().err
-
-
-def test_keep_going_grades_the_rest_and_still_says_so(rollouts: Path, data: Path, capsys: pytest.CaptureFixture) -> None:
-    (episode_folder(rollouts, TASK, SEED, "franka_panda") / "rgb.mkv").write_bytes(b"cut off")
-    with pytest.raises(SystemExit) as exit_:
-        grade(rollouts, data, keep_going=True)
-    assert exit_.value.code == 2 and "1 of 2 could not be graded" in capsys.readouterr().err
-    assert set(pd.read_parquet(rollouts.parent / "scores.parquet")["robot"]) == {"piper"}
 
 
 def test_models_over_different_horizons_do_not_share_a_table(

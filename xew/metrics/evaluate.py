@@ -96,6 +96,17 @@ BASELINES: dict[str, Callable[[Truth], np.ndarray]] = {
 """What a score of nothing and a score of everything look like; the second is the noise floor of the estimators."""
 
 
+WRITTEN = {
+    "parquet": "scores",
+    "curves.parquet": "the same by frame",
+    "summary.md": "means and differences between models",
+    "summary.csv": "means, intervals, noise",
+    "pairs.csv": "differences between models",
+    "bundle.json": "for others to check",
+}
+"""What lies beside each other, by the ending of the name."""
+
+
 @user_errors
 def main(args: Args) -> None:
     """Grade, write, and print what came out; or check a bundle."""
@@ -109,6 +120,7 @@ def main(args: Args) -> None:
     store = CellStore(beside(args.out, "cells"))
     errors: list[str] = []
     jobs = plan(args, errors if args.keep_going else None)
+    total = len(jobs) + len(errors)
     errors += grade_all(jobs, metrics, args, store)
     cells = [job.cell for job in jobs]
     write_tables(args.out, attributes, cells, store)
@@ -116,7 +128,7 @@ def main(args: Args) -> None:
     write_bundle(beside(args.out, "bundle.json"), args.out, rows, cells)
     print(_write_summary(args, rows))
     if errors:
-        raise EpisodeError(f"{len(errors)} of {len(jobs) + len(errors)} could not be graded:\n  " + "\n  ".join(errors))
+        raise EpisodeError(f"{len(errors)} of {total} could not be graded:\n  " + "\n  ".join(errors))
 
 
 def _write_summary(args: Args, rows: pd.DataFrame) -> str:
@@ -124,11 +136,11 @@ def _write_summary(args: Args, rows: pd.DataFrame) -> str:
     if rows.empty:
         return "no scores"
     summary = summarise(rows, args.resample, HELD_OUT_ROBOTS)
-    text = to_markdown(summary)
-    write_whole(beside(args.out, "summary.md"), text.encode())
+    write_whole(beside(args.out, "summary.md"), to_markdown(summary).encode())
     write_whole(beside(args.out, "summary.csv"), summary.means.to_csv(index=False).encode())
     write_whole(beside(args.out, "pairs.csv"), summary.pairs.to_csv(index=False).encode())
-    return f"{text}\nscores: {args.out}\nbeside it: curves.parquet, summary.md, summary.csv, pairs.csv, bundle.json"
+    written = "\n".join(f"{beside(args.out, ending)}  {what}" for ending, what in WRITTEN.items())
+    return f"{to_markdown(summary, with_pairs=False)}\n{written}"
 
 
 def choose_metrics(args: Args) -> tuple[str, ...]:

@@ -30,9 +30,6 @@ UNITS = {"scene": ["task", "seed"], "task": ["task"]}
 PAIRS_SHOWN = 6
 """More pairs of models than this stand in the file of pairs alone."""
 
-Model = tuple[str, str]
-"""Its name and its condition."""
-
 
 @dataclass(frozen=True)
 class Summary:
@@ -181,8 +178,8 @@ def bootstrap(values: np.ndarray, units: np.ndarray, seed: int = 0) -> tuple[np.
     return ends[0], ends[1]
 
 
-def to_markdown(summary: Summary) -> str:
-    """Both tables for people: a robot after the other, a line per metric, a column per model."""
+def to_markdown(summary: Summary, with_pairs: bool = True) -> str:
+    """For people: a robot after the other, a line per metric, a column per model; then the differences between models."""
     lines = [
         "# Scores",
         "",
@@ -191,7 +188,8 @@ def to_markdown(summary: Summary) -> str:
         "the true video's; a difference is unresolved where its interval holds 0 or it is no larger than the noise.",
     ]
     for robot, means in summary.means.groupby("robot", sort=False):
-        lines += ["", f"## {robot}", "", *_mean_lines(means), *_pair_lines(summary.pairs[summary.pairs["robot"] == robot])]
+        lines += ["", f"## {robot}", "", *_mean_lines(means)]
+        lines += _pair_lines(summary.pairs[summary.pairs["robot"] == robot]) if with_pairs else []
     return "\n".join(lines) + "\n"
 
 
@@ -221,19 +219,13 @@ def _mean_text(row: Any) -> str:
 def _pair_lines(pairs: pd.DataFrame) -> list[str]:
     """Differences between models and from the frozen first frame; those from the truth stand as marks in the means."""
     pairs = pairs[(pairs["model"] != FROZEN) & (pairs["other"] != TRUTH)]
-    names = list(dict.fromkeys(zip(pairs["model"], pairs["condition"], pairs["other"], pairs["other_condition"], strict=True)))
-    if len(names) > PAIRS_SHOWN:
-        return ["", f"{len(names)} pairs of models: see the file of pairs."]
+    groups = pairs.groupby(["model", "condition", "other", "other_condition"], sort=False)
+    if len(groups) > PAIRS_SHOWN:
+        return ["", f"{len(groups)} pairs of models: see the file of pairs."]
     lines = []
-    for name in names:
-        found = pairs[(pairs[["model", "condition", "other", "other_condition"]] == name).all(axis=1)]
-        lines += [
-            "",
-            f"{title(name[:2])} minus {title(name[2:])}, paired:",
-            "",
-            "| metric | difference | verdict |",
-            "|---|---|---|",
-        ]
+    for (model, condition, other, other_condition), found in groups:
+        names = f"{title((model, condition))} minus {title((other, other_condition))}"
+        lines += ["", f"{names}, paired:", "", "| metric | difference | verdict |", "|---|---|---|"]
         row: Any
         for row in found.itertuples():
             interval = "" if math.isnan(row.low) else f" [{row.low:+.4g}, {row.high:+.4g}]"
@@ -241,6 +233,6 @@ def _pair_lines(pairs: pd.DataFrame) -> list[str]:
     return lines
 
 
-def title(model: Model) -> str:
+def title(model: tuple[Any, ...]) -> str:
     """A model's name for people, with its condition."""
     return " · ".join(part for part in model if part).replace("|", "/")
