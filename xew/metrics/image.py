@@ -5,6 +5,7 @@ float32 and results agree with a float64 reference to about 1e-7. Floating input
 """
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -36,10 +37,20 @@ def psnr(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) 
     """
     check_videos(prediction, target)
     error = mean_squared_error(prediction, target, chunk)
-    finite = -10 * jnp.log10(jnp.where(error > 0, error, 1) / 255**2)
-    attainable = 10 * jnp.log10(jnp.float32(255**2) * target[0].size)
+    finite = finite_psnr(error)
     largest = jnp.max(jnp.where(error > 0, finite, -jnp.inf))
-    return jnp.where(error > 0, finite, jnp.where(jnp.isfinite(largest), largest, attainable))
+    cap = jnp.where(jnp.isfinite(largest), largest, attainable_psnr(np.shape(target)))
+    return jnp.where(error > 0, finite, cap)
+
+
+def finite_psnr(error: jax.Array) -> jax.Array:
+    """[dB] of mean squared errors in levels of 255; 48.13, of an error of 1, where there is none."""
+    return -10 * jnp.log10(jnp.where(error > 0, error, 1) / 255**2)
+
+
+def attainable_psnr(shape: tuple[int, ...]) -> jax.Array:
+    """[dB], the most that an inexact frame of a video [t h w 3] can have: one channel of one pixel off by one level."""
+    return 10 * jnp.log10(jnp.float32(255**2 * math.prod(shape[1:])))
 
 
 @jax.jit

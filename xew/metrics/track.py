@@ -27,11 +27,7 @@ def pck(prediction: jax.Array, target: jax.Array, valid: jax.Array, alpha: float
     Returns:
         Scalar float32; NaN where no point counts.
     """
-    check_tracks(prediction, target, valid)
-    diagonal = box_diagonal(target, valid)
-    counts = valid & (diagonal > 0)[:, None]
-    correct = counts & (_distance(prediction, target) < alpha * diagonal[:, None])
-    return jnp.sum(correct) / jnp.sum(counts)
+    return _masked_mean(*hits(prediction, target, valid, alpha))
 
 
 @jax.jit
@@ -52,8 +48,7 @@ def coverage(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.
     Returns:
         Scalar float32; NaN where no point is valid.
     """
-    check_tracks(prediction, target, valid)
-    return jnp.sum(valid & _found(prediction)) / jnp.sum(valid)
+    return _masked_mean(*presence(prediction, target, valid))
 
 
 @jax.jit
@@ -66,9 +61,7 @@ def keypoint_error(prediction: jax.Array, target: jax.Array, valid: jax.Array) -
     Returns:
         Scalar float32; NaN where there is no such point.
     """
-    check_tracks(prediction, target, valid)
-    tracked = valid & _found(prediction)
-    return _masked_mean(_distance(prediction, target), tracked)
+    return _masked_mean(*distances(prediction, target, valid))
 
 
 @jax.jit
@@ -81,10 +74,8 @@ def trajectory_error(prediction: jax.Array, target: jax.Array, valid: jax.Array)
     Returns:
         Scalar float32; NaN where no object is ever valid.
     """
-    check_tracks(prediction, target, valid)
-    tracked = valid & _found(prediction)
-    per_object = _masked_mean(_distance(prediction, target), tracked, axis=0)
-    return _masked_mean(per_object, jnp.any(tracked, axis=0))
+    distance, tracked = distances(prediction, target, valid)
+    return _masked_mean(_masked_mean(distance, tracked, axis=0), jnp.any(tracked, axis=0))
 
 
 @functools.partial(jax.jit, static_argnames="tolerance")
@@ -130,6 +121,33 @@ def ndtw(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Arra
     Returns:
         Scalar float32; NaN where no keypoint has a path with a scale.
     """
+    return _masked_mean(*warpings(prediction, target, valid))
+
+
+def hits(
+    prediction: jax.Array, target: jax.Array, valid: jax.Array, alpha: float | jax.Array = 0.1
+) -> tuple[jax.Array, jax.Array]:
+    """What `pck` is the mean of: [t k] float32, 1 where a point is near enough, and [t k] bool, which count."""
+    check_tracks(prediction, target, valid)
+    diagonal = box_diagonal(target, valid)
+    correct = _distance(prediction, target) < alpha * diagonal[:, None]
+    return correct.astype(jnp.float32), valid & (diagonal > 0)[:, None]
+
+
+def presence(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What `coverage` is the mean of: [t k] float32, 1 where the prediction has the point, and [t k] bool, which count."""
+    check_tracks(prediction, target, valid)
+    return _found(prediction).astype(jnp.float32), valid
+
+
+def distances(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What the errors are means of: [t k] float32 pixels, infinite where lost, and [t k] bool, which count."""
+    check_tracks(prediction, target, valid)
+    return _distance(prediction, target), valid & _found(prediction)
+
+
+def warpings(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What `ndtw` is the mean of: [k] float32, and [k] bool, which count."""
     check_tracks(prediction, target, valid)
     tracked = valid & _found(prediction)
     diagonal = jnp.broadcast_to(box_diagonal(target, valid)[:, None], valid.shape)
@@ -137,7 +155,7 @@ def ndtw(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Arra
     length = jnp.sum(tracked, axis=0)
     cost = jax.vmap(_path_cost, in_axes=1)(prediction, target, tracked)
     counts = (length > 0) & (scale > 0)
-    return _masked_mean(cost / jnp.where(counts, 2 * length.astype(jnp.float32) * scale, 1), counts)
+    return cost / jnp.where(counts, 2 * length.astype(jnp.float32) * scale, 1), counts
 
 
 def box_diagonal(points: jax.Array, valid: jax.Array) -> jax.Array:
