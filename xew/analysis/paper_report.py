@@ -231,7 +231,7 @@ def _frame(cells: Sequence[Cell], changes: Sequence[RecomputedChange], arm_alone
         for cell in cells
     ]
     rows += [
-        {"row": "; ".join(compared_places(found.change)), "axis": found.change.source, "quantity": "percent"}
+        {"row": compared_places(found.change), "axis": found.change.source, "quantity": "percent"}
         | {"published": found.change.percent, "ours": found.ours, "least": found.least, "most": found.most}
         | {"agrees": found.agrees}
         for found in changes

@@ -14,13 +14,21 @@ from xew.analysis.findings import Finding
 from xew.analysis.grades import PaperGrades
 from xew.analysis.paper import AXES, Cell, Paper, PublishedChange, RecomputedChange
 from xew.analysis.summary import METRIC_TITLES, ROBOT_TITLES
-from xew.analysis.tables import Block, Builder, Column, Row, Table
+from xew.analysis.tables import ACTIONS, LADDER, SYSTEMS, Block, Builder, Column, Row, Table
 from xew.protocol import ROBOT_NAMES
 from xew.sim_warp.robots import ROBOTS
 
 AXIS_TITLES = {"appearance": "Appearance distance", "kinematic": "Kinematic distance"}
 SEEDS = range(20)
 """Draws of the clouds that kinematic distances of our own are means of."""
+SECTIONS = {
+    "sec:exp-actrep": "Action representation",
+    "sec:exp-cond": "Robot descriptions",
+    "sec:exp-fewshot": "Few-shot adaptation",
+    "sec:exp-baseline": "World models",
+}
+"""Titles of the paper's sections that print percentages."""
+
 CORRELATION_TEXT = (
     "Pearson's r of each robot's distance to the other four with its score when it was held out, and its range when one "
     "robot is left out. Positive means: farther is worse. Ours is computed from the printed scores and distances; the "
@@ -175,39 +183,47 @@ def base_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
 
 
 def change_table(changes: Sequence[RecomputedChange]) -> Table:
-    rows = []
-    for found in changes:
-        word = {"rounded": "", "about": "about ", "less than": "less than "}[found.change.word]
-        cell = tables.Cell(
-            percent(found.ours),
-            f"{percent(found.least)} to {percent(found.most)}",
-            f"{word}{percent(found.change.percent, 0)}",
-            agrees=found.agrees,
-            value=found.ours,
-            low=found.least,
-            high=found.most,
-            printed=found.change.percent,
-        )
-        rows.append(Row(compared_places(found.change), (cell,)))
-    heads = ("metric", "of", "from", "to")
-    return Table("changes", "What the tables give for them", CHANGE_TEXT, heads, (Column("change"),), (Block("", tuple(rows)),))
+    blocks = []
+    for source, title in SECTIONS.items():
+        found = [one for one in changes if one.change.source == source]
+        rows = (Row((compared_places(one.change),), (_change_cell(one),)) for one in found)
+        blocks.append(Block(title, tuple(rows)))
+    caption, columns = CHANGE_TEXT, (Column("change"),)
+    return Table("changes", "What the tables give for them", caption, ("what is compared",), columns, tuple(blocks))
 
 
-def compared_places(change: PublishedChange) -> tuple[str, str, str, str]:
-    """Metric, what is compared, before and after, such as ('LPIPS', 'Piper', 'joints', 'optical flow')."""
-    (_, before, start), (_, after, end) = (place.split("/") for place in (change.before, change.after))
-    subject, pair = (end, (before, after)) if start == end else (before, (start, end))
-    first, second = map(_place_title, pair)
-    goal = ", share of the gap closed" if change.toward else ""
-    return METRIC_TITLES[change.metric], _place_title(subject), first, second + goal
+def _change_cell(found: RecomputedChange) -> tables.Cell:
+    printed = percent(found.change.percent, 0)
+    if found.change.word != "rounded":
+        printed = f"{found.change.word} {printed.lstrip('+−') if found.change.word == 'less than' else printed}"
+    return tables.Cell(
+        percent(found.ours),
+        f"{percent(found.least)} to {percent(found.most)}",
+        printed,
+        agrees=found.agrees,
+        value=found.ours,
+        low=found.least,
+        high=found.most,
+        printed=found.change.percent,
+    )
 
 
-def _place_title(name: str) -> str:
-    robot, _, shots = name.rpartition("-")
-    if robot:
-        return f"{ROBOT_TITLES[robot]}, M = {shots}"
-    known = {"none": "without", "irasim": "IRASim", "ctrl_world": "Ctrl-World", "enerverse_ac": "EnerVerse-AC"}
-    return (ROBOT_TITLES | known).get(name, name.replace("_", " "))
+def compared_places(change: PublishedChange) -> str:
+    """Such as 'LPIPS, Piper: joint pose to optical flow'."""
+    (part, before, start), (_, after, end) = (place.split("/") for place in (change.before, change.after))
+    if start == end:
+        subject, first, second = ROBOT_TITLES[end], _row_title(part, before, end), _row_title(part, after, end)
+    else:
+        subject, first, second = SYSTEMS[after], *(ROBOT_TITLES.get(robot, "seen robots") for robot in (start, end))
+    gap = ", share of the gap to seen robots" if change.toward else ""
+    return f"{METRIC_TITLES[change.metric]}, {subject}: {first} to {second}{gap}"
+
+
+def _row_title(part: str, key: str, robot: str) -> str:
+    target, _, shots = key.rpartition("-")
+    if target:
+        return f"M = {shots}" if target == robot else f"{ROBOT_TITLES[target]}, M = {shots}"
+    return {"actions": ACTIONS, "ladder": LADDER, "forgetting": {"none": "no adaptation"}}[part][key].lower()
 
 
 def percent(value: float, digits: int = 1) -> str:
