@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from itertools import groupby
 from pathlib import Path
@@ -17,26 +16,6 @@ from xew.analysis.tables import Row as TableRow
 
 FOLDER = Path(__file__).parent
 SOFT = ' class="soft"'
-
-
-@dataclass(frozen=True)
-class Compared:
-    """A value, the one that the paper prints, and whether they agree; the latter two where there is something to compare."""
-
-    ours: str
-    published: str = ""
-    agrees: bool | None = None
-
-
-@dataclass(frozen=True)
-class ComparedTable:
-    """Values beside the paper's."""
-
-    groups: Sequence[tuple[str, int]]
-    """Titles over several columns, without the first column; may be empty."""
-    heads: Sequence[str]
-    rows: Mapping[str, Sequence[Compared]]
-    """By the text of the first column."""
 
 
 def page(title: str, finding: Sequence[str], sections: Sequence[str], footer: str) -> str:
@@ -134,23 +113,6 @@ def point_only(score: Interval) -> bool:
 
 def interval_text(score: Interval, metric: MetricInfo) -> str:
     return f"{number(score.low, metric)}–{number(score.high, metric)}"
-
-
-def compared_table(table: ComparedTable) -> str:
-    """Ours large, the paper's small below it, marked where the two agree or differ."""
-    groups = "".join(f'<th colspan="{count}">{escape(title)}</th>' for title, count in table.groups)
-    above = f'<tr class="dimension"><th></th>{groups}</tr>' if groups else ""
-    heads = "".join(f"<th>{escape(head)}</th>" for head in table.heads)
-    rows = "\n".join(
-        f"<tr><td>{escape(title)}</td>{''.join(map(_compared_cell, cells))}</tr>" for title, cells in table.rows.items()
-    )
-    return f'<div class="wide"><table><thead>{above}<tr>{heads}</tr></thead>\n<tbody>\n{rows}\n</tbody></table></div>'
-
-
-def _compared_cell(cell: Compared) -> str:
-    kind = "" if cell.agrees is None else ' class="agrees"' if cell.agrees else ' class="differs"'
-    published = f'<span class="interval">paper {escape(cell.published)}</span>' if cell.published else ""
-    return f'<td{kind}><span class="mean">{escape(cell.ours)}</span>{published}</td>'
 
 
 def table(shown: Table) -> str:
@@ -290,17 +252,3 @@ def _markdown_cell(row: Row, metric: MetricInfo) -> str:
         return "exact"
     interval = "" if point_only(score) else f" [{interval_text(score, metric)}]"
     return number(score.mean, metric) + interval + (f" {row.verdicts[metric.name]}" if row.verdicts.get(metric.name) else "")
-
-
-def compared_markdown(table: ComparedTable) -> str:
-    """The same for report.md: ours (the paper's) and whether they agree."""
-    over = ["", *(title for title, count in table.groups for _ in range(count))] if table.groups else [""] * len(table.heads)
-    heads = [": ".join(filter(None, pair)) for pair in zip(over, table.heads, strict=True)]
-    lines = [f"| {' | '.join(heads)} |", f"|---|{'---:|' * (len(heads) - 1)}"]
-    lines += [f"| {title} | {' | '.join(map(_compared_text, cells))} |" for title, cells in table.rows.items()]
-    return "\n".join(lines)
-
-
-def _compared_text(cell: Compared) -> str:
-    mark = "" if cell.agrees is None else " ✓" if cell.agrees else " ✗"
-    return cell.ours + (f" (paper {cell.published})" if cell.published else "") + mark
