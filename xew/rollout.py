@@ -253,7 +253,8 @@ def _promised_frames(container: Any, stream: Any, times: list[float]) -> int:
     if container.duration is None or len(container.streams) != 1 or len(times) < 2 or times[-1] <= times[0]:
         return 0
     gap = (times[-1] - times[0]) / (len(times) - 1)
-    return round((container.duration / av.time_base - times[0]) / gap)
+    last = max(gap, float(1 / stream.average_rate) if stream.average_rate else 0.0)  # how long the last frame is shown
+    return len(times) + round((container.duration / av.time_base - times[-1] - last) / gap)
 
 
 def _check_rate(path: Path, times: np.ndarray, tick: float, frame_rate: float) -> None:

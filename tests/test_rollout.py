@@ -1,0 +1,199 @@
+"""Rollouts of anybody's making are read whole or not at all, and nothing outside their tree is."""
+
+import json
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from xew.episode import write_video
+from xew.rollout import RolloutError, find_rollouts, read_rollout, read_rollout_video
+
+RATE = 1000 / 60
+FRAMES = 12
+VIDEO = np.random.default_rng(0).integers(0, 255, (FRAMES, 48, 64, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "theirs" / "stack_bowls" / "1000000" / "piper"
+    folder.mkdir(parents=True)
+    return folder
+
+
+def write(path: Path, pixels: str = "yuv420p", codec: str = "libx264", times: Callable[[int], int] | None = None) -> None:
+    """VIDEO by PyAV, its frames at multiples of 60 ms or where `times` says [ms]."""
+    with av.open(str(path), "w", options={"movflags": "faststart"} if path.suffix == ".mp4" else {}) as container:
+        stream = container.add_stream(codec, rate=Fraction(RATE).limit_denominator(1000))
+        stream.width, stream.height, stream.pix_fmt = VIDEO.shape[2], VIDEO.shape[1], pixels
+        for i, image in enumerate(VIDEO):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format=pixels)
+            frame.pts, frame.time_base = (times or (lambda i: 60 * i))(i), Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def read(folder: Path) -> np.ndarray:
+    return read_rollout_video(read_rollout(folder), RATE)
+
+
+def fails(folder: Path, *words: str) -> None:
+    with pytest.raises(RolloutError) as error:
+        read(folder)
+    for word in (str(folder), *words):
+        assert word in str(error.value)
+
+
+def test_what_we_write_is_read_exactly_and_opencvs_too(folder: Path) -> None:
+    write_video(folder / "rgb.mkv", VIDEO)
+    assert (read(folder) == VIDEO).all()
+    writer = cv2.VideoWriter(str(folder / "rgb.mkv"), cv2.VideoWriter_fourcc(*"FFV1"), RATE, (VIDEO.shape[2], VIDEO.shape[1]))
+    for frame in VIDEO:
+        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+    writer.release()
+    assert (read(folder) == VIDEO).all()
+
+
+@pytest.mark.parametrize("name", ["rgb.mkv", "rgb.mp4"])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.95, 0.98])
+def test_a_file_that_is_cut_off_is_no_video(folder: Path, name: str, share: float) -> None:
+    write(folder / name)
+    whole = (folder / name).read_bytes()
+    assert read(folder).shape == VIDEO.shape
+    (folder / name).write_bytes(whole[: int(share * len(whole))])
+    fails(folder, name, "make this rollout again")
+
+
+def test_bits_that_are_lost_are_not_painted_over(folder: Path) -> None:
+    write(folder / "rgb.mp4")
+    content = bytearray((folder / "rgb.mp4").read_bytes())
+    content[len(content) // 2 : len(content) // 2 + 40] = bytes(40)
+    (folder / "rgb.mp4").write_bytes(content)
+    fails(folder, "make this rollout again")
+
+
+@pytest.mark.parametrize(
+    ("pixels", "codec", "word"),
+    [("gray", "ffv1", "grey frames"), ("yuv420p10le", "ffv1", "10 bits a channel"), ("yuva420p", "ffv1", None)],
+)
+def test_only_rgb_of_8_bits_is_read(folder: Path, pixels: str, codec: str, word: str | None) -> None:
+    write(folder / "rgb.mkv", pixels, codec)
+    if word is None:  # alpha that hides nothing
+        assert read(folder).shape == VIDEO.shape
+    else:
+        fails(folder, word)
+
+
+def test_alpha_that_hides_something_is_an_error(folder: Path) -> None:
+    with av.open(str(folder / "rgb.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=16)
+        stream.width, stream.height, stream.pix_fmt = VIDEO.shape[2], VIDEO.shape[1], "bgra"
+        half = np.full((*VIDEO.shape[1:3], 1), 128, np.uint8)
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(np.concatenate([VIDEO[0], half], -1), format="rgba")))
+        container.mux(stream.encode())
+    fails(folder, "alpha")
+
+
+def test_a_changing_rate_is_an_error_and_rounding_is_none(folder: Path) -> None:
+    write(folder / "rgb.mkv", times=lambda i: 60 * i + i % 2)
+    assert read(folder).shape == VIDEO.shape
+    for times in (lambda i: 60 * i + 30 * (i % 2), lambda i: 60 * i + (60 if i > 5 else 0)):
+        write(folder / "rgb.mkv", times=times)
+        fails(folder, "variable frame rate", "--allow rate")
+        assert len(read_rollout_video(read_rollout(folder))) == FRAMES
+    write(folder / "rgb.mkv", times=lambda i: 40 * i)
+    fails(folder, "25.00 frames a second, its episode 16.67")
+
+
+def png(folder: Path, number: int, image: np.ndarray) -> Path:
+    path = folder / f"{number}.png"
+    assert cv2.imwrite(str(path), image)
+    return path
+
+
+def test_pngs_are_in_the_order_of_their_numbers_and_are_whole(folder: Path) -> None:
+    for i, frame in enumerate(VIDEO):
+        png(folder, i, cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+    assert (read(folder) == VIDEO).all()
+    path = folder / "7.png"
+    path.write_bytes(path.read_bytes()[:-30])
+    fails(folder, "7.png", "cut off")
+    path.write_bytes(b"")
+    fails(folder, "7.png", "no readable PNG")
+    for image, word in (
+        (VIDEO[0][..., 0], "grey"),
+        (np.dstack([VIDEO[0], VIDEO[0][..., :1]]), "alpha"),
+        (VIDEO[0].astype(np.uint16), "uint16"),
+        (VIDEO[0][:-1], "sizes must be one"),
+    ):
+        png(folder, 7, image)
+        fails(folder, "7.png", word)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "word"),
+    [
+        ({"a": VIDEO / np.float32(255)}, "float32"),
+        ({"a": np.full(VIDEO.shape, np.nan)}, "NaN"),
+        ({"a": VIDEO.astype(np.int64)}, "int64"),
+        ({"a": VIDEO[:0]}, "no frame"),
+        ({"a": VIDEO[..., 0]}, "grey"),
+        ({"a": VIDEO[..., :1]}, "grey"),
+        ({"a": np.concatenate([VIDEO, VIDEO[..., :1]], -1)}, "alpha"),
+        ({"a": np.array([{}], object)}, "damaged"),
+        ({"a": VIDEO, "b": VIDEO}, "['a', 'b']"),
+        ({}, "[]"),
+    ],
+)
+def test_an_array_that_is_no_video_is_named_as_what_it_is(folder: Path, arrays: dict, word: str) -> None:
+    np.savez(folder / "rgb.npz", **arrays)
+    fails(folder, "rgb.npz", word)
+
+
+def test_links_out_of_the_tree_are_not_followed(folder: Path, tmp_path: Path) -> None:
+    write_video(tmp_path / "secret.mkv", VIDEO)
+    (folder / "rgb.mkv").symlink_to(tmp_path / "secret.mkv")
+    fails(folder, "secret.mkv", "out of the tree")
+    (folder / "rgb.mkv").unlink()
+    write_video(folder / "rgb.mkv", VIDEO)
+    (folder / "rollout.json").symlink_to(tmp_path / "elsewhere.json")
+    (tmp_path / "elsewhere.json").write_text("{}")
+    fails(folder, "elsewhere.json", "out of the tree")
+    (folder / "rollout.json").unlink()
+    folder.rename(tmp_path / "moved")
+    folder.symlink_to(tmp_path / "moved")
+    fails(folder, "moved", "out of the tree")
+    linked = tmp_path / "linked"
+    folder.unlink()
+    (tmp_path / "moved").rename(folder)
+    linked.symlink_to(folder.parents[2])
+    assert len(find_rollouts(linked)) == 1, "the tree itself may be a link"
+
+
+@pytest.mark.parametrize("name", ["../up", "/etc/passwd", "~root", "a/../../b", "..", "a\\b", "line\nbreak", 3, None, ["a"]])
+@pytest.mark.parametrize("key", ["model", "condition"])
+def test_a_name_is_a_name(folder: Path, key: str, name: object) -> None:
+    np.savez(folder / "rgb.npz", VIDEO)
+    (folder / "rollout.json").write_text(json.dumps({key: name}))
+    fails(folder, "rollout.json", key)
+
+
+def test_names_with_a_slash_are_fine(folder: Path) -> None:
+    np.savez(folder / "rgb.npz", VIDEO)
+    (folder / "rollout.json").write_text(json.dumps({"model": "lab/model-1..2", "condition": "flow + clip"}))
+    assert read_rollout(folder).model == "lab/model-1..2"
+
+
+def test_problems_are_told_one_by_one_if_asked(folder: Path) -> None:
+    np.savez(folder / "rgb.npz", VIDEO)
+    other = folder.with_name("franka_panda")
+    other.mkdir()
+    with pytest.raises(RolloutError, match="franka_panda"):
+        find_rollouts(folder.parents[2])
+    problems: list[str] = []
+    assert [rollout.robot for rollout in find_rollouts(folder.parents[2], problems)] == ["piper"]
+    assert len(problems) == 1 and str(other) in problems[0]
