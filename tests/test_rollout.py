@@ -30,6 +30,7 @@ def write(path: Path, pixels: str = "yuv420p", codec: str = "libx264", times: Ca
     with av.open(str(path), "w", options={"movflags": "faststart"} if path.suffix == ".mp4" else {}) as container:
         stream = container.add_stream(codec, rate=Fraction(RATE).limit_denominator(1000))
         stream.width, stream.height, stream.pix_fmt = VIDEO.shape[2], VIDEO.shape[1], pixels
+        stream.codec_context.time_base = Fraction(1, 1000)
         for i, image in enumerate(VIDEO):
             frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format=pixels)
             frame.pts, frame.time_base = (times or (lambda i: 60 * i))(i), Fraction(1, 1000)
