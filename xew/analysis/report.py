@@ -93,7 +93,7 @@ def _report_paper(args: Args) -> None:
 
 
 def _report_study(args: Args, scores: Scores) -> None:
-    if args.data and not find_records(args.data):
+    if args.data and not any(find_records(args.data)):
         raise ConfigError(f"{args.data} holds no episode; make some: python -m xew.sim_warp.generate --out {args.data}")
     report = report_study.build(scores, args.data, args.rollouts, args.distances, _footer(scores.versions))
     _write(args.out, report.html, (report.markdown, report.files), report.summary)

@@ -93,6 +93,7 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
     """
     paper = read_paper()
     known = read_distances(distances) if distances else printed_distances(paper)
+    strips = study_strips(scores.rows, data, rollouts) if data and rollouts else {}
     grades = StudyGrades(scores.rows, scores.metrics, {axis: known.of(axis) for axis in AXES})
     printed = PaperGrades(paper, scores.metrics)
     planned = scores.attributes.get("study", {}).get("variants", {})
@@ -107,7 +108,7 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
         ask(printed),
         {table.name: table for table in tables},
         study_charts(builder, known, scores.curves),
-        study_strips(scores.rows, data, rollouts) if data and rollouts else {},
+        strips,
         list(_lacks(builder, scores)),
     )
     html = _html(content, scores, footer)
