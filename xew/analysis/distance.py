@@ -23,6 +23,9 @@ CONFIGURATIONS = 1500
 CLOUD_POINTS = 4000
 """The paper's numbers (its appendix on embodiment distances)."""
 
+ANOTHER_DRAW = 1_000_000
+"""Between the seeds of two draws of one robot."""
+
 ROBOTWIN_OPEN = {"arx_x5": 0.045, "ur5_wsg": 0.06, "franka_panda": 0.05}
 """Where RoboTwin's `gripper_scale` holds the fingers of open grippers, metres: beyond the limits of the URDF, to press. The
 paper does not say how its grippers stood; of five ways this one comes nearest to its reach and hull volume."""
@@ -87,6 +90,15 @@ def measure(
         volume=np.array([[one.volume for one in draw] for draw in draws]),
         kinematic=np.array([chamfer_matrix([one.cloud for one in draw], workers) for draw in draws]),
     )
+
+
+def chamfer_floor(robots: Mapping[str, RobotSpec | Urdf], seeds: Sequence[int] = (0,), frame: Frame = "root") -> np.ndarray:
+    """How far a robot is from itself by another draw [s n], metres: what sampling makes of no distance at all. Ours."""
+
+    def to_itself(robot: RobotSpec | Urdf, seed: int) -> float:
+        return chamfer(workspace_cloud(robot, seed, frame), workspace_cloud(robot, seed + ANOTHER_DRAW, frame))
+
+    return np.array([[to_itself(robot, seed) for robot in robots.values()] for seed in seeds])
 
 
 def workspace(robot: RobotSpec | Urdf, seed: int = 0, frame: Frame = "root") -> Workspace:

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import tyro
 
-from xew.analysis.distance import Features, ImageDistance, appearance_matrix, measure, perceptual_matrices
+from xew.analysis.distance import Features, ImageDistance, appearance_matrix, chamfer_floor, measure, perceptual_matrices
 from xew.analysis.paper import Paper, read_paper
 from xew.config import ConfigError, user_errors
 from xew.protocol import ROBOT_NAMES
@@ -29,6 +29,8 @@ TITLES = {
     "perceptual": "Perceptual distance of the nine views, mean of {} (ours)",
 }
 DIGITS = 3
+FLOOR_SEEDS = 20
+"""Draws that the floor is a mean of, at most."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ def main(args: Args) -> None:
     if args.looks:
         whole = {key: name for (key, robot), name in zip(robots.items(), names, strict=True) if isinstance(robot, RobotSpec)}
         axes |= _looks(whole, distance)
-    pairs, singles = distance_frame(axes), robot_frame(features, axes)
+    floor = chamfer_floor(robots, range(min(args.seeds, FLOOR_SEEDS)))
+    pairs, singles = distance_frame(axes), robot_frame(features, axes, floor)
     for title, axis in axes.items():
         print(f"\n{TITLES[title].format(args.perceptual)}\n{matrix_text(pairs[pairs['axis'] == title], axis.robots)}")
     print(f"\nRobots\n{robot_text(singles)}\n\n{_legend(args.seeds)}")
@@ -119,14 +122,14 @@ def distance_frame(axes: Mapping[str, Axis]) -> pd.DataFrame:
     )
 
 
-def robot_frame(features: Features, axes: Mapping[str, Axis]) -> pd.DataFrame:
+def robot_frame(features: Features, axes: Mapping[str, Axis], floor: np.ndarray) -> pd.DataFrame:
     """All features as a tidy frame: robot feature value spread published.
 
-    Distances are means to the paper's robots other than itself.
+    Distances are means to the paper's robots other than itself; `floor` [s n] is of `chamfer_floor`.
     """
     counts = {"dof": features.dof, "links": features.links}
     columns = [(name, features.robots, count, np.zeros(len(count))) for name, count in counts.items()]
-    drawn = {"reach": features.reach, "volume": features.volume}
+    drawn = {"reach": features.reach, "volume": features.volume, "floor": floor}
     columns += [(name, features.robots, draws.mean(axis=0), _deviation(draws)) for name, draws in drawn.items()]
     for name, axis in axes.items():
         mean, draws = (_mean_to_the_fleet(axis.robots, matrix) for matrix in (axis.value, axis.draws))
@@ -166,6 +169,7 @@ def _legend(seeds: int) -> str:
     drawn = f"the standard deviation of one draw over {seeds} seeds (kinematic) and " if seeds > 1 else ""
     return (
         f"± is {drawn}the jackknife's standard error over nine views (appearance). "
+        "floor: kinematic distance of two draws of the same robot. "
         "In brackets: the paper's, from its own models of the robots and its own renders."
     )
 
