@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any, NoReturn
@@ -60,7 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             ledger.forget(cell)
         machines = open_machines(study)
         print(status(study, cells, ledger), cost(study, cells, ledger, machines.slots), sep="\n\n", flush=True)
-        failed = Run(study, cells, ledger, machines).to_the_end()
+        seconds = corrected(estimate(study, cells), cells, ledger)
+        failed = Run(study, cells, ledger, machines, longest_ways(cells, seconds)).to_the_end()
         table = status(study, cells, ledger, failed)
         (study.out / "status.txt").write_text(table + "\n")
     print(table)
@@ -129,16 +131,20 @@ def stoppable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+@dataclass
 class Run:
     """One pass over the graph: what is done is skipped, what can start is started, the longest way to the end first."""
 
-    def __init__(self, study: Study, cells: Mapping[str, Cell], ledger: Ledger, machines: Machines) -> None:
-        self.study, self.cells, self.ledger, self.machines = study, cells, ledger, machines
-        self.ways = longest_ways(cells, corrected(estimate(study, cells), cells, ledger))
-        self.started: dict[str, float] = {}
-        self.settled = 0
-        self.failed: dict[str, str] = {}
-        """Cells that failed, and cells that could not be made for it, with the reason."""
+    study: Study
+    cells: Mapping[str, Cell]
+    ledger: Ledger
+    machines: Machines
+    ways: Mapping[str, float]
+    """Seconds from the start of each cell to the end of the study."""
+    started: dict[str, float] = field(default_factory=dict)
+    settled: int = 0
+    failed: dict[str, str] = field(default_factory=dict)
+    """Cells that failed, and cells that could not be made for it, with the reason."""
 
     def to_the_end(self) -> dict[str, str]:
         """Run all that can be run; returns what failed."""

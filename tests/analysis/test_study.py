@@ -1,0 +1,311 @@
+"""The study runner on commands that cost nothing: order, skipping, failing, stopping, killing, Ray, what it says."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from xew.analysis import study as runner
+from xew.analysis import study_ledger
+from xew.analysis.study_cell import last_lines, start_cell
+from xew.analysis.study_config import Study, load_study
+from xew.analysis.study_ledger import Ledger
+from xew.analysis.study_machines import Machines, RayCluster, ThisMachine, open_machines, visible_gpus
+from xew.analysis.study_plan import Cell
+from xew.config import ConfigError
+
+ROOT = Path(__file__).parents[2]
+STEPS = "tests.analysis.steps"
+CHAIN = (("data", ""), ("left", "data"), ("right", "data"), ("end", "left right"))
+"""Cells and what each needs."""
+
+
+@pytest.fixture(autouse=True)
+def at_the_root(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+
+
+@pytest.fixture(autouse=True)
+def outcomes_of_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cells here make one file each, whatever stage they claim to be."""
+    monkeypatch.setattr(study_ledger, "read_outcome", lambda cell: study_ledger._of_file(cell.product))
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Study:
+    return load_study(ROOT / "configs" / "study_debug.yaml", ["--out", str(tmp_path)])
+
+
+def chain(out: Path, **changes: tuple[str, ...]) -> dict[str, Cell]:
+    """The cells of CHAIN; `changes` are more arguments of single ones."""
+    cells = [
+        Cell("train", name, (STEPS, str(out / name), name, *changes.get(name, ())), tuple(f"train/{n}" for n in needs.split()),
+             list(changes.get(name, ())), out / name)
+        for name, needs in CHAIN
+    ]  # fmt: skip
+    return {cell.name: cell for cell in cells}
+
+
+def begun(out: Path) -> dict[str, int]:
+    """How often each cell was started."""
+    return {path.stem: len(path.read_text().splitlines()) for path in out.glob("*.begun")}
+
+
+def run(study: Study, cells: dict[str, Cell], machines: Machines | None = None) -> dict[str, str]:
+    """One pass over the cells; what failed."""
+    machines = machines or ThisMachine((), 2, {})
+    return runner.Run(study, cells, Ledger(study.out), machines, dict.fromkeys(cells, 1.0)).to_the_end()
+
+
+def test_what_is_done_is_not_done_again(study: Study) -> None:
+    cells = chain(study.out)
+    assert run(study, cells) == {}
+    assert run(study, cells) == {}
+    assert begun(study.out) == dict.fromkeys(("data", "left", "right", "end"), 1)
+    assert (study.out / "end").read_text() == "end"
+
+
+def test_a_change_is_carried_on_and_no_further(study: Study) -> None:
+    """Other inputs of `left` make it and what needs it anew; where its product stays the same, only it."""
+    run(study, chain(study.out))
+    changed = chain(study.out, left=("--wait", "0.01"))
+    run(study, changed)
+    assert begun(study.out) == {"data": 1, "left": 2, "right": 1, "end": 1}
+    (study.out / "right").write_text("tampered with")
+    run(study, changed)
+    assert begun(study.out) == {"data": 1, "left": 2, "right": 2, "end": 1}
+    (study.out / "data").unlink()
+    run(study, changed)
+    assert begun(study.out) == {"data": 2, "left": 2, "right": 2, "end": 1}
+
+
+def test_a_failing_cell_is_named_and_the_others_go_on(study: Study, capsys: pytest.CaptureFixture[str]) -> None:
+    cells, ledger = chain(study.out, left=("--fail",)), Ledger(study.out)
+    failed = run(study, cells)
+    assert failed == {"train/left": "exit status 1", "train/end": "needs train/left"}
+    assert begun(study.out) == {"data": 1, "left": 1, "right": 1}
+    with pytest.raises(SystemExit) as stop:
+        runner.tell_failures(failed, ledger, cells)
+    said = capsys.readouterr().err
+    assert stop.value.code == 1
+    assert f"log: {study.out / 'logs' / 'train' / 'left.log'}" in said and "the disk is made of cheese" in said
+    assert "1 cells failed, 1 could not be made for it" in said
+    assert run(study, chain(study.out)) == {}
+    assert begun(study.out) == {"data": 1, "left": 2, "right": 1, "end": 1}
+
+
+def test_a_command_that_makes_nothing_has_failed(study: Study) -> None:
+    cells = chain(study.out)
+    cells = {"train/data": cells["train/data"], "train/left": cells["train/left"]}
+    cells["train/left"] = Cell("train", "left", (STEPS, str(study.out / "elsewhere"), "x"), (), None, study.out / "left")
+    assert run(study, cells) == {"train/left": f"it made no {study.out / 'left'}"}
+
+
+def test_the_analysis_is_of_whatever_was_graded(study: Study) -> None:
+    cells = chain(study.out, left=("--fail",))
+    end = cells.pop("train/end")
+    analyse = Cell("analyse", "", end.command, end.needs, None, end.product)
+    assert list(run(study, cells | {"analyse": analyse})) == ["train/left"]
+    assert "$ python -m tests.analysis.steps" in (study.out / "logs" / "analyse.log").read_text()
+    assert " end right" in (study.out / "logs" / "analyse.log").read_text()
+
+
+def test_a_training_goes_on_only_where_nothing_changed(study: Study) -> None:
+    cell = chain(study.out)["train/data"]
+    ledger = Ledger(study.out)
+    assert runner.command_of(cell, ledger.begin(cell), {})[-1] == "--overwrite"
+    assert runner.command_of(cell, ledger.begin(cell), {})[-1] == "--resume"
+    other = chain(study.out, data=("--wait", "0"))["train/data"]
+    assert runner.command_of(other, ledger.begin(other), {})[-1] == "--overwrite"
+
+
+def test_rollouts_of_another_training_are_removed(study: Study) -> None:
+    product = study.out / "rollouts"
+    cell = Cell("rollout", "a", (), (), "first", product)
+    ledger = Ledger(study.out)
+    ledger.begin(cell)
+    product.mkdir()
+    ledger.begin(cell)
+    assert product.exists()
+    ledger.begin(Cell("rollout", "a", (), (), "second", product))
+    assert not product.exists()
+
+
+def test_a_damaged_record_is_no_record(study: Study) -> None:
+    cells, ledger = chain(study.out), Ledger(study.out)
+    run(study, cells)
+    (study.out / "state" / "train" / "data.json").write_text('{"status": "do')
+    assert ledger.record(cells["train/data"]) == {}
+    assert run(study, cells) == {}
+    assert begun(study.out)["data"] == 2
+
+
+def wait_for(happened: Callable[[], bool], seconds: float = 60.0) -> None:
+    """Until it has happened; fails after some time."""
+    until = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < until, "it did not happen"
+        time.sleep(0.05)
+
+
+def alive(name: Path) -> bool:
+    """Whether a process holds the lock that cells hold."""
+    return subprocess.run(["flock", "--nonblock", str(name), "true"]).returncode != 0
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+from tests.analysis.test_study import ROOT, chain, load_study, run, runner
+
+if __name__ == "__main__":
+    study = load_study(ROOT / "configs" / "study_debug.yaml", ["--out", sys.argv[1]])
+    with runner.alone(study.out), runner.stoppable():
+        run(study, chain(study.out, data=("--wait", "300")))
+"""
+
+
+@pytest.fixture
+def waiting_study(study: Study) -> Iterator[subprocess.Popen[bytes]]:
+    """Another process that runs a chain whose first cell takes long."""
+    (study.out / "script.py").write_text(SCRIPT)
+    arguments = [sys.executable, study.out / "script.py", study.out]
+    process = subprocess.Popen(arguments, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    wait_for((study.out / "data.begun").exists)
+    yield process
+    process.kill()
+    process.wait()
+
+
+def test_killed_studies_leave_nobody_behind(study: Study, waiting_study: subprocess.Popen[bytes]) -> None:
+    lock = study.out / "logs" / "train" / "data.lock"
+    assert alive(lock)
+    with pytest.raises(ConfigError, match="another process runs the study"), runner.alone(study.out):
+        pass
+    waiting_study.kill()
+    waiting_study.wait()
+    wait_for(lambda: not alive(lock))
+    assert json.loads((study.out / "state" / "train" / "data.json").read_text())["status"] == "begun"
+    with runner.alone(study.out):
+        assert run(study, chain(study.out)) == {}
+
+
+def test_sigterm_stops_a_study_and_its_cells(study: Study, waiting_study: subprocess.Popen[bytes]) -> None:
+    waiting_study.send_signal(signal.SIGTERM)
+    assert waiting_study.wait(60) != 0
+    assert not alive(study.out / "logs" / "train" / "data.lock")
+
+
+def test_two_of_one_cell_never_run_at_once(study: Study) -> None:
+    """The second waits until the first has gone, as after a kill that was not noticed yet."""
+    log = study.out / "cell.log"
+    command = (STEPS, str(study.out / "file"), "text", "--wait", "0.5")
+    first = start_cell(command, log, {})
+    wait_for((study.out / "file.begun").exists)
+    second = start_cell(command, log, {})
+    assert begun(study.out) == {"file": 1}
+    first.join()
+    second.join()
+    assert (first.exitcode, second.exitcode, begun(study.out)) == (0, 0, {"file": 2})
+    assert last_lines(log, 1).startswith("exit status 0, ")
+
+
+@pytest.mark.parametrize(("arguments", "code"), [(["--fail"], 1), (["--unknown-number", "x"], 0), (["--wait", "x"], 2)])
+def test_exit_statuses_are_those_of_the_command(tmp_path: Path, arguments: list[str], code: int) -> None:
+    process = start_cell((STEPS, str(tmp_path / "file"), "text", *arguments), tmp_path / "cell.log", {})
+    process.join()
+    assert process.exitcode == code
+
+
+def test_a_launcher_starts_the_command(tmp_path: Path) -> None:
+    """As srun would; here env, which also sets a variable."""
+    process = start_cell(
+        ("json.tool", "--help"), tmp_path / "cell.log", {}, method="spawn", launcher=("env", "PYTHONIOENCODING=utf-8")
+    )
+    process.join()
+    assert process.exitcode == 0
+    assert (tmp_path / "cell.log").read_text().startswith("$ env PYTHONIOENCODING=utf-8 python -m json.tool")
+
+
+def test_gpus_are_shared_out(study: Study) -> None:
+    machine = ThisMachine((2, 5, 7), 1, {})
+    one, two = Cell("rollout", "a", (), (), None, study.out), Cell("train", "b", (), (), None, study.out, gpus=2)
+    assert machine.slots == 3 and machine.room_for(two)
+    for cell in (two, one):
+        machine.start(cell, (STEPS, str(study.out / cell.variant), "x", "--wait", "0.2"), study.out / f"{cell.variant}.log")
+    assert machine._running["train/b"].slots == (2, 5) and machine._running["rollout/a"].slots == (7,)
+    assert not machine.room_for(one)
+    while machine._running:
+        machine.wait()
+    assert machine.room_for(Cell("train", "c", (), (), None, study.out, gpus=3))
+
+
+def test_gpus_that_are_not_there(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    assert visible_gpus() == ()
+    asked = load_study(ROOT / "configs" / "study_debug.yaml", ["--machine.gpus", "0", "--machine.gpus-per-training", "8"])
+    with pytest.raises(ConfigError, match="gpus_per_training is 8, there are 1 GPUs"):
+        open_machines(asked)
+
+
+def test_redo_names_cells(study: Study) -> None:
+    cells = chain(study.out)
+    assert [cell.name for cell in runner.chosen(cells, ["train/*t"])] == ["train/left", "train/right"]
+    with pytest.raises(ConfigError, match="matches no cell"):
+        runner.chosen(cells, ["evaluate/*"])
+
+
+def test_the_dry_run_shows_everything_and_does_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runner.main([str(ROOT / "configs" / "study_debug.yaml"), "--dry-run", "--out", str(tmp_path / "study")])
+    said = capsys.readouterr().out
+    assert "few_shot-piper-1" in said and "left to do" in said
+    assert not (tmp_path / "study").exists()
+
+
+def test_experiments_that_the_model_does_not_take_are_said_before_anything_starts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "study.yaml"
+    text = (ROOT / "configs" / "study_debug.yaml").read_text()
+    config.write_text(text.replace("epochs: 2,", "epoch: 2,"))
+    with pytest.raises(SystemExit) as stop:
+        runner.main([str(config), "--out", str(tmp_path / "study")])
+    assert stop.value.code == 2
+    assert "unknown key 'epoch'; did you mean 'epochs'" in capsys.readouterr().err
+    assert not (tmp_path / "study" / "state").exists()
+
+
+def test_cells_run_as_tasks_on_a_ray_cluster(study: Study) -> None:
+    """Two nodes of one core each: two cells that wait for one another run at once, so on both; a failure is told."""
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    try:
+        cluster.add_node(num_cpus=1)
+        machines = RayCluster(cluster.address, {})
+        try:
+            assert machines.slots == 2
+            left = ("--until", str(study.out / "right.begun"))
+            right = ("--until", str(study.out / "left.begun"), "--fail")
+            assert run(study, chain(study.out, left=left, right=right), machines) == {
+                "train/right": "exit status 1",
+                "train/end": "needs train/right",
+            }
+            assert (study.out / "left").read_text() == "left"
+        finally:
+            machines.stop()
+    finally:
+        cluster.shutdown()
+
+
+def test_a_ray_cluster_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ray")
+    with pytest.raises(ConfigError, match="ray start --head"):
+        RayCluster("auto", {})
