@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.analysis.browser import assert_readable, needs_chromium
 from tests.analysis.conftest import FRAMES, Study
 from xew.analysis.report import Args, main
 from xew.analysis.scores import read_scores
@@ -68,6 +69,11 @@ def test_the_page_is_well_formed_and_needs_no_network(report: Path) -> None:
         assert image["alt"]
     # Three strips for each of two held-out robots, and the data; the curves of three metrics and two robots.
     assert len(page.images) == 3 * 2 + 1 and page.charts == 3 * 2
+
+
+@needs_chromium
+def test_a_browser_shows_it_on_a_phone_and_a_desk_in_light_and_dark(report: Path) -> None:
+    assert_readable(report / "index.html", images=3 * 2 + 1, charts=3 * 2)
 
 
 def test_each_held_out_robot_has_its_own_table_and_the_seen_are_pooled(report: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.analysis.browser import assert_readable, needs_chromium
 from tests.analysis.synthetic_study import TASKS, write_study
 from tests.analysis.test_report import Page, refers_outside
 from tests.synthetic import write_synthetic_data
@@ -81,6 +82,12 @@ def test_the_page_is_well_formed_and_needs_no_network(folder: Path) -> None:
     assert {target for target in re.findall(r'href="#([^"]*)"', text) if not target.startswith(("m", "p", "C", "D"))} <= set(
         re.findall(r'id="([^"]*)"', text)
     )
+
+
+@needs_chromium
+def test_a_browser_shows_it_on_a_phone_and_a_desk_in_light_and_dark(folder: Path) -> None:
+    text = (folder / "report" / "index.html").read_text()
+    assert_readable(folder / "report" / "index.html", images=2, charts=text.count("<svg"))
 
 
 def test_the_finding_comes_first(folder: Path) -> None:
