@@ -116,13 +116,24 @@ def test_the_analysis_is_of_whatever_was_graded(study: Study) -> None:
     assert " end right" in (study.out / "logs" / "analyse.log").read_text()
 
 
-def test_a_training_goes_on_only_where_nothing_changed(study: Study) -> None:
-    cell = chain(study.out)["train/data"]
+def write_checkpoint(run: Path) -> None:
+    """As much of a checkpoint as tells one from another."""
+    folder = run / "checkpoints" / "10"
+    folder.mkdir(parents=True)
+    (folder / "_CHECKPOINT_METADATA").write_text('{"init_timestamp_nsecs": 7}')
+
+
+def test_a_training_goes_on_from_its_own_checkpoint_only(study: Study) -> None:
+    run = study.out / "run"
+    first, second = (Cell("train", "a", (), (), inputs, run) for inputs in ("first", "second"))
     ledger = Ledger(study.out)
-    assert runner.command_of(cell, ledger.begin(cell), {})[-1] == "--overwrite"
-    assert runner.command_of(cell, ledger.begin(cell), {})[-1] == "--resume"
-    other = chain(study.out, data=("--wait", "0"))["train/data"]
-    assert runner.command_of(other, ledger.begin(other), {})[-1] == "--overwrite"
+    assert not ledger.begin(first)
+    run.mkdir()
+    (run / "config.yaml").write_text("cut o")
+    assert not ledger.begin(first) and not run.exists()
+    write_checkpoint(run)
+    assert ledger.begin(first) and run.exists()
+    assert not ledger.begin(second) and not run.exists()
 
 
 def test_rollouts_of_another_training_are_removed(study: Study) -> None:

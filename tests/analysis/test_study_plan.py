@@ -108,6 +108,13 @@ def test_settings_are_laid_over_one_another() -> None:
     assert below["train"] == {"steps": 3, "batch": 2}
 
 
+def test_trainings_may_be_launched_on_other_machines(study: Study) -> None:
+    launched = replace(study, machine=replace(study.machine, train_launcher="srun --nodes=2"))
+    cell = plan(launched)["train/fixed-joints-none"]
+    assert cell.launcher == ("srun", "--nodes=2") and "--distributed" in cell.command
+    assert plan(launched)["rollout/fixed-joints-none"].launcher == plan(study)["train/fixed-joints-none"].launcher == ()
+
+
 def test_systems_and_remedies_have_their_settings() -> None:
     study = replace(load_study(CONFIGS / "study_small.yaml"), parts=(*PAPER_PARTS, "remedies"))
     assert experiment_of(study, VARIANTS["fixed-ctrl_world"])["model"]["history"] == [-60, -50, -40, -30, -20, -10]

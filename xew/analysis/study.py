@@ -27,7 +27,7 @@ from xew.analysis.study_cell import last_lines
 from xew.analysis.study_config import Study, load_study
 from xew.analysis.study_cost import corrected, cost_table, duration, estimate, longest_ways
 from xew.analysis.study_ledger import Ledger
-from xew.analysis.study_machines import Machines, open_machines
+from xew.analysis.study_machines import Machines, gpus_of, open_machines
 from xew.analysis.study_plan import STAGES, Cell, in_order, plan, write_configs
 from xew.config import ConfigError, save, user_errors
 from xew.episode import find_records
@@ -53,7 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     cells, ledger = plan(study), Ledger(study.out)
     if args.dry_run:
         check_configs([study.experiment])
-        print(status(study, cells, ledger), cost(study, cells, ledger, max(1, study.machine.workers)), sep="\n\n")
+        print(
+            status(study, cells, ledger), cost(study, cells, ledger, len(gpus_of(study)) or study.machine.workers), sep="\n\n"
+        )
         return
     with alone(study.out), stoppable():
         prepare(study)
@@ -192,7 +194,7 @@ class Run:
         goes_on = self.ledger.begin(cell)
         self.started[cell.name] = time.monotonic()
         self._tell(f"{cell.name}{', goes on' if goes_on else ''}")
-        self.machines.start(cell, command_of(cell, goes_on, self.failed), self.ledger.log(cell))
+        self.machines.start(cell, command_of(cell, self.failed), self.ledger.log(cell))
 
     def _finish(self, name: str, code: int) -> str:
         cell, seconds = self.cells[name], time.monotonic() - self.started.pop(name)
@@ -218,10 +220,8 @@ class Run:
         print(f"{time.strftime('%H:%M:%S')} [{self.settled}/{len(self.cells)}] {text}", flush=True)
 
 
-def command_of(cell: Cell, goes_on: bool, failed: Mapping[str, str]) -> tuple[str, ...]:
-    """A cell's command, with what only its start tells: whether it goes on, or which variants there are."""
-    if cell.stage in ("train", "adapt"):
-        return (*cell.command, "--resume" if goes_on else "--overwrite")
+def command_of(cell: Cell, failed: Mapping[str, str]) -> tuple[str, ...]:
+    """A cell's command, with what only its start tells: of the analysis, which variants are graded."""
     if cell.stage == "analyse":
         return (*cell.command, *(name.partition("/")[2] for name in cell.needs if name not in failed))
     return cell.command

@@ -68,8 +68,8 @@ class Machine:
     """Cells at once where there is no GPU."""
     gpus_per_training: int = 1
     """A training takes as many at once."""
-    train_launcher: tuple[str, ...] = ()
-    """Put before a training's command, which then joins the processes that it starts (jax.distributed): [srun, --nodes=2]."""
+    train_launcher: str = ""
+    """Put before a training's command, which then joins the processes that it starts (jax.distributed): srun --nodes=2."""
     ray: str | None = None
     """Address of a Ray cluster whose machines share this folder: auto, or host:port. Its resources are used instead."""
 

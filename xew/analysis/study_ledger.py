@@ -60,11 +60,14 @@ class Ledger:
     def begin(self, cell: Cell) -> bool:
         """Note that a cell is being made; returns whether it goes on from what an earlier try left.
 
-        What was made from other inputs is removed where the command would take it for its own.
+        What was made from other inputs is removed where the command would take it for its own, and so is a run that was
+        killed before its first checkpoint, perhaps in the middle of writing its config.
         """
         key = self.key(cell)
         goes_on = self.record(cell).get("key") == key
-        if not goes_on and cell.stage == "rollout":
+        if cell.stage in ("train", "adapt"):
+            goes_on = goes_on and _of_run(cell.product) is not None
+        if not goes_on and cell.stage in ("train", "adapt", "rollout"):
             shutil.rmtree(cell.product, ignore_errors=True)
         self._write(cell, {"key": key, "status": "begun"})
         return goes_on

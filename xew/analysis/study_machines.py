@@ -49,11 +49,16 @@ def open_machines(study: Study) -> Machines:
     """Those that the config names. Raises ConfigError if they are not there or too small."""
     if study.machine.ray:
         return RayCluster(study.machine.ray, study.environment)
-    gpus = visible_gpus() if study.machine.gpus is None else study.machine.gpus
+    gpus = gpus_of(study)
     needed = study.machine.gpus_per_training
     if gpus and needed > len(gpus):
         raise ConfigError(f"machine.gpus_per_training is {needed}, there are {len(gpus)} GPUs ({gpus}); lower it.")
     return ThisMachine(gpus, study.machine.workers, study.environment)
+
+
+def gpus_of(study: Study) -> tuple[int, ...]:
+    """Numbers of the GPUs of this machine that a study may use."""
+    return visible_gpus() if study.machine.gpus is None else study.machine.gpus
 
 
 def visible_gpus() -> tuple[int, ...]:

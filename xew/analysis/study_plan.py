@@ -6,6 +6,7 @@ generate -> latents -> train -> rollout -> evaluate -> analyse
 
 import hashlib
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -131,12 +132,12 @@ def _train(study: Study, variant: Variant, experiment: Settings) -> Cell:
     return Cell(
         _training(variant).partition("/")[0],
         variant.name,
-        ("xew.model.train", str(_config(study, variant)), *joins),
+        ("xew.model.train", str(_config(study, variant)), "--resume", *joins),
         needs=(f"latents/{variant.name}", *before),
         inputs=_of_training(experiment),
         product=run_folder(study, variant),
         gpus=study.machine.gpus_per_training,
-        launcher=study.machine.train_launcher,
+        launcher=tuple(shlex.split(study.machine.train_launcher)),
     )
 
 
