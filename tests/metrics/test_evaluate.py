@@ -14,8 +14,9 @@ from tests.synthetic import write_synthetic_data
 from xew.episode import episode_folder, read_states, read_video
 from xew.metrics import keypoint_error, mask_iou, psnr, ssim
 from xew.metrics.backends import Backend, Tracker, estimate_masks
+from xew.metrics.contact import predicted_contact, touching_distance
 from xew.metrics.evaluate import Args, main
-from xew.metrics.truth import project
+from xew.metrics.truth import _visible, project, read_truth
 from xew.rollout import write_rollout
 
 TASK, SEED, ROBOTS = "place_empty_cup", 1_000_000, ("franka_panda", "piper")
@@ -34,7 +35,17 @@ def open_shifted(_: Path | None) -> Tracker:
     return shifted
 
 
+def exact(prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """A tracker that says what is true, where that is visible."""
+    return np.where(visible[..., None], points, np.nan).astype(np.float32)
+
+
+def open_exact(_: Path | None) -> Tracker:
+    return exact
+
+
 SHIFTED = Backend(open_shifted, None, "for tests")
+EXACT = Backend(open_exact, None, "for tests")
 
 
 @pytest.fixture(scope="module")
@@ -127,10 +138,35 @@ def test_tracks_are_compared_with_what_the_episode_holds(rollouts: Path, data: P
         assert value(scores, "late", robot, "object_coverage") == 0
 
 
-def test_projected_objects_lie_where_they_are_drawn(data: Path) -> None:
-    """The disc is the one thing that moves besides the robot; its colour is at its projected centre wherever that is free."""
-    from xew.metrics.truth import read_truth
+def test_contact_is_a_diagnostic_and_no_part_of_the_suite(rollouts: Path, data: Path) -> None:
+    """The tracker never finds the object (it is the last point), which then touches nothing; where it does, all is found."""
+    scores = grade(rollouts, data, metrics=("psnr",), diagnostics=True, baselines=True, tracks=f"{__name__}:SHIFTED")
+    assert set(scores["metric"]) == {"psnr"} and "contact_f1" not in scores.attrs["metrics"]
+    rows = pd.read_parquet(rollouts.parent / "scores.diagnostics.parquet")
+    assert set(rows["metric"]) == {"contact_f1"} and set(rows["value"]) == {0.0} and len(rows) == 6
+    grade(rollouts, data, metrics=("psnr",), diagnostics=True, baselines=True, tracks=f"{__name__}:EXACT")
+    rows = pd.read_parquet(rollouts.parent / "scores.diagnostics.parquet").set_index(["robot", "model"])["value"]
+    for robot in ROBOTS:
+        states = read_states(episode_folder(data, TASK, SEED, robot))
+        assert states.contact[1:ASKED].any() and not states.contact[1:ASKED].all(axis=0).any()
+        assert rows[robot, "ground_truth"] > 0.8
 
+
+def test_touching_is_told_by_the_distance_that_tells_it_best_in_the_truth() -> None:
+    distance = np.array([9.0, 5.0, 5.0, 2.0, np.nan, 1.0])
+    assert touching_distance(distance, np.array([0, 0, 1, 1, 1, 1], bool)) == 5
+    assert touching_distance(distance, np.array([1, 0, 0, 1, 0, 1], bool)) == 2
+    assert touching_distance(distance, np.zeros(6, bool)) == -1
+    assert touching_distance(np.full(3, np.nan), np.ones(3, bool)) == -1
+    true = np.array([[0, 1], [0, 0], [1, 0]], bool)
+    apart = np.array([[8.0, 3.0], [7.0, 9.0], [2.0, 9.0]])
+    assert (predicted_contact(apart, apart, true) == true).all()
+    assert not predicted_contact(np.full_like(apart, np.nan), apart, true).any()
+
+
+def test_projected_objects_lie_where_they_are_drawn(data: Path) -> None:
+    """The disc is the one thing that moves besides the robot; its colour is at its projected centre wherever that is free.
+    What is put on a thing at rest hides it."""
     read = read_truth(episode_folder(data, TASK, SEED, "piper"), FRAMES, ("objects",))
     assert read.objects.shape == (FRAMES, 1, 2) and read.object_visible[0, 0]
     colours = [
@@ -140,6 +176,12 @@ def test_projected_objects_lie_where_they_are_drawn(data: Path) -> None:
     ]
     assert len(colours) > 1 and (np.array(colours) == colours[0]).all()
     assert not read.object_visible[-1, 0] and read.mask[-1][tuple(np.round(read.objects[-1, 0, ::-1]).astype(int))]
+    rgb, points = read.rgb.copy(), np.repeat(read.objects[:1], FRAMES, axis=0)
+    rgb[:] = rgb[0]
+    assert _visible(points, rgb, np.zeros(rgb.shape[:3], bool)).all()
+    x, y = np.round(points[0, 0]).astype(int)
+    rgb[5:, y - 4 : y + 5, x - 4 : x + 5] = 0
+    assert _visible(points, rgb, np.zeros(rgb.shape[:3], bool))[:, 0].tolist() == [t < 5 for t in range(FRAMES)]
     behind = project(np.array([[0.0, 0.0, -1.0]]), np.eye(3), np.eye(4))
     assert np.isnan(behind).all()
 
@@ -169,6 +211,17 @@ def test_curves_hold_every_predicted_frame_and_average_to_the_scores(rollouts: P
     means = curves.groupby(["robot", "metric"])["value"].mean()
     for row in scores.itertuples():
         assert means[row.robot, row.metric] == pytest.approx(row.value, rel=1e-6)
+
+
+def test_curves_of_tracks_are_the_metric_of_each_frame(rollouts: Path, data: Path) -> None:
+    grade(rollouts, data, metrics=("pck", "keypoint_error", "ndtw", "coverage"), tracks=f"{__name__}:SHIFTED")
+    curves = pd.read_parquet(rollouts.parent / "scores.curves.parquet").set_index(["robot", "metric", "frame"])["value"]
+    for robot in ROBOTS:
+        moved = (late(truth(data, robot)) != truth(data, robot)).any(axis=(1, 2, 3))
+        for frame in range(1, ASKED):
+            assert curves[robot, "keypoint_error", frame] == pytest.approx(3 * moved[frame])
+            assert 0 < curves[robot, "coverage", frame] < 1
+        assert (robot, "ndtw") not in curves.index.droplevel("frame")
 
 
 def as_mp4(folder: Path, video: np.ndarray, rate: float = 1000 / 60) -> None:

@@ -31,8 +31,18 @@ from xew.episode import EpisodeError, Record, episode_folder, read_record, verif
 from xew.metrics import METRICS
 from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, identity, open_masker, open_tracker
 from xew.metrics.bundle import demand_none, differences, disagreements, read_bundle, write_bundle
-from xew.metrics.grade import Comparison, Grades, compared, grade
-from xew.metrics.scores import Cell, CellStore, beside, check_out, describe, file_digest, write_tables, write_whole
+from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, compared, grade
+from xew.metrics.scores import (
+    Cell,
+    CellStore,
+    beside,
+    check_out,
+    describe,
+    file_digest,
+    write_diagnostics,
+    write_tables,
+    write_whole,
+)
 from xew.metrics.summary import summarise, to_markdown
 from xew.metrics.truth import Truth, read_truth
 from xew.protocol import HELD_OUT_ROBOTS
@@ -75,6 +85,8 @@ class Args:
     rate: containers may say any frame rate, their frames are the episode's one by one."""
     baselines: bool = True
     """Also grade, as models of their own, the frozen first frame, and the true video itself: the noise floor of the scores."""
+    diagnostics: bool = False
+    """Also write scores.diagnostics.parquet: contact F1, which is too unreliable in predicted video to be reported."""
     resample: Literal["scene", "task"] = "scene"
     """What the summary's intervals resample: scenes (what would other scenes of these tasks give?), or whole tasks."""
     keep_going: bool = False
@@ -121,9 +133,12 @@ def main(args: Args) -> None:
     errors: list[str] = []
     jobs = plan(args, errors if args.keep_going else None)
     total = len(jobs) + len(errors)
-    errors += grade_all(jobs, metrics, args, store)
+    diagnostics = tuple(DIAGNOSTICS) if args.diagnostics else ()
+    errors += grade_all(jobs, (*metrics, *diagnostics), args, store)
     cells = [job.cell for job in jobs]
     write_tables(args.out, attributes, cells, store)
+    if diagnostics:
+        write_diagnostics(beside(args.out, "diagnostics.parquet"), attributes, diagnostics, cells, store)
     rows = pd.read_parquet(args.out)
     write_bundle(beside(args.out, "bundle.json"), args.out, rows, cells)
     print(_write_summary(args, rows))
@@ -309,10 +324,17 @@ class Bench(threading.local):
 
 def open_bench(args: Args, metrics: Sequence[str]) -> Bench:
     """A bench with the chosen estimators, as far as these metrics need them. Raises ConfigError if weights are missing."""
-    inputs = {METRICS[name].inputs for name in metrics}
-    masker = _per_thread(args.masks if "mask" in inputs else "default", MASKERS, open_masker, args.masks_checkpoint)
-    tracker = _per_thread(args.tracks if "track" in inputs else "default", TRACKERS, open_tracker, args.tracks_checkpoint)
+    kinds = {compared(name) for name in metrics}
+    masker, tracker = _not_needed, _not_needed
+    if "mask" in kinds:
+        masker = _per_thread(args.masks, MASKERS, open_masker, args.masks_checkpoint)
+    if kinds & {"keypoints", "objects", "contact"}:
+        tracker = _per_thread(args.tracks, TRACKERS, open_tracker, args.tracks_checkpoint)
     return Bench(masker, tracker, itertools.cycle(jax.local_devices()))
+
+
+def _not_needed() -> Any:
+    """In place of an estimator that no metric asks."""
 
 
 E = TypeVar("E", bound=Callable[..., np.ndarray])
@@ -360,7 +382,7 @@ def _grade_group(group: list[tuple[Job, tuple[str, ...]]], args: Args, bench: Be
     truth: Truth | None = None
     for job, metrics in group:
         try:
-            needed = {compared(METRICS[name]) for _, names in group for name in names}
+            needed = {compared(name) for _, names in group for name in names}
             truth = truth or read_truth(job.episode, job.cell.frames, needed)
             store.write(job.cell, _grade_job(job, truth, metrics, args, bench))
         except (EpisodeError, ValueError) as error:
@@ -427,7 +449,7 @@ def check(args: Args, path: Path) -> None:
     bench, found = open_bench(args, metrics), list[str]()
     for job in tqdm(picked, desc="grade anew", unit="video", disable=None):
         verify_episode(job.episode)
-        truth = read_truth(job.episode, job.cell.frames, {compared(METRICS[name]) for name in metrics})
+        truth = read_truth(job.episode, job.cell.frames, {compared(name) for name in metrics})
         found += disagreements(bundle, job.cell.key, _grade_job(job, truth, metrics, args, bench).values)
     demand_none(path, found)
     if picked:

@@ -3,22 +3,29 @@
 Frames and points go through the compiler in blocks of one size, so that a few programs serve episodes of all lengths.
 """
 
+import functools
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import jax
 import numpy as np
 
-from xew.metrics import METRICS
+from xew.metrics import METRICS, contact_f1
 from xew.metrics.backends import Masker, Tracker
+from xew.metrics.contact import predicted_contact
 from xew.metrics.metric import Metric
 from xew.metrics.perceptual import SMALLEST_SIDE, union_box
-from xew.metrics.truth import Truth
+from xew.metrics.truth import Truth, inside
 
 FRAME_BLOCK = 16
 POINT_BLOCK = 8
 WHOLE_VIDEO = ("psnr",)
 """Metrics in which a frame's score depends on the others (the cap of exact frames); all others are computed block by block."""
+
+WHOLE_PATH = ("ndtw",)
+"""Metrics of tracks that say nothing of a single frame."""
+DIAGNOSTICS = {"contact_f1": contact_f1}
+"""What is computed if asked and is no part of the reported suite."""
 
 ESTIMATED = ("mask", "track")
 """Inputs that have to be estimated in a prediction, so that even the true video does not get the best score."""
@@ -31,13 +38,16 @@ class Grades:
     values: dict[str, float]
     """By metric; NaN where it is not defined, such as the error of keypoints of which none is ever seen."""
     curves: dict[str, np.ndarray]
-    """By metric, [t] float32 by graded frame, NaN where a frame has no value; nothing for metrics of whole paths."""
+    """By metric, [t] float32 by graded frame, NaN where a frame has no value; none for metrics of whole paths."""
     exact_frames: int
     """How many graded frames equal the truth in every byte (their PSNR is the cap's)."""
 
 
-def compared(metric: Metric) -> str:
-    """What a metric compares, a key of `truth.NEEDS`."""
+def compared(name: str) -> str:
+    """What a metric or a diagnostic compares, a key of `truth.NEEDS`."""
+    if name in DIAGNOSTICS:
+        return "contact"
+    metric = METRICS[name]
     if metric.inputs != "track":
         return metric.inputs
     return "objects" if metric.dimension == "objects" else "keypoints"
@@ -57,16 +67,18 @@ class Comparison:
 
 
 def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
-    """Scores of one predicted video by the metrics of these names."""
-    inputs = {kind: INPUTS[kind](comparison) for kind in {compared(METRICS[name]) for name in metrics}}
+    """Scores of one predicted video by the metrics and diagnostics of these names."""
+    inputs = {kind: INPUTS[kind](comparison) for kind in sorted({compared(name) for name in metrics})}
     values: dict[str, float] = {}
     curves: dict[str, np.ndarray] = {}
     for name in metrics:
-        metric, arrays = METRICS[name], inputs[compared(METRICS[name])]
+        arrays = inputs[compared(name)]
         if arrays is None:
             values[name] = float("nan")
-        elif metric.inputs == "track":
-            values[name], curve = _grade_tracks(metric, arrays)
+        elif name in DIAGNOSTICS:
+            values[name] = float(DIAGNOSTICS[name](*arrays))
+        elif METRICS[name].inputs == "track":
+            values[name], curve = _grade_tracks(name, arrays)
             curves |= {} if curve is None else {name: curve}
         else:
             curves[name] = _curve(name, arrays)
@@ -103,12 +115,30 @@ def _objects(c: Comparison) -> Arrays | None:
     return _tracks(c, c.truth.objects, c.truth.object_visible)
 
 
+def _contact(c: Comparison) -> Arrays | None:
+    """Predicted and true contact [t, pairs of a hand and an object that touch at some time]; None where none does.
+
+    What a hand holds is mostly behind it; so the tracker is asked for all that is in the image, also where it is covered.
+    """
+    arms, objects = np.nonzero(np.any(c.truth.contact, axis=0))
+    points = np.concatenate([c.truth.hands, c.truth.objects], axis=1)
+    within = inside(points, c.truth.rgb.shape)
+    if not within[:, 2 + objects].any():
+        return None
+    true = np.where(within[..., None], points, np.nan)
+    found = c.tracker(c.prediction, c.truth.rgb, np.nan_to_num(points), within)
+    apart, true_apart = (np.linalg.norm(some[:, arms] - some[:, 2 + objects], axis=-1) for some in (found, true))
+    contact = c.truth.contact[:, arms, objects]
+    return predicted_contact(apart, true_apart, contact)[c.first :], contact[c.first :]
+
+
 INPUTS: dict[str, Callable[[Comparison], Arrays | None]] = {
     "video": _video,
     "mask": _mask,
     "region": _region,
     "keypoints": _keypoints,
     "objects": _objects,
+    "contact": _contact,
 }
 """What the functions of metrics take, by `compared`; None where the truth has nothing to compare."""
 
@@ -118,16 +148,22 @@ def _tracks(c: Comparison, points: np.ndarray, visible: np.ndarray) -> Arrays | 
     if not visible[c.first :].any():
         return None
     seen = visible.any(axis=0)
-    points, visible = np.where(visible[..., None], points, 0)[:, seen].astype(np.float32), visible[:, seen]
+    points, visible = np.nan_to_num(points[:, seen]), visible[:, seen]
     found = c.tracker(c.prediction, c.truth.rgb, points, visible)
     return found[c.first :].astype(np.float32), points[c.first :], visible[c.first :]
 
 
-def _grade_tracks(metric: Metric, arrays: Arrays) -> tuple[float, np.ndarray | None]:
+def _grade_tracks(name: str, arrays: Arrays) -> tuple[float, np.ndarray | None]:
     """A score and its curve. What is filled up is not valid, which no metric of tracks looks at."""
     padded = [_fill(_fill(array, 0, FRAME_BLOCK, 0), 1, POINT_BLOCK, 0) for array in arrays]
-    value = float(metric.function(*padded))
-    return value, None if metric.curve is None else np.asarray(metric.curve(*padded))[: len(arrays[0])]
+    value = float(METRICS[name].function(*padded))
+    return value, None if name in WHOLE_PATH else np.asarray(_frame_by_frame(METRICS[name])(*padded))[: len(arrays[0])]
+
+
+@functools.cache
+def _frame_by_frame(metric: Metric) -> Callable[..., jax.Array]:
+    """A metric of tracks of each frame alone, [t], NaN where it has nothing to compare."""
+    return jax.jit(jax.vmap(lambda *frame: metric.function(*(array[None] for array in frame))))
 
 
 def _curve(name: str, arrays: Arrays) -> np.ndarray:

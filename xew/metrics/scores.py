@@ -13,7 +13,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -130,11 +130,31 @@ def write_tables(path: Path, attributes: dict[str, Any], cells: Sequence[Cell], 
         ConfigError: the disk does not take them; what stood there before still stands.
     """
     metrics = list(attributes["metrics"])
-    graded = sorted((cell for cell in cells if not store.missing(cell, metrics)), key=lambda cell: cell.key)
     # The curves first: what is in the table always has its curves.
-    for target, schema, tabulate in ((beside(path, "curves.parquet"), CURVES, _curve_table), (path, ROWS, _row_table)):
-        tables = (tabulate(cell, _demand(store, cell), metrics) for cell in graded)
-        _write_parquet(target, schema.with_metadata({"PANDAS_ATTRS": json.dumps(attributes)}), tables)
+    _write_table(beside(path, "curves.parquet"), CURVES, _curve_table, attributes, metrics, cells, store)
+    _write_table(path, ROWS, _row_table, attributes, metrics, cells, store)
+
+
+def write_diagnostics(
+    path: Path, attributes: dict[str, Any], names: Sequence[str], cells: Sequence[Cell], store: CellStore
+) -> None:
+    """Write a table like the score table of what is no part of the suite. Raises ConfigError as `write_tables`."""
+    attributes = {key: value for key, value in attributes.items() if key != "metrics"}
+    _write_table(path, ROWS, _row_table, attributes, names, cells, store)
+
+
+def _write_table(
+    path: Path,
+    schema: pa.Schema,
+    tabulate: Callable[[Cell, Grades, Sequence[str]], pa.Table],
+    attributes: dict[str, Any],
+    names: Sequence[str],
+    cells: Sequence[Cell],
+    store: CellStore,
+) -> None:
+    graded = sorted((cell for cell in cells if not store.missing(cell, names)), key=lambda cell: cell.key)
+    tables = (tabulate(cell, _demand(store, cell), names) for cell in graded)
+    _write_parquet(path, schema.with_metadata({"PANDAS_ATTRS": json.dumps(attributes)}), tables)
 
 
 def _demand(store: CellStore, cell: Cell) -> Grades:

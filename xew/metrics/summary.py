@@ -212,7 +212,7 @@ def _mean_text(row: Any) -> str:
     if row is None:
         return ""
     interval = "" if math.isnan(row.low) else f" [{row.low:.4g}, {row.high:.4g}]"
-    mark = " ~" if row.versus_truth == "unresolved" else ""
+    mark = " ~" if row.versus_truth == "unresolved" and interval else ""
     return f"{row.mean:.4g}{interval}{mark}"
 
 

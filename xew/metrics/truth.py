@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from xew.episode import EpisodeError, States, demand_known, read_states, read_video
+from xew.episode import EpisodeError, demand_known, read_states, read_video
 
 NEEDS = {
     "video": (),
@@ -17,8 +17,17 @@ NEEDS = {
     "region": ("robot_mask",),
     "keypoints": ("keypoints", "keypoint_visible"),
     "objects": ("object_pose", "extrinsics", "intrinsics"),
+    "contact": ("object_pose", "tool_pose", "contact", "extrinsics", "intrinsics"),
 }
 """What is compared, and the arrays of an episode that it rests on; imported episodes may not know some."""
+
+
+REST = 1.0
+"""Pixels by which a resting object's point may move."""
+PATCH = 2
+"""Pixels to each side of a point whose mean is the colour of its place."""
+OTHER_COLOUR = 40
+"""Levels of a channel. A shadow on a bright object may be one too: then its frames are left out, which costs little."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +45,12 @@ class Truth:
     objects: np.ndarray
     """[t o 2] float32 pixels, origins of the objects' recorded poses, projected; NaN behind the camera."""
     object_visible: np.ndarray
-    """[t o] bool: in the image and not behind the robot. What hides behind another object counts as visible: episodes hold
-    no depth."""
+    """[t o] bool: in the image, not behind the robot, and, where the object rests, not behind another (`_changed_at_rest`).
+    A moving object that is behind another counts as visible: episodes hold no depth."""
+    hands: np.ndarray
+    """[t 2 2] float32 pixels, the tool frames of the left and right arm, projected; NaN behind the camera."""
+    contact: np.ndarray
+    """[t 2 o] bool, does any finger of the left, right arm touch the object."""
 
 
 def read_truth(folder: Path, frames: int, compared: Collection[str]) -> Truth:
@@ -56,14 +69,18 @@ def read_truth(folder: Path, frames: int, compared: Collection[str]) -> Truth:
     rgb = read_video(folder / "rgb.mkv")
     if rgb.shape[:3] != states.robot_mask.shape:
         raise EpisodeError(f"{folder}: video {rgb.shape[:3]} and masks {states.robot_mask.shape} differ; generate it anew.")
-    objects = project(states.object_pose[..., :3], states.intrinsics, states.extrinsics)
+    objects, hands = (
+        project(pose[..., :3], states.intrinsics, states.extrinsics) for pose in (states.object_pose, states.tool_pose)
+    )
     return Truth(
         rgb=rgb[:frames],
         mask=states.robot_mask[:frames],
         keypoints=states.keypoints[:frames],
         keypoint_visible=states.keypoint_visible[:frames],
         objects=objects[:frames],
-        object_visible=_uncovered(objects, states)[:frames],
+        object_visible=_visible(objects, rgb, states.robot_mask)[:frames],
+        hands=hands[:frames],
+        contact=states.contact[:frames],
     )
 
 
@@ -74,11 +91,41 @@ def project(points: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) 
     return ((seen / depth) @ intrinsics[:2].T).astype(np.float32)
 
 
-def _uncovered(points: np.ndarray, states: States) -> np.ndarray:
-    """[t o] bool, is each point [t o 2] in the image, in a pixel that does not show the robot."""
-    frames, height, width = states.robot_mask.shape
-    pixels = np.nan_to_num(np.round(points), nan=-1).astype(int)
-    x, y = pixels[..., 0], pixels[..., 1]
-    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    covered = states.robot_mask[np.arange(frames)[:, None], np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
-    return inside & ~covered
+def _visible(points: np.ndarray, rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """[t o] bool, as `Truth.object_visible` says."""
+    free = inside(points, rgb.shape) & ~_covered(points, mask)
+    return free & ~_changed_at_rest(points, free, rgb)
+
+
+def _changed_at_rest(points: np.ndarray, free: np.ndarray, rgb: np.ndarray) -> np.ndarray:
+    """[t o] bool: the object is where it was when it was first free, and its place has another colour since.
+
+    So is what a robot puts on something, a cup on its coaster, told from the coaster.
+    """
+    t, o = free.shape
+    first, objects = free.argmax(axis=0), np.arange(o)
+    at_rest = np.linalg.norm(np.nan_to_num(points - points[first, objects]), axis=-1) < REST
+    around = np.arange(-PATCH, PATCH + 1)
+    x, y = np.moveaxis(_pixels(points), -1, 0)[..., None]
+    rows = np.clip(y + around, 0, rgb.shape[1] - 1)[..., :, None]
+    columns = np.clip(x + around, 0, rgb.shape[2] - 1)[..., None, :]
+    colour = rgb[np.arange(t)[:, None, None, None], rows, columns].mean(axis=(2, 3))
+    changed = np.abs(colour - colour[first, objects]).max(axis=-1) > OTHER_COLOUR
+    return at_rest & changed & free.any(axis=0)
+
+
+def inside(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """[t n] bool, is each point [t n 2] in a pixel of a video of this shape [t h w 3]."""
+    x, y = np.moveaxis(_pixels(points), -1, 0)
+    return (x >= 0) & (x < shape[2]) & (y >= 0) & (y < shape[1])
+
+
+def _covered(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """[t n] bool, does the pixel of each point [t n 2] belong to the mask [t h w]; of points outside, the nearest pixel."""
+    x, y = np.moveaxis(_pixels(points), -1, 0)
+    frames, height, width = mask.shape
+    return mask[np.arange(frames)[:, None], np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+
+
+def _pixels(points: np.ndarray) -> np.ndarray:
+    return np.nan_to_num(np.round(points), nan=-1).astype(int)
