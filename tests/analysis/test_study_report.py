@@ -139,12 +139,12 @@ def test_best_and_marks_follow_the_paired_differences(tables: dict[str, Table]) 
 
 def test_what_is_missing_is_said_in_the_table_in_every_format(folder: Path, tables: dict[str, Table]) -> None:
     note = tables["actions_full"].blocks[1].note
-    assert note.startswith("Incomplete") and "not run: Mask" in note and "12 of 500 episodes: Joint pose" in note
+    assert note.startswith("Incomplete") and "Not run: Mask" in note and "12 of 500 episodes: Joint pose" in note
     mask = tables["actions_full"].blocks[1].rows[2]
     assert [cell.text for cell in mask.cells] == ["–"] * 10 and mask.cells[0].published == "18.376"
     report = folder / "report"
     for name in ("index.html", "report.md", "tables/actions_full.tex", "tables/actions_full.csv"):
-        assert "not run: Mask" in (report / name).read_text(), name
+        assert "Not run: Mask" in (report / name).read_text(), name
     assert "Not run in this study" not in (report / "index.html").read_text()
 
 

@@ -66,7 +66,8 @@ def latex(table: Table) -> str:
         lines += [r"\addlinespace"] if i else []
         for text in filter(None, (block.title, block.note)):
             lines.append(rf"\multicolumn{{{width}}}{{@{{}}l}}{{\textit{{{_escape(text)}}}}} \\")
-        lines += [line for row in block.rows for line in _latex_rows(row)]
+        for row, above in zip(block.rows, (None, *block.rows), strict=False):
+            lines += _latex_rows(row, above)
     caption = rf"\textbf{{{_escape(table.title)}.}} {_escape(table.caption)}"
     lines += [r"\bottomrule", r"\end{tabular}}", rf"\caption{{{caption}}}", rf"\label{{tab:{table.name}}}", r"\end{table*}", ""]
     return "\n".join(lines)
@@ -85,8 +86,11 @@ def _latex_groups(table: Table) -> Iterator[str]:
     yield "".join(rules)
 
 
-def _latex_rows(row: Row) -> Iterator[str]:
-    yield _latex_line([*map(_escape, row.labels), *map(_latex_cell, row.cells)])
+def _latex_rows(row: Row, above: Row | None) -> Iterator[str]:
+    """A label that the row above has too stands there only, but for the last one."""
+    same = [bool(above and above.labels[i] == label and label != row.labels[-1]) for i, label in enumerate(row.labels)]
+    labels = ["" if repeated else _escape(label) for label, repeated in zip(row.labels, same, strict=True)]
+    yield _latex_line([*labels, *map(_latex_cell, row.cells)])
     if any(cell.published for cell in row.cells):
         paper = [rf"{{\tiny ({_escape(cell.published)})}}" if cell.published else "" for cell in row.cells]
         yield _latex_line([*[""] * len(row.labels), *paper])

@@ -120,16 +120,21 @@ def table(shown: Table) -> str:
     groups = [(title, len(list(members))) for title, members in groupby(shown.columns, key=lambda column: column.group)]
     above = ""
     if any(title for title, _ in groups):
-        titles = "".join(f'<th colspan="{count}">{escape(title)}</th>' for title, count in groups)
+        titles = "".join(f'<th colspan="{count}">{_unbroken(title)}</th>' for title, count in groups)
         above = f'<tr class="dimension">{"<th></th>" * len(shown.stubs)}{titles}</tr>'
-    heads = "".join(f'<th class="stub">{escape(stub)}</th>' for stub in shown.stubs)
-    heads += "".join(f"<th>{escape(column.title)}</th>" for column in shown.columns)
+    heads = "".join(f'<th class="stub{" lead" * (not i)}">{escape(stub)}</th>' for i, stub in enumerate(shown.stubs))
+    heads += "".join(f"<th>{_unbroken(column.title)}</th>" for column in shown.columns)
     width = len(shown.stubs) + len(shown.columns)
     blocks = "\n".join(_block(block, width) for block in shown.blocks)
     return (
         f"<h3>{escape(shown.title)}</h3>\n{paragraph(shown.caption, soft=True) if shown.caption else ''}\n"
         f'<div class="wide" tabindex="0"><table class="study"><thead>{above}<tr>{heads}</tr></thead>\n{blocks}</table></div>'
     )
+
+
+def _unbroken(title: str) -> str:
+    """The arrow stays with its word."""
+    return escape(title).replace(" ↑", "&nbsp;↑").replace(" ↓", "&nbsp;↓")
 
 
 def _block(block: Block, width: int) -> str:
@@ -149,12 +154,13 @@ def _block_row(block: Block, index: int) -> str:
 def _stub(rows: Sequence[TableRow], index: int, place: int) -> str:
     """A row's label, once for all rows in a row that share it."""
     label = rows[index].labels[place]
+    kind = "" if place else " lead"
     if place == len(rows[index].labels) - 1:
-        return f'<th class="stub">{escape(label)}</th>'
+        return f'<th class="stub{kind}">{escape(label)}</th>'
     if index and rows[index - 1].labels[place] == label:
         return ""
     same = next((i for i, row in enumerate(rows[index:]) if row.labels[place] != label), len(rows) - index)
-    return f'<th class="stub" rowspan="{same}">{escape(label)}</th>'
+    return f'<th class="stub{kind}" rowspan="{same}">{escape(label)}</th>'
 
 
 def _value_cell(cell: Cell) -> str:

@@ -204,7 +204,8 @@ class Builder:
         word = "As planned, but smaller than the paper's protocol" if as_planned else "Incomplete"
         if len(found) == 1:
             return f"{word}: {next(iter(found))} in every row."
-        return f"{word}: " + ". ".join(f"{text}: {'; '.join(names)}" for text, names in found.items()) + "."
+        parts = (f"{text[0].upper()}{text[1:]}: {'; '.join(names)}." for text, names in found.items())
+        return f"{word}. {' '.join(parts)}"
 
     def _baseline(self, model: str, robots: Sequence[str], metric: str) -> Cell:
         assert isinstance(self.ours, StudyGrades)
