@@ -4,9 +4,11 @@ Each predicted frame is read with the help of the true episode, whose masks are 
 log-likelihood ratios learnt from the true video itself:
     colour      how much more often the robot has this colour than everything else has
     background  how far the pixel is from the empty scene behind it (the camera stands still)
-    shape       the true mask of the same frame, carried along by optical flow onto the predicted frame
-Shape counts only where flow explains the pixel (small residual, flow there and back closes). Without these gates a video
-that stands still would be given the true masks for nothing; with them it is judged by what it shows.
+    shape       a true mask, carried along by optical flow onto the predicted frame: that of the same frame or, where it
+                explains a pixel better, that of the true frame which looks most like the predicted one
+Shape counts only where flow explains the pixel (small residual, flow there and back closes), and there it counts for more
+than looks. Without these gates a video that stands still would be given the true masks for nothing; with them it is judged
+by what it shows.
 Its error on true video is published beside every score: the row `ground_truth` of `evaluate --baselines`.
 """
 
@@ -15,6 +17,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+
+from xew.metrics.alike import most_alike
 
 COLOUR_BINS = 24
 """Per channel of Lab."""
@@ -28,8 +32,10 @@ EVIDENCE_LIMIT = 4.0
 """No single kind of evidence may say more than exp(4) : 1; histograms of one episode know no better."""
 SHAPE_WEIGHT = 9.0
 """More than both other kinds together: where flow explains a pixel fully, an object in the robot's colours stays out."""
-SHAPE_REACH = 2.0
+SHAPE_REACH = 1.0
 """Pixels from the carried contour at which shape evidence is three quarters of its full weight."""
+SHAPE_TRUST = 0.8
+"""How much of the other two kinds is dropped where flow explains a pixel fully: a carried contour is sharper than they are."""
 SMALLEST_PIECE = 24
 """Pixels; what is smaller is the rim of some object, not a robot."""
 RESIDUAL_SCALE = 25.0
@@ -66,8 +72,13 @@ def estimate_masks(
         [t h w] bool.
     """
     appearance = appearance or learn_appearance(target, target_mask)
-    frames = zip(prediction, target, target_mask, strict=True)
-    return np.stack([_estimate_frame(appearance, *frame) for frame in frames])
+    alike, _ = most_alike(prediction, target)
+    masks = []
+    for t, frame in enumerate(prediction):
+        # The mask of the frame itself comes first: where both explain a pixel equally well, it is the one that counts.
+        references = [(target[i], target_mask[i]) for i in dict.fromkeys((t, int(alike[t])))]
+        masks.append(_estimate_frame(appearance, frame, references))
+    return np.stack(masks)
 
 
 def learn_appearance(video: np.ndarray, mask: np.ndarray) -> Appearance:
@@ -91,13 +102,29 @@ def learn_appearance(video: np.ndarray, mask: np.ndarray) -> Appearance:
     )
 
 
-def _estimate_frame(appearance: Appearance, frame: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:
+def _estimate_frame(appearance: Appearance, frame: np.ndarray, references: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    gate, shape = functools.reduce(_better, (_carried_shape(frame, *reference) for reference in references))
+    looks = (1 - SHAPE_TRUST * gate) * _looks(appearance, frame)
+    return _drop_specks(cv2.medianBlur((looks + SHAPE_WEIGHT * gate * shape > 0).astype(np.uint8), 3))
+
+
+def _looks(appearance: Appearance, frame: np.ndarray) -> np.ndarray:
+    """[h w] float32, evidence of colour and background."""
     colour = appearance.colour.reshape(-1)[_colour_bins(frame)]
     difference = appearance.difference[_difference(frame, appearance.background)]
     looks = np.clip(colour, -EVIDENCE_LIMIT, EVIDENCE_LIMIT)
     looks += np.where(appearance.uncovered, np.clip(difference, -EVIDENCE_LIMIT, EVIDENCE_LIMIT), 0)
-    score = cv2.GaussianBlur(looks.astype(np.float32), (0, 0), 0.8) + _shape_evidence(frame, target, target_mask)
-    return _drop_specks(cv2.medianBlur((score > 0).astype(np.uint8), 3))
+    return cv2.GaussianBlur(looks.astype(np.float32), (0, 0), 0.8)
+
+
+Shape = tuple[np.ndarray, np.ndarray]
+"""How well flow explains each pixel, [h w] 0 to 1, and how surely the mask it carries is there, [h w] -1 to 1."""
+
+
+def _better(a: Shape, b: Shape) -> Shape:
+    """At each pixel the shape whose flow explains it better."""
+    take = b[0] > a[0]
+    return np.where(take, b[0], a[0]), np.where(take, b[1], a[1])
 
 
 def _drop_specks(mask: np.ndarray) -> np.ndarray:
@@ -108,8 +135,8 @@ def _drop_specks(mask: np.ndarray) -> np.ndarray:
     return large[pieces]
 
 
-def _shape_evidence(frame: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:
-    """[h w] float32: the target's mask carried onto the frame by flow, gated by how well flow explains the pixel."""
+def _carried_shape(frame: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> Shape:
+    """A true frame's mask carried onto a predicted frame by flow."""
     grey, grey_target = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame, target))
     there, back = _flow(grey, grey_target), _flow(grey_target, grey)
     source = _grid(grey.shape) + there
@@ -117,7 +144,7 @@ def _shape_evidence(frame: np.ndarray, target: np.ndarray, target_mask: np.ndarr
     soft_frame, soft_target = (_soften(image, RESIDUAL_SOFTNESS).astype(np.float32) for image in (frame, target))
     residual = _difference(soft_frame, _sample(soft_target, source))
     gate = np.exp(-((residual / RESIDUAL_SCALE) ** 2) - (closure / CLOSURE_SCALE) ** 2)
-    return SHAPE_WEIGHT * gate * np.tanh(_sample(_signed_distance(target_mask), source) / SHAPE_REACH)
+    return gate, np.tanh(_sample(_signed_distance(target_mask), source) / SHAPE_REACH)
 
 
 def _soften(image: np.ndarray, sigma: float) -> np.ndarray:

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from xew.metrics.alike import most_alike
+
 PATCH = 12
 """Half the side of the patch round a point [pixels]."""
 PATCH_STEP = 2
@@ -40,10 +42,6 @@ LOST = 0.6
 """Cost of each frame in which a point is nowhere."""
 INNER_MOTION = 8.0
 """A link's origin lies inside the link and moves by so much otherwise than the surface in front of it, at most [pixels]."""
-THUMBNAIL = (40, 30)
-"""Width and height to which frames are shrunk to find the one most alike [pixels]."""
-CLEARLY = 0.9
-"""Another moment must differ by so much less, as a factor of the squared difference, to be preferred to the same one."""
 SAME_MOMENT = 4.0
 """Root mean square difference [levels] of thumbnails up to which two frames show the same moment, hidden points included."""
 HIDDEN = 0.3
@@ -100,27 +98,6 @@ def estimate_tracks(prediction: np.ndarray, target: np.ndarray, points: np.ndarr
         step = np.where(known_before | ~seen, JUMP, 0)[:, None, None] * _straying(place, carried, inner)
         paths.add(place, cost, step, lost=np.where(seen, LOST, 0))
     return np.where(visible[..., None], paths.best(), np.nan).astype(np.float32)
-
-
-def most_alike(prediction: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For each predicted frame the true frame that looks most like it: its index [t], and their difference [t] in levels.
-
-    The frame of the same time is preferred unless another is clearly more alike.
-    """
-    predicted, true = (_thumbnails(video) for video in (prediction, target))
-    square = np.sum(predicted**2, axis=1)[:, None] + np.sum(true**2, axis=1) - 2 * predicted @ true.T
-    square = np.maximum(square / predicted.shape[1], 0)
-    rows = np.arange(len(square))
-    nearest = np.argmin(square, axis=1)
-    # A hundredth of a squared level is rounding: frames that are the same stay with their own time.
-    chosen = np.where(square[rows, nearest] < CLEARLY * square[rows, rows] - 0.01, nearest, rows)
-    return chosen, np.sqrt(square[rows, chosen])
-
-
-def _thumbnails(video: np.ndarray) -> np.ndarray:
-    """[t n] float64."""
-    small = [cv2.resize(frame, THUMBNAIL, interpolation=cv2.INTER_AREA) for frame in video]
-    return np.stack(small).reshape(len(video), -1).astype(np.float64)
 
 
 def _propose(

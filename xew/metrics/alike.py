@@ -1,0 +1,39 @@
+"""Metrics, default estimators: which moment of the true video does a predicted frame show?
+
+Both estimators read a predicted frame beside two true frames: that of the same time, and the one found here.
+"""
+
+import cv2
+import numpy as np
+
+THUMBNAIL = (40, 30)
+"""Width and height to which frames are shrunk to be compared [pixels]."""
+CLEARLY = 0.9
+"""Another moment must differ by so much less, as a factor of the squared difference, to be preferred to the same one."""
+ROUNDING = 0.01
+"""Squared levels by which frames that are the same may seem to differ: they stay with their own time."""
+
+
+def most_alike(prediction: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For each predicted frame the true frame that looks most like it.
+
+    Args:
+        prediction, target: [t h w 3] uint8, predicted and true video of one episode.
+
+    Returns:
+        [t] the true frame's index, and [t] the root mean square difference of both as thumbnails, in levels. The frame of
+        the same time is preferred unless another is clearly more alike.
+    """
+    predicted, true = (_thumbnails(video) for video in (prediction, target))
+    square = np.sum(predicted**2, axis=1)[:, None] + np.sum(true**2, axis=1) - 2 * predicted @ true.T
+    square = np.maximum(square / predicted.shape[1], 0)
+    rows = np.arange(len(square))
+    nearest = np.argmin(square, axis=1)
+    chosen = np.where(square[rows, nearest] < CLEARLY * square[rows, rows] - ROUNDING, nearest, rows)
+    return chosen, np.sqrt(square[rows, chosen])
+
+
+def _thumbnails(video: np.ndarray) -> np.ndarray:
+    """[t n] float64."""
+    small = [cv2.resize(frame, THUMBNAIL, interpolation=cv2.INTER_AREA) for frame in video]
+    return np.stack(small).reshape(len(video), -1).astype(np.float64)
