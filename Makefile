@@ -25,6 +25,7 @@ $(STAMP): pyproject.toml requirements/test.txt
 
 $(REFERENCE): $(STAMP)
 	$(BIN)/python -m pip install --disable-pip-version-check -c requirements/test.txt -e '.[dev,reference]'
+	SAM2_BUILD_CUDA=0 $(BIN)/python -m pip install --disable-pip-version-check --no-deps --no-build-isolation sam2==1.1.0
 	touch $@
 
 # One thread a worker in the numerical libraries: two workers with a pool each only wait for one another.
