@@ -11,35 +11,58 @@ from xew.analysis.summary import Interval, RobotTable, Row, finding, mean_interv
 rng = np.random.default_rng(0)
 
 
+def episodes(values: object, robots: tuple[str, ...] = ("piper",)) -> pd.Series:
+    """Scores of scenes and robots, scene by scene."""
+    values = np.atleast_1d(np.asarray(values, float))
+    scenes = [("lift_pot", seed) for seed in range(len(values) // len(robots))]
+    index = pd.MultiIndex.from_tuples([(*s, r) for s in scenes for r in robots], names=["task", "seed", "robot"])
+    return pd.Series(values, index)
+
+
 def info(name: str, unit: str = "", higher: bool = False) -> MetricInfo:
     return MetricInfo(name, "visual", unit, higher, None, None, "")
 
 
 def test_the_interval_is_close_to_the_normal_one_for_many_values() -> None:
     values = rng.normal(3, 2, 400)
-    interval = mean_interval(values)
+    interval = mean_interval(episodes(values))
     half = 1.96 * values.std() / np.sqrt(len(values))
     assert interval.mean == pytest.approx(values.mean())
     assert (interval.low, interval.high) == pytest.approx((values.mean() - half, values.mean() + half), abs=0.1 * half)
-    assert interval == mean_interval(values)
+    assert interval == mean_interval(episodes(values))
 
 
 def test_one_value_has_no_interval_and_equal_values_a_point() -> None:
-    assert np.isnan(mean_interval(np.array([2.0])).low)
-    assert mean_interval(np.array([2.0, 2.0])) == Interval(2, 2, 2, 2)
+    assert np.isnan(mean_interval(episodes(2.0)).low)
+    assert mean_interval(episodes([2.0, 2.0])) == Interval(2, 2, 2, 2)
 
 
 @pytest.mark.parametrize(("shift", "higher", "expected"), [(1, True, "better"), (1, False, "worse"), (0, True, "unresolved")])
 def test_verdicts_are_paired(shift: float, higher: bool, expected: str) -> None:
     """Episodes differ by far more than the models do, so that only pairing can tell them apart."""
-    copy = pd.Series(rng.normal(0, 50, 20))
+    copy = episodes(rng.normal(0, 50, 20))
     model = copy + shift + np.tile([-0.5, 0.5], 10)
     assert verdict(model.sample(frac=1, random_state=1), copy, higher) == expected
 
 
-def test_a_single_episode_resolves_nothing() -> None:
-    assert verdict(pd.Series([9.0]), pd.Series([1.0]), True) == "unresolved"
-    assert verdict(pd.Series([9.0, 8.0], index=[0, 1]), pd.Series([1.0, 2.0], index=[1, 2]), True) == "unresolved"
+def test_a_single_scene_resolves_nothing() -> None:
+    assert verdict(episodes([9.0]), episodes([1.0]), True) == "unresolved"
+    assert verdict(episodes([9.0, 8.0]), episodes([1.0, 2.0]).iloc[1:], True) == "unresolved"
+    pooled = ("aloha_agilex", "arx_x5", "ur5_wsg")
+    assert verdict(episodes([9.0, 8.0, 9.5], pooled), episodes([1.0, 2.0, 1.5], pooled), True) == "unresolved"
+
+
+def test_robots_in_one_scene_are_resampled_together() -> None:
+    """Three robots that score alike in every scene tell no more than one of them."""
+    scenes, pooled = rng.normal(3, 2, 30), ("aloha_agilex", "arx_x5", "ur5_wsg")
+    one, three = mean_interval(episodes(scenes)), mean_interval(episodes(np.repeat(scenes, 3), pooled))
+    assert (three.low, three.high) == pytest.approx((one.low, one.high)) and (one.count, three.count) == (30, 90)
+
+
+def test_a_difference_inside_the_noise_floor_is_not_resolved() -> None:
+    model, copy = episodes(0.53 + 0.001 * np.arange(8)), episodes(0.5 + 0.001 * np.arange(8))
+    assert verdict(model, copy, True, floor=0.02) == "better" and verdict(model, copy, True, floor=0.04) == "unresolved"
+    assert verdict(copy, model, True, floor=0.02) == "worse" and verdict(copy, model, True, floor=0.04) == "unresolved"
 
 
 def table(title: str, model: float, copy: float = 0.4) -> RobotTable:

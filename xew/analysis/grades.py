@@ -11,7 +11,7 @@ prints the same. Whoever computes a difference or a ratio does it on all these v
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -123,6 +123,28 @@ def pooled(variant: Variant, robots: str) -> tuple[str, ...]:
     return SPLITS[variant.split].train_robots if robots == SEEN else (robots,)
 
 
+def resample(values: np.ndarray) -> Mean | None:
+    """The mean of scores [s r] of scenes and robots, and of DRAWS resamples of the scenes; NaN where there is no score.
+
+    The same resamples for any two arrays of as many scenes, so that their differences are paired. None without any score.
+    """
+    held = ~np.isnan(values)
+    if not held.any():
+        return None
+    sums, counts = np.where(held, values, 0).sum(axis=1), held.sum(axis=1)
+    weights = _scene_weights(len(values))
+    with np.errstate(invalid="ignore"):
+        means = (weights @ sums) / (weights @ counts)
+    return Mean(means, int(counts.sum()), int((counts > 0).sum()))
+
+
+@lru_cache(maxsize=4)
+def _scene_weights(scenes: int) -> np.ndarray:
+    """How often each scene is drawn [1 + DRAWS s]: once each in the first row, then at random with replacement."""
+    drawn = np.random.default_rng(0).multinomial(scenes, np.full(scenes, 1 / scenes), DRAWS)
+    return np.concatenate([np.ones((1, scenes)), drawn])
+
+
 class StudyGrades:
     """A study's score table with the column `variant`.
 
@@ -170,7 +192,7 @@ class StudyGrades:
             values = self._block(variant, robots, metric)
             if shared_part:
                 values = np.where(self._shared(shared_part, robots, metric), values, np.nan)
-            self._cache[key] = self._resample(values)
+            self._cache[key] = resample(values)
         return self._cache[key]
 
     def floor(self, robots: str, metric: str) -> float:
@@ -195,15 +217,6 @@ class StudyGrades:
         blocks = [~np.isnan(self._block(variant.name, robots, metric)) for variant in variants_of(part)]
         return np.logical_and.reduce([block for block in blocks if block.any()] or [np.ones_like(blocks[0])])
 
-    def _resample(self, values: np.ndarray) -> Mean | None:
-        held = ~np.isnan(values)
-        if not held.any():
-            return None
-        sums, counts = np.where(held, values, 0).sum(axis=1), held.sum(axis=1)
-        with np.errstate(invalid="ignore"):
-            means = (self._weights @ sums) / (self._weights @ counts)
-        return Mean(means, int(counts.sum()), int((counts > 0).sum()))
-
     @cached_property
     def _variants(self) -> set[str]:
         return {variant for variant, _, _ in self._columns}
@@ -211,13 +224,6 @@ class StudyGrades:
     @cached_property
     def _values(self) -> np.ndarray:
         return self._cells.to_numpy(np.float64)
-
-    @cached_property
-    def _weights(self) -> np.ndarray:
-        """How often each scene is drawn [1 + DRAWS s]: once each in the first row, then at random with replacement."""
-        scenes = len(self._cells)
-        drawn = np.random.default_rng(0).multinomial(scenes, np.full(scenes, 1 / scenes), DRAWS)
-        return np.concatenate([np.ones((1, scenes)), drawn])
 
 
 class PaperGrades:

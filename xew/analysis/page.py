@@ -232,11 +232,6 @@ def labelled_picture(source: str, caption: str, columns: Sequence[str], rows: Se
     )
 
 
-def picture(source: str, caption: str, text: str) -> str:
-    """A figure; the caption is HTML, the text is for those who cannot see it."""
-    return f'<figure><figcaption>{caption}</figcaption><img src="{source}" alt="{escape(text)}"></figure>'
-
-
 def definitions(pairs: Mapping[str, str]) -> str:
     items = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in pairs.items())
     return f"<dl>{items}</dl>"

@@ -5,12 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
+from xew.analysis.grades import LEVEL, interval, resample
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores
-
-RESAMPLES = 9999
-LEVEL = 0.95
 
 ROBOT_TITLES = {
     "aloha_agilex": "Aloha-AgileX",
@@ -88,32 +85,34 @@ class RobotTable:
         return self.expected is None or all(count == self.expected for count in self.counts)
 
 
-def mean_interval(values: np.ndarray) -> Interval:
-    """Mean of episodes' scores [n] and its percentile bootstrap interval at LEVEL; the same at every call."""
-    values = np.asarray(values, np.float64)
-    mean = float(values.mean())
-    if len(values) < 2:
-        return Interval(mean, np.nan, np.nan, len(values))
-    if np.ptp(values) == 0:
-        return Interval(mean, mean, mean, len(values))
-    result = stats.bootstrap(
-        (values,), np.mean, n_resamples=RESAMPLES, confidence_level=LEVEL, method="percentile", rng=np.random.default_rng(0)
-    )
-    return Interval(mean, float(result.confidence_interval.low), float(result.confidence_interval.high), len(values))
+def mean_interval(scores: pd.Series) -> Interval:
+    """Mean of episodes' scores and its percentile bootstrap interval; the same at every call.
 
-
-def verdict(model: pd.Series, copy: pd.Series, higher_is_better: bool) -> str:
-    """Is a model better than the frozen first frame on the episodes that both have? Series are indexed by episode.
-
-    'unresolved' where the interval of the mean paired difference holds 0, or where there are fewer than two episodes.
+    Args:
+        scores: indexed by task, seed and robot; scenes (task, seed) are resampled, with all robots that they have.
     """
-    difference = (model - copy).dropna().to_numpy() * (1 if higher_is_better else -1)
-    if len(difference) < 2:
+    mean = resample(scores.unstack("robot").to_numpy(np.float64))
+    assert mean is not None, "no episode"
+    if mean.scenes < 2:
+        return Interval(mean.value, np.nan, np.nan, mean.count)
+    if np.ptp(scores) == 0:
+        return Interval(mean.value, mean.value, mean.value, mean.count)
+    return Interval(mean.value, *interval(mean.values, LEVEL), mean.count)
+
+
+def verdict(model: pd.Series, copy: pd.Series, higher_is_better: bool, floor: float = 0) -> str:
+    """Is a model better than the frozen first frame on the episodes that both have? Series are indexed as above.
+
+    'unresolved' where the interval of the mean paired difference holds 0, where the difference is inside the estimators' noise
+    floor, or where there are fewer than two scenes.
+    """
+    difference = (model - copy).dropna() * (1 if higher_is_better else -1)
+    if len(difference.unstack("robot")) < 2:
         return "unresolved"
-    interval = mean_interval(difference)
-    if interval.low > 0:
+    found = mean_interval(difference)
+    if found.low > 0 and found.mean > floor:
         return "better"
-    return "worse" if interval.high < 0 else "unresolved"
+    return "worse" if found.high < 0 and -found.mean > floor else "unresolved"
 
 
 def robot_table(scores: Scores, title: str, robots: Sequence[str], expected: int | None) -> RobotTable:
@@ -123,19 +122,34 @@ def robot_table(scores: Scores, title: str, robots: Sequence[str], expected: int
     by_model = {(str(model), str(condition)): group for (model, condition), group in groups}
     ends = [key for name in (COPY, TRUTH) for key in by_model if key[0] == name]
     order = [key for key in by_model if key[0] not in (COPY, TRUTH)] + ends
-    copy = next((by_model[key] for key in ends if key[0] == COPY), None)
-    built = tuple(_row(key, by_model[key], copy, scores.metrics) for key in order)
+    copy, truth = (next((by_model[key] for key in ends if key[0] == name), None) for name in (COPY, TRUTH))
+    built = tuple(_row(key, by_model[key], copy, truth, scores.metrics) for key in order)
     return RobotTable(title, tuple(robots), built, expected)
 
 
-def _row(key: tuple[str, str], group: pd.DataFrame, copy: pd.DataFrame | None, metrics: Sequence[MetricInfo]) -> Row:
+def _row(
+    key: tuple[str, str],
+    group: pd.DataFrame,
+    copy: pd.DataFrame | None,
+    truth: pd.DataFrame | None,
+    metrics: Sequence[MetricInfo],
+) -> Row:
     values = {metric.name: _by_episode(group, metric.name) for metric in metrics}
     verdicts = {}
     if copy is not None and key[0] not in (COPY, TRUTH):
         for metric in metrics:
-            verdicts[metric.name] = verdict(values[metric.name], _by_episode(copy, metric.name), metric.higher_is_better)
-    intervals = {name: mean_interval(series.to_numpy()) for name, series in values.items() if len(series)}
+            floor = _noise_floor(truth, metric)
+            still = _by_episode(copy, metric.name)
+            verdicts[metric.name] = verdict(values[metric.name], still, metric.higher_is_better, floor)
+    intervals = {name: mean_interval(series) for name, series in values.items() if len(series)}
     return Row(*key, intervals, verdicts)
+
+
+def _noise_floor(truth: pd.DataFrame | None, metric: MetricInfo) -> float:
+    """How far from perfect the true video is graded."""
+    perfect = metric.high if metric.higher_is_better else metric.low
+    graded = _by_episode(truth, metric.name) if truth is not None else pd.Series()
+    return abs(float(graded.mean()) - perfect) if len(graded) and perfect is not None and np.isfinite(perfect) else 0.0
 
 
 def _by_episode(rows: pd.DataFrame, metric: str) -> pd.Series:
