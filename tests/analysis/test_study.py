@@ -224,7 +224,7 @@ def test_two_of_one_cell_never_run_at_once(study: Study) -> None:
     first.join()
     second.join()
     assert (first.exitcode, second.exitcode, begun(study.out)) == (0, 0, {"file": 2})
-    assert last_lines(log, 1).startswith("exit status 0, ")
+    assert log.read_text().splitlines()[-1].startswith("exit status 0, ")
 
 
 @pytest.mark.parametrize(("arguments", "code"), [(["--fail"], 1), (["--unknown-number", "x"], 0), (["--wait", "x"], 2)])
@@ -232,6 +232,14 @@ def test_exit_statuses_are_those_of_the_command(tmp_path: Path, arguments: list[
     process = start_cell((STEPS, str(tmp_path / "file"), "text", *arguments), tmp_path / "cell.log", {})
     process.join()
     assert process.exitcode == code
+
+
+def test_the_end_of_a_log_has_no_progress_bars(tmp_path: Path) -> None:
+    (tmp_path / "a.log").write_text(
+        "$ python -m x\ntrain:  0%\rtrain: 50%\rtrain: 100%\n\nerror: no\nexit status 2, 0.1 s of CPU\n"
+    )
+    assert last_lines(tmp_path / "a.log", 2) == "train: 100%\nerror: no"
+    assert last_lines(tmp_path / "none.log") == ""
 
 
 def test_a_launcher_starts_the_command(tmp_path: Path) -> None:

@@ -265,10 +265,13 @@ def _state(cell: Cell, ledger: Ledger, failed: Mapping[str, str]) -> str:
 
 def tell_failures(failed: Mapping[str, str], ledger: Ledger, cells: Mapping[str, Cell]) -> NoReturn:
     """Name what failed with its log and its last words, and end with status 1."""
+    told = ""
     for name, reason in failed.items():
         if not reason.startswith("needs "):
             log = ledger.log(cells[name])
-            print(f"FAILED {name}: {reason}; log: {log}\n  " + last_lines(log).replace("\n", "\n  "), file=sys.stderr)
+            words = "  " + last_lines(log).replace("\n", "\n  ")
+            print(f"FAILED {name}: {reason}; log: {log}", *([words] if words != told else []), sep="\n", file=sys.stderr)
+            told = words
     blocked = sum(reason.startswith("needs ") for reason in failed.values())
     print(f"{len(failed) - blocked} cells failed, {blocked} could not be made for it; the others are done.", file=sys.stderr)
     raise SystemExit(1)

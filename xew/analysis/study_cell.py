@@ -24,6 +24,8 @@ from typing import Literal
 
 PRELOADED = ("xew.model.train", "xew.model.rollout", "xew.metrics.evaluate")
 """What the fork server imports. None of them may start a thread or a JAX backend at import, which forks would not survive."""
+ENDED = "exit status"
+"""How the last line of a log begins."""
 
 CONTEXTS: dict[str, ForkServerContext | SpawnContext] = {
     "forkserver": multiprocessing.get_context("forkserver"),
@@ -62,13 +64,13 @@ def shown(command: Sequence[str]) -> str:
 
 
 def last_lines(log: Path, count: int = 3) -> str:
-    """The end of a log, without progress bars."""
+    """The end of a command's log, without progress bars."""
     try:
         text = log.read_text(errors="replace")
     except OSError:
         return ""
-    lines = [line.rpartition("\r")[2].strip() for line in text.splitlines()]
-    return "\n".join([line for line in lines if line][-count:])
+    lines = [line.rpartition("\r")[2].strip() for line in text.split("\n")]
+    return "\n".join([line for line in lines if line and not line.startswith(ENDED)][-count:])
 
 
 def _run(command: tuple[str, ...], log: Path, environment: dict[str, str], launcher: tuple[str, ...]) -> None:
@@ -85,7 +87,7 @@ def _run(command: tuple[str, ...], log: Path, environment: dict[str, str], launc
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
-        print(f"exit status {code}, {_cpu_seconds():.1f} s of CPU", flush=True)
+        print(f"{ENDED} {code}, {_cpu_seconds():.1f} s of CPU", flush=True)
     raise SystemExit(code)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from xew.analysis.study_config import Settings, Study, experiment_of
 from xew.analysis.study_ledger import Ledger
+from xew.analysis.study_machines import gpus_of
 from xew.analysis.study_plan import STAGES, Cell, in_order
 from xew.protocol import Variant
 
@@ -119,7 +120,8 @@ def cost_table(
     study: Study, cells: Mapping[str, Cell], costs: Mapping[str, Cost], seconds: Mapping[str, float], ledger: Ledger, slots: int
 ) -> str:
     """What is left to do, a line per stage, and what it takes altogether."""
-    lines = [f"{'stage':<10}{'cells':>7}{'done':>7}{'left to do':>22}{'hours':>9}{'GPU-hours':>11}{'GB':>8}"]
+    on_gpus = bool(gpus_of(study) or study.machine.ray)
+    lines = [f"{'stage':<10}{'cells':>7}{'done':>7}{'left to do':>22}{'hours':>9}{'GPU-hours' if on_gpus else '':>11}{'GB':>8}"]
     done = {name for name in cells if ledger.outcome(name)}
     totals = [0.0, 0.0, 0.0]
     for stage in STAGES:
@@ -132,9 +134,10 @@ def cost_table(
         if names:
             amount = f"{sum(costs[name].amount for name in left):,} {costs[names[0]].unit}"
             counts = f"{stage:<10}{len(names):>7}{len(names) - len(left):>7}{amount:>22}"
-            lines.append(f"{counts}{hours:>9.2f}{gpu_hours:>11.2f}{disk:>8.1f}")
+            lines.append(f"{counts}{hours:>9.2f}{f'{gpu_hours:.2f}' if on_gpus else '':>11}{disk:>8.1f}")
     wall = wall_seconds(cells, seconds, done, slots)
-    lines.append(f"{'all':<10}{len(cells):>7}{len(done):>7}{'':>22}{totals[0]:>9.2f}{totals[1]:>11.2f}{totals[2]:>8.1f}")
+    total = f"{'all':<10}{len(cells):>7}{len(done):>7}{'':>22}{totals[0]:>9.2f}"
+    lines.append(f"{total}{f'{totals[1]:.2f}' if on_gpus else '':>11}{totals[2]:>8.1f}")
     lines.append(f"about {duration(wall)} with {slots} at once, by the rates of: {study.rates.measured_on}")
     free = free_gb(study.out)
     if free < totals[2]:

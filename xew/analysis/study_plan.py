@@ -159,7 +159,7 @@ def _evaluate(study: Study, variant: Variant, baselines: bool) -> Cell:
     """The first variant is of all robots, so the baselines stand beside its rows and not again beside the others'."""
     out = _scores(study, variant.name)
     given = ("--data", str(study.data_folder), "--out", str(out))
-    asked = (*(("--baselines",) if baselines else ()), *study.evaluate)
+    asked = ("--baselines" if baselines else "--no-baselines", *study.evaluate)
     return Cell(
         "evaluate",
         variant.name,
