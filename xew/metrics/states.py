@@ -12,6 +12,7 @@ batch that it is computed in. On a CPU it does not; on a GPU, convolutions of ot
 otherwise in its last digit. All functions are pure and work under jit; `lax.scan` can carry a state.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -139,18 +140,18 @@ def _as_float(limbs: jax.Array) -> jax.Array:
     return jnp.where(negative, -total, total)
 
 
-def _mean_over(values: Callable[..., tuple[jax.Array, jax.Array | bool]]) -> Mergeable:
+def _mean_over(values: Callable[..., tuple[jax.Array, jax.Array | None]]) -> Mergeable:
     """Of a metric that is the mean of values that some parts have: function of the inputs to values and which count."""
 
     def update(state: Mean, *inputs: jax.Array, **options: Any) -> Mean:
         found, counts = values(*inputs, **options)
-        return merge_means(state, mean_of(found.reshape(-1), counts if counts is True else counts.reshape(-1)))
+        return merge_means(state, mean_of(found.reshape(-1), True if counts is None else counts.reshape(-1)))
 
     return Mergeable(empty_mean, update, merge_means, lambda state: state.value)
 
 
 def _mean_over_frames(curve: Callable[..., jax.Array]) -> Mergeable:
-    return _mean_over(lambda *inputs, **options: (curve(*inputs, **options), True))
+    return _mean_over(lambda *inputs, **options: (curve(*inputs, **options), None))
 
 
 def _update_psnr(state: CappedMean, prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) -> CappedMean:
@@ -200,7 +201,7 @@ STATES = {
     "boundary_f1": _mean_over_frames(boundary_f1),
     "region_lpips": _mean_over_frames(region_lpips_frames),
     "pck": _mean_over(hits),
-    "pck_05": _mean_over(lambda *inputs: hits(*inputs, alpha=0.05)),
+    "pck_05": _mean_over(functools.partial(hits, alpha=0.05)),
     "keypoint_error": _mean_over(distances),
     "ndtw": _mean_over(warpings),
     "coverage": _mean_over(presence),
@@ -212,5 +213,5 @@ video: `update(state, prediction, target, mask, box=union_box(all_masks))`. A pa
 at once, and its state is the mean over keypoints of several such. States of several videos, merged, are means over all their
 frames or points; for the mean over videos, each counting the same, give one number a video to MEAN."""
 
-MEAN = _mean_over(lambda values: (values, True))
+MEAN = _mean_over(lambda values: (values, None))
 """The mean of numbers [n], such as one score for each video. NaN, the score where no point is valid, is not counted."""
