@@ -22,7 +22,7 @@ FORBIDDEN = {
 }
 """Names that a room must not import; '' is the ground that all rooms stand on (episode, protocol, rollout, config)."""
 
-READERS = {"evaluate", "scores", "bundle", "truth", "alexnet", "adapters", "backends", "sam2", "cotracker", "tapir", "flow"}
+READERS = {"evaluate", "scores", "bundle", "truth", "jobs", "workers", "alexnet", "adapters", "backends", "sam2", "cotracker", "tapir", "flow"}
 """The files of `metrics` that may touch the disk or anything of ours outside the room."""
 
 

@@ -17,7 +17,8 @@ from tests.metrics.small import write_many
 from tests.synthetic import write_synthetic_data
 from xew.episode import find_accepted, read_video
 from xew.metrics import evaluate, scores
-from xew.metrics.evaluate import Args, in_order, main
+from xew.metrics.evaluate import Args, main
+from xew.metrics.workers import Bench, in_order
 from xew.rollout import write_rollout
 
 ROBOTS = ("franka_panda", "piper")
@@ -118,7 +119,7 @@ def graded(out: Path) -> list[Path]:
 def test_workers_are_shared_out_to_the_devices() -> None:
     """Each thread takes the next device; one that has an estimator of its own keeps it."""
     devices = iter(["first", "second", "first"])  # the thread that opens it takes one too
-    bench = evaluate.Bench(object, object, devices)
+    bench = Bench(object, object, devices)
     found = []
     threads = [threading.Thread(target=lambda: found.append((bench.device, bench.masker is bench.masker))) for _ in range(2)]
     for thread in threads:

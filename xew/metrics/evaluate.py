@@ -10,49 +10,34 @@ Writes scores.parquet, one row per model, condition, task, seed, robot and metri
 """
 
 import itertools
-import os
-import threading
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
-import cv2
 import jax
 import numpy as np
 import pandas as pd
 import tyro
 from tqdm import tqdm
 
-from xew.config import ConfigError, pick, user_errors
-from xew.episode import EpisodeError, Record, episode_folder, read_record, verify_episode
+from xew.config import ConfigError, pick, suggestion, user_errors
+from xew.episode import EpisodeError, verify_episode
 from xew.metrics import METRICS
-from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, identity, open_masker, open_tracker
+from xew.metrics.backends import MASKERS, TRACKERS, identity, open_masker, open_tracker
 from xew.metrics.bundle import demand_none, differences, disagreements, read_bundle, write_bundle
 from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, compared, grade
-from xew.metrics.scores import (
-    Cell,
-    CellStore,
-    beside,
-    check_out,
-    describe,
-    file_digest,
-    write_diagnostics,
-    write_tables,
-    write_whole,
-)
+from xew.metrics.jobs import BASELINES, Job, plan, prediction_of
+from xew.metrics.scores import CellStore, beside, check_out, describe, write_diagnostics, write_tables, write_whole
 from xew.metrics.summary import summarise, to_markdown
 from xew.metrics.truth import Truth, read_truth
+from xew.metrics.workers import Bench, compile_cache, in_order, not_needed, per_thread, worker_count
 from xew.protocol import HELD_OUT_ROBOTS
-from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video
+from xew.rollout import RolloutError
 
 PROTOCOL = 2
 """Goes up when any number that evaluate writes would change; scores of another protocol are graded anew."""
 DIMENSIONS = tuple(dict.fromkeys(metric.dimension for metric in METRICS.values()))
-MOST_WORKERS = 32
-"""A worker holds an episode and a prediction, a quarter of a gigabyte at full length."""
 
 
 @dataclass(frozen=True)
@@ -101,13 +86,6 @@ class Args:
     """With --check: grade so many of its videos anew and compare."""
 
 
-BASELINES: dict[str, Callable[[Truth], np.ndarray]] = {
-    "copy_first_frame": lambda truth: np.repeat(truth.rgb[:1], len(truth.rgb), axis=0),
-    "ground_truth": lambda truth: truth.rgb,
-}
-"""What a score of nothing and a score of everything look like; the second is the noise floor of the estimators."""
-
-
 WRITTEN = {
     "parquet": "scores",
     "curves.parquet": "the same by frame",
@@ -131,7 +109,7 @@ def main(args: Args) -> None:
     attributes = describe(settings(args), metrics)
     store = CellStore(beside(args.out, "cells"))
     errors: list[str] = []
-    jobs = plan(args, errors if args.keep_going else None)
+    jobs = find_jobs(args, errors if args.keep_going else None)
     total = len(jobs) + len(errors)
     diagnostics = tuple(DIAGNOSTICS) if args.diagnostics else ()
     errors += grade_all(jobs, (*metrics, *diagnostics), args, store)
@@ -160,11 +138,10 @@ def _write_summary(args: Args, rows: pd.DataFrame) -> str:
 
 def choose_metrics(args: Args) -> tuple[str, ...]:
     """Names of the metrics to grade, in the registry's order. Raises ConfigError for an unknown name, or if none is left."""
-    for name in args.metrics:
-        pick(METRICS, name, "metric")
-    known = dict.fromkeys(DIMENSIONS, "")
-    for name in args.dimensions:
-        pick(known, name, "dimension")
+    for kind, names, known in (("metric", args.metrics, tuple(METRICS)), ("dimension", args.dimensions, DIMENSIONS)):
+        for name in names:
+            if name not in known:
+                raise ConfigError(f"unknown {kind} {name!r};{suggestion(name, known)} known: {', '.join(known)}.")
     chosen = tuple(name for name in METRICS if name in args.metrics and METRICS[name].dimension in args.dimensions)
     if not chosen:
         raise ConfigError(f"no metric of {', '.join(args.metrics)} is of the dimensions {', '.join(args.dimensions)}.")
@@ -192,165 +169,23 @@ def _identity(name: str, checkpoint: Path | None, option: str) -> str:
     return identity(name, checkpoint)
 
 
-@dataclass(frozen=True)
-class Job:
-    """One video to grade: a rollout, or a baseline on a rollout's episode and frames."""
-
-    cell: Cell
-    rollout: Rollout | None
-    """None: the baseline that the cell names as its model."""
-    episode: Path
-    frame_rate: float
-    """The episode's."""
-
-    @property
-    def place(self) -> Path:
-        return self.rollout.folder if self.rollout else self.episode
-
-
-def plan(args: Args, problems: list[str] | None = None) -> list[Job]:
-    """All that is to be graded, each once, jobs of one episode together.
-
-    Args:
-        args: of the command.
-        problems: where given, rollouts that cannot be graded are told here and left out.
-
-    Raises:
-        EpisodeError: a rollout cannot be graded. ConfigError: none is named.
-    """
-    if not args.rollouts:
-        raise ConfigError("no rollouts named; give their folder: python -m xew.metrics.evaluate ROLLOUTS --data DATA")
+def find_jobs(args: Args, problems: list[str] | None = None) -> list[Job]:
+    """All that is to be graded. Raises, or tells the problems, as `plan`."""
     if args.frame_zero == "predicted" and args.baselines:
         raise ConfigError("frame 0 of the frozen first frame is the truth: with --frame-zero predicted say --no-baselines.")
-    chosen = str(settings(args))
-    rollouts = _unique(args.rollouts, problems)
-    jobs: dict[Cell, Job] = {}
-    with ThreadPoolExecutor(_workers(args)) as pool:
-        found = pool.map(lambda rollout: _try_jobs(rollout, args, chosen), rollouts)
-        for result in tqdm(found, total=len(rollouts), desc="read", unit="video", disable=None, leave=False):
-            if isinstance(result, EpisodeError):
-                _tell(problems, str(result))
-            else:
-                jobs |= {job.cell: job for job in result}
-    _check_horizons(jobs.values())
-    return sorted(jobs.values(), key=lambda job: (job.episode, job.rollout is None, job.cell.key))
-
-
-def _try_jobs(rollout: Rollout, args: Args, chosen: str) -> list[Job] | EpisodeError:
-    try:
-        return list(_jobs(rollout, args, chosen))
-    except EpisodeError as error:
-        return error
-
-
-def _jobs(rollout: Rollout, args: Args, chosen: str) -> Iterator[Job]:
-    """The rollout's own job, then its baselines'."""
-    episode = episode_folder(args.data, rollout.task, rollout.seed, rollout.robot)
-    record = _find_record(rollout, episode, args.data)
-    frames = rollout.frame_count or record.frame_count
-    if not 1 < frames <= record.frame_count:
-        raise RolloutError(
-            f"{rollout.folder}: asks for {frames} frames, its episode has {record.frame_count}; at least 2 are needed and no "
-            "more than there are."
-        )
-    try:
-        digest = file_digest(rollout.video)
-    except OSError as error:
-        raise RolloutError(f"{rollout.folder} cannot be read: {error}.") from error
-    rgb, states = (record.hashes.get(name, "") for name in ("rgb", "states"))
-    key = (rollout.model, rollout.condition, rollout.task, rollout.seed, rollout.robot)
-    cell = Cell(*key, frames, digest, rgb, states, chosen)
-    yield Job(cell, rollout, episode, record.frame_rate)
-    for name in BASELINES if args.baselines else ():
-        yield Job(replace(cell, model=name, condition="", prediction=""), None, episode, record.frame_rate)
-
-
-def _check_horizons(jobs: Iterable[Job]) -> None:
-    """Raise RolloutError where models are graded over different numbers of frames of one episode: they do not compare."""
-    first: dict[Path, Job] = {}
-    for job in jobs:
-        other = first.setdefault(job.episode, job)
-        if other.cell.frames != job.cell.frames:
-            raise RolloutError(
-                f"{job.episode}: {other.cell.model} has {other.cell.frames} frames and {job.cell.model} {job.cell.frames}; "
-                "scores over different horizons do not compare, grade them into separate tables (--out)."
-            )
-
-
-def _find_record(rollout: Rollout, folder: Path, data: Path) -> Record:
-    if not folder.is_dir():
-        raise RolloutError(
-            f"{rollout.folder} predicts {rollout.task}, seed {rollout.seed}, {rollout.robot}, which {data} does not hold; name "
-            "the data set that the rollout was made from: --data."
-        )
-    record = read_record(folder)
-    if not record.success:
-        raise RolloutError(f"{rollout.folder} predicts an episode that was rejected ({record.failure}); delete this rollout.")
-    source = rollout.header.get("source_hash")
-    if source is not None and source != record.hashes.get("rgb"):
-        raise RolloutError(f"{rollout.folder} was made from another video than {folder} now holds; make this rollout again.")
-    return record
-
-
-def _unique(roots: tuple[Path, ...], problems: list[str] | None) -> list[Rollout]:
-    """Rollouts of all trees. Raises RolloutError, or tells, when two claim to be the same model's video of one episode."""
-    seen: dict[tuple[str, str, str, int, str], Rollout] = {}
-    for rollout in (rollout for root in roots for rollout in find_rollouts(root, problems)):
-        first = seen.setdefault((rollout.model, rollout.condition, rollout.task, rollout.seed, rollout.robot), rollout)
-        if rollout.model in BASELINES:
-            _tell(problems, f"{rollout.folder}: the name {rollout.model} is a baseline's; give the model another.")
-        elif first is not rollout:
-            _tell(
-                problems,
-                f"{first.folder} and {rollout.folder} are both model {rollout.model!r}, condition {rollout.condition!r}; "
-                "give them different names in rollout.json.",
-            )
-    return [rollout for rollout in seen.values() if rollout.model not in BASELINES]
-
-
-def _tell(problems: list[str] | None, message: str) -> None:
-    """Raise RolloutError, or add to the problems where there is a list of them."""
-    if problems is None:
-        raise RolloutError(message)
-    problems.append(message)
-
-
-class Bench(threading.local):
-    """What each worker thread has for itself: a device, and estimators that keep notes of the episode at hand."""
-
-    def __init__(self, masker: Callable[[], Masker], tracker: Callable[[], Tracker], devices: Iterator[jax.Device]) -> None:
-        self.masker, self.tracker, self.device = masker(), tracker(), next(devices)
+    baselines = tuple(BASELINES) if args.baselines else ()
+    return plan(args.rollouts, args.data, str(settings(args)), baselines, worker_count(args.workers), problems)
 
 
 def open_bench(args: Args, metrics: Sequence[str]) -> Bench:
     """A bench with the chosen estimators, as far as these metrics need them. Raises ConfigError if weights are missing."""
     kinds = {compared(name) for name in metrics}
-    masker, tracker = _not_needed, _not_needed
+    masker, tracker = not_needed, not_needed
     if "mask" in kinds:
-        masker = _per_thread(args.masks, MASKERS, open_masker, args.masks_checkpoint)
+        masker = per_thread(args.masks, MASKERS, open_masker, args.masks_checkpoint)
     if kinds & {"keypoints", "objects", "contact"}:
-        tracker = _per_thread(args.tracks, TRACKERS, open_tracker, args.tracks_checkpoint)
+        tracker = per_thread(args.tracks, TRACKERS, open_tracker, args.tracks_checkpoint)
     return Bench(masker, tracker, itertools.cycle(jax.local_devices()))
-
-
-def _not_needed() -> Any:
-    """In place of an estimator that no metric asks."""
-
-
-E = TypeVar("E", bound=Callable[..., np.ndarray])
-
-
-def _per_thread(name: str, registry: Any, open_: Callable[[str, Path | None], E], checkpoint: Path | None) -> Callable[[], E]:
-    """How a thread comes by an estimator: its own, or, of one with weights, the only one, which they use in turn."""
-    if pick(registry, name, "estimator").needs is None:
-        return lambda: open_(name, checkpoint)
-    opened, turn = open_(name, checkpoint), threading.Lock()
-
-    def in_turn(*arrays: np.ndarray) -> np.ndarray:
-        with turn:
-            return opened(*arrays)
-
-    return lambda: in_turn  # type: ignore[return-value]
 
 
 def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: CellStore) -> list[str]:
@@ -369,7 +204,7 @@ def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: Cell
     groups = [list(group) for _, group in itertools.groupby(todo, key=lambda pair: (pair[0].episode, pair[0].cell.frames))]
     errors: list[str] = []
     with tqdm(total=len(jobs), initial=len(jobs) - len(todo), desc="evaluate", unit="video", disable=None) as bar:
-        results = in_order(lambda group: _grade_group(group, args, bench, store), groups, _workers(args))
+        results = in_order(lambda group: _grade_group(group, args, bench, store), groups, worker_count(args.workers))
         for group, problems in zip(groups, results, strict=True):
             errors += problems
             bar.update(len(group))
@@ -394,41 +229,10 @@ def _grade_group(group: list[tuple[Job, tuple[str, ...]]], args: Args, bench: Be
 
 
 def _grade_job(job: Job, truth: Truth, metrics: tuple[str, ...], args: Args, bench: Bench) -> Grades:
-    prediction = read_prediction(job, truth, args) if job.rollout else BASELINES[job.cell.model](truth)
+    prediction = prediction_of(job, truth, args.allow, args.frame_zero)
     first = 0 if args.frame_zero == "predicted" else 1
     with jax.default_device(bench.device):
         return grade(Comparison(prediction, truth, bench.masker, bench.tracker, first), metrics)
-
-
-def read_prediction(job: Job, truth: Truth, args: Args) -> np.ndarray:
-    """A rollout's frames, of the truth's shape. Raises RolloutError where they are not, and not allowed to be."""
-    assert job.rollout is not None
-    video = read_rollout_video(job.rollout, None if "rate" in args.allow else job.frame_rate)
-    if "resize" in args.allow:
-        video = _resized(video, truth.rgb.shape[1:3])
-    if args.frame_zero == "absent" and video.shape[1:] == truth.rgb.shape[1:]:
-        video = np.concatenate([truth.rgb[:1], video])
-    if "trim" in args.allow:
-        video = video[: len(truth.rgb)]
-    if video.shape != truth.rgb.shape:
-        raise RolloutError(
-            f"{job.rollout.video[0]} is {_size(video)}, expected {_size(truth.rgb)} as in the episode; say in rollout.json how "
-            'many frames were asked for ({"frame_count": n}), or allow what may be changed: --allow resize trim; a video '
-            "without the given frame: --frame-zero absent."
-        )
-    return video
-
-
-def _resized(video: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """Frames of another height and width, by areas where that is smaller."""
-    if video.shape[1:3] == size:
-        return video
-    method = cv2.INTER_AREA if video.shape[1] > size[0] else cv2.INTER_CUBIC
-    return np.stack([cv2.resize(frame, size[::-1], interpolation=method) for frame in video])
-
-
-def _size(video: np.ndarray) -> str:
-    return f"{len(video)} frames of {video.shape[2]}x{video.shape[1]}"
 
 
 def check(args: Args, path: Path) -> None:
@@ -441,7 +245,7 @@ def check(args: Args, path: Path) -> None:
     print(f"{path}: {len(bundle['samples'])} videos, whole, and its means are those of its values")
     if not args.rollouts:
         return
-    jobs = plan(args)
+    jobs = find_jobs(args)
     demand_none(path, differences(bundle, settings(args), [job.cell for job in jobs]))
     print("made from these rollouts and this data, by their digests")
     picked = [jobs[i] for i in np.unique(np.linspace(0, len(jobs) - 1, args.regrade).astype(int))]
@@ -454,41 +258,6 @@ def check(args: Args, path: Path) -> None:
     demand_none(path, found)
     if picked:
         print(f"{len(picked)} videos graded anew: the same scores")
-
-
-def _workers(args: Args) -> int:
-    if args.workers < 0:
-        raise ConfigError(f"--workers is {args.workers}, expected a positive number, or 0 for one for each core.")
-    return args.workers or max(len(jax.local_devices()), min(os.cpu_count() or 1, MOST_WORKERS))
-
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
-
-
-def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Iterator[Result]:
-    """Results of a function over items, in their order, computed by threads that are at most a few items ahead.
-
-    Where one raises, or whoever takes the results stops, nothing more is begun.
-    """
-    with ThreadPoolExecutor(workers) as pool:
-        waiting: deque[Future[Result]] = deque()
-        try:
-            for item in items:
-                waiting.append(pool.submit(function, item))
-                if len(waiting) > 2 * workers:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-
-
-def compile_cache() -> None:
-    """Keep compiled programs between runs in the user's cache folder, unless JAX was told otherwise."""
-    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "xew" / "jax"
-        jax.config.update("jax_compilation_cache_dir", str(cache))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,83 @@
+"""Metrics, many videos at once: worker threads, what each has for itself, and how far they run ahead.
+
+Threads and not processes: decoding, OpenCV and XLA let go of Python's lock, and compiled programs are shared.
+"""
+
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from xew.config import ConfigError, pick
+from xew.metrics.backends import Masker, Tracker
+
+MOST_WORKERS = 32
+"""A worker holds an episode and a prediction, a quarter of a gigabyte at full length."""
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Iterator[Result]:
+    """Results of a function over items, in their order, computed by threads that are at most a few items ahead.
+
+    Where one raises, or whoever takes the results stops, nothing more is begun.
+    """
+    with ThreadPoolExecutor(workers) as pool:
+        waiting: deque[Future[Result]] = deque()
+        try:
+            for item in items:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) > 2 * workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def worker_count(asked: int) -> int:
+    """How many threads to use; 0 asks for one for each processor core. Raises ConfigError for a negative number."""
+    if asked < 0:
+        raise ConfigError(f"--workers is {asked}, expected a positive number, or 0 for one for each core.")
+    return asked or max(len(jax.local_devices()), min(os.cpu_count() or 1, MOST_WORKERS))
+
+
+class Bench(threading.local):
+    """What each worker thread has for itself: a device, and estimators that keep notes of the episode at hand."""
+
+    def __init__(self, masker: Callable[[], Masker], tracker: Callable[[], Tracker], devices: Iterator[jax.Device]) -> None:
+        self.masker, self.tracker, self.device = masker(), tracker(), next(devices)
+
+
+def not_needed() -> Any:
+    """In place of an estimator that no metric asks."""
+
+
+E = TypeVar("E", bound=Callable[..., np.ndarray])
+
+
+def per_thread(name: str, registry: Any, open_: Callable[[str, Path | None], E], checkpoint: Path | None) -> Callable[[], E]:
+    """How a thread comes by an estimator: its own, or, of one with weights, the only one, which they use in turn."""
+    if pick(registry, name, "estimator").needs is None:
+        return lambda: open_(name, checkpoint)
+    opened, turn = open_(name, checkpoint), threading.Lock()
+
+    def in_turn(*arrays: np.ndarray) -> np.ndarray:
+        with turn:
+            return opened(*arrays)
+
+    return lambda: in_turn  # type: ignore[return-value]
+
+
+def compile_cache() -> None:
+    """Keep compiled programs between runs in the user's cache folder, unless JAX was told otherwise."""
+    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
+        cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "xew" / "jax"
+        jax.config.update("jax_compilation_cache_dir", str(cache))
