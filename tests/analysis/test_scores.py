@@ -6,6 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from tests.analysis.synthetic_study import write_study
 from xew.analysis.scores import (
     COPY,
     TRUTH,
@@ -16,7 +17,9 @@ from xew.analysis.scores import (
     write_scores,
 )
 from xew.config import ConfigError
+from xew.protocol import VARIANTS
 
+ADAPTED = ("fixed-optical_flow-nine_views", "few_shot-piper-1", "few_shot-franka_panda-1")
 METRICS = {
     "lpips": {"dimension": "visual", "unit": "", "higher_is_better": False, "reference": "x", "low": 0.0, "high": None},
     "pck": {"dimension": "kinematics", "unit": "", "higher_is_better": True, "reference": "x", "low": 0.0, "high": 1.0},
@@ -128,6 +131,30 @@ def test_merging_names_variants_and_keeps_baselines_once(tmp_path: Path) -> None
     pd.testing.assert_frame_equal(again.curves, merged.curves)
     assert again.attributes == merged.attributes and again.protocol == 2
     assert sorted(path.name for path in (tmp_path / "study").iterdir()) == ["scores.curves.parquet", "scores.parquet"]
+
+
+def test_a_study_that_was_graded_in_parts_is_the_whole_again(tmp_path: Path) -> None:
+    """Also where each part has the baselines of its own robots."""
+    whole = read_scores(write_study(tmp_path / "whole.parquet", ADAPTED, tasks=("lift_pot",), seeds=2))
+    parts = []
+    for name in ADAPTED:
+        robots = VARIANTS[name].graded_robots
+        path = tmp_path / f"{name}.parquet"
+        for table, file in ((whole.rows, path), (whole.curves, path.with_suffix(".curves.parquet"))):
+            of_part = (table["variant"] == name) | ((table["variant"] == "") & table["robot"].isin(robots))
+            part = table[of_part].drop(columns="variant").reset_index(drop=True)
+            part.attrs = dict(whole.attributes)
+            part.to_parquet(file, index=False)
+        parts.append((name, path))
+    merged = merge_scores(parts)
+    for ours, theirs in ((merged.rows, whole.rows), (merged.curves, whole.curves)):
+        order = [column for column in theirs.columns if column != "value"]
+        texts = {column: str for column in order if column not in ("seed", "frame", "frames", "exact_frames")}
+        ours, theirs = (
+            table.astype(texts).sort_values(order, ignore_index=True)[[*order, "value"]] for table in (ours, theirs)
+        )
+        pd.testing.assert_frame_equal(ours, theirs)
+    assert merged.curves["robot"].dtype == "category", "a hundred million rows of text would not fit"
 
 
 def test_missing_cells_of_a_study_are_by_variant(tmp_path: Path) -> None:

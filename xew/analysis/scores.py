@@ -19,6 +19,8 @@ from xew.protocol import ROBOT_NAMES
 VARIANT = "variant"
 EPISODE = ["task", "seed", "robot"]
 KEY = ["model", "condition", *EPISODE]
+NAMES = [VARIANT, "model", "condition", "task", "robot", "metric"]
+"""Columns of text."""
 COLUMNS = [*KEY, "metric", "value", "frames", "exact_frames"]
 COPY, TRUTH = "copy_first_frame", "ground_truth"
 """The two models that every other is read against: a score of nothing, and the ceiling."""
@@ -116,24 +118,26 @@ def merge_scores(tables: Sequence[tuple[str, Path]], own_robots: Sequence[str] =
     """
     if not tables:
         raise ConfigError("there is no score table to merge; grade at least one variant's rollouts first.")
-    read = [(variant, path, read_scores(path, own_robots)) for variant, path in tables]
-    for variant, path, scores in read:
+    attributes, rows, curves = [], [], []
+    metrics: tuple[MetricInfo, ...] = ()
+    graded: set[tuple[object, ...]] = set()
+    for variant, path in tables:
+        scores = read_scores(path, own_robots)
         if not variant or scores.of_study:
             found = f"is a merged table of {scores.rows[VARIANT].nunique()} variants" if variant else "has no variant's name"
             raise ConfigError(f"{path} {found}; expected the score table of one variant, and its name.")
-    attributes = _common_attributes([(path, scores.attributes) for _, path, scores in read])
-    rows = _stacked([(variant, scores.rows) for variant, _, scores in read])
-    curves = _stacked([(variant, scores.curves) for variant, _, scores in read])
-    baselines = rows["model"].isin((COPY, TRUTH))
-    same = rows.duplicated([*KEY, "metric", "content"]) if "content" in rows else rows.duplicated([*KEY, "metric", "value"])
-    rows = rows[~(baselines & same)].reset_index(drop=True)
-    curves = curves[~curves.duplicated([VARIANT, *KEY, "metric", "frame"])].reset_index(drop=True)
-    metrics = read[0][2].metrics
-    wrong = _wrong_cells(rows, metrics, set(rows["robot"]))
+        new = _without_known_baselines(scores.rows, graded)
+        rows.append(_named(variant, new))
+        curves.append(_compact(_named(variant, _curves_of(scores.curves, new))))
+        attributes.append((path, scores.attributes))
+        metrics = metrics or scores.metrics
+    common = _common_attributes(attributes)
+    merged = pd.concat(rows, ignore_index=True)
+    wrong = _wrong_cells(merged, metrics, set(merged["robot"]))
     if wrong:
-        paths = ", ".join(str(path) for _, path, _ in read)
+        paths = ", ".join(str(path) for _, path in tables)
         raise ConfigError(f"the score tables {paths} do not go together:\n{_listed(wrong)}\nGrade them anew from one data set.")
-    return Scores(rows, curves, metrics, attributes)
+    return Scores(merged, _stacked(curves), metrics, common)
 
 
 def write_scores(scores: Scores, path: Path) -> None:
@@ -235,12 +239,39 @@ def _common_attributes(tables: Sequence[tuple[Path, Mapping[Hashable, Any]]]) ->
     return merged | ({"robots": robots} if robots else {})
 
 
-def _stacked(tables: Sequence[tuple[str, pd.DataFrame]]) -> pd.DataFrame:
-    """All tables, one below the other, the variant in front."""
-    named = []
-    for variant, table in tables:
-        own = np.where(table["model"].isin((COPY, TRUTH)), "", variant)
-        table = table.copy(deep=False)
-        table.attrs = {}  # concat compares them
-        named.append(table.assign(**{VARIANT: own})[[VARIANT, *table.columns]])
-    return pd.concat(named, ignore_index=True)
+def _without_known_baselines(rows: pd.DataFrame, graded: set[tuple[object, ...]]) -> pd.DataFrame:
+    """Rows but those of baselines that are in `graded`, to which the others' are added."""
+    columns = [*KEY, "metric", "content" if "content" in rows else "value"]
+    identities = list(rows[columns].itertuples(index=False, name=None))
+    is_baseline = rows["model"].isin((COPY, TRUTH))
+    new = [not (baseline and identity in graded) for baseline, identity in zip(is_baseline, identities, strict=True)]
+    graded |= {identity for baseline, identity in zip(is_baseline, identities, strict=True) if baseline}
+    return rows[new]
+
+
+def _curves_of(curves: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame:
+    """The curves of baselines that are in a table's rows, and all others."""
+    is_baseline = curves["model"].isin((COPY, TRUTH))
+    kept = rows.loc[rows["model"].isin((COPY, TRUTH)), [*KEY, "metric"]]
+    own = curves[~is_baseline]
+    return own if kept.empty else pd.concat([own, curves[is_baseline].merge(kept, on=[*KEY, "metric"])])
+
+
+def _named(variant: str, table: pd.DataFrame) -> pd.DataFrame:
+    """A table with its variant in front; baselines have none."""
+    own = np.where(table["model"].isin((COPY, TRUTH)), "", variant)
+    named = table.assign(**{VARIANT: own})[[VARIANT, *table.columns]]
+    named.attrs = {}  # concat compares them
+    return named
+
+
+def _compact(curves: pd.DataFrame) -> pd.DataFrame:
+    """Names as numbers: a study of the paper's size has a hundred million frames."""
+    return curves.astype(dict.fromkeys(NAMES, "category"))
+
+
+def _stacked(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Compact tables, one below the other, still compact."""
+    known = {name: sorted(set().union(*(table[name].cat.categories for table in tables))) for name in NAMES}
+    alike = [table.astype({name: pd.CategoricalDtype(known[name]) for name in NAMES}) for table in tables]
+    return pd.concat(alike, ignore_index=True)
