@@ -125,6 +125,10 @@ def test_pngs_are_in_the_order_of_their_numbers_and_are_whole(folder: Path) -> N
     fails(folder, "7.png", "cut off")
     path.write_bytes(b"")
     fails(folder, "7.png", "no readable PNG")
+    path.unlink()
+    path.mkdir()
+    fails(folder, "7.png", "cannot be read")
+    path.rmdir()
     for image, word in (
         (VIDEO[0][..., 0], "grey"),
         (np.dstack([VIDEO[0], VIDEO[0][..., :1]]), "alpha"),
@@ -164,6 +168,9 @@ def test_links_out_of_the_tree_are_not_followed(folder: Path, tmp_path: Path) ->
     (folder / "rollout.json").symlink_to(tmp_path / "elsewhere.json")
     (tmp_path / "elsewhere.json").write_text("{}")
     fails(folder, "elsewhere.json", "out of the tree")
+    (folder / "rollout.json").unlink()
+    (folder / "rollout.json").symlink_to("rollout.json")
+    fails(folder, "rollout.json", "leads nowhere")
     (folder / "rollout.json").unlink()
     folder.rename(tmp_path / "moved")
     folder.symlink_to(tmp_path / "moved")

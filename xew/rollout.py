@@ -150,8 +150,12 @@ def read_rollout_video(rollout: Rollout, frame_rate: float | None = None) -> np.
 
 def _check_inside(root: Path, file: Path) -> None:
     """Raise RolloutError where links lead out of the tree."""
-    if not file.resolve().is_relative_to(root.resolve()):
-        raise RolloutError(f"{file} leads to {file.resolve()}, out of the tree {root}; put the file itself there.")
+    try:
+        end = file.resolve()
+    except (OSError, RuntimeError) as error:
+        raise RolloutError(f"{file} leads nowhere ({error}); put the file itself there.") from error
+    if not end.is_relative_to(root.resolve()):
+        raise RolloutError(f"{file} leads to {end}, out of the tree {root}; put the file itself there.")
 
 
 def _name(path: Path, key: str, name: object) -> str:
@@ -288,7 +292,10 @@ def _read_pngs(paths: tuple[Path, ...]) -> np.ndarray:
 
 def _read_png(path: Path) -> np.ndarray:
     """RGB of 8 bits [h w 3]; what OpenCV would quietly convert or fill up is an error."""
-    content = path.read_bytes()
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise RolloutError(f"{path} cannot be read ({error}); make this rollout again.") from error
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
     if image is None or not content.rstrip(b"\0").endswith(PNG_END):
         raise RolloutError(f"{path} is no readable PNG or is cut off; make this rollout again.")
