@@ -362,6 +362,8 @@ def _appearance_significant(reader: Reader) -> Iterator[Comparison]:
 
 
 def _pair_differs_in_looks(reader: Reader) -> Iterator[Comparison]:
+    if not reader.grades.own_distances:
+        raise NotMeasuredError("distances between robots (--distances)")
     for axis, above, below in (("appearance", 1.5, np.inf), ("kinematic", -np.inf, 1.25)):
         values = reader.grades.axis(axis)
         ratio = values[..., ROBOT_NAMES.index(FRANKA)] / values[..., ROBOT_NAMES.index(PIPER)]

@@ -63,6 +63,10 @@ class Grades(Protocol):
     def metrics(self) -> Mapping[str, MetricInfo]:
         """By name."""
 
+    @property
+    def own_distances(self) -> bool:
+        """Are the distances between robots this study's, or the paper's in their place?"""
+
     def mean(self, part: str, row: str, robots: str, metric: str, shared: bool = False) -> Mean | None:
         """The mean at an address, None where nothing is measured; `shared`: over the cells that all rows of the part have."""
 
@@ -152,11 +156,19 @@ class StudyGrades:
         rows: columns variant, model, task, seed, robot, metric, value; each cell once.
         metrics: what the table says of its metrics.
         axes: mean distances by axis, for correlations; in the order of ROBOT_NAMES.
+        own_distances: these were measured, and are not the paper's.
     """
 
     level = LEVEL
 
-    def __init__(self, rows: pd.DataFrame, metrics: Sequence[MetricInfo], axes: Mapping[str, np.ndarray]) -> None:
+    def __init__(
+        self,
+        rows: pd.DataFrame,
+        metrics: Sequence[MetricInfo],
+        axes: Mapping[str, np.ndarray],
+        own_distances: bool = False,
+    ) -> None:
+        self.own_distances = own_distances
         self.metrics = {metric.name: metric for metric in metrics}
         self._axes = axes
         # Baselines belong to no variant; they are found by the model's name.
@@ -230,6 +242,7 @@ class PaperGrades:
     """The printed means. What prints the same is tried at the ends of its range, in DRAWS combinations drawn at random."""
 
     level = 1.0
+    own_distances = True
     ALIASES: ClassVar = {
         ("fixed", "fixed"): ("actions", "optical_flow"),
         ("few_shot", "robot_render"): ("ladder", "robot_render"),

@@ -102,7 +102,7 @@ def _median_scene(
     shown = {name for by_robot in names.values() for name in by_robot.values()}
     chosen = rows[(rows["metric"] == RANKED_BY) & rows[VARIANT].isin(shown) & rows["robot"].isin(HELD_OUT_ROBOTS)]
     keys = zip(chosen[VARIANT], chosen["task"], chosen["seed"], chosen["robot"], strict=True)
-    chosen = chosen[[key in videos for key in keys]]
+    chosen = chosen[np.array([key in videos for key in keys], bool)]
     if chosen[VARIANT].nunique() < 2:
         return None
     scenes = chosen.groupby(["task", "seed"])["value"].agg(["size", "mean"]).reset_index()

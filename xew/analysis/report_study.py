@@ -94,7 +94,7 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
     paper = read_paper()
     known = read_distances(distances) if distances else printed_distances(paper)
     strips = study_strips(scores.rows, data, rollouts) if data and rollouts else {}
-    grades = StudyGrades(scores.rows, scores.metrics, {axis: known.of(axis) for axis in AXES})
+    grades = StudyGrades(scores.rows, scores.metrics, {axis: known.of(axis) for axis in AXES}, known.measured)
     printed = PaperGrades(paper, scores.metrics)
     planned = scores.attributes.get("study", {}).get("variants", {})
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
@@ -130,12 +130,12 @@ def _verdict_sentence(findings: Sequence[Finding]) -> str:
     claims = [finding for finding in findings if finding.claim.where != "ours"]
     counts = {word: sum(finding.verdict == word for finding in claims) for word in (HOLDS, FAILS, UNRESOLVED, UNMEASURED)}
     measured = len(claims) - counts[UNMEASURED]
+    if not measured:
+        return f"None of {len(claims)} claims of the paper could be asked of what was graded here."
     asked = "all" if measured == len(claims) else str(measured)
-    text = (
-        f"Of {len(claims)} claims of the paper {asked} could be asked here: {counts[HOLDS]} hold, "
-        f"{counts[FAILS] or 'none'} fail{'s' * (counts[FAILS] < 2)}, {counts[UNRESOLVED] or 'none'} "
-        f"{'is' if counts[UNRESOLVED] < 2 else 'are'} unresolved."
-    )
+    verbs = {HOLDS: ("holds", "hold"), FAILS: ("fails", "fail"), UNRESOLVED: ("is unresolved", "are unresolved")}
+    parts = [f"{counts[word] or 'none'} {verbs[word][counts[word] > 1]}" for word in verbs]
+    text = f"Of {len(claims)} claims of the paper {asked} could be asked here: {', '.join(parts)}."
     failed = [finding.claim.says.strip("… ").rstrip(".") for finding in claims if finding.verdict == FAILS]
     return text + (f" What fails: {'; '.join(failed)}." if failed else "")
 
@@ -256,7 +256,8 @@ def _part_section(content: Content, part: str) -> str:
 def _method_section(content: Content, scores: Scores) -> str:
     attributes = scores.attributes
     made = {"protocol": str(scores.protocol), "scenes graded": str(len(scores.rows[["task", "seed"]].drop_duplicates()))}
-    made |= {name.replace("_", " "): str(attributes[name]) for name in ("estimators", "frame_zero") if name in attributes}
+    made |= {f"estimator of {name}": str(used) for name, used in attributes.get("estimators", {}).items()}
+    made |= {"frame 0": str(attributes["frame_zero"])} if "frame_zero" in attributes else {}
     definitions = {METRIC_TITLES.get(metric.name, metric.name): metric.reference for metric in scores.metrics}
     return page.section(
         "How it was measured",
