@@ -1,0 +1,284 @@
+"""How far the metrics can be trusted: what they say of videos whose truth is known. Two tables, for docs/calibration.md.
+
+Reads  a data set; for the second table its episodes are rendered anew, with robot and objects moved wrongly
+Writes <out>/calibration.md (both tables), references.parquet and wrong.parquet (a row for each episode, case and metric),
+       frames.parquet (the second by frame)
+
+References: every metric on the true video itself, on what a codec leaves of it, and on videos that are wrong altogether.
+Wrong motions: where the true mask and the true points of the video are known, so that what a metric makes of the estimators'
+masks and points stands beside what it makes of the true ones.
+
+    python -m xew.metrics.calibrate --data data --codec runs/fixed --out calibration
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import tyro
+from scipy.stats import spearmanr
+from tqdm import tqdm
+
+from xew.config import ConfigError, user_errors
+from xew.episode import EpisodeError, Record, episode_folder, find_accepted, read_video
+from xew.metrics import METRICS
+from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
+from xew.metrics.grade import Comparison, Grades, compared, grade
+from xew.metrics.truth import NEEDS, Truth, read_truth
+from xew.metrics.wrong import WrongVideo, wrong_videos
+
+LATE = 8
+"""Frames of the time-shifted truth, half a second."""
+KEY = ["task", "seed", "robot", "case"]
+ESTIMATED = tuple(name for name in METRICS if compared(name) in ("mask", "keypoints", "objects"))
+"""Metrics that see a prediction through an estimator."""
+BY_MOTION = ("mask_iou", "boundary_f1", "keypoint_error")
+"""Metrics of the table by motion, frame by frame."""
+MOTION_STEPS = (0, 0.5, 2, 5, 10, 20, 40, 80, np.inf)
+"""Pixels by which the keypoints of a wrong video are off in the mean of a frame."""
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Args:
+    """Calibrate the metrics on a data set of `xew.sim_warp.generate`."""
+
+    data: Path = Path("data")
+    """At least two robots and two seeds of a task, or the videos of others are left out."""
+    out: Path = Path("calibration")
+    """Folder of the tables."""
+    codec: Path | None = None
+    """A run of `xew.model.train`, through whose codec the true videos go."""
+    seeds: tuple[int, ...] = ()
+    """Only episodes of these seeds; all others serve as another seed's."""
+    episodes: int = 0
+    """At most so many, evenly chosen; 0: all."""
+    masks: str = "default"
+    """Who finds the robot: a name of xew.metrics.backends.MASKERS, or module:NAME."""
+    masks_checkpoint: Path | None = None
+    """Its weights, where it has some."""
+    tracks: str = "default"
+    """Who finds keypoints and objects: a name of xew.metrics.backends.TRACKERS, or module:NAME."""
+    tracks_checkpoint: Path | None = None
+    """Its weights, where it has some."""
+
+
+@dataclass(frozen=True)
+class Estimators:
+    """Who looks into the videos."""
+
+    masker: Masker
+    tracker: Tracker
+
+    def grade(self, video: np.ndarray, truth: Truth, names: Sequence[str]) -> Grades:
+        return grade(Comparison(video, truth, self.masker, self.tracker), names)
+
+
+@user_errors
+def main(args: Args) -> None:
+    """Grade, write, and print both tables."""
+    estimators = Estimators(open_masker(args.masks, args.masks_checkpoint), open_tracker(args.tracks, args.tracks_checkpoint))
+    through_codec = None if args.codec is None else open_codec(args.codec)
+    chosen = choose(args)
+    references: list[Row] = []
+    wrong: list[Row] = []
+    frames: list[pd.DataFrame] = []
+    for folder, record in tqdm(chosen, desc="calibrate", unit="episode", disable=None):
+        truth = read_truth(folder, record.frame_count, NEEDS)
+        key: Row = {"task": record.task, "seed": record.seed, "robot": record.robot}
+        for case, video in reference_videos(args.data, record, truth, through_codec):
+            values = estimators.grade(video, truth, tuple(METRICS)).values
+            references += [key | {"case": case, "metric": name, "value": value} for name, value in values.items()]
+        for case, shown in wrong_videos(folder):
+            grades, true = estimators.grade(shown.rgb, truth, ESTIMATED), true_grades(shown, truth)
+            wrong += [
+                key | {"case": case, "metric": name, "estimate": grades.values[name], "truth": true.values[name]}
+                for name in ESTIMATED
+            ]
+            frames.append(_by_frame(grades, true).assign(**key, case=case))
+    text = report(pd.DataFrame(references), pd.DataFrame(wrong), pd.concat(frames, ignore_index=True))
+    write(args.out, text, {"references": pd.DataFrame(references), "wrong": pd.DataFrame(wrong), "frames": pd.concat(frames)})
+    print(text)
+
+
+def choose(args: Args) -> list[tuple[Path, Record]]:
+    """The episodes to calibrate on. Raises ConfigError if the data holds none of the seeds asked for."""
+    found = find_accepted(args.data)
+    held = sorted({record.seed for _, record in found})
+    if unknown := [seed for seed in args.seeds if seed not in held]:
+        raise ConfigError(f"{args.data} holds no seed {unknown[0]}; it has {', '.join(map(str, held[:20]))}: --seeds.")
+    chosen = [(folder, record) for folder, record in found if not args.seeds or record.seed in args.seeds]
+    count = min(args.episodes or len(chosen), len(chosen))
+    return [chosen[i] for i in np.unique(np.linspace(0, len(chosen) - 1, count).round().astype(int))]
+
+
+def reference_videos(
+    data: Path, record: Record, truth: Truth, through_codec: Callable[[np.ndarray], np.ndarray] | None
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Videos to grade as predictions of an episode, by the name of the case, each uint8 [t h w 3]."""
+    frames = np.arange(len(truth.rgb))
+    yield "truth itself", truth.rgb
+    if through_codec is not None:
+        yield "truth through the codec", through_codec(truth.rgb)
+    yield "frozen first frame", truth.rgb[np.zeros_like(frames)]
+    yield f"truth {LATE} frames late", truth.rgb[np.maximum(frames - LATE, 0)]
+    for case, folder in (("another robot", another(data, record, "robot")), ("another seed", another(data, record, "seed"))):
+        if folder is not None:
+            video = read_video(folder / "rgb.mkv")
+            yield case, video[np.minimum(frames, len(video) - 1)]
+
+
+def another(data: Path, record: Record, differs: str) -> Path | None:
+    """The next episode that differs in robot or seed alone, the first after the last; None where there is none."""
+    same = ("task", "seed") if differs == "robot" else ("task", "robot")
+    others = sorted(
+        getattr(other, differs)
+        for _, other in find_accepted(data)
+        if all(getattr(other, name) == getattr(record, name) for name in same)
+    )
+    following = others[(others.index(getattr(record, differs)) + 1) % len(others)]
+    if following == getattr(record, differs):
+        return None
+    who: Row = {"task": record.task, "seed": record.seed, "robot": record.robot} | {differs: following}
+    return episode_folder(data, **who)
+
+
+def open_codec(run: Path) -> Callable[[np.ndarray], np.ndarray]:
+    """What a run's codec leaves of a video uint8 [t h w 3]. Raises ConfigError if there is no such run."""
+    # Only here: the metrics load without the model.
+    from xew.model.checkpoint import load_run
+    from xew.model.frames import to_camera_size, to_model_size
+
+    try:
+        experiment, codec = load_run(run)
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"{run} is no run with a codec ({error.filename}); name a folder that xew.model.train wrote."
+        ) from error
+
+    def through(video: np.ndarray) -> np.ndarray:
+        filled = np.concatenate([video, np.repeat(video[-1:], -(len(video) - 1) % 4, axis=0)])  # it takes 4 k + 1 frames
+        small = to_model_size(filled, experiment.clip.height, experiment.clip.width)
+        return to_camera_size(codec.decode(codec.encode(small)))[: len(video)]
+
+    return through
+
+
+def true_grades(shown: WrongVideo, truth: Truth) -> Grades:
+    """What the metrics of ESTIMATED say of a wrong video's true mask and true points."""
+    values: dict[str, float] = {}
+    curves: dict[str, np.ndarray] = {}
+    points = {"keypoints": (shown.keypoints, truth.keypoint_visible), "objects": (shown.objects, truth.object_visible)}
+    for name in ESTIMATED:
+        places, visible = points.get(compared(name), (shown.keypoints, truth.keypoint_visible))
+        known = Estimators(lambda *_: shown.mask, lambda *_, p=places, v=visible: p[:, v.any(axis=0)])
+        grades = known.grade(shown.rgb, truth, (name,))
+        values |= grades.values
+        curves |= grades.curves
+    return Grades(values, curves, 0)
+
+
+def _by_frame(grades: Grades, true: Grades) -> pd.DataFrame:
+    """frame metric estimate truth motion: a row for each graded frame and metric of BY_MOTION."""
+    tables = []
+    for name in BY_MOTION:
+        if name in grades.curves and name in true.curves:
+            columns = {"estimate": grades.curves[name], "truth": true.curves[name], "motion": true.curves["keypoint_error"]}
+            tables.append(pd.DataFrame({"frame": np.arange(1, len(true.curves[name]) + 1), "metric": name} | columns))
+    return pd.concat(tables, ignore_index=True)
+
+
+def report(references: pd.DataFrame, wrong: pd.DataFrame, frames: pd.DataFrame) -> str:
+    """All tables in Markdown."""
+    episodes = len(wrong[["task", "seed", "robot"]].drop_duplicates())
+    parts = [
+        f"Means over {episodes} episodes: {', '.join(sorted(wrong['task'].unique()))}; robots "
+        f"{', '.join(sorted(wrong['robot'].unique()))}.",
+        "### References",
+        _markdown(reference_table(references)),
+        "### Wrong motions: estimate (truth)",
+        _markdown(wrong_table(wrong, frames)),
+        "### Wrong motions, frame by frame: mean difference of the estimate from the truth (mean of its absolute value)",
+        _markdown(motion_table(frames)),
+        "### Order",
+        _markdown(order_table(wrong)),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def reference_table(references: pd.DataFrame) -> pd.DataFrame:
+    """Mean of each metric (rows) on each reference (columns); both in their own order."""
+    table = references.groupby(["metric", "case"])["value"].mean().unstack()
+    return table.loc[list(METRICS), list(references["case"].unique())].map("{:.3f}".format)
+
+
+def wrong_table(wrong: pd.DataFrame, frames: pd.DataFrame) -> pd.DataFrame:
+    """Estimate and truth of each metric (columns) for each motion (rows), and by how many pixels keypoints are off."""
+    means = wrong.groupby(["case", "metric"])[["estimate", "truth"]].mean()
+    motion = frames.drop_duplicates([*KEY, "frame"]).groupby("case")["motion"].mean()
+    rows = {}
+    for case in wrong["case"].unique():
+        cells = {name: "{estimate:.3f} ({truth:.3f})".format(**means.loc[(case, name)]) for name in ESTIMATED}
+        rows[case] = {"motion [px]": f"{motion[case]:.1f}"} | cells
+    return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def motion_table(frames: pd.DataFrame) -> pd.DataFrame:
+    """How far estimates are from the truth in frames whose keypoints are off by so much."""
+    steps = pd.cut(frames["motion"], MOTION_STEPS, right=False)
+    rows = {}
+    for step, part in frames.groupby(steps, observed=True):
+        errors = {name: (own["estimate"] - own["truth"]).dropna() for name, own in part.groupby("metric")}
+        cells = {name: f"{errors[name].mean():+.3f} ({errors[name].abs().mean():.3f})" for name in BY_MOTION if name in errors}
+        rows[f"{step.left:g} to {step.right:g} px"] = {"frames": str(len(part.drop_duplicates([*KEY, "frame"])))} | cells
+    return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def order_table(wrong: pd.DataFrame) -> pd.DataFrame:
+    """Whether estimates put wrong motions in the order that the truth puts them in."""
+    rows = {}
+    for name in ESTIMATED:
+        own = wrong[wrong["metric"] == name].dropna(subset=["estimate", "truth"])
+        if len(own) < 3 or own["truth"].nunique() < 2:
+            continue
+        pairs = [kept for _, episode in own.groupby(["task", "seed", "robot"]) for kept in _kept(episode)]
+        means = list(_kept(own.groupby("case")[["estimate", "truth"]].mean()))
+        rows[name] = {
+            "Spearman, all videos": f"{spearmanr(own['estimate'], own['truth']).statistic:.3f}",
+            "pairs of an episode's videos in order": f"{sum(pairs)} of {len(pairs)}",
+            "pairs of mean scores in order": f"{sum(means)} of {len(means)}",
+        }
+    return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def _kept(table: pd.DataFrame) -> Iterator[bool]:
+    """For each two rows that the truth tells apart: does the estimate put them in the same order?"""
+    for (_, a), (_, b) in combinations(table[["estimate", "truth"]].iterrows(), 2):
+        if a["truth"] != b["truth"]:
+            yield bool((a["truth"] - b["truth"]) * (a["estimate"] - b["estimate"]) > 0)
+
+
+def _markdown(table: pd.DataFrame) -> str:
+    """A table of texts, its index first."""
+    lines = [["", *map(str, table.columns)], ["---"] * (1 + len(table.columns))]
+    lines += [[str(name), *map(str, row)] for name, row in zip(table.index, table.to_numpy(), strict=True)]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def write(out: Path, text: str, tables: dict[str, pd.DataFrame]) -> None:
+    """Raises EpisodeError if the folder cannot be written."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "calibration.md").write_text(text)
+        for name, table in tables.items():
+            table.to_parquet(out / f"{name}.parquet", index=False)
+    except OSError as error:
+        raise EpisodeError(f"cannot write the tables to {out}: {error}; choose another --out.") from error
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, prog="python -m xew.metrics.calibrate"))
