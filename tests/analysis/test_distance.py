@@ -112,15 +112,19 @@ def test_any_urdf_has_a_workspace(tmp_path: Path) -> None:
     low, high = (load_urdf(stick(tmp_path, height)) for height in (0, 1))
     found = workspace(low)
     # The arm's longest chain is sampled; the finger stays in, and the lamp, which does not move, where it is.
-    assert found.reach == pytest.approx(2) and workspace(low, frame="arm_base").reach == pytest.approx(0.8, abs=1e-3)
-    assert workspace(high).reach == pytest.approx(2) and workspace(high, frame="arm_base").reach < 0.8001
-    np.testing.assert_allclose(workspace_cloud(high, 1, "arm_base"), workspace_cloud(low, 1, "arm_base"), atol=1e-12)
+    assert found.reach == pytest.approx(2) and workspace(low, frame="arm_alone").reach == pytest.approx(0.8, abs=1e-3)
+    assert workspace(high).reach == pytest.approx(2) and workspace(high, frame="arm_alone").reach < 0.8001
+    np.testing.assert_allclose(workspace_cloud(high, 1, "arm_alone"), workspace_cloud(low, 1, "arm_alone"), atol=1e-12)
     # A torus of 0.3 m round a circle of 0.5 m, at whose hull points are dense.
     turned = np.pi**2 * 0.5 * 0.3**2 + 2 * np.pi * 0.3 * 0.5**2
-    assert workspace(low, frame="arm_base").volume == pytest.approx(turned, rel=0.15)
-    between = measure({"low": low, "high": high}, range(2), "arm_base")
+    assert workspace(low, frame="arm_alone").volume == pytest.approx(turned, rel=0.15)
+    between = measure({"low": low, "high": high}, range(2), "arm_alone")
     assert between.kinematic.max() < 1e-12 and between.dof.tolist() == [2, 2] and between.links.tolist() == [6, 6]
     assert measure({"low": low, "high": high}).kinematic.max() > 0.1
+    # From the arm's base all other links are seen too: the floor below it, the lamp beside it.
+    from_base = workspace(high, frame="arm_base")
+    assert from_base.reach == pytest.approx(np.hypot(2, 1)) and len(np.unique(from_base.cloud, axis=0)) > 1000
+    np.testing.assert_allclose(workspace_cloud(low, 1, "arm_base"), workspace_cloud(low, 1), atol=1e-12)
 
 
 def test_a_robot_is_not_at_zero_from_its_own_next_draw() -> None:

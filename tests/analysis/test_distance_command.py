@@ -10,7 +10,7 @@ from tests.analysis.test_distance import stick
 from xew.analysis.distance_command import Args, main
 from xew.protocol import ROBOT_NAMES
 
-OF_ANY_URDF = {"dof", "links", "reach", "volume", "floor", "kinematic", "arm_base"}
+OF_ANY_URDF = {"dof", "links", "reach", "volume", "floor", "kinematic", "arm_base", "arm_alone"}
 
 
 def mean_difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -34,7 +34,13 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 def test_both_matrices_are_written_with_spread_and_the_papers_figures(table: tuple[Path, str]) -> None:
     pairs = pd.read_csv(table[0] / "distances.csv")
-    assert pairs.groupby("axis").size().to_dict() == {"kinematic": 15, "arm_base": 15, "appearance": 10, "perceptual": 10}
+    assert pairs.groupby("axis").size().to_dict() == {
+        "kinematic": 15,
+        "arm_base": 15,
+        "arm_alone": 15,
+        "appearance": 10,
+        "perceptual": 10,
+    }
     by_axis = {axis: frame.set_index(["robot", "other"]) for axis, frame in pairs.groupby("axis")}
     row = by_axis["kinematic"].loc[("arx_x5", "piper")]
     assert row["value"] == pytest.approx(0.034, abs=0.002) and 0 < row["spread"] < 0.003 and row["published"] == 0.034
@@ -48,7 +54,7 @@ def test_aloha_is_two_arms_of_the_make_of_the_arx(table: tuple[Path, str]) -> No
     """What the arm's own frame is for: on its body an Aloha is far from the ARX, its arm is one."""
     pairs = pd.read_csv(table[0] / "distances.csv").set_index(["axis", "robot", "other"])["value"]
     assert pairs["kinematic", "aloha_agilex", "arx_x5"] > 0.18
-    assert pairs["arm_base", "aloha_agilex", "arx_x5"] < 0.03
+    assert pairs["arm_alone", "aloha_agilex", "arx_x5"] < 0.03 < pairs["arm_base", "aloha_agilex", "arx_x5"]
 
 
 def test_a_row_for_each_feature_of_each_robot(table: tuple[Path, str]) -> None:

@@ -4,7 +4,7 @@
     python -m xew.analysis.distance --robot lab/my_arm.urdf --out out  # and one of one's own
 
 Kinematic and appearance distance are the paper's (its appendix on embodiment distances). Ours: the spread over sampling
-seeds, workspaces in the arm's own base frame, and a perceptual distance of the reference renders.
+seeds, workspaces in the frame of the arm's base, and a perceptual distance of the reference renders.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,9 +34,10 @@ HUE_BINS = SATURATION_BINS = 16
 WHITE = 250
 """A pixel of a robot-only render is ground where all channels are at least this."""
 
-Frame = Literal["root", "arm_base"]
-"""Of workspaces: the URDF's root link with all links, as in the paper; or the link that carries the arm's first joint, with
-this arm's links only, so that neither a body nor the height of a stand counts (ours)."""
+Frame = Literal["root", "arm_base", "arm_alone"]
+"""Of workspaces. `root`: all links in the URDF's root frame, which gives the paper's figures. `arm_base`: all links in the
+frame of the link that carries the arm's first joint, which is what its text says. `arm_alone`: in that frame the links of
+this arm only, so that neither a body nor the height of a stand counts (ours)."""
 ImageDistance = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Of two videos or lists of views [n h w 3] uint8, frame by frame: [n]."""
 
@@ -127,8 +128,8 @@ def workspace(robot: RobotSpec | Urdf, seed: int = 0, frame: Frame = "root") -> 
     for name, position in held.items():
         joint_pos[:, urdf.joint_names.index(name)] = position
     frames = link_matrices(urdf, joint_pos)
-    if frame == "arm_base":
-        frames = _from_arm_base(urdf, joints[0], frames)
+    if frame != "root":
+        frames = _from_arm_base(urdf, joints[0], frames, alone=frame == "arm_alone")
     by_link = [matrix[:, :3, 3] for matrix in frames.values()]
     origins = np.concatenate(by_link)
     kept = rng.choice(len(origins), min(CLOUD_POINTS, len(origins)), replace=False)
@@ -228,12 +229,12 @@ def _sampled(robot: RobotSpec | Urdf) -> tuple[Urdf, tuple[str, ...], dict[str, 
     return robot, tuple(joint.name for joint in max(arms, key=len)), {}
 
 
-def _from_arm_base(urdf: Urdf, first_joint: str, frames: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Frames [n 4 4] of the links beyond an arm's first joint, and of the one that carries it, in the latter's frame."""
+def _from_arm_base(urdf: Urdf, first_joint: str, frames: Mapping[str, np.ndarray], alone: bool) -> dict[str, np.ndarray]:
+    """Frames [n 4 4] in that of the link that carries an arm's first joint: of all links, or of it and those beyond."""
     base = urdf.joints[first_joint].parent
     beyond = [link for link in urdf.links if first_joint in [joint.name for joint in urdf.chain(link)]]
     to_base = np.linalg.inv(frames[base])
-    return {link: to_base @ frames[link] for link in (base, *beyond)}
+    return {link: to_base @ frames[link] for link in ((base, *beyond) if alone else urdf.links)}
 
 
 def _hull_volume(points: np.ndarray) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import tyro
 
-from xew.analysis.distance import Features, ImageDistance, appearance_matrix, chamfer_floor, measure, perceptual_matrices
+from xew.analysis.distance import Features, Frame, ImageDistance, appearance_matrix, chamfer_floor, measure, perceptual_matrices
 from xew.analysis.paper import Paper, read_paper
 from xew.config import ConfigError, user_errors
 from xew.protocol import ROBOT_NAMES
@@ -24,10 +24,12 @@ from xew.sim_warp.robots import RobotSpec, Urdf, get_robot, load_urdf
 
 TITLES = {
     "kinematic": "Kinematic distance [m]: workspace Chamfer",
-    "arm_base": "The same in the frame of the arm's base, arm alone [m] (ours)",
+    "arm_base": "The same in the frame of the arm's base [m] (ours)",
+    "arm_alone": "The same of the arm alone [m] (ours)",
     "appearance": "Appearance distance: cosine of hue-saturation histogram and Hu moments of nine views",
     "perceptual": "Perceptual distance of the nine views, mean of {} (ours)",
 }
+OTHER_FRAMES: tuple[Frame, ...] = ("arm_base", "arm_alone")
 DIGITS = 3
 FLOOR_SEEDS = 20
 """Draws that the floor is a mean of, at most."""
@@ -73,11 +75,10 @@ def main(args: Args) -> None:
     names = (*ROBOT_NAMES, *args.robot)
     robots = find_robots(names)
     features = measure(robots, range(args.seeds), workers=args.workers)
-    alone = measure(robots, range(args.seeds), "arm_base", args.workers)
-    axes = {
-        "kinematic": Axis(features.robots, features.kinematic.mean(axis=0), features.kinematic),
-        "arm_base": Axis(alone.robots, alone.kinematic.mean(axis=0), alone.kinematic),
-    }
+    axes = {"kinematic": Axis(features.robots, features.kinematic.mean(axis=0), features.kinematic)}
+    for other in OTHER_FRAMES:
+        draws = measure(robots, range(args.seeds), other, args.workers).kinematic
+        axes[other] = Axis(features.robots, draws.mean(axis=0), draws)
     if args.looks:
         whole = {key: name for (key, robot), name in zip(robots.items(), names, strict=True) if isinstance(robot, RobotSpec)}
         axes |= _looks(whole, distance)

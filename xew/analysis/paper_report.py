@@ -1,8 +1,8 @@
 """Stage 11 of 11: the paper's figures checked against each other. `report --paper` writes what is made here.
 
 Its distance table is rebuilt from its scores and distances, the percentages of its text from its tables, and its claims are
-asked of its own figures. Ours is the question what would have come out if workspaces had been compared in the frame of the
-arm's base, as its text says that they were.
+asked of its own figures. Ours is the question what comes out if workspaces are compared in the frame of the arm's base, as
+its text says that they were.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,6 +14,7 @@ import pandas as pd
 from xew.analysis import formats, page, tables
 from xew.analysis.charts import Chart, chart_files
 from xew.analysis.correlation import Correlation
+from xew.analysis.distance import Frame
 from xew.analysis.distance_tables import Distances, distance_tables, printed_distances, signed
 from xew.analysis.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask, findings_frame
 from xew.analysis.grades import PaperGrades
@@ -47,6 +48,8 @@ from xew.analysis.tables import Table
 from xew.protocol import ROBOT_NAMES
 
 TITLE = "The paper's figures, rebuilt from one another"
+OWN_FRAMES: tuple[Frame, ...] = ("arm_base", "arm_alone")
+"""Frames of workspaces whose distances the paper does not print."""
 PRIMARY = "lpips"
 """The paper's primary outcome; it calls all others exploratory."""
 CLAIMS_TEXT = (
@@ -83,13 +86,13 @@ def build(paper: Paper, footer: str) -> Report:
     cells, means, changes = rebuild(paper), mean_distance_cells(paper), recompute_changes(paper)
     results = {(metric, axis): paper.correlation(metric, axis) for metric in paper.metrics for axis in AXES}
     frames = frame_distances()
-    arm_alone = frame_results(paper, frames["arm_base"])
+    by_frame = {frame: frame_results(paper, frames[frame]) for frame in OWN_FRAMES}
     grades = PaperGrades(paper, paper.infos)
     claims = ask(grades)
-    chart = distance_chart(grades, _with_arm_alone(printed_distances(paper), frames["arm_base"]), PRIMARY)
+    chart = distance_chart(grades, _with_own_frames(printed_distances(paper), frames), PRIMARY)
     assert chart is not None  # all folds are printed
     content = Content(
-        finding(cells, results, changes, arm_alone, claims),
+        finding(cells, results, changes, by_frame, claims),
         claims,
         {
             "Does distance predict difficulty?": [correlation_table(paper, cells), certainty_table(paper, cells, results)],
@@ -100,7 +103,7 @@ def build(paper: Paper, footer: str) -> Report:
         [*tables.build_tables(PrintedBuilder(grades, None)), *distance_tables(printed_distances(paper))[-1:]],
         chart,
     )
-    summary = _frame([*cells, *means], changes, arm_alone)
+    summary = _frame([*cells, *means], changes, by_frame)
     return Report(_html(content, paper, footer), _markdown(content), summary, dict(_files(content)))
 
 
@@ -108,7 +111,7 @@ def finding(
     cells: Sequence[Cell],
     results: Mapping[tuple[str, str], Correlation],
     changes: Sequence[RecomputedChange],
-    arm_alone: Mapping[str, Correlation],
+    by_frame: Mapping[Frame, Mapping[str, Correlation]],
     claims: Sequence[Finding],
 ) -> list[str]:
     """What came out, in sentences."""
@@ -116,7 +119,7 @@ def finding(
         *_rebuilt_sentences(cells, changes),
         *(_sentence(axis, results[PRIMARY, axis]) for axis in AXES),
         *_certainty_sentences(results),
-        _arm_sentence(results, arm_alone),
+        *_frame_sentences(results, by_frame),
         _claims_sentence(claims),
     ]
 
@@ -139,13 +142,21 @@ def _certainty_sentences(results: Mapping[tuple[str, str], Correlation]) -> Iter
     yield f"The smallest p of all {len(results)} is {results[key].p_value:.3f} ({_name(*key)}), before any correction."
 
 
-def _arm_sentence(results: Mapping[tuple[str, str], Correlation], arm_alone: Mapping[str, Correlation]) -> str:
-    turned = [METRIC_TITLES[name] for name, result in arm_alone.items() if result.r * results[name, "kinematic"].r < 0]
-    return (
-        f"By workspaces of the arm alone, in its base frame (ours), {METRIC_TITLES[PRIMARY]} has "
-        f"r = {signed(arm_alone[PRIMARY].r)} and its sign {_survives(arm_alone[PRIMARY])}; against the kinematic distance as "
-        f"printed, r turns its sign for {', '.join(turned) or 'no metric'}."
-    )
+def _frame_sentences(
+    results: Mapping[tuple[str, str], Correlation], by_frame: Mapping[Frame, Mapping[str, Correlation]]
+) -> Iterator[str]:
+    """What the frame of workspaces does to the primary outcome, and to the others."""
+    starts: dict[Frame, str] = {
+        "arm_base": "By kinematic distance as the text defines it, in the arm's base frame (our clouds, its scores)",
+        "arm_alone": "By workspaces of the arm alone, in that frame (ours)",
+    }
+    for frame, start in starts.items():
+        found = by_frame[frame]
+        turned = [METRIC_TITLES[name] for name, one in found.items() if one.r * results[name, "kinematic"].r < 0]
+        yield (
+            f"{start}, {METRIC_TITLES[PRIMARY]} has r = {signed(found[PRIMARY].r)}, p = {found[PRIMARY].p_value:.3f}; its sign "
+            f"{_survives(found[PRIMARY])}. Against the printed figures r turns its sign for {', '.join(turned) or 'no metric'}."
+        )
 
 
 def _claims_sentence(claims: Sequence[Finding]) -> str:
@@ -176,10 +187,10 @@ def _name(metric: str, axis: str) -> str:
     return f"{METRIC_TITLES[metric]} by {axis}"
 
 
-def _with_arm_alone(distances: Distances, arm_alone: np.ndarray) -> Distances:
-    """The printed distances, and our own of the arm alone [s 5]."""
-    own = pd.DataFrame({"robot": ROBOT_NAMES, "feature": "arm_base", "value": arm_alone.mean(axis=0)})
-    return replace(distances, robots=pd.concat([distances.robots, own], ignore_index=True))
+def _with_own_frames(distances: Distances, frames: Mapping[Frame, np.ndarray]) -> Distances:
+    """The printed distances, and our own [s 5] in other frames."""
+    own = [pd.DataFrame({"robot": ROBOT_NAMES, "feature": frame, "value": frames[frame].mean(axis=0)}) for frame in OWN_FRAMES]
+    return replace(distances, robots=pd.concat([distances.robots, *own], ignore_index=True))
 
 
 # --- Formats.
@@ -223,7 +234,9 @@ def _files(content: Content) -> Iterator[tuple[str, bytes]]:
     yield "findings.csv", findings_frame(content.claims, "paper").to_csv(index=False).encode()
 
 
-def _frame(cells: Sequence[Cell], changes: Sequence[RecomputedChange], arm_alone: Mapping[str, Correlation]) -> pd.DataFrame:
+def _frame(
+    cells: Sequence[Cell], changes: Sequence[RecomputedChange], by_frame: Mapping[Frame, Mapping[str, Correlation]]
+) -> pd.DataFrame:
     """Columns: row axis quantity published ours least most agrees; blank where the paper prints nothing."""
     names = ("published", "ours", "least", "most", "agrees")
     rows = [
@@ -237,8 +250,9 @@ def _frame(cells: Sequence[Cell], changes: Sequence[RecomputedChange], arm_alone
         for found in changes
     ]
     rows += [
-        {"row": metric, "axis": "arm_base", "quantity": quantity, "ours": getattr(result, quantity)}
-        for metric, result in arm_alone.items()
+        {"row": metric, "axis": frame, "quantity": quantity, "ours": getattr(result, quantity)}
+        for frame, results in by_frame.items()
+        for metric, result in results.items()
         for quantity in ("r", "low", "high", "p_value")
     ]
     return pd.DataFrame(rows)
