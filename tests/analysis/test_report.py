@@ -136,7 +136,8 @@ def test_an_incomplete_table_says_so(study: Study, tmp_path: Path) -> None:
     main(Args(edit(study, tmp_path, piper), study.data, (study.rollouts,), tmp_path / "report"))
     text = (tmp_path / "report" / "index.html").read_text()
     assert text.count("Incomplete: 2 of 4 test episodes are scored.") == 1
-    assert "incomplete: 2 of 4" in (tmp_path / "report" / "report.md").read_text()
+    for name in ("report.md", "tables/piper.tex"):
+        assert "Incomplete: 2 of 4 test episodes are scored." in (tmp_path / "report" / name).read_text()
 
 
 def test_without_data_there_are_numbers_and_a_word_on_the_missing_pictures(study: Study, tmp_path: Path) -> None:

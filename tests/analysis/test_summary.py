@@ -4,9 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from xew.analysis.page import number
 from xew.analysis.scores import MetricInfo
 from xew.analysis.summary import Interval, RobotTable, Row, finding, mean_interval, progress, verdict
+from xew.analysis.tables import number
 
 rng = np.random.default_rng(0)
 

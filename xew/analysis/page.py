@@ -1,6 +1,5 @@
 """Stage 11 of 11: what the report says as HTML and as Markdown. Text in, text out; `report` reads and writes files."""
 
-import math
 from collections.abc import Mapping, Sequence
 from html import escape
 from itertools import groupby
@@ -9,9 +8,7 @@ from string import Template
 
 from xew.analysis.charts import Chart, Series, panel_svg, themed
 from xew.analysis.findings import Answer, Finding
-from xew.analysis.scores import COPY, TRUTH, MetricInfo
-from xew.analysis.summary import Interval, RobotTable, Row
-from xew.analysis.tables import Block, Cell, Table, metric_title, number
+from xew.analysis.tables import Block, Cell, Table
 from xew.analysis.tables import Row as TableRow
 
 FOLDER = Path(__file__).parent
@@ -56,63 +53,6 @@ def paragraph(text: str, soft: bool = False) -> str:
 
 def note(text: str) -> str:
     return f'<p class="note">{escape(text)}</p>'
-
-
-def score_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> str:
-    """One robot's scores: metrics by dimension across, models down, intervals under the means."""
-    shown = [metric for metric in metrics if any(metric.name in row.scores for row in table.rows)]
-    groups = [(dimension, len(list(members))) for dimension, members in groupby(shown, key=lambda metric: metric.dimension)]
-    dimensions = "".join(f'<th colspan="{count}">{escape(dimension)}</th>' for dimension, count in groups)
-    heads = "".join(f"<th>{_head(metric)}</th>" for metric in shown)
-    rows = "\n".join(_table_row(row, shown) for row in table.rows)
-    return (
-        f"<h3>{escape(table.title)}</h3>\n{_count_note(table)}\n"
-        f'<div class="wide"><table><thead><tr class="dimension"><th></th>{dimensions}</tr>\n'
-        f"<tr><th>model</th>{heads}</tr></thead>\n"
-        f"<tbody>\n{rows}\n</tbody></table></div>"
-    )
-
-
-def _count_note(table: RobotTable) -> str:
-    counts = sorted(table.counts)
-    found = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1]))) if counts else "0"
-    if table.expected is None:
-        return paragraph(f"{found} episodes.", soft=True)
-    if table.complete:
-        return paragraph(f"{found} of {table.expected} test episodes.", soft=True)
-    return note(f"Incomplete: {found} of {table.expected} test episodes are scored.")
-
-
-def _head(metric: MetricInfo) -> str:
-    word = "higher is better" if metric.higher_is_better else "lower is better"
-    return f'<span title="{word}: {escape(metric.reference)}">{escape(metric_title(metric))}</span>'
-
-
-def _table_row(row: Row, metrics: Sequence[MetricInfo]) -> str:
-    kind = ' class="baseline"' if row.model in (COPY, TRUTH) else ""
-    cells = "".join(_cell(row, metric) for metric in metrics)
-    return f"<tr{kind}><td>{escape(row.title)}</td>{cells}</tr>"
-
-
-def _cell(row: Row, metric: MetricInfo) -> str:
-    score = row.scores.get(metric.name)
-    if score is None:
-        return "<td>–</td>"
-    if row.model == TRUTH and metric.name == "psnr":
-        return '<td><span class="mean" title="all frames are equal to the truth">exact</span></td>'
-    interval = "" if point_only(score) else f'<span class="interval">{interval_text(score, metric)}</span>'
-    return (
-        f'<td class="{row.verdicts.get(metric.name, "")}"><span class="mean">{number(score.mean, metric)}</span>{interval}</td>'
-    )
-
-
-def point_only(score: Interval) -> bool:
-    """Is there no interval to show: one episode, or all episodes equal."""
-    return math.isnan(score.low) or score.low == score.high
-
-
-def interval_text(score: Interval, metric: MetricInfo) -> str:
-    return f"{number(score.low, metric)}–{number(score.high, metric)}"
 
 
 def table(shown: Table) -> str:
@@ -235,21 +175,3 @@ def labelled_picture(source: str, caption: str, columns: Sequence[str], rows: Se
 def definitions(pairs: Mapping[str, str]) -> str:
     items = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in pairs.items())
     return f"<dl>{items}</dl>"
-
-
-def markdown_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> str:
-    """The same table for report.md: mean [interval], and better, worse or unresolved against the frozen first frame."""
-    shown = [metric for metric in metrics if any(metric.name in row.scores for row in table.rows)]
-    lines = [f"| model | {' | '.join(map(metric_title, shown))} |", f"|---|{'---:|' * len(shown)}"]
-    lines += [f"| {row.title} | {' | '.join(_markdown_cell(row, metric) for metric in shown)} |" for row in table.rows]
-    return "\n".join(lines)
-
-
-def _markdown_cell(row: Row, metric: MetricInfo) -> str:
-    score = row.scores.get(metric.name)
-    if score is None:
-        return "–"
-    if row.model == TRUTH and metric.name == "psnr":
-        return "exact"
-    interval = "" if point_only(score) else f" [{interval_text(score, metric)}]"
-    return number(score.mean, metric) + interval + (f" {row.verdicts[metric.name]}" if row.verdicts.get(metric.name) else "")

@@ -1,7 +1,7 @@
 """Stage 11 of 11: report. A score table to one page that opens without a network.
 
 Reads  scores.parquet and its curves; the data set and the rollouts for pictures
-Writes <out>/index.html (self-contained), report.md with figures/, summary.csv; of a study also tables/ and findings.csv
+Writes <out>/index.html (self-contained), report.md with figures/, tables/ (LaTeX), summary.csv; of a study also findings.csv
 
 A table with the column `variant` is a study's (xew.analysis.study writes it) and becomes the report of `report_study`.
 
@@ -24,12 +24,14 @@ import pandas as pd
 import tyro
 from tqdm import tqdm
 
-from xew.analysis import page, paper_report, pictures, report_study
+from xew.analysis import formats, page, paper_report, pictures, report_study
 from xew.analysis.charts import Chart, chart_files
 from xew.analysis.paper import read_paper
 from xew.analysis.report_charts import run_chart
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, read_scores
-from xew.analysis.summary import METRIC_TITLES, ROBOT_TITLES, RobotTable, finding, flat_summary, robot_table
+from xew.analysis.summary import METRIC_TITLES, ROBOT_TITLES, RobotTable, Row, finding, flat_summary, robot_table
+from xew.analysis.tables import Block, Cell, Table, interval_text, metric_columns, number
+from xew.analysis.tables import Row as TableRow
 from xew.config import ConfigError, user_errors
 from xew.episode import Record, episode_folder, find_records, read_video
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
@@ -157,7 +159,7 @@ def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo
             "distance from perfect is the error of the mask estimator."
         ),
         caution,
-        *(page.score_table(table, metrics) for table in tables),
+        *(page.table(run_table(table, metrics)) for table in tables),
     )
 
 
@@ -165,7 +167,43 @@ def _seen_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -
     if not tables:
         return ""
     text = "The same model on robots that it was trained on, at test seeds: what is missing here is not embodiment."
-    return page.section("Robots seen in training", page.paragraph(text), *(page.score_table(t, metrics) for t in tables))
+    return page.section("Robots seen in training", page.paragraph(text), *(page.table(run_table(t, metrics)) for t in tables))
+
+
+def run_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> Table:
+    """One robot's scores as a table: metrics by dimension across, models down."""
+    shown = [metric for metric in metrics if any(metric.name in row.scores for row in table.rows)]
+    found = " to ".join(map(str, sorted({min(table.counts, default=0), max(table.counts, default=0)})))
+    of = f"{found} episodes" if table.expected is None else f"{found} of {table.expected} test episodes"
+    rows = [
+        TableRow((row.title,), tuple(_run_cell(row, metric) for metric in shown), row.model in (COPY, TRUTH))
+        for row in table.rows
+    ]
+    return Table(
+        "_".join(table.robots),
+        table.title,
+        f"{of[0].upper()}{of[1:]}.",
+        ("model",),
+        metric_columns({metric.name: metric for metric in shown}, [metric.name for metric in shown]),
+        (Block("", tuple(rows), "" if table.complete else f"Incomplete: {of} are scored."),),
+    )
+
+
+def _run_cell(row: Row, metric: MetricInfo) -> Cell:
+    score = row.scores.get(metric.name)
+    if score is None:
+        return Cell()
+    if row.model == TRUTH and metric.name == "psnr":
+        return Cell("exact", episodes=score.count)  # all frames are equal to the truth
+    return Cell(
+        number(score.mean, metric),
+        interval_text((score.low, score.high), metric),
+        verdict=row.verdicts.get(metric.name, ""),
+        value=score.mean,
+        low=score.low,
+        high=score.high,
+        episodes=score.count,
+    )
 
 
 def _strip_section(strips: Sequence[Picture]) -> str:
@@ -288,11 +326,13 @@ def _markdown(
     for heading, tables in (("Robots never seen in training", held_out), ("Robots seen in training", seen)):
         lines += ["", f"## {heading}"]
         for table in tables:
-            state = "" if table.complete else f" (incomplete: {table.count} of {table.expected} test episodes)"
-            lines += ["", f"### {table.title}{state}", "", page.markdown_table(table, scores.metrics)]
+            made = run_table(table, scores.metrics)
+            lines += ["", f"### {table.title}", "", made.caption, "", formats.markdown(made)]
     files = {figure.name: figure.image for figure in figures} | dict(charts)
     lines += ["", "## Figures", "", *(f"![{name}](figures/{name})" for name in files if name.endswith(".png"))]
-    return "\n".join(lines) + "\n", {f"figures/{name}": content for name, content in files.items()}
+    made_tables = [run_table(table, scores.metrics) for table in (*held_out, *seen)]
+    written = {f"tables/{table.name}.tex": formats.latex(table).encode() for table in made_tables}
+    return "\n".join(lines) + "\n", written | {f"figures/{name}": content for name, content in files.items()}
 
 
 def _write(out: Path, html: str, markdown: tuple[str, Mapping[str, bytes]], summary: pd.DataFrame) -> None:

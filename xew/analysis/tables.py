@@ -161,7 +161,7 @@ class Builder:
         return replace(
             printed,
             text=number(mean.value, info),
-            interval=_interval_text(ends, info),
+            interval=interval_text(ends, info),
             verdict=verdict(self.ours, part, row, base, robots, metric) if base and base != row else "",
             value=mean.value,
             low=ends[0],
@@ -217,7 +217,7 @@ class Builder:
         ends = _ends(mean, self.ours.level)
         return Cell(
             number(mean.value, info),
-            _interval_text(ends, info),
+            interval_text(ends, info),
             value=mean.value,
             low=ends[0],
             high=ends[1],
@@ -253,8 +253,9 @@ def metric_title(metric: MetricInfo) -> str:
     return f"{METRIC_TITLES.get(metric.name, metric.name)}{unit} {'↑' if metric.higher_is_better else '↓'}"
 
 
-def metric_columns(grades: Grades, names: Sequence[str]) -> tuple[Column, ...]:
-    infos = [grades.metrics[name] for name in names]
+def metric_columns(metrics: Mapping[str, MetricInfo], names: Sequence[str]) -> tuple[Column, ...]:
+    """A column for each name, under its dimension."""
+    infos = [metrics[name] for name in names]
     return tuple(Column(metric_title(info), DIMENSION_TITLES.get(info.dimension, info.dimension)) for info in infos)
 
 
@@ -296,7 +297,7 @@ def action_table(builder: Builder) -> Table:
         "Action representation, robots never seen",
         "Each robot by itself; bold is best for that robot. Marks: against joint pose.",
         ("action representation", "target"),
-        metric_columns(builder.ours, metrics),
+        metric_columns(builder.ours.metrics, metrics),
         (block,),
     )
 
@@ -356,7 +357,7 @@ def recovery_full(builder: Builder) -> Table:
         title = f"Held-out {ROBOT_TITLES[robot]}"
         blocks.append(_block(builder, title, "few_shot", keys, robot, metrics, f"{robot}-0"))
     caption = "Marks: against M = 0."
-    columns = metric_columns(builder.ours, metrics)
+    columns = metric_columns(builder.ours.metrics, metrics)
     return Table("few_shot_full", "Few-shot recovery, all metrics", caption, ("demonstrations a task",), columns, tuple(blocks))
 
 
@@ -379,7 +380,7 @@ def forgetting_full(builder: Builder) -> Table:
         f"Forgetting on {ROBOT_TITLES[FORGETTING_ROBOT]}, all metrics",
         f"The same {ROBOT_TITLES[FORGETTING_ROBOT]} episodes after each adaptation. Marks: against before.",
         ("adapted to",),
-        metric_columns(builder.ours, metrics),
+        metric_columns(builder.ours.metrics, metrics),
         (replace(block, rows=plain),),
     )
 
@@ -426,7 +427,7 @@ def loeo_full(builder: Builder) -> Table:
         "Each robot held out in turn",
         "Each row is a model of its own, trained on the other four robots; not to be compared with the fixed split.",
         ("held out",),
-        metric_columns(builder.ours, metrics),
+        metric_columns(builder.ours.metrics, metrics),
         (Block("", tuple(rows), note),),
     )
 
@@ -472,7 +473,7 @@ def _full(builder: Builder, name: str, title: str, part: str, stub: str, keys: d
     groups = {SEEN: SEEN_TITLE, **{robot: f"Held-out {ROBOT_TITLES[robot]}" for robot in HELD_OUT_ROBOTS}}
     blocks = tuple(_block(builder, text, part, keys, robots, metrics, base) for robots, text in groups.items())
     caption = f"Marks: against {keys[base].lower()}." if base else ""
-    return Table(name, title, caption, (stub,), metric_columns(builder.ours, metrics), blocks)
+    return Table(name, title, caption, (stub,), metric_columns(builder.ours.metrics, metrics), blocks)
 
 
 def _block(
@@ -511,7 +512,10 @@ def _ends(mean: Mean, level: float) -> tuple[float, float]:
     return interval(mean.values, level) if mean.scenes >= MIN_SCENES else (np.nan, np.nan)
 
 
-def _interval_text(ends: tuple[float, float], metric: MetricInfo) -> str:
+def interval_text(ends: tuple[float, float], metric: MetricInfo) -> str:
+    """Such as '0.12–0.15'; '' where there is no interval, or none at these digits."""
     low, high = ends
+    if np.isnan(low):
+        return ""
     first, last = number(low, metric), number(high, metric)
-    return "" if np.isnan(low) or first == last else f"{first}–{last}"
+    return "" if first == last else f"{first}–{last}"
