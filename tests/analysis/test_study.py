@@ -110,10 +110,12 @@ def test_a_command_that_makes_nothing_has_failed(study: Study) -> None:
 def test_the_analysis_is_of_whatever_was_graded(study: Study) -> None:
     cells = chain(study.out, left=("--fail",))
     end = cells.pop("train/end")
-    analyse = Cell("analyse", "", end.command, end.needs, None, end.product)
-    assert list(run(study, cells | {"analyse": analyse})) == ["train/left"]
-    assert "$ python -m tests.analysis.steps" in (study.out / "logs" / "analyse.log").read_text()
-    assert " end right" in (study.out / "logs" / "analyse.log").read_text()
+    for name in ("left", "right"):
+        cell = cells.pop(f"train/{name}")
+        cells[f"evaluate/{name}"] = Cell("evaluate", name, cell.command, cell.needs, None, cell.product)
+    analyse = Cell("analyse", "", end.command, ("evaluate/left", "evaluate/right"), None, end.product)
+    assert list(run(study, cells | {"analyse": analyse})) == ["evaluate/left"]
+    assert (study.out / "logs" / "analyse.log").read_text().splitlines()[0].endswith(f"{study.out / 'end'} end right")
 
 
 def write_checkpoint(run: Path) -> None:
@@ -133,6 +135,8 @@ def test_a_training_goes_on_from_its_own_checkpoint_only(study: Study) -> None:
     assert not ledger.begin(first) and not run.exists()
     write_checkpoint(run)
     assert ledger.begin(first) and run.exists()
+    assert runner.command_of(first, True, {}) == ("--resume",)
+    assert runner.command_of(first, False, {}) == ()
     assert not ledger.begin(second) and not run.exists()
 
 

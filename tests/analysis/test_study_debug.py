@@ -1,6 +1,6 @@
 """The debug study from nothing to a report by its real commands, then a part of it killed again and again.
 
-The task is the tests' own of twelve simulated frames, and of the 18 models twelve are made, which cover every part.
+The task is the tests' own of twelve simulated frames, and of the 18 models eight are made, something of every part.
 """
 
 import filecmp
@@ -24,10 +24,10 @@ from xew.protocol import PAPER_PARTS, PARTS, VARIANTS
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "configs" / "study_debug.yaml"
 MADE = (
-    *("fixed-optical_flow-none", "fixed-joints-none", "fixed-ray_map-none", "fixed-irasim"),
-    *("fixed-optical_flow-nine_views", "fixed-optical_flow-robot_render", "loeo_*", "few_shot-piper-1"),
+    *("fixed-optical_flow-none", "fixed-joints-none", "fixed-irasim", "fixed-optical_flow-nine_views"),
+    *("fixed-optical_flow-robot_render", "loeo_franka_panda-*", "loeo_piper-*", "few_shot-piper-1"),
 )
-"""At least one variant of each table, all five folds."""
+"""Something of each table."""
 ADAPTED = "few_shot-piper-1"
 KILLS = 5
 
@@ -85,7 +85,7 @@ def test_from_nothing_to_a_report(place: Place, told: str) -> None:
     table = rows_of(place.study)
     planned = table.attrs["study"]
     assert set(table["variant"]) == {"", *planned["variants"]}
-    assert len(planned["variants"]) == 12 and planned["incomplete"] == [] and not planned["of_paper"]
+    assert len(planned["variants"]) == len(MADE) and planned["incomplete"] == [] and not planned["of_paper"]
     for part in PAPER_PARTS:
         assert {variant.name for variant in PARTS[part]} & set(planned["variants"]), f"nothing of {part}"
     for name, counts in planned["variants"].items():

@@ -36,7 +36,7 @@ def test_the_configs_plan_every_variant_of_their_parts(name: str) -> None:
     }
     assert wanted <= {variant.name for variant in study.planned}
     cells = plan(study)
-    assert len(cells) == 2 + 4 * len(study.planned)
+    assert len(cells) == 3 + 4 * len(study.planned)
     assert set(study.parts) >= set(PAPER_PARTS)
 
 

@@ -186,7 +186,7 @@ class Run:
     def _blocked(self, cell: Cell) -> str:
         """Why a cell cannot be made, or ''. The analysis is of whatever was graded."""
         wrong = [name for name in cell.needs if name in self.failed]
-        if not wrong or (cell.stage == "analyse" and len(wrong) < len(cell.needs)):
+        if not wrong or (cell.stage == "analyse" and graded(cell, self.failed)):
             return ""
         return f"needs {wrong[0]}"
 
@@ -194,7 +194,7 @@ class Run:
         goes_on = self.ledger.begin(cell)
         self.started[cell.name] = time.monotonic()
         self._tell(f"{cell.name}{', goes on' if goes_on else ''}")
-        self.machines.start(cell, command_of(cell, self.failed), self.ledger.log(cell))
+        self.machines.start(cell, command_of(cell, goes_on, self.failed), self.ledger.log(cell))
 
     def _finish(self, name: str, code: int) -> str:
         cell, seconds = self.cells[name], time.monotonic() - self.started.pop(name)
@@ -220,11 +220,20 @@ class Run:
         print(f"{time.strftime('%H:%M:%S')} [{self.settled}/{len(self.cells)}] {text}", flush=True)
 
 
-def command_of(cell: Cell, failed: Mapping[str, str]) -> tuple[str, ...]:
-    """A cell's command, with what only its start tells: of the analysis, which variants are graded."""
+def command_of(cell: Cell, goes_on: bool, failed: Mapping[str, str]) -> tuple[str, ...]:
+    """A cell's command, with what only its start tells: whether a training goes on, what the analysis has."""
+    if cell.stage in ("train", "adapt") and goes_on:
+        return (*cell.command, "--resume")
     if cell.stage == "analyse":
-        return (*cell.command, *(name.partition("/")[2] for name in cell.needs if name not in failed))
+        distances = "distances" in cell.needs and "distances" not in failed
+        folder = ("--distances", str(Path(cell.command[1], "distances"))) if distances else ()
+        return (*cell.command, *graded(cell, failed), *folder)
     return cell.command
+
+
+def graded(analyse: Cell, failed: Mapping[str, str]) -> list[str]:
+    """Names of the variants that an analysis has scores of."""
+    return [name.partition("/")[2] for name in analyse.needs if name.startswith("evaluate/") and name not in failed]
 
 
 def find_done(cells: Mapping[str, Cell], ledger: Ledger) -> None:
@@ -243,14 +252,14 @@ def cost(study: Study, cells: Mapping[str, Cell], ledger: Ledger, slots: int) ->
 def status(study: Study, cells: Mapping[str, Cell], ledger: Ledger, failed: Mapping[str, str] | None = None) -> str:
     """A row per variant and a column per stage: the time of what is done, FAILED, blocked, begun, or nothing yet."""
     find_done(cells, ledger)
-    columns = [stage for stage in STAGES if stage not in ("generate", "analyse", "adapt")]
+    columns = [stage for stage in STAGES if stage in ("latents", "train", "rollout", "evaluate")]
     width = max(len(variant.name) for variant in study.planned) + 2
     lines = [f"{'variant':<{width}}" + "".join(f"{stage:>12}" for stage in columns)]
     for variant in study.planned:
         training = "adapt" if variant.target else "train"
         names = [f"{training if stage == 'train' else stage}/{variant.name}" for stage in columns]
         lines.append(f"{variant.name:<{width}}" + "".join(f"{_state(cells[name], ledger, failed or {}):>12}" for name in names))
-    lines += [f"{name:<{width}}{_state(cells[name], ledger, failed or {}):>12}" for name in ("generate", "analyse")]
+    lines += [f"{name:<{width}}{_state(cells[name], ledger, failed or {}):>12}" for name in cells if "/" not in name]
     return "\n".join(lines)
 
 

@@ -30,6 +30,8 @@ class Args:
     """Folder of the study."""
     variants: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Those that are graded; all that have scores where left out."""
+    distances: Path | None = None
+    """Folder of python -m xew.analysis.distance; without it the report has the paper's distances."""
 
 
 @user_errors
@@ -45,9 +47,8 @@ def main(args: Args) -> None:
     write_scores(scores, args.study / "scores.parquet")
     print(coverage(scores.attributes["study"]))
     rollouts = tuple(args.study / "rollouts" / name for name in graded)
-    report.main(
-        report.Args(scores=args.study / "scores.parquet", data=study.data_folder, rollouts=rollouts, out=args.study / "report")
-    )
+    table, data, out = args.study / "scores.parquet", study.data_folder, args.study / "report"
+    report.main(report.Args(scores=table, data=data, rollouts=rollouts, distances=args.distances, out=out))
 
 
 def describe(study: Study, scores: Scores) -> dict[str, Any]:

@@ -106,6 +106,8 @@ class Study:
     """More arguments of `xew.sim_warp.generate`."""
     evaluate: tuple[str, ...] = ()
     """More arguments of `xew.metrics.evaluate`, such as --masks sam2."""
+    distances: tuple[str, ...] = ()
+    """More arguments of `xew.analysis.distance`, which runs where the part loeo is planned."""
     environment: dict[str, str] = field(default_factory=dict)
     """Variables set for every cell."""
     data: Path | None = None

@@ -49,7 +49,7 @@ def estimate(study: Study, cells: Mapping[str, Cell]) -> dict[str, Cost]:
             ),
             f"evaluate/{variant.name}": Cost(graded, "episodes", rates.start_s + graded * rates.grade_s),
         }
-    costs["analyse"] = Cost(1, "report", rates.start_s)
+    costs |= {"distances": Cost(1, "table", 2 * rates.start_s), "analyse": Cost(1, "report", 2 * rates.start_s)}
     return {name: costs[name] for name in cells}
 
 

@@ -162,5 +162,6 @@ _OUTCOMES: dict[str, Callable[[Path], str | None]] = {
     "adapt": _of_run,
     "rollout": _of_rollouts,
     "evaluate": _of_file,
+    "distances": _of_file,
     "analyse": _of_file,
 }

@@ -2,6 +2,7 @@
 
 generate -> latents -> train -> rollout -> evaluate -> analyse
                          |__ latents -> adapt -> rollout -> evaluate __|
+distances _____________________________________________________________|
 """
 
 import hashlib
@@ -21,7 +22,7 @@ from xew.analysis.study_config import Settings, Study, experiment_of, run_folder
 from xew.episode import SCHEMA_VERSION
 from xew.protocol import Variant
 
-STAGES = ("generate", "latents", "train", "adapt", "rollout", "evaluate", "analyse")
+STAGES = ("generate", "latents", "train", "adapt", "rollout", "evaluate", "distances", "analyse")
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,9 @@ def plan(study: Study) -> dict[str, Cell]:
             _rollout(study, variant, experiment),
             _evaluate(study, variant, baselines=number == 0),
         ]
-    cells.append(_analyse(study))
+    if "loeo" in study.parts:
+        cells.append(_distances(study))
+    cells.append(_analyse(study, tuple(cell.name for cell in cells if cell.stage in ("evaluate", "distances"))))
     return {cell.name: cell for cell in cells}
 
 
@@ -132,7 +135,7 @@ def _train(study: Study, variant: Variant, experiment: Settings) -> Cell:
     return Cell(
         _training(variant).partition("/")[0],
         variant.name,
-        ("xew.model.train", str(_config(study, variant)), "--resume", *joins),
+        ("xew.model.train", str(_config(study, variant)), *joins),
         needs=(f"latents/{variant.name}", *before),
         inputs=_of_training(experiment),
         product=run_folder(study, variant),
@@ -170,13 +173,26 @@ def _evaluate(study: Study, variant: Variant, baselines: bool) -> Cell:
     )
 
 
-def _analyse(study: Study) -> Cell:
+def _distances(study: Study) -> Cell:
+    """Of the robots as they are drawn here, which the errors of the LOEO folds are held against."""
+    folder = study.out / "distances"
+    return Cell(
+        "distances",
+        "",
+        ("xew.analysis.distance", "--out", str(folder), *study.distances),
+        needs=(),
+        inputs=[study.distances, source_digest("analysis")],
+        product=folder / "distances.csv",
+    )
+
+
+def _analyse(study: Study, needs: tuple[str, ...]) -> Cell:
     """The names of the variants that have been graded are added to its command when it starts."""
     return Cell(
         "analyse",
         "",
         ("xew.analysis.study_analyse", str(study.out)),
-        needs=tuple(f"evaluate/{variant.name}" for variant in study.planned),
+        needs=needs,
         inputs=[[asdict(variant) for variant in study.planned], source_digest("analysis")],
         product=study.out / "report" / "index.html",
         gpus=0,
