@@ -191,15 +191,17 @@ def test_threads_are_a_few_items_ahead_and_no_more() -> None:
 
 def test_where_one_fails_nothing_more_is_begun() -> None:
     begun: list[int] = []
+    stop = threading.Event()
 
     def fails(i: int) -> int:
         begun.append(i)
         if i == 3:
             raise ValueError("three")
+        assert i < 3 or stop.wait(10), "what is under way learns of it"
         return i
 
     with pytest.raises(ValueError, match="three"):
-        list(in_order(fails, range(1000), workers=2))
+        list(in_order(fails, range(1000), 2, stop))
     assert len(begun) < 20
 
 
@@ -209,9 +211,9 @@ def test_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path, monkey
     held: list[float] = []
     real = evaluate._grade_group
 
-    def notes(*args: object) -> object:
+    def notes(*args: object, **settings: object) -> object:
         held.append(resident())
-        return real(*args)
+        return real(*args, **settings)
 
     monkeypatch.setattr(evaluate, "_grade_group", notes)
     args = Args((tmp_path / "rollouts",), tmp_path / "data", tmp_path / "scores.parquet", ("psnr", "mask_iou"), workers=2)

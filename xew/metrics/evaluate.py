@@ -9,7 +9,9 @@ Writes scores.parquet, one row per model, condition, task, seed, robot and metri
     python -m xew.metrics.evaluate demo/rollouts --data demo/data --check demo/scores.bundle.json --regrade 5
 """
 
+import functools
 import itertools
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -203,19 +205,25 @@ def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: Cell
     bench = open_bench(args, metrics)
     groups = [list(group) for _, group in itertools.groupby(todo, key=lambda pair: (pair[0].episode, pair[0].cell.frames))]
     errors: list[str] = []
+    stop = threading.Event()
     with tqdm(total=len(jobs), initial=len(jobs) - len(todo), desc="evaluate", unit="video", disable=None) as bar:
-        results = in_order(lambda group: _grade_group(group, args, bench, store), groups, worker_count(args.workers))
+        work = functools.partial(_grade_group, args=args, bench=bench, store=store, stop=stop)
+        results = in_order(work, groups, worker_count(args.workers), stop)
         for group, problems in zip(groups, results, strict=True):
             errors += problems
             bar.update(len(group))
     return errors
 
 
-def _grade_group(group: list[tuple[Job, tuple[str, ...]]], args: Args, bench: Bench, store: CellStore) -> list[str]:
+def _grade_group(
+    group: list[tuple[Job, tuple[str, ...]]], args: Args, bench: Bench, store: CellStore, stop: threading.Event
+) -> list[str]:
     """Grade jobs of one episode, which is read once; return what went wrong, or raise it as `grade_all` does."""
     errors: list[str] = []
     truth: Truth | None = None
     for job, metrics in group:
+        if stop.is_set():
+            break
         try:
             needed = {compared(name) for _, names in group for name in names}
             truth = truth or read_truth(job.episode, job.cell.frames, needed)

@@ -24,10 +24,13 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Iterator[Result]:
+def in_order(
+    function: Callable[[Item], Result], items: Iterable[Item], workers: int, stop: threading.Event | None = None
+) -> Iterator[Result]:
     """Results of a function over items, in their order, computed by threads that are at most a few items ahead.
 
-    Where one raises, or whoever takes the results stops, nothing more is begun.
+    Where one raises, or whoever takes the results stops, nothing more is begun, and `stop` is set, so that what is under way
+    can end early.
     """
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[Result]] = deque()
@@ -40,6 +43,8 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers:
                 yield waiting.popleft().result()
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
+            if stop is not None:
+                stop.set()
 
 
 def worker_count(asked: int) -> int:
