@@ -148,6 +148,22 @@ def test_what_is_missing_is_said_in_the_table_in_every_format(folder: Path, tabl
     assert "Not run in this study" not in (report / "index.html").read_text()
 
 
+def test_scores_that_other_models_have_are_named_cell_by_cell(tmp_path: Path) -> None:
+    path = write_study(tmp_path / "scores.parquet", ["fixed-optical_flow-none", "fixed-joints-none"], TASKS[:1], seeds=2)
+    rows = pd.read_parquet(path)
+    lost = (rows["variant"] == "fixed-joints-none") & (rows["metric"] == "pck") & (rows["seed"] == TEST_SEED_START)
+    kept = rows[~(lost & (rows["robot"] == "piper"))]
+    kept.attrs = rows.attrs
+    kept.to_parquet(path, index=False)
+    main(Args(path, out=tmp_path / "report"))
+    missing = pd.read_csv(tmp_path / "report" / "missing.csv")
+    assert missing[["variant", "task", "seed", "robot", "metric"]].to_numpy().tolist() == [
+        ["fixed-joints-none", TASKS[0], TEST_SEED_START, "piper", "pck"]
+    ]
+    for name in ("index.html", "report.md"):
+        assert f"{TASKS[0]} {TEST_SEED_START} piper pck" in (tmp_path / "report" / name).read_text()
+
+
 def test_a_study_of_its_own_size_is_not_called_incomplete(folder: Path) -> None:
     made = builder(folder / "scores.parquet")
     planned = {name: dict.fromkeys(variant.graded_robots, 12) for name, variant in VARIANTS.items()}

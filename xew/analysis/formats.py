@@ -14,7 +14,7 @@ LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "−": "$-$", "–": "--",
     "³": "$^3$", "ρ": r"$\rho$", "≈": r"$\approx$", "▲": r"$\blacktriangle$", "▼": r"$\blacktriangledown$", "…": r"\dots{}",
-    "·": r"$\cdot$", "×": r"$\times$", "±": r"$\pm$", "<": "$<$", ">": "$>$",
+    "·": r"$\cdot$", "×": r"$\times$", "±": r"$\pm$", "\u00a0": "~", "<": "$<$", ">": "$>$",
 }  # fmt: skip
 """What stands for characters that LaTeX reads otherwise, or does not have."""
 

@@ -1,4 +1,4 @@
-"""Stage 11 of 11: what the report says as HTML and as Markdown. Text in, text out; `report` reads and writes files."""
+"""Stage 11 of 11: what the report says as HTML. Text in, text out; `report` reads and writes files."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -68,7 +68,7 @@ def table(shown: Table) -> str:
     blocks = "\n".join(_block(block, width) for block in shown.blocks)
     return (
         f"<h3>{escape(shown.title)}</h3>\n{paragraph(shown.caption, soft=True) if shown.caption else ''}\n"
-        f'<div class="wide" tabindex="0"><table class="study"><thead>{above}<tr>{heads}</tr></thead>\n{blocks}</table></div>'
+        f'<div class="wide" tabindex="0"><table><thead>{above}<tr>{heads}</tr></thead>\n{blocks}</table></div>'
     )
 
 

@@ -28,7 +28,7 @@ from xew.analysis import formats, page, paper_report, pictures, report_study
 from xew.analysis.charts import Chart, chart_files
 from xew.analysis.paper import read_paper
 from xew.analysis.report_charts import run_chart
-from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, read_scores
+from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, missing_cells, read_scores
 from xew.analysis.summary import METRIC_TITLES, ROBOT_TITLES, RobotTable, Row, finding, flat_summary, robot_table
 from xew.analysis.tables import Block, Cell, Table, interval_text, metric_columns, number
 from xew.analysis.tables import Row as TableRow
@@ -109,10 +109,12 @@ def _report_scores(args: Args, scores: Scores) -> None:
     if args.data and not records:
         raise ConfigError(f"{args.data} holds no episode; make some: python -m xew.sim_warp.generate --out {args.data}")
     held_out, seen = _tables(scores, records, args.held_out)
+    missing = missing_cells(scores.rows)
     strips = _strips(scores, args) if args.data and args.rollouts else []
     curves = _curves(scores, args.held_out)
     sheets = [_contact_sheet(args.data, records)] if args.data else []
     sections = [
+        *map(page.note, report_study.missing_note(missing)),
         _held_out_section(held_out, scores.metrics),
         _strip_section(strips),
         page.section("How the error grows with time", page.chart(curves)),
@@ -123,7 +125,10 @@ def _report_scores(args: Args, scores: Scores) -> None:
     sentences = finding(held_out, seen, scores.metrics)
     html = page.page(TITLE, sentences, [text for text in sections if text], _footer(scores.versions))
     markdown = _markdown(sentences, held_out, seen, scores, [*strips, *sheets], chart_files(curves))
-    _write(args.out, html, markdown, flat_summary(held_out + seen))
+    text, files = markdown
+    if len(missing):
+        files["missing.csv"] = missing.to_csv(index=False).encode()
+    _write(args.out, html, (text, files), flat_summary(held_out + seen))
 
 
 def _tables(scores: Scores, records: Sequence[Record], held_out: Sequence[str]) -> tuple[list[RobotTable], list[RobotTable]]:
@@ -154,9 +159,9 @@ def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo
     return page.section(
         "Robots never seen in training",
         page.paragraph(
-            "Means over episodes with 95 % bootstrap intervals. Against the frozen first frame, paired by episode: "
-            "▲ better, ▼ worse, ≈ not resolved. The ceiling is the true video graded in the model's place, so its "
-            "distance from perfect is the error of the mask estimator."
+            "Means over episodes with 95 % bootstrap intervals; scenes (task and seed) are resampled. Against the frozen first "
+            "frame, paired by episode: ▲ better, ▼ worse, ≈ not resolved. The ceiling is the true video graded in the model's "
+            "place: what it lacks is the estimators' own error, and a smaller difference is not resolved."
         ),
         caution,
         *(page.table(run_table(table, metrics)) for table in tables),

@@ -76,6 +76,8 @@ class Content:
     strips: Mapping[str, Strip]
     lacks: Sequence[str]
     """Notes on what is not there."""
+    missing: pd.DataFrame
+    """Every cell that other models have."""
 
 
 def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances: Path | None, footer: str) -> Report:
@@ -102,6 +104,7 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
     if builder.present("loeo"):
         tables += [correlation_table(grades, known, paper), certainty_table(grades, known, paper)]
     findings = ask(grades)
+    missing = missing_cells(scores.rows)
     content = Content(
         _sentences(grades, known, findings),
         findings,
@@ -109,7 +112,8 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
         {table.name: table for table in tables},
         study_charts(builder, known, scores.curves),
         strips,
-        list(_lacks(builder, scores)),
+        [*_lacks(builder, scores), *missing_note(missing)],
+        missing,
     )
     html = _html(content, scores, footer)
     return Report(html, _markdown(content), formats.tables_frame(tables), dict(_files(content)))
@@ -208,12 +212,16 @@ def _lacks(builder: Builder, scores: Scores) -> Iterator[str]:
     unknown = set(scores.rows["variant"]) - {variant.name for variants in PARTS.values() for variant in variants} - {""}
     if unknown:
         yield f"Graded, but in no table of the protocol: {', '.join(sorted(unknown))}."
-    missing = missing_cells(scores.rows)
-    if len(missing):
-        yield (
-            f"{len(missing)} scores are missing that other models have; comparisons leave these cells out for all: "
-            f"{describe_cells(missing, 5)}."
-        )
+
+
+def missing_note(missing: pd.DataFrame) -> list[str]:
+    """What to say of scores that other models have; none where there is nothing to say."""
+    if missing.empty:
+        return []
+    return [
+        f"{len(missing)} scores are missing that other models have; comparisons leave these cells out for all. They are in "
+        f"missing.csv: {describe_cells(missing, 3)}."
+    ]
 
 
 def _html(content: Content, scores: Scores, footer: str) -> str:
@@ -312,5 +320,7 @@ def _files(content: Content) -> Iterator[tuple[str, bytes]]:
     for part, strip in content.strips.items():
         yield f"figures/strip_{part}.png", strip.image
     both = pd.concat([findings_frame(content.findings, "here"), findings_frame(content.printed, "paper")])
+    if len(content.missing):
+        yield "missing.csv", content.missing.to_csv(index=False).encode()
     yield "findings.csv", both.to_csv(index=False).encode()
     yield "tables/findings.tex", formats.findings_latex(content.findings, content.printed).encode()
