@@ -40,6 +40,8 @@ BY_MOTION = ("mask_iou", "boundary_f1", "keypoint_error")
 """Metrics of the table by motion, frame by frame."""
 MOTION_STEPS = (0, 0.5, 2, 5, 10, 20, 40, 80, np.inf)
 """Pixels by which the keypoints of a wrong video are off in the mean of a frame."""
+TOLD_APART = {"px": 0.5, "": 0.005}
+"""By unit, how far two true scores must lie apart that their order counts: less is no order."""
 Row = dict[str, Any]
 
 
@@ -245,8 +247,9 @@ def order_table(wrong: pd.DataFrame) -> pd.DataFrame:
         own = wrong[wrong["metric"] == name].dropna(subset=["estimate", "truth"])
         if len(own) < 3 or own["truth"].nunique() < 2:
             continue
-        pairs = [kept for _, episode in own.groupby(["task", "seed", "robot"]) for kept in _kept(episode)]
-        means = list(_kept(own.groupby("case")[["estimate", "truth"]].mean()))
+        apart = TOLD_APART[METRICS[name].unit]
+        pairs = [kept for _, episode in own.groupby(["task", "seed", "robot"]) for kept in _kept(episode, apart)]
+        means = list(_kept(own.groupby("case")[["estimate", "truth"]].mean(), apart))
         rows[name] = {
             "Spearman, all videos": f"{spearmanr(own['estimate'], own['truth']).statistic:.3f}",
             "pairs of an episode's videos in order": f"{sum(pairs)} of {len(pairs)}",
@@ -255,10 +258,10 @@ def order_table(wrong: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def _kept(table: pd.DataFrame) -> Iterator[bool]:
-    """For each two rows that the truth tells apart: does the estimate put them in the same order?"""
+def _kept(table: pd.DataFrame, apart: float) -> Iterator[bool]:
+    """For each two rows whose truths lie so far apart: does the estimate put them in the same order?"""
     for (_, a), (_, b) in combinations(table[["estimate", "truth"]].iterrows(), 2):
-        if a["truth"] != b["truth"]:
+        if abs(a["truth"] - b["truth"]) >= apart:
             yield bool((a["truth"] - b["truth"]) * (a["estimate"] - b["estimate"]) > 0)
 
 
