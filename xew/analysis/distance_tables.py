@@ -21,8 +21,8 @@ from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES
 AXIS_TITLES = {
     "kinematic": "Kinematic distance [m]",
     "appearance": "Appearance distance",
-    "arm_base": "All links, from the arm's base [m] (ours)",
-    "arm_alone": "Arm alone, from its base [m] (ours)",
+    "arm_base": "From the arm's base [m] (ours)",
+    "arm_alone": "Arm alone, from there [m] (ours)",
     "perceptual": "LPIPS of the renders (ours)",
 }
 FEATURE_TITLES = {"dof": "Joints", "links": "Links", "reach": "Reach [m]", "volume": "Volume [m³]"}

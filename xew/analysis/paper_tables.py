@@ -48,9 +48,9 @@ FRAME_TEXT = (
     "robot of seven joints, is then the farthest; five robots cannot tell the two apart."
 )
 FRAME_TITLES: dict[Frame, str] = {
-    "root": "Root frame, all links (ours)",
-    "arm_base": "As the text says: arm's base frame, all links (ours)",
-    "arm_alone": "Arm alone, its base frame (ours)",
+    "root": "Root frame (ours)",
+    "arm_base": "Arm's base frame, as the text says (ours)",
+    "arm_alone": "Arm alone, in that frame (ours)",
 }
 CHANGE_TEXT = (
     "What the text says (small), and what the tables give for it: from the printed scores, and below from all scores that "
@@ -165,14 +165,18 @@ def frame_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
     def row(metric: str) -> Row:
         printed = paper.metrics[metric].kinematic
         cells = [_signed(printed.r), _range(printed.low, printed.high)]
-        for results in by_frame.values():
+        for frame, results in by_frame.items():
             result = results[metric]
             p = tables.Cell(f"{result.p_value:.3f}", value=result.p_value)
-            cells += [_signed(result.r), _range(result.low, result.high), p]
+            cells += [_signed(result.r), *((_range(result.low, result.high), p) if frame != "root" else ())]
         return Row((METRIC_TITLES[metric],), tuple(cells))
 
-    columns = [Column(head, "As printed") for head in ("Pearson r", "leave one out")]
-    columns += [Column(head, FRAME_TITLES[frame]) for frame in frames for head in ("Pearson r", "leave one out", "p")]
+    columns = [Column(head, "As printed") for head in ("r", "leave one out")]
+    columns += [
+        Column(head, FRAME_TITLES[frame])
+        for frame in frames
+        for head in (("r",) if frame == "root" else ("r", "leave one out", "p"))
+    ]
     rows = [row(metric) for metric in paper.metrics]
     return _table("frames", "Kinematic distance with the paper's scores", FRAME_TEXT, "metric", columns, rows)
 
