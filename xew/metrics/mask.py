@@ -55,7 +55,8 @@ def boundary_f1(prediction: jax.Array, target: jax.Array, tolerance: float = 2) 
         TypeError: a mask is not bool.
     """
     check_masks(prediction, target)
-    return _f1(*_packed(prediction, target), np.shape(target)[1], _disc(tolerance))
+    p, t = _packed(prediction, target)
+    return _f1(p, t, np.shape(target)[1], _disc(tolerance))
 
 
 def mask_scores(prediction: jax.Array, target: jax.Array, tolerance: float = 2) -> tuple[jax.Array, jax.Array]:
