@@ -80,6 +80,7 @@ def test_what_is_printed_says_what_is_what(table: tuple[Path, str]) -> None:
 def test_one_seed_has_no_spread(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     main(Args(out=tmp_path, seeds=1, looks=False, workers=1))
     assert (pd.read_csv(tmp_path / "distances.csv")["spread"] == 0).all()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["distances.csv", "robots.csv"]
     assert "standard deviation" not in capsys.readouterr().out
 
 

@@ -6,6 +6,7 @@ standard error over views) and the figure that the paper prints.
 """
 
 import importlib
+import os
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -87,7 +88,7 @@ def main(args: Args) -> None:
     for title, axis in axes.items():
         print(f"\n{TITLES[title].format(args.perceptual)}\n{matrix_text(pairs[pairs['axis'] == title], axis.robots)}")
     print(f"\nRobots\n{robot_text(singles)}\n\n{_legend(args.seeds)}")
-    for name, frame in (("distances", pairs), ("robots", singles)):
+    for name, frame in (("robots", singles), ("distances", pairs)):  # where the second stands, both do
         path = args.out / f"{name}.csv"
         _write(frame, path)
         print(path)
@@ -237,7 +238,9 @@ def _image_distance(name: str) -> ImageDistance:
 def _write(frame: pd.DataFrame, path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        frame.to_csv(path, index=False)
+        temporary = path.with_name(f".{path.name}.partial")
+        frame.to_csv(temporary, index=False)
+        os.replace(temporary, path)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error}. Choose another --out.") from error
 
