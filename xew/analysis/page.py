@@ -94,13 +94,14 @@ def _block_row(block: Block, index: int) -> str:
 def _stub(rows: Sequence[TableRow], index: int, place: int) -> str:
     """A row's label, once for all rows in a row that share it."""
     label = rows[index].labels[place]
+    text = _unbroken(label)
     kind = "" if place else " lead"
     if place == len(rows[index].labels) - 1:
-        return f'<th class="stub{kind}">{escape(label)}</th>'
+        return f'<th class="stub{kind}">{text}</th>'
     if index and rows[index - 1].labels[place] == label:
         return ""
     same = next((i for i, row in enumerate(rows[index:]) if row.labels[place] != label), len(rows) - index)
-    return f'<th class="stub{kind}" rowspan="{same}">{escape(label)}</th>'
+    return f'<th class="stub{kind}" rowspan="{same}">{text}</th>'
 
 
 def _value_cell(cell: Cell) -> str:
