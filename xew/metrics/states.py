@@ -130,6 +130,7 @@ def _carried(limbs: jax.Array) -> jax.Array:
     return jnp.concatenate([jnp.moveaxis(low, 0, -1), (limbs[..., -1] + carry)[..., None]], axis=-1)
 
 
+@jax.jit
 def _as_float(limbs: jax.Array) -> jax.Array:
     """float32 [...] of exact sums [... 20]."""
     negative = limbs[..., -1] < 0

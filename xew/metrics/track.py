@@ -124,6 +124,7 @@ def ndtw(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Arra
     return _masked_mean(*warpings(prediction, target, valid))
 
 
+@jax.jit
 def hits(
     prediction: jax.Array, target: jax.Array, valid: jax.Array, alpha: float | jax.Array = 0.1
 ) -> tuple[jax.Array, jax.Array]:
@@ -134,18 +135,21 @@ def hits(
     return correct.astype(jnp.float32), valid & (diagonal > 0)[:, None]
 
 
+@jax.jit
 def presence(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
     """What `coverage` is the mean of: [t k] float32, 1 where the prediction has the point, and [t k] bool, which count."""
     check_tracks(prediction, target, valid)
     return _found(prediction).astype(jnp.float32), valid
 
 
+@jax.jit
 def distances(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
     """What the errors are means of: [t k] float32 pixels, infinite where lost, and [t k] bool, which count."""
     check_tracks(prediction, target, valid)
     return _distance(prediction, target), valid & _found(prediction)
 
 
+@jax.jit
 def warpings(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
     """What `ndtw` is the mean of: [k] float32, and [k] bool, which count."""
     check_tracks(prediction, target, valid)
