@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,11 +12,13 @@ import pandas as pd
 import pytest
 
 from tests.synthetic import write_synthetic_data
-from xew.episode import episode_folder, read_states, read_video
+from xew.episode import episode_folder, read_record, read_states, read_video, write_episode
 from xew.metrics import METRICS, keypoint_error, mask_iou, psnr, ssim
 from xew.metrics.backends import Backend, Tracker, estimate_masks
 from xew.metrics.contact import predicted_contact, touching_distance
 from xew.metrics.evaluate import Args, main
+from xew.metrics.grade import Comparison
+from xew.metrics.grade import grade as grade_one
 from xew.metrics.truth import _visible, project, read_truth
 from xew.rollout import write_rollout
 
@@ -192,10 +195,6 @@ def test_projected_objects_lie_where_they_are_drawn(data: Path) -> None:
 
 def test_an_undefined_metric_has_no_row_and_the_rest_stands(rollouts: Path, data: Path, tmp_path: Path) -> None:
     """A robot that is hardly seen: its box is too small for LPIPS and no keypoint is visible."""
-    from dataclasses import replace
-
-    from xew.episode import read_record, write_episode
-
     folder = episode_folder(data, TASK, SEED, "piper")
     states = read_states(folder)
     mask = np.zeros_like(states.robot_mask)
@@ -206,6 +205,19 @@ def test_an_undefined_metric_has_no_row_and_the_rest_stands(rollouts: Path, data
     scores = grade(rollouts, tmp_path / "data", metrics=("psnr", "region_lpips", "pck", "coverage"))
     assert scores["metric"].tolist() == ["psnr"]
     assert scores["value"].notna().all()
+
+
+def test_the_region_of_a_robot_all_over_the_frame_is_the_frame(data: Path) -> None:
+    """What is then taken from LPIPS is, to the bit, what region LPIPS computes alone; of a smaller region it is not taken."""
+    read = read_truth(episode_folder(data, TASK, SEED, "piper"), 4, ("region",))
+    corners = read.mask.copy()
+    corners[1, 0, 0] = corners[2, -1, -1] = True
+    for mask, same in ((corners, True), (read.mask & (np.arange(240) > 90)[:, None], False)):
+        comparison = Comparison(late(read.rgb), replace(read, mask=mask), estimate_masks, shifted)
+        both = grade_one(comparison, ("lpips", "region_lpips")).curves
+        alone = grade_one(comparison, ("region_lpips",)).curves["region_lpips"]
+        assert both["region_lpips"].tobytes() == alone.tobytes()
+        assert (both["region_lpips"].tobytes() == both["lpips"].tobytes()) == same
 
 
 def test_curves_hold_every_predicted_frame_and_average_to_the_scores(rollouts: Path, data: Path) -> None:

@@ -22,6 +22,8 @@ POINT_BLOCK = 8
 WHOLE_VIDEO = ("psnr",)
 """Metrics in which a frame's score depends on the others (the cap of exact frames); all others are computed block by block."""
 
+OF_WHOLE_FRAMES = {"region_lpips": "lpips"}
+"""Metrics of the robot's box, and what they are where that is the whole frame, which it often is over an episode."""
 WHOLE_PATH = ("ndtw",)
 """Metrics of tracks that say nothing of a single frame."""
 DIAGNOSTICS = {"contact_f1": contact_f1}
@@ -81,7 +83,9 @@ def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
             values[name], curve = _grade_tracks(name, arrays)
             curves |= {} if curve is None else {name: curve}
         else:
-            curves[name] = _curve(name, arrays)
+            whole = OF_WHOLE_FRAMES.get(name)
+            known = curves.get(whole) if whole and _spans(arrays[-1][0]) else None
+            curves[name] = _curve(name, arrays) if known is None else known
             values[name] = float(np.mean(curves[name], dtype=np.float64))
     prediction, target = _video(comparison)
     return Grades(values, curves, int(np.all(prediction == target, axis=(1, 2, 3)).sum()))
@@ -151,6 +155,11 @@ def _tracks(c: Comparison, points: np.ndarray, visible: np.ndarray) -> Arrays | 
     points, visible = np.nan_to_num(points[:, seen]), visible[:, seen]
     found = c.tracker(c.prediction, c.truth.rgb, points, visible)
     return found[c.first :].astype(np.float32), points[c.first :], visible[c.first :]
+
+
+def _spans(mask: np.ndarray) -> bool:
+    """Does the bounding box of a mask [h w] touch all four borders of the image?"""
+    return bool(mask[[0, -1]].any(axis=1).all() and mask[:, [0, -1]].any(axis=0).all())
 
 
 def _grade_tracks(name: str, arrays: Arrays) -> tuple[float, np.ndarray | None]:
