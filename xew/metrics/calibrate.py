@@ -13,7 +13,7 @@ masks and points stands beside what it makes of the true ones.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +58,7 @@ class Args:
     seeds: tuple[int, ...] = ()
     """Only episodes of these seeds; all others serve as another seed's."""
     episodes: int = 0
-    """At most so many, evenly chosen; 0: all."""
+    """At most so many, of as many robots and tasks as there are; 0: all."""
     masks: str = "default"
     """Who finds the robot: a name of xew.metrics.backends.MASKERS, or module:NAME."""
     masks_checkpoint: Path | None = None
@@ -86,25 +86,39 @@ def main(args: Args) -> None:
     estimators = Estimators(open_masker(args.masks, args.masks_checkpoint), open_tracker(args.tracks, args.tracks_checkpoint))
     through_codec = None if args.codec is None else open_codec(args.codec)
     chosen = choose(args)
+    tables = {name: pd.DataFrame() for name in ("references", "wrong", "frames")}
+    text = ""
+    for folder, record in tqdm(chosen, desc="calibrate", unit="episode", disable=None):
+        for name, table in calibrate(folder, record, args.data, estimators, through_codec).items():
+            tables[name] = pd.concat([tables[name], table], ignore_index=True)
+        text = report(**tables)
+        write(args.out, text, tables)  # each time, so that a run that is stopped has told something
+    print(text)
+
+
+def calibrate(
+    folder: Path,
+    record: Record,
+    data: Path,
+    estimators: Estimators,
+    through_codec: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> dict[str, pd.DataFrame]:
+    """The rows of one episode: references (KEY metric value), wrong (KEY metric estimate truth), frames (by frame)."""
+    truth = read_truth(folder, record.frame_count, NEEDS)
+    key: Row = {"task": record.task, "seed": record.seed, "robot": record.robot}
     references: list[Row] = []
     wrong: list[Row] = []
     frames: list[pd.DataFrame] = []
-    for folder, record in tqdm(chosen, desc="calibrate", unit="episode", disable=None):
-        truth = read_truth(folder, record.frame_count, NEEDS)
-        key: Row = {"task": record.task, "seed": record.seed, "robot": record.robot}
-        for case, video in reference_videos(args.data, record, truth, through_codec):
-            values = estimators.grade(video, truth, tuple(METRICS)).values
-            references += [key | {"case": case, "metric": name, "value": value} for name, value in values.items()]
-        for case, shown in wrong_videos(folder):
-            grades, true = estimators.grade(shown.rgb, truth, ESTIMATED), true_grades(shown, truth)
-            wrong += [
-                key | {"case": case, "metric": name, "estimate": grades.values[name], "truth": true.values[name]}
-                for name in ESTIMATED
-            ]
-            frames.append(_by_frame(grades, true).assign(**key, case=case))
-    text = report(pd.DataFrame(references), pd.DataFrame(wrong), pd.concat(frames, ignore_index=True))
-    write(args.out, text, {"references": pd.DataFrame(references), "wrong": pd.DataFrame(wrong), "frames": pd.concat(frames)})
-    print(text)
+    for case, video in reference_videos(data, record, truth, through_codec):
+        values = estimators.grade(video, truth, tuple(METRICS)).values
+        references += [key | {"case": case, "metric": name, "value": value} for name, value in values.items()]
+    for case, shown in wrong_videos(folder):
+        grades, true = estimators.grade(shown.rgb, truth, ESTIMATED), true_grades(shown, truth)
+        pairs = {name: {"estimate": grades.values[name], "truth": true.values[name]} for name in ESTIMATED}
+        wrong += [key | {"case": case, "metric": name} | pair for name, pair in pairs.items()]
+        frames.append(_by_frame(grades, true).assign(**key, case=case))
+    rows = {"references": pd.DataFrame(references), "wrong": pd.DataFrame(wrong)}
+    return rows | {"frames": pd.concat(frames, ignore_index=True)}
 
 
 def choose(args: Args) -> list[tuple[Path, Record]]:
@@ -114,8 +128,16 @@ def choose(args: Args) -> list[tuple[Path, Record]]:
     if unknown := [seed for seed in args.seeds if seed not in held]:
         raise ConfigError(f"{args.data} holds no seed {unknown[0]}; it has {', '.join(map(str, held[:20]))}: --seeds.")
     chosen = [(folder, record) for folder, record in found if not args.seeds or record.seed in args.seeds]
-    count = min(args.episodes or len(chosen), len(chosen))
-    return [chosen[i] for i in np.unique(np.linspace(0, len(chosen) - 1, count).round().astype(int))]
+    return _mixed(chosen)[: args.episodes or None]
+
+
+def _mixed(episodes: list[tuple[Path, Record]]) -> list[tuple[Path, Record]]:
+    """Robots by turns, each beginning elsewhere, so that the first few are of many robots and tasks."""
+    queues = []
+    for index, robot in enumerate(dict.fromkeys(record.robot for _, record in episodes)):
+        own = [episode for episode in episodes if episode[1].robot == robot]
+        queues.append([*own[index % len(own) :], *own[: index % len(own)]])
+    return [episode for turn in zip_longest(*queues) for episode in turn if episode is not None]
 
 
 def reference_videos(
