@@ -13,11 +13,12 @@ import numpy as np
 from xew.metrics import METRICS, contact_f1
 from xew.metrics.backends import Masker, Tracker
 from xew.metrics.contact import predicted_contact
-from xew.metrics.metric import Metric
+from xew.metrics.metric import ACCELERATOR_CHUNK, Metric
 from xew.metrics.perceptual import SMALLEST_SIDE, union_box
 from xew.metrics.truth import Truth, inside
 
 FRAME_BLOCK = 16
+"""On a CPU; on a GPU as many frames as it takes at once."""
 POINT_BLOCK = 8
 WHOLE_VIDEO = ("psnr",)
 """Metrics in which a frame's score depends on the others (the cap of exact frames); all others are computed block by block."""
@@ -180,8 +181,9 @@ def _curve(name: str, arrays: Arrays) -> np.ndarray:
     curve = METRICS[name].curve
     assert curve is not None, "metrics of frames have one"
     count = len(arrays[0])
-    padded = [_fill(array, 0, FRAME_BLOCK, "last") for array in arrays]
-    size = len(padded[0]) if name in WHOLE_VIDEO else FRAME_BLOCK
+    block = FRAME_BLOCK if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK
+    padded = [_fill(array, 0, block, "last") for array in arrays]
+    size = len(padded[0]) if name in WHOLE_VIDEO else block
     blocks = [curve(*(array[i : i + size] for array in padded)) for i in range(0, len(padded[0]), size)]
     return np.concatenate(jax.device_get(blocks))[:count].astype(np.float32)
 
