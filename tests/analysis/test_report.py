@@ -166,6 +166,17 @@ def test_scores_that_cannot_be_trusted_are_named(
     assert not (tmp_path / "report").exists()
 
 
+def test_a_robot_of_ones_own_has_its_own_table(study: Study, tmp_path: Path) -> None:
+    def rename(rows: pd.DataFrame) -> pd.DataFrame:
+        rows.attrs["robots"] = ["my_arm"]
+        return rows.assign(robot=rows["robot"].replace("piper", "my_arm"))
+
+    main(Args(edit(study, tmp_path, rename), out=tmp_path / "report"))
+    headings = Page((tmp_path / "report" / "index.html").read_text()).headings
+    assert [h for h in headings if h in ("Franka Panda", "Piper", "my_arm")] == ["Franka Panda", "my_arm"]
+    assert (tmp_path / "report" / "tables" / "my_arm.tex").exists()
+
+
 def test_missing_inputs_name_the_command_that_makes_them(study: Study, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     (tmp_path / "void").mkdir()
     for args, command in (

@@ -14,7 +14,7 @@ With --paper it reads nothing: the paper's own figures come with the package, an
 
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated
@@ -29,7 +29,7 @@ from xew.analysis.charts import Chart, chart_files
 from xew.analysis.paper import read_paper
 from xew.analysis.report_charts import run_chart
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, missing_cells, read_scores
-from xew.analysis.summary import METRIC_TITLES, ROBOT_TITLES, RobotTable, Row, finding, flat_summary, robot_table
+from xew.analysis.summary import METRIC_TITLES, RobotTable, Row, finding, flat_summary, robot_table, robot_title
 from xew.analysis.tables import Block, Cell, Table, interval_text, metric_columns, number
 from xew.analysis.tables import Row as TableRow
 from xew.config import ConfigError, user_errors
@@ -57,7 +57,7 @@ class Args:
     out: Path = Path("report")
     """Folder to write."""
     held_out: tuple[str, ...] = HELD_OUT_ROBOTS
-    """Robots that the models have not seen; each has a table of its own."""
+    """Robots that the models have not seen; each has a table of its own, as have all robots that are not the paper's."""
     distances: Path | None = None
     """Folder that python -m xew.analysis.distance wrote; for a study. Without it the paper's distances stand in."""
     paper: bool = False
@@ -102,9 +102,12 @@ def _report_study(args: Args, scores: Scores) -> None:
 
 
 def _report_scores(args: Args, scores: Scores) -> None:
+    own = [robot for robot in dict.fromkeys(scores.rows["robot"]) if robot not in ROBOT_NAMES]
     for robot in args.held_out:
-        if robot not in ROBOT_NAMES:
-            raise ConfigError(f"--held-out names {robot!r}; known: {', '.join(ROBOT_NAMES)}.")
+        if robot not in (*ROBOT_NAMES, *own):
+            raise ConfigError(f"--held-out names {robot!r}; known: {', '.join((*ROBOT_NAMES, *own))}.")
+    # Robots of one's own are none that a split trains on.
+    args = replace(args, held_out=tuple(dict.fromkeys((*args.held_out, *own))))
     records = [record for _, record in find_records(args.data)] if args.data else []
     if args.data and not records:
         raise ConfigError(f"{args.data} holds no episode; make some: python -m xew.sim_warp.generate --out {args.data}")
@@ -138,9 +141,9 @@ def _tables(scores: Scores, records: Sequence[Record], held_out: Sequence[str]) 
     def build(title: str, robots: Sequence[str]) -> RobotTable:
         return robot_table(scores, title, robots, _expected(records, robots) if records else None)
 
-    apart = [build(ROBOT_TITLES[robot], [robot]) for robot in held_out if robot in present]
+    apart = [build(robot_title(robot), [robot]) for robot in held_out if robot in present]
     rest = [robot for robot in ROBOT_NAMES if robot in present and robot not in held_out]
-    pooled = [build("Pooled: " + ", ".join(ROBOT_TITLES[robot] for robot in rest), rest)] if rest else []
+    pooled = [build("Pooled: " + ", ".join(map(robot_title, rest)), rest)] if rest else []
     return apart, pooled
 
 
@@ -270,7 +273,7 @@ def _strip(row: pd.Series, word: str, rollouts: dict[tuple[str, str, str, int, s
     times = pictures.strip_times(int(row["frames"]))
     image = pictures.png(pictures.strip(observed, predicted, times))
     caption = (
-        f"<b>{ROBOT_TITLES[row['robot']]}, {page.escape(row['task'])}</b>, seed {row['seed']} · "
+        f"<b>{page.escape(robot_title(row['robot']))}, {page.escape(row['task'])}</b>, seed {row['seed']} · "
         f"{page.escape(' · '.join(filter(None, key[:2])))} · {word}, LPIPS {row['value']:.3f}"
     )
     columns = [f"frame {t}" for t in times]
@@ -288,11 +291,12 @@ def _contact_sheet(data: Path, records: Sequence[Record]) -> Picture:
     """One seed of each task, middle frame, all robots side by side."""
     accepted = [record for record in records if record.success]
     tasks = sorted({record.task for record in accepted})[:SHEET_TASKS]
-    robots = [robot for robot in ROBOT_NAMES if any(record.robot == robot for record in accepted)]
+    known = dict.fromkeys((*ROBOT_NAMES, *(record.robot for record in accepted)))
+    robots = [robot for robot in known if any(record.robot == robot for record in accepted)]
     rows = [_task_row(data, [record for record in accepted if record.task == task], robots) for task in tasks]
     image = pictures.png(pictures.sheet(rows))
     caption = "One seed of each task half-way through: the scene is the same for every robot."
-    titles = [ROBOT_TITLES[robot] for robot in robots]
+    titles = [robot_title(robot) for robot in robots]
     names = [task.replace("_", " ") for task in tasks]
     return Picture("data.png", image, page.labelled_picture(pictures.data_uri(image), caption, titles, names))
 

@@ -85,6 +85,11 @@ class RobotTable:
         return self.expected is None or all(count == self.expected for count in self.counts)
 
 
+def robot_title(robot: str) -> str:
+    """Its name in print; robots of one's own are called by their key."""
+    return ROBOT_TITLES.get(robot, robot)
+
+
 def mean_interval(scores: pd.Series) -> Interval:
     """Mean of episodes' scores and its percentile bootstrap interval; the same at every call.
 
