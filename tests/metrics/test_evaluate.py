@@ -1,9 +1,10 @@
 """The command: rollouts in every admitted form to a table, and clear words for every mistake."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import cv2
@@ -432,3 +433,15 @@ def test_models_over_different_horizons_do_not_share_a_table(
     with pytest.raises(SystemExit):
         main(Args((rollouts, other), data, tmp_path / "scores.parquet", CHEAP))
     assert "different names" in capsys.readouterr().err
+
+
+def test_the_page_shows_what_works(data: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "evaluate.md").read_text()
+    options = {field.name.replace("_", "-") for field in fields(Args)}
+    assert {name.removeprefix("no-") for name in re.findall(r"--([a-z][a-z-]+)", text)} <= options
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    folder = episode_folder(data, TASK, SEED, "piper")
+    code = code.replace("data/place_empty_cup/1000000/piper", str(folder)).replace("121", str(FRAMES))
+    names: dict[str, object] = {"Path": Path, "video": late(truth(data, "piper"))}
+    exec(code, names)
+    assert set(names["grades"].values) == {"lpips", "mask_iou", "pck"}
