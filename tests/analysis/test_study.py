@@ -7,10 +7,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from tests.synthetic import write_synthetic_data
 from xew.analysis import study as runner
 from xew.analysis import study_ledger
 from xew.analysis.study_cell import last_lines, start_cell
@@ -257,12 +259,12 @@ def test_a_launcher_starts_the_command(tmp_path: Path) -> None:
 
 
 def test_gpus_are_shared_out(study: Study) -> None:
-    machine = ThisMachine((2, 5, 7), 1, {})
+    machine = ThisMachine(("2", "5", "7"), 1, {})
     one, two = Cell("rollout", "a", (), (), None, study.out), Cell("train", "b", (), (), None, study.out, gpus=2)
     assert machine.slots == 3 and machine.room_for(two)
     for cell in (two, one):
         machine.start(cell, (STEPS, str(study.out / cell.variant), "x", "--wait", "0.2"), study.out / f"{cell.variant}.log")
-    assert machine._running["train/b"].slots == (2, 5) and machine._running["rollout/a"].slots == (7,)
+    assert machine._running["train/b"].slots == ("2", "5") and machine._running["rollout/a"].slots == ("7",)
     assert not machine.room_for(one)
     while machine._running:
         machine.wait()
@@ -282,6 +284,31 @@ def test_redo_names_cells(study: Study) -> None:
     assert [cell.name for cell in runner.chosen(cells, ["train/*t"])] == ["train/left", "train/right"]
     with pytest.raises(ConfigError, match="matches no cell"):
         runner.chosen(cells, ["evaluate/*"])
+
+
+def test_grades_made_anew_do_not_go_on_from_old_ones(study: Study) -> None:
+    scores = study.out / "scores"
+    (scores / "a.cells").mkdir(parents=True)
+    for name in ("a.parquet", "a.curves.parquet", "b.parquet"):
+        (scores / name).touch()
+    Ledger(study.out).forget(Cell("evaluate", "a", (), (), None, scores / "a.parquet"))
+    assert [path.name for path in scores.iterdir()] == ["b.parquet"]
+
+
+def test_data_beyond_the_study_is_an_error(study: Study) -> None:
+    """Its models would learn from it, and be graded on it."""
+    write_synthetic_data(study.data_folder, tasks=("place_empty_cup", "open_laptop"), seeds=(0, 1, 1_000_000), frames=3)
+    only = replace(study, robots=("ur5_wsg", "aloha_agilex", "arx_x5", "piper"))
+    said = runner.Run(only, {}, Ledger(study.out), ThisMachine((), 1, {}), {})._check_data()
+    assert "also holds open_laptop, franka_panda, 1 more train seeds a task" in said
+    fitting = replace(study, tasks=("place_empty_cup", "open_laptop"), train_seeds=2)
+    assert runner.Run(fitting, {}, Ledger(study.out), ThisMachine((), 1, {}), {})._check_data() == ""
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="choose another --out"), runner.alone(tmp_path / "file" / "study"):
+        pass
 
 
 def test_the_dry_run_shows_everything_and_does_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

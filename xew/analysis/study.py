@@ -30,7 +30,8 @@ from xew.analysis.study_ledger import Ledger
 from xew.analysis.study_machines import Machines, gpus_of, open_machines
 from xew.analysis.study_plan import STAGES, Cell, in_order, plan, write_configs
 from xew.config import ConfigError, save, user_errors
-from xew.episode import find_records
+from xew.episode import find_accepted
+from xew.protocol import seed_split
 
 CHECK_CONFIGS = """
 import sys
@@ -76,7 +77,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def prepare(study: Study) -> None:
     """Write the configs of the study and of all variants, and have the model check those that are new."""
     try:
-        study.out.mkdir(parents=True, exist_ok=True)
         changed = write_configs(study)
         save(study, study.out / "study.yaml")
     except OSError as error:
@@ -108,8 +108,12 @@ def chosen(cells: Mapping[str, Cell], patterns: Sequence[str]) -> list[Cell]:
 @contextlib.contextmanager
 def alone(out: Path) -> Iterator[None]:
     """Raises ConfigError while another process runs a study in the same folder."""
-    out.mkdir(parents=True, exist_ok=True)
-    with (out / ".lock").open("w") as file:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        lock = (out / ".lock").open("w")
+    except OSError as error:
+        raise ConfigError(f"cannot write the study {out}: {error}; choose another --out.") from error
+    with lock as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -207,14 +211,16 @@ class Run:
         return name
 
     def _check_data(self) -> str:
-        """'' or what the data set holds beyond the study: its models would be trained and graded on that, too."""
-        records = [record for _, record in find_records(self.study.data_folder)]
-        tasks = {record.task for record in records} - set(self.study.tasks or {record.task for record in records})
-        robots = {record.robot for record in records} - set(self.study.robots)
-        beyond = ", ".join(sorted(tasks | robots))
-        return (
-            f"{self.study.data_folder} also holds {beyond}; name them in the study, or give it its own data" if beyond else ""
-        )
+        """Nothing, or what the data set holds beyond the study: its models would be trained and graded on that, too."""
+        study, accepted = self.study, [record for _, record in find_accepted(self.study.data_folder)]
+        tasks, robots = ({getattr(record, name) for record in accepted} for name in ("task", "robot"))
+        beyond = sorted(tasks - set(study.tasks or tasks)) + sorted(robots - set(study.robots))
+        for family, wanted in (("train", study.train_seeds), ("test", study.test_seeds)):
+            seeds = {(record.task, record.seed) for record in accepted if seed_split(record.seed) == family}
+            more = max((len([1 for task, _ in seeds if task == name]) for name in tasks), default=0) - wanted
+            beyond += [f"{more} more {family} seeds a task"] if more > 0 else []
+        found = ", ".join(beyond)
+        return f"{study.data_folder} also holds {found}; name them in the study, or give it its own data" if found else ""
 
     def _tell(self, text: str) -> None:
         print(f"{time.strftime('%H:%M:%S')} [{self.settled}/{len(self.cells)}] {text}", flush=True)

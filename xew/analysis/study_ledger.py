@@ -89,8 +89,10 @@ class Ledger:
         return error
 
     def forget(self, cell: Cell) -> None:
-        """Make a cell undone, from nothing."""
+        """Make a cell undone, from nothing; of grades, also what a command would go on from (`scores/<variant>.*`)."""
         self._path(cell).unlink(missing_ok=True)
+        for path in cell.product.parent.glob(f"{cell.product.stem}.*") if cell.stage == "evaluate" else ():
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def _path(self, cell: Cell) -> Path:
         return self.out / "state" / f"{cell.name}.json"

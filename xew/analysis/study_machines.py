@@ -52,39 +52,39 @@ def open_machines(study: Study) -> Machines:
     gpus = gpus_of(study)
     needed = study.machine.gpus_per_training
     if gpus and needed > len(gpus):
-        raise ConfigError(f"machine.gpus_per_training is {needed}, there are {len(gpus)} GPUs ({gpus}); lower it.")
+        raise ConfigError(f"machine.gpus_per_training is {needed}, there are {len(gpus)} GPUs ({', '.join(gpus)}); lower it.")
     return ThisMachine(gpus, study.machine.workers, study.environment)
 
 
-def gpus_of(study: Study) -> tuple[int, ...]:
-    """Numbers of the GPUs of this machine that a study may use."""
-    return visible_gpus() if study.machine.gpus is None else study.machine.gpus
+def gpus_of(study: Study) -> tuple[str, ...]:
+    """The GPUs of this machine that a study may use, as CUDA_VISIBLE_DEVICES names them."""
+    return visible_gpus() if study.machine.gpus is None else tuple(map(str, study.machine.gpus))
 
 
-def visible_gpus() -> tuple[int, ...]:
-    """Numbers of NVIDIA's GPUs that this process may use."""
+def visible_gpus() -> tuple[str, ...]:
+    """NVIDIA's GPUs that this process may use."""
     try:
         told = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=True).stdout
     except (OSError, subprocess.CalledProcessError):
         return ()
     count = len([line for line in told.splitlines() if line.startswith("GPU ")])
     limited = os.environ.get("CUDA_VISIBLE_DEVICES")
-    return tuple(range(count)) if limited is None else tuple(int(part) for part in limited.split(",") if part.isdecimal())
+    return tuple(map(str, range(count))) if limited is None else tuple(part for part in limited.split(",") if part)
 
 
 @dataclass(frozen=True)
 class _Running:
     process: BaseProcess
-    slots: tuple[int, ...]
+    slots: tuple[str, ...]
 
 
 class ThisMachine:
     """GPU by GPU; without one, as many cells at once as there are workers."""
 
-    def __init__(self, gpus: tuple[int, ...], workers: int, environment: Mapping[str, str]) -> None:
+    def __init__(self, gpus: tuple[str, ...], workers: int, environment: Mapping[str, str]) -> None:
         self.gpus, self.environment = gpus, dict(environment)
         self.slots = len(gpus) or workers
-        self._free = list(gpus or range(workers))
+        self._free = list(gpus or map(str, range(workers)))
         self._running: dict[str, _Running] = {}
         os.environ.update(environment)  # the fork server imports JAX, which reads some of it then
 
@@ -97,7 +97,7 @@ class ThisMachine:
 
     def start(self, cell: Cell, command: tuple[str, ...], log: Path) -> None:
         slots = tuple(self._free.pop(0) for _ in range(self._needed(cell)))
-        own = {"CUDA_VISIBLE_DEVICES": ",".join(map(str, slots))} if self.gpus else {}
+        own = {"CUDA_VISIBLE_DEVICES": ",".join(slots)} if self.gpus else {}
         process = start_cell(command, log, self.environment | own, launcher=cell.launcher)
         self._running[cell.name] = _Running(process, slots)
 
