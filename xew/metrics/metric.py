@@ -115,5 +115,9 @@ def map_frames(function: Callable[..., Any], frames: Any, chunk: int | None) -> 
     chunks = -(-count // chunk)
     size = -(-count // chunks)
     order = np.minimum(np.arange(chunks * size), count - 1).reshape(chunks, size)
-    values = lax.map(lambda rows: jax.vmap(function)(jax.tree.map(lambda leaf: leaf[rows], frames)), order)
+
+    def of_chunk(rows: jax.Array) -> Any:
+        return jax.vmap(function)(jax.tree.map(lambda leaf: jnp.take(leaf, rows, axis=0, mode="clip"), frames))
+
+    values = lax.map(of_chunk, order)
     return jax.tree.map(lambda leaf: leaf.reshape(chunks * size, *leaf.shape[2:])[:count], values)
