@@ -24,7 +24,17 @@ from xew.analysis.grades import (
 )
 from xew.analysis.scores import COPY, TRUTH, MetricInfo
 from xew.analysis.summary import METRIC_TITLES, ROBOT_TITLES
-from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS, ROBOT_NAMES, SHOTS, expected_counts, reference
+from xew.protocol import (
+    FORGETTING_ROBOT,
+    HELD_OUT_ROBOTS,
+    PAPER_PARTS,
+    PARTS,
+    ROBOT_NAMES,
+    SEEN_ROBOTS,
+    SHOTS,
+    expected_counts,
+    reference,
+)
 
 PAPER_METRICS = (
     "psnr", "ssim", "lpips", "mask_iou", "boundary_f1", "region_lpips", "pck", "keypoint_error", "ndtw", "trajectory_error",
@@ -49,6 +59,7 @@ LADDER = {
 }
 SYSTEMS = {"irasim": "IRASim", "ctrl_world": "Ctrl-World", "enerverse_ac": "EnerVerse-AC", REFERENCE: "reference model"}
 SYSTEM_ACTIONS = ("relative tool poses", "absolute tool poses", "tool poses + ray maps", "optical flow")
+STILL, TRUE = "frozen first frame", "true video, graded"
 REMEDIES = {"replay": "with replay", "lora": "with LoRA"}
 
 MARKS = (
@@ -174,14 +185,12 @@ class Builder:
 
     def baselines(self, robots: Sequence[str], metrics: Sequence[str]) -> list[Row]:
         """The frozen first frame and the true video, where they were graded."""
-        if not isinstance(self.ours, StudyGrades):
-            return []
-        rows = []
-        for model, label in ((COPY, "frozen first frame"), (TRUTH, "true video, graded")):
-            cells = tuple(self._baseline(model, robots, metric) for metric in metrics)
-            if any(cell.episodes for cell in cells):
-                rows.append(Row((label,), cells, baseline=True))
-        return rows
+        still = [Row((STILL,), tuple(self.baseline(COPY, robots, metric) for metric in metrics), baseline=True)]
+        return [*_graded(still), *self.truth((TRUE,), [(robots, metric) for metric in metrics])]
+
+    def truth(self, labels: tuple[str, ...], places: Sequence[tuple[Sequence[str], str]]) -> list[Row]:
+        """The true video, of robots and a metric for each column: what it lacks is the noise floor. Empty if not graded."""
+        return _graded([Row(labels, tuple(self.baseline(TRUTH, *place) for place in places), baseline=True)])
 
     def note(self, part: str, rows: Iterable[tuple[str, str, str]]) -> str:
         """What a block lacks. Rows are key, robots and label."""
@@ -207,9 +216,10 @@ class Builder:
         parts = (f"{text[0].upper()}{text[1:]}: {'; '.join(names)}." for text, names in found.items())
         return f"{word}. {' '.join(parts)}"
 
-    def _baseline(self, model: str, robots: Sequence[str], metric: str) -> Cell:
-        assert isinstance(self.ours, StudyGrades)
-        info, mean = self.ours.metrics.get(metric), self.ours.baseline(model, robots, metric)
+    def baseline(self, model: str, robots: Sequence[str], metric: str) -> Cell:
+        """Mean of COPY or TRUTH on some robots."""
+        info = self.ours.metrics.get(metric)
+        mean = self.ours.baseline(model, robots, metric) if isinstance(self.ours, StudyGrades) else None
         if info is None or mean is None:
             return Cell()
         if model == TRUTH and metric == "psnr":
@@ -227,6 +237,10 @@ class Builder:
     def _printed(self, part: str, row: str, robots: str, metric: str) -> Cell:
         text = self.paper.print(part, row, robots, metric) if self.paper else ""
         return Cell(published=text, printed=float(text)) if text else Cell()
+
+
+def _graded(rows: Sequence[Row]) -> list[Row]:
+    return [row for row in rows if any(cell.episodes for cell in row.cells)]
 
 
 def verdict(grades: Grades, part: str, row: str, base: str, robots: str, metric: str) -> str:
@@ -291,7 +305,8 @@ def action_table(builder: Builder) -> Table:
     for first, step in enumerate([len(HELD_OUT_ROBOTS)] * len(HELD_OUT_ROBOTS)):
         rows[first::step] = _mark_best(rows[first::step], builder, metrics)
     places = ((key, robot, f"{ACTIONS[key]}, {SHORT_ROBOTS[robot]}") for key, robot in keys)
-    block = Block("", tuple(rows), builder.note("actions", places))
+    floors = (builder.truth((TRUE, SHORT_ROBOTS[r]), [((r,), metric) for metric in metrics]) for r in HELD_OUT_ROBOTS)
+    block = Block("", (*rows, *(row for found in floors for row in found)), builder.note("actions", places))
     return Table(
         "actions",
         "Action representation, robots never seen",
@@ -328,10 +343,12 @@ def ladder_full(builder: Builder) -> Table:
 def few_shot_table(builder: Builder) -> Table:
     """The paper's main few-shot table: metrics down, demonstrations across."""
     metrics = _measured(builder, ("mask_iou", "region_lpips", "lpips"))
+    graded = any(builder.baseline(TRUTH, (robot,), metric).episodes for robot in HELD_OUT_ROBOTS for metric in metrics)
 
     def row(robot: str, metric: str) -> Row:
         cells = [builder.cell("few_shot", f"{robot}-{shots}", robot, metric, f"{robot}-0") for shots in (0, *SHOTS)]
         cells.append(builder.cell("few_shot", "robot_render", robot, metric))
+        cells += [builder.baseline(TRUTH, (robot,), metric)] * graded
         return Row((SHORT_ROBOTS[robot], metric_title(builder.ours.metrics[metric])), tuple(cells))
 
     return Table(
@@ -339,7 +356,11 @@ def few_shot_table(builder: Builder) -> Table:
         "Few-shot adaptation",
         "M demonstrations of each task; M = 0 is the model told nine views, before adaptation. Marks: against M = 0.",
         ("target", "metric"),
-        (*(Column(f"M = {shots}", "Demonstrations a task") for shots in (0, *SHOTS)), Column("per-frame render")),
+        (
+            *(Column(f"M = {shots}", "Demonstrations a task") for shots in (0, *SHOTS)),
+            Column("per-frame render"),
+            *([Column(TRUE)] * graded),
+        ),
         tuple(
             Block("", tuple(row(robot, metric) for metric in metrics), _few_shot_note(builder, robot))
             for robot in HELD_OUT_ROBOTS
@@ -404,9 +425,11 @@ def baseline_table(builder: Builder) -> Table:
         for metric in metrics
         for robots in groups
     )
+    truths = [(SEEN_ROBOTS if robots == SEEN else (robots,), metric) for metric in metrics for robots in groups]
+    floor = builder.truth((TRUE, ""), truths)
     notes = {robots: builder.note("baselines", ((key, robots, SYSTEMS[key]) for key in systems)) for robots in groups}
     note = " ".join(f"{SHORT_ROBOTS.get(robots, 'Seen robots')}: {text}" for robots, text in notes.items() if text)
-    block = Block("", tuple(_best(rows, better_up)), note)
+    block = Block("", (*_best(rows, better_up), *floor), note)
     return Table(
         "baselines",
         "Seen and unseen robots under other world models",
@@ -421,6 +444,7 @@ def loeo_full(builder: Builder) -> Table:
     """The appendix's absolute scores of the five folds; each row is another model."""
     metrics = _measured(builder, PAPER_METRICS)
     rows = [builder.row("loeo", f"loeo_{robot}", robot, metrics, (ROBOT_TITLES[robot],)) for robot in ROBOT_NAMES]
+    floors = [row for r in ROBOT_NAMES for row in builder.truth((ROBOT_TITLES[r],), [((r,), metric) for metric in metrics])]
     note = builder.note("loeo", ((f"loeo_{robot}", robot, ROBOT_TITLES[robot]) for robot in ROBOT_NAMES))
     return Table(
         "loeo_full",
@@ -428,7 +452,7 @@ def loeo_full(builder: Builder) -> Table:
         "Each row is a model of its own, trained on the other four robots; not to be compared with the fixed split.",
         ("held out",),
         metric_columns(builder.ours.metrics, metrics),
-        (Block("", tuple(rows), note),),
+        (Block("", tuple(rows), note), *([Block("True video, graded", tuple(floors))] if floors else [])),
     )
 
 
