@@ -87,6 +87,12 @@ def test_shared_cells_are_those_that_all_rows_of_a_part_have(scores: Scores) -> 
     assert counts == {False: [12, 9], True: [9, 9]}
 
 
+def test_an_adapted_model_takes_no_seen_robot_from_the_one_that_it_starts_from(grades: StudyGrades) -> None:
+    """It is graded on UR5 alone of the seen ones; the pool stays whole."""
+    pool, alone = (grades.mean("few_shot", "reference", robots, "lpips", shared=True) for robots in (SEEN, "ur5_wsg"))
+    assert pool is not None and alone is not None and (pool.count, alone.count) == (36, 12)
+
+
 def test_the_papers_means_vary_by_what_prints_the_same() -> None:
     paper = read_paper()
     grades = PaperGrades(paper, paper.infos)

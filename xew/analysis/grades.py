@@ -225,9 +225,11 @@ class StudyGrades:
         return np.stack([empty if i is None else self._values[:, i] for i in columns], axis=1)
 
     def _shared(self, part: str, robots: tuple[str, ...], metric: str) -> np.ndarray:
-        """Which cells [s r] all variants of a part have that have any."""
-        blocks = [~np.isnan(self._block(variant.name, robots, metric)) for variant in variants_of(part)]
-        return np.logical_and.reduce([block for block in blocks if block.any()] or [np.ones_like(blocks[0])])
+        """Which cells [s r] all variants of a part have that were asked for these robots and have any."""
+        asked = [variant for variant in variants_of(part) if set(robots) <= set(variant.graded_robots)]
+        blocks = [~np.isnan(self._block(variant.name, robots, metric)) for variant in asked]
+        measured = [block for block in blocks if block.any()]
+        return np.logical_and.reduce(measured or [np.ones((len(self._cells), len(robots)), bool)])
 
     @cached_property
     def _variants(self) -> set[str]:
