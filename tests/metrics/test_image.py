@@ -79,7 +79,7 @@ def test_frames_do_not_depend_on_their_neighbours_or_the_chunk() -> None:
     prediction, target = noise(5), noise(5)
     order = rng.permutation(5)
     np.testing.assert_array_equal(ssim(prediction, target)[order], ssim(prediction[order], target[order]))
-    for chunk in (2, 3, 5, 64):
+    for chunk in (2, 64):
         for metric in (psnr, ssim):
             np.testing.assert_allclose(metric(prediction, target), metric(prediction, target, chunk=chunk), rtol=1e-6)
     with pytest.raises(ValueError, match="chunk is 0"):
