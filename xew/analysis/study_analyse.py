@@ -8,6 +8,7 @@ Writes <study>/scores.parquet with the column `variant`, its curves, and report/
 The merged table says in its attribute `study` what was planned, so that whoever reads it can tell what is missing.
 """
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -48,6 +49,7 @@ def main(args: Args) -> None:
     print(coverage(scores.attributes["study"]))
     rollouts = tuple(args.study / "rollouts" / name for name in graded)
     table, data, out = args.study / "scores.parquet", study.data_folder, args.study / "report"
+    shutil.rmtree(out, ignore_errors=True)  # a larger study's figures would stay
     report.main(report.Args(scores=table, data=data, rollouts=rollouts, distances=args.distances, out=out))
 
 
