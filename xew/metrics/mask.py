@@ -32,7 +32,7 @@ def mask_iou(prediction: jax.Array, target: jax.Array) -> jax.Array:
         [t] float32; 1 where both masks are empty, 0 where one is.
     """
     check_masks(prediction, target)
-    p, t = _packed(prediction, target)
+    p, t = _packed(prediction), _packed(target)
     return _iou(p, t, p & t)
 
 
@@ -55,24 +55,24 @@ def boundary_f1(prediction: jax.Array, target: jax.Array, tolerance: float = 2) 
         TypeError: a mask is not bool.
     """
     check_masks(prediction, target)
-    p, t = _packed(prediction, target)
+    p, t = _packed(prediction), _packed(target)
     return _f1(p, t, np.shape(target)[1], _disc(tolerance))
 
 
 def mask_scores(prediction: jax.Array, target: jax.Array, tolerance: float = 2) -> tuple[jax.Array, jax.Array]:
     """`mask_iou` and `boundary_f1` of the same masks, each of which is packed once."""
     check_masks(prediction, target)
-    p, t = _packed(prediction, target)
+    p, t = _packed(prediction), _packed(target)
     return _iou(p, t, p & t), _f1(p, t, np.shape(target)[1], _disc(tolerance))
 
 
 @jax.jit
-def _packed(*masks: jax.Array) -> list[jax.Array]:
+def _packed(mask: jax.Array) -> jax.Array:
     """[t h w] bool to [t bytes w] uint8: pixel (x, y) is bit y % 8 of byte (x, y // 8); no pixel is beyond the height."""
-    t, height, width = masks[0].shape
-    rows = [jnp.pad(mask, ((0, 0), (0, -height % BYTE), (0, 0))).reshape(t, -1, BYTE, width) for mask in masks]
+    t, height, width = mask.shape
+    rows = jnp.pad(mask, ((0, 0), (0, -height % BYTE), (0, 0))).reshape(t, -1, BYTE, width)
     places = jnp.arange(BYTE, dtype=jnp.uint8)[:, None]
-    return [jnp.sum(row.astype(jnp.uint8) << places, axis=2, dtype=jnp.uint8) for row in rows]
+    return jnp.sum(rows.astype(jnp.uint8) << places, axis=2, dtype=jnp.uint8)
 
 
 @jax.jit
