@@ -136,7 +136,7 @@ def test_tracks_are_compared_with_what_the_episode_holds(rollouts: Path, data: P
         found = seen[:, :-1].sum() / seen.sum()
         assert value(scores, "ground_truth", robot, "coverage") == pytest.approx(found)
         assert value(scores, "ground_truth", robot, "pck") == pytest.approx(found), "what is lost is a miss"
-        assert value(scores, "ground_truth", robot, "ndtw") == 0
+        assert value(scores, "ground_truth", robot, "keypoint_error") == 3, "estimators see the truth softened"
         shifts = (late(truth(data, robot)) != truth(data, robot)).any(axis=(1, 2, 3))[1:ASKED]
         tracks = states.keypoints[1:ASKED] + np.where(shifts, 3, 0)[:, None, None] * np.float32([1, 0])
         expected = float(keypoint_error(tracks[:, :-1], states.keypoints[1:ASKED, :-1], seen[:, :-1]))

@@ -29,7 +29,7 @@ from xew.metrics import METRICS
 from xew.metrics.backends import MASKERS, TRACKERS, identity, open_masker, open_tracker
 from xew.metrics.bundle import demand_none, differences, disagreements, read_bundle, write_bundle
 from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, compared, grade
-from xew.metrics.jobs import BASELINES, Job, plan, prediction_of
+from xew.metrics.jobs import BASELINES, Job, plan, prediction_of, shown_of
 from xew.metrics.scores import CellStore, beside, check_out, describe, write_diagnostics, write_tables, write_whole
 from xew.metrics.summary import summarise, to_markdown
 from xew.metrics.truth import Truth, read_truth
@@ -240,7 +240,7 @@ def _grade_job(job: Job, truth: Truth, metrics: tuple[str, ...], args: Args, ben
     prediction = prediction_of(job, truth, args.allow, args.frame_zero)
     first = 0 if args.frame_zero == "predicted" else 1
     with jax.default_device(bench.device):
-        return grade(Comparison(prediction, truth, bench.masker, bench.tracker, first), metrics)
+        return grade(Comparison(prediction, truth, bench.masker, bench.tracker, first, shown_of(job, truth)), metrics)
 
 
 def check(args: Args, path: Path) -> None:

@@ -67,6 +67,12 @@ class Comparison:
     tracker: Tracker
     first: int = 1
     """The first graded frame; those before it were given to the model."""
+    shown: np.ndarray | None = None
+    """[t h w 3] uint8, what the estimators see of the prediction; the prediction itself where left out."""
+
+    @property
+    def seen(self) -> np.ndarray:
+        return self.prediction if self.shown is None else self.shown
 
 
 def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
@@ -100,7 +106,7 @@ def _video(c: Comparison) -> Arrays:
 
 
 def _mask(c: Comparison) -> Arrays:
-    return c.masker(c.prediction, c.truth.rgb, c.truth.mask)[c.first :], c.truth.mask[c.first :]
+    return c.masker(c.seen, c.truth.rgb, c.truth.mask)[c.first :], c.truth.mask[c.first :]
 
 
 def _region(c: Comparison) -> Arrays | None:
@@ -131,7 +137,7 @@ def _contact(c: Comparison) -> Arrays | None:
     if not within[:, 2 + objects].any():
         return None
     true = np.where(within[..., None], points, np.nan)
-    found = c.tracker(c.prediction, c.truth.rgb, np.nan_to_num(points), within)
+    found = c.tracker(c.seen, c.truth.rgb, np.nan_to_num(points), within)
     apart, true_apart = (np.linalg.norm(some[:, arms] - some[:, 2 + objects], axis=-1) for some in (found, true))
     contact = c.truth.contact[:, arms, objects]
     return predicted_contact(apart, true_apart, contact)[c.first :], contact[c.first :]
@@ -154,7 +160,7 @@ def _tracks(c: Comparison, points: np.ndarray, visible: np.ndarray) -> Arrays | 
         return None
     seen = visible.any(axis=0)
     points, visible = np.nan_to_num(points[:, seen]), visible[:, seen]
-    found = c.tracker(c.prediction, c.truth.rgb, points, visible)
+    found = c.tracker(c.seen, c.truth.rgb, points, visible)
     return found[c.first :].astype(np.float32), points[c.first :], visible[c.first :]
 
 

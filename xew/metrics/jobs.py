@@ -20,6 +20,9 @@ BASELINES: dict[str, Callable[[Truth], np.ndarray]] = {
     "ground_truth": lambda truth: truth.rgb,
 }
 """What a score of nothing and a score of everything look like; the second is the noise floor of the estimators."""
+SOFTNESS = 0.8
+"""Standard deviation [pixels] of the blur through which estimators see the true video. Reference-aligned ones hardly err on the
+very video that they compare with; no prediction is ever that, and this is about as soft as a good codec leaves a video."""
 
 
 @dataclass(frozen=True)
@@ -180,6 +183,13 @@ def prediction_of(job: Job, truth: Truth, allow: Collection[str] = (), frame_zer
             "without the given frame: --frame-zero absent."
         )
     return video
+
+
+def shown_of(job: Job, truth: Truth) -> np.ndarray | None:
+    """What estimators see in place of a job's video: the true video softened, whose masks and points are still known."""
+    if job.rollout is not None or job.cell.model != "ground_truth":
+        return None
+    return np.stack([cv2.GaussianBlur(frame, (0, 0), SOFTNESS) for frame in truth.rgb])
 
 
 def _resized(video: np.ndarray, size: tuple[int, ...]) -> np.ndarray:

@@ -4,9 +4,9 @@ Resampling unit: by default the scene, a (task, seed). It is drawn with all its 
 they share its layout: differences are paired. An interval then says what other scenes of these tasks would give. With
 `unit="task"` whole tasks are drawn with all their scenes: what other tasks would give.
 
-Noise: metrics that need an estimator do not give even the true video their best score. By how much they miss it, on the
-mean over the same robot's episodes, is the noise of the metric, and a difference that is smaller is unresolved, whatever its
-interval. Metrics that compare pixels directly have none.
+Noise: metrics that need an estimator do not give even the true video their best score, softened as any prediction is
+(jobs.SOFTNESS). By how much they miss it, on the mean over the same robot's episodes, is the noise of the metric, and a
+difference that is smaller is unresolved, whatever its interval. Metrics that compare pixels directly have none.
 """
 
 import math
