@@ -375,7 +375,7 @@ def test_adaptation_learns_from_few_episodes_of_the_target(world: Path, experime
 
 def test_adapted_run_starts_from_the_trained_weights(world: Path, tmp_path: Path) -> None:
     arguments = adapt(world, tmp_path / "run")
-    train.main([*arguments, "--train.steps", "1"])
+    train.main([*arguments, "--train.steps", "1", "--resume"])  # of nothing: it begins, and notes where
     adapted = load_experiment(tmp_path / "run" / "config.yaml")
     start, base = train.start_params(adapted, make_mesh(adapted.mesh)), network(world / "run")[0]
     jax.tree.map(np.testing.assert_array_equal, start, base)

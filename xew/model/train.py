@@ -29,6 +29,7 @@ from xew.config import user_errors
 from xew.model.adaptation import corrected
 from xew.model.blocks import choose_attention
 from xew.model.checkpoint import (
+    START,
     TrainState,
     check_start,
     note_start,
@@ -274,7 +275,7 @@ def begin_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite: 
     """Make the run folder ready, by the first process; the others wait for it."""
     if jax.process_index() == 0:
         prepare_run(experiment, codec, resume=resume, overwrite=overwrite)
-        if experiment.adapt.start_from is not None and not resume:
+        if experiment.adapt.start_from is not None and not (resume and (experiment.out / START).exists()):
             note_start(experiment)
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices("run folder")
