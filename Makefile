@@ -48,7 +48,7 @@ demo: $(STAMP)
 	$(BIN)/python -m xew.model.latents configs/debug.yaml --data $(DATA)
 	$(BIN)/python -m xew.model.train configs/debug.yaml --data $(DATA) --out $(RUN) --resume
 	$(BIN)/python -m xew.model.rollout $(RUN) --data $(DATA) --split test --out $(ROLLOUTS)
-	$(BIN)/python -m xew.metrics.evaluate $(ROLLOUTS) --data $(DATA) --baselines --out $(DEMO)/scores.parquet
+	$(BIN)/python -m xew.metrics.evaluate $(ROLLOUTS) --data $(DATA) --out $(DEMO)/scores.parquet
 	$(BIN)/python -m xew.analysis.report $(DEMO)/scores.parquet --data $(DATA) --rollouts $(ROLLOUTS) --out $(DEMO)/report
 	@echo "The report is at $(DEMO)/report/index.html"
 
