@@ -29,7 +29,7 @@ COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero")
 LISTED = 20
 """Cells that an error names of each kind; it counts the others."""
 
-EVALUATE = "python -m xew.metrics.evaluate ROLLOUTS --data DATA --baselines --out {path}"
+EVALUATE = "python -m xew.metrics.evaluate ROLLOUTS --data DATA --out {path}"
 
 
 @dataclass(frozen=True)

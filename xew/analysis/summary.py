@@ -171,7 +171,7 @@ def finding(held_out: Sequence[RobotTable], seen: Sequence[RobotTable], metrics:
         sentences.append(
             f"{table.title} ({episodes}): {row.title} {_compare(row, metrics)}.{_distance_left((table, row), twins)}"
         )
-    return sentences or ["No model has been compared with the frozen first frame yet: grade with --baselines."]
+    return sentences or ["No model has been compared with the frozen first frame yet: grade without --no-baselines."]
 
 
 def _same_model(a: Row, b: Row) -> bool:

@@ -9,7 +9,7 @@ log-likelihood ratios learnt from the true video itself:
 Shape counts only where flow explains the pixel (small residual, flow there and back closes), and there it counts for more
 than looks. Without these gates a video that stands still would be given the true masks for nothing; with them it is judged
 by what it shows.
-Its error on true video is published beside every score: the row `ground_truth` of `evaluate --baselines`.
+Its error on true video is published beside every score: the row `ground_truth` of `evaluate`.
 """
 
 import functools

@@ -8,7 +8,7 @@ of the same time, and the one that looks most like it, which is another where a 
     motion      how far a proposal lies from where the predicted video's flow carries the one before
 The cheapest path through all frames wins (Viterbi). Where nothing looks like the point it is lost (NaN), not left where
 the truth has it: a video that stands still is measured as standing still.
-Its error on true video is published beside every score: the row `ground_truth` of `evaluate --baselines`.
+Its error on true video is published beside every score: the row `ground_truth` of `evaluate`.
 """
 
 from dataclasses import dataclass
