@@ -33,7 +33,12 @@ def own_compile_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture(scope="module")
 def quick_compile() -> Iterator[None]:
-    """For modules most of whose time is compiling: leave out what makes programs fast."""
+    """For modules most of whose time is compiling: leave out what makes programs fast.
+
+    Programs of the two kinds may differ in the last bit, and JAX does not tell them apart in memory.
+    """
+    jax.clear_caches()
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
+    jax.clear_caches()
