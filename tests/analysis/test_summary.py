@@ -89,7 +89,7 @@ def test_the_finding_says_better_worse_and_how_far() -> None:
         "Piper (4 episodes): m · c falls behind a frozen first frame on LPIPS. "
         "In LPIPS it is at 125% of that frame's distance from the truth (on seen robots 50%).",
     ]
-    assert "--baselines" in finding([], [], [info("lpips")])[0]
+    assert "--no-baselines" in finding([], [], [info("lpips")])[0]
 
 
 def test_numbers_have_the_digits_that_mean_something() -> None:
