@@ -16,7 +16,6 @@ import json
 import os
 import shutil
 import tempfile
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
@@ -26,11 +25,10 @@ from pathlib import Path
 import av
 import numpy as np
 
+from xew.threads import PARSING
+
 SCHEMA_VERSION = 2
 WIDTH, HEIGHT = 320, 240
-PARSING = threading.RLock()
-"""Held by whatever threads do that parses Python: reading .npy headers, building kernels. Python 3.11 counts the depth of all
-parsers in one place (github.com/python/cpython/issues/106905), and two at a time end in a SystemError now and then."""
 FAILURES = ("plan", "grasp", "slip", "timeout", "physics", "overflow")
 """plan: no joint path. grasp: never held. slip: held and lost. timeout: the plan ended short of success.
 physics: an object sank into something, fell off the table or crept in a hand. overflow: a physics buffer was too small."""

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +15,11 @@ import pytest
 
 from tests.metrics.small import write_many
 from tests.synthetic import write_synthetic_data
+from xew import files
 from xew.episode import find_accepted, read_video
-from xew.metrics import evaluate, scores
+from xew.metrics import evaluate
 from xew.metrics.evaluate import Args, main
-from xew.metrics.workers import Bench, in_order
+from xew.metrics.workers import Bench
 from xew.rollout import write_rollout
 
 ROBOTS = ("franka_panda", "piper")
@@ -71,10 +72,10 @@ def dying(function: Callable, at: int) -> Callable:
 PLACES = [
     (evaluate, "grade", 1),
     (evaluate, "grade", 8),
-    (scores.os, "replace", 1),  # a cell that is written but does not have its name yet
-    (scores.os, "replace", 11),
-    (scores.os, "replace", CELLS + 1),  # the curves
-    (scores.os, "replace", CELLS + 2),  # the scores, whose curves are there
+    (files.os, "replace", 1),  # a cell that is written but does not have its name yet
+    (files.os, "replace", 11),
+    (files.os, "replace", CELLS + 1),  # the curves
+    (files.os, "replace", CELLS + 2),  # the scores, whose curves are there
     (evaluate, "write_bundle", 1),
     (evaluate, "summarise", 1),
 ]
@@ -168,41 +169,6 @@ def test_a_damaged_cell_is_graded_anew(world: Path, whole: dict[str, bytes], tmp
     second.write_text("[1, 2]")
     main(args)
     assert read_all(args.out) == whole
-
-
-def test_threads_are_a_few_items_ahead_and_no_more() -> None:
-    begun: list[int] = []
-    taken = 0
-
-    def items() -> Iterator[int]:
-        for i in range(200):
-            assert i - taken <= 2 * 3 + 1, "no more is read than is waited for"
-            yield i
-
-    def note(i: int) -> int:
-        begun.append(i)
-        return i * i
-
-    for i, square in enumerate(in_order(note, items(), workers=3)):
-        taken = i + 1
-        assert square == i * i
-    assert sorted(begun) == list(range(200))
-
-
-def test_where_one_fails_nothing_more_is_begun() -> None:
-    begun: list[int] = []
-    stop = threading.Event()
-
-    def fails(i: int) -> int:
-        begun.append(i)
-        if i == 3:
-            raise ValueError("three")
-        assert i < 3 or stop.wait(10), "what is under way learns of it"
-        return i
-
-    with pytest.raises(ValueError, match="three"):
-        list(in_order(fails, range(1000), 2, stop))
-    assert len(begun) < 20
 
 
 def test_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,8 +3,6 @@
 import json
 import shutil
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +15,7 @@ from xew.model.codec import PatchCodec
 from xew.model.conditions import Command
 from xew.model.experiment import load_experiment
 from xew.model.latents import encode_many, needed_pixels
-from xew.model.pixels import ahead, stored_pixels
+from xew.model.pixels import stored_pixels
 
 CONFIG = """
 clip: {frames: 17, height: 64, width: 80}
@@ -107,32 +105,6 @@ def test_only_what_is_needed_is_read(simulated: Path) -> None:
     assert needed_pixels(experiment, ["action"]) == []
     joints = load_experiment(simulated / "config.yaml", ["--model.action", "joints", "--model.embodiment", "none"])
     assert needed_pixels(joints, ["rgb", "joints"]) == ["rgb"]
-
-
-def test_results_come_in_order_and_not_too_far_ahead() -> None:
-    begun: list[int] = []
-
-    def slow_at_first(number: int) -> int:
-        begun.append(number)
-        time.sleep(0.02 if number == 0 else 0)
-        return 10 * number
-
-    pairs = ahead(slow_at_first, range(100))
-    assert next(pairs) == (0, 0)
-    assert len(begun) < 100
-    assert list(pairs) == [(number, 10 * number) for number in range(1, 100)]
-
-
-def test_failure_ahead_is_raised_where_it_belongs() -> None:
-    def fail_at_three(number: int) -> int:
-        if number == 3:
-            raise EpisodeError("three")
-        return number
-
-    pairs: Iterator[tuple[int, int]] = ahead(fail_at_three, range(9))
-    assert [next(pairs)[0] for _ in range(3)] == [0, 1, 2]
-    with pytest.raises(EpisodeError, match="three"):
-        next(pairs)
 
 
 def test_a_render_at_hand_is_not_read_again() -> None:

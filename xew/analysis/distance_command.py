@@ -6,7 +6,6 @@ standard error over views) and the figure that the paper prints.
 """
 
 import importlib
-import os
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -20,6 +19,7 @@ import tyro
 from xew.analysis.distance import Features, Frame, ImageDistance, appearance_matrix, chamfer_floor, measure, perceptual_matrices
 from xew.analysis.paper import Paper, read_paper
 from xew.config import ConfigError, user_errors
+from xew.files import replacing
 from xew.protocol import ROBOT_NAMES
 from xew.sim_warp.robots import RobotSpec, Urdf, get_robot, load_urdf
 
@@ -237,10 +237,8 @@ def _image_distance(name: str) -> ImageDistance:
 
 def _write(frame: pd.DataFrame, path: Path) -> None:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.partial")
-        frame.to_csv(temporary, index=False)
-        os.replace(temporary, path)
+        with replacing(path) as temporary:
+            frame.to_csv(temporary, index=False)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error}. Choose another --out.") from error
 

@@ -4,7 +4,6 @@ A study's table is several runs' tables as one: `merge_scores` adds the column `
 each row (xew.protocol.Variant) and is empty for the two baselines, which belong to no model.
 """
 
-import os
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from xew.config import ConfigError
+from xew.files import replacing
 from xew.protocol import ROBOT_NAMES
 
 VARIANT = "variant"
@@ -147,12 +147,11 @@ def write_scores(scores: Scores, path: Path) -> None:
         ConfigError: they cannot be written there.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         for frame, file in ((scores.curves, path.with_suffix(".curves.parquet")), (scores.rows, path)):
-            temporary, frame = file.with_name(f".{file.name}.partial"), frame.copy(deep=False)
+            frame = frame.copy(deep=False)
             frame.attrs = dict(scores.attributes)
-            frame.to_parquet(temporary, index=False)
-            os.replace(temporary, file)
+            with replacing(file) as temporary:
+                frame.to_parquet(temporary, index=False)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error}. Free some space or choose another place.") from error
 

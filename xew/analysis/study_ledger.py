@@ -8,7 +8,6 @@ its product still has the outcome that was noted. Anything else is made again, f
 
 import hashlib
 import json
-import os
 import shutil
 import socket
 import time
@@ -19,6 +18,7 @@ from typing import Any
 from xew.analysis.study_plan import Cell, key_of
 from xew.config import ConfigError
 from xew.episode import EpisodeError, find_accepted
+from xew.files import replacing
 
 
 class Ledger:
@@ -99,11 +99,9 @@ class Ledger:
 
     def _write(self, cell: Cell, record: Mapping[str, Any]) -> None:
         path = self._path(cell)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.write_text(json.dumps({**record, "at": time.strftime("%Y-%m-%d %H:%M:%S")}, indent=1) + "\n")
-            os.replace(temporary, path)
+            with replacing(path) as temporary:
+                temporary.write_text(json.dumps({**record, "at": time.strftime("%Y-%m-%d %H:%M:%S")}, indent=1) + "\n")
         except OSError as error:
             raise ConfigError(f"cannot write {path}: {error}. Free some space, or choose another --out.") from error
 

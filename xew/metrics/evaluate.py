@@ -33,9 +33,10 @@ from xew.metrics.jobs import BASELINES, Job, plan, prediction_of, shown_of
 from xew.metrics.scores import CellStore, beside, check_out, describe, write_diagnostics, write_tables, write_whole
 from xew.metrics.summary import summarise, to_markdown
 from xew.metrics.truth import Truth, read_truth
-from xew.metrics.workers import Bench, compile_cache, in_order, not_needed, per_thread, worker_count
+from xew.metrics.workers import Bench, compile_cache, not_needed, per_thread, worker_count
 from xew.protocol import HELD_OUT_ROBOTS
 from xew.rollout import RolloutError
+from xew.threads import in_order
 
 PROTOCOL = 2
 """Goes up when any number that evaluate writes would change; scores of another protocol are graded anew."""

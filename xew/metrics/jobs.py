@@ -12,8 +12,8 @@ from xew.config import ConfigError
 from xew.episode import EpisodeError, Record, episode_folder, read_record
 from xew.metrics.scores import Cell, file_digest
 from xew.metrics.truth import Truth
-from xew.metrics.workers import in_order
 from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video
+from xew.threads import in_order
 
 BASELINES: dict[str, Callable[[Truth], np.ndarray]] = {
     "copy_first_frame": lambda truth: np.repeat(truth.rgb[:1], len(truth.rgb), axis=0),

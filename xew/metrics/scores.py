@@ -12,7 +12,6 @@ many threads, and how often it was stopped on the way.
 import hashlib
 import json
 import math
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,6 +25,7 @@ import pyarrow.parquet as pq
 
 import xew
 from xew.config import ConfigError
+from xew.files import replacing
 from xew.metrics import METRICS
 from xew.metrics.grade import Grades
 
@@ -152,16 +152,9 @@ def _write_table(
     cells: Sequence[Cell],
     store: CellStore,
 ) -> None:
-    graded = sorted((cell for cell in cells if not store.missing(cell, names)), key=lambda cell: cell.key)
-    tables = (tabulate(cell, _demand(store, cell), names) for cell in graded)
+    graded = ((cell, store.read(cell)) for cell in sorted(cells, key=lambda cell: cell.key))
+    tables = (tabulate(cell, grades, names) for cell, grades in graded if grades and grades.values.keys() >= set(names))
     _write_parquet(path, schema.with_metadata({"PANDAS_ATTRS": json.dumps(attributes)}), tables)
-
-
-def _demand(store: CellStore, cell: Cell) -> Grades:
-    grades = store.read(cell)
-    if grades is None:
-        raise ConfigError(f"the scores of {cell.key} in {store.folder} were changed while the table was written; try again.")
-    return grades
 
 
 def _row_table(cell: Cell, grades: Grades, metrics: Sequence[str]) -> pa.Table:
@@ -189,13 +182,10 @@ def _repeated(cell: Cell, count: int) -> list[pa.Array]:
 
 
 def _write_parquet(path: Path, schema: pa.Schema, tables: Iterator[pa.Table]) -> None:
-    temporary = path.with_name(f".{path.name}.partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with pq.ParquetWriter(temporary, schema) as writer:
+        with replacing(path) as temporary, pq.ParquetWriter(temporary, schema) as writer:
             for group in _groups(tables, ROW_GROUP):
                 writer.write_table(pa.concat_tables(group).replace_schema_metadata(schema.metadata))
-        os.replace(temporary, path)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error}. Free some space or choose another --out.") from error
 
@@ -213,11 +203,9 @@ def _groups(items: Iterator[pa.Table], size: int) -> Iterator[list[pa.Table]]:
 
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file that is there complete or not at all. Raises ConfigError if the disk does not take it."""
-    temporary = path.with_name(f".{path.name}.partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(content)
-        os.replace(temporary, path)
+        with replacing(path) as temporary:
+            temporary.write_bytes(content)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error}. Free some space or choose another --out.") from error
 

@@ -5,9 +5,7 @@ Threads and not processes: decoding, OpenCV and XLA let go of Python's lock, and
 
 import os
 import threading
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,36 +13,11 @@ import jax
 import numpy as np
 
 from xew.config import ConfigError, pick
+from xew.files import cache_folder
 from xew.metrics.backends import Masker, Tracker
 
 MOST_WORKERS = 32
 """A worker holds an episode and a prediction, a quarter of a gigabyte at full length."""
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
-
-
-def in_order(
-    function: Callable[[Item], Result], items: Iterable[Item], workers: int, stop: threading.Event | None = None
-) -> Iterator[Result]:
-    """Results of a function over items, in their order, computed by threads that are at most a few items ahead.
-
-    Where one raises, or whoever takes the results stops, nothing more is begun, and `stop` is set, so that what is under way
-    can end early.
-    """
-    with ThreadPoolExecutor(workers) as pool:
-        waiting: deque[Future[Result]] = deque()
-        try:
-            for item in items:
-                waiting.append(pool.submit(function, item))
-                if len(waiting) > 2 * workers:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-            if stop is not None:
-                stop.set()
 
 
 def worker_count(asked: int) -> int:
@@ -84,5 +57,4 @@ def per_thread(name: str, registry: Any, open_: Callable[[str, Path | None], E],
 def compile_cache() -> None:
     """Keep compiled programs between runs in the user's cache folder, unless JAX was told otherwise."""
     if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "xew" / "jax"
-        jax.config.update("jax_compilation_cache_dir", str(cache))
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder("jax")))

@@ -1,6 +1,5 @@
 """The config of a world-model experiment: what configs/*.yaml hold. Fields without a default must be given."""
 
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from flax import nnx
 
 from xew.config import ConfigError, load, pick, suggestion
+from xew.files import cache_folder
 from xew.model.codec import CODECS, TEMPORAL_FACTOR, CodecSettings, latent_frames
 from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition
 from xew.model.dit import MODELS, PATCH, AttentionName, ModelSize, RematName, TimeEmbedding, Visibility, WorldModel
@@ -286,5 +286,4 @@ def create_model(experiment: Experiment) -> WorldModel:
 def compile_cache() -> None:
     """Keep compiled programs between runs in the user's cache folder, unless JAX was told otherwise."""
     if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "xew" / "jax"
-        jax.config.update("jax_compilation_cache_dir", str(cache))
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder("jax")))

@@ -12,7 +12,6 @@ import argparse
 import hashlib
 import itertools
 import json
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -26,15 +25,17 @@ from tqdm import tqdm
 
 from xew.config import ConfigError, digest, user_errors
 from xew.episode import Record, complete_folder, episode_folder, find_accepted, read_states
+from xew.files import replacing
 from xew.model.ceiling import measure_ceiling, spread
 from xew.model.checkpoint import load_run
 from xew.model.codec import CODECS, Codec, check_clip_shape, encode_pictures
 from xew.model.conditions import Command, Condition, clip_numbers, command_of, robot_render
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.frames import to_model_size
-from xew.model.pixels import Pixels, PixelSource, ahead, rendered_pixels, stored_pixels
+from xew.model.pixels import Pixels, PixelSource, rendered_pixels, stored_pixels
 from xew.model.scales import Scale, fit_scales, load_run_scales, read_scales, save_scales
 from xew.protocol import seed_split
+from xew.threads import in_order
 
 Episode = tuple[Path, Record]
 CEILING_CLIPS = 8
@@ -112,7 +113,7 @@ class LatentCache:
             pixels = source(*episode, needed_pixels(self.experiment, missing))
             return stream_videos(self.experiment, *episode, missing, pixels)
 
-        for (_, record), videos in ahead(load, pending):
+        for (_, record), videos in zip(pending, in_order(load, pending), strict=True):
             written += self._encode_videos(record, videos, batch)
             progress.update()
         progress.close()
@@ -206,14 +207,6 @@ def cut_clip(
     if condition is None or condition.aligned:
         video = video[np.minimum(np.arange(start, start + frames), len(video) - 1)]
     return [video]
-
-
-def encode_clip(
-    codec: Codec, condition: Condition | None, video: np.ndarray, start: int, frames: int, history: Sequence[int] = ()
-) -> np.ndarray:
-    """`cut_clip` as the network takes it: latents [t' h' w' c] or numbers [t' n], not scaled yet."""
-    parts = cut_clip(condition, video, start, frames, history)
-    return np.concatenate([codec.encode(part) if part.dtype == np.uint8 else part for part in parts])
 
 
 def encode_many(codec: Codec, clips: Sequence[np.ndarray], batch: int) -> list[np.ndarray]:
@@ -374,10 +367,8 @@ def ceiling(experiment: Experiment, codec: Codec, episodes: Sequence[Episode], s
 def _write(path: Path, array: np.ndarray) -> int:
     """Save atomically, latents as float16 and numbers as float32; returns the size in bytes."""
     array = array.astype(np.float32 if array.ndim == 3 else np.float16)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    save_file({CLIPS: array}, temporary)
-    os.replace(temporary, path)
+    with replacing(path) as temporary:
+        save_file({CLIPS: array}, temporary)
     return array.nbytes
 
 

@@ -6,13 +6,8 @@ Writes {"rgb": …, "robot": …} uint8 [t 240 320 3], the head camera and the r
 Stored videos are lossless, so both ways give the same pixels; `rendered_pixels` holds each episode to its hashes.
 """
 
-import itertools
-import os
-from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -21,8 +16,6 @@ from xew.episode import EpisodeError, Record, read_video
 Pixels = Mapping[str, np.ndarray]
 PixelSource = Callable[[Path, Record, Collection[str]], Pixels]
 """(folder, header, names among rgb and robot) -> the videos of these names, perhaps more."""
-T = TypeVar("T")
-R = TypeVar("R")
 
 
 def stored_pixels(folder: Path, record: Record, names: Collection[str]) -> Pixels:
@@ -55,19 +48,3 @@ def rendered_pixels() -> PixelSource:
         return dict(zip(("rgb", "robot"), render_again(folder, default_renderer()), strict=True))
 
     return render
-
-
-def ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R]]:
-    """Each item with the function's result, in order, some items ahead in as many threads as there are cores."""
-    threads = os.cpu_count() or 1
-    with ThreadPoolExecutor(threads) as pool:
-        remaining = iter(items)
-        running = deque((item, pool.submit(function, item)) for item in itertools.islice(remaining, 2 * threads))
-        try:
-            while running:
-                item, future = running.popleft()
-                result = future.result()
-                running.extend((item, pool.submit(function, item)) for item in itertools.islice(remaining, 1))
-                yield item, result
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)

@@ -5,7 +5,6 @@ Writes `Scale`, kept with the latent cache and with the run, since a rollout nee
 """
 
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from xew.config import ConfigError
+from xew.files import replacing
 from xew.model.conditions import Command, Condition
 from xew.model.experiment import Experiment
 
@@ -77,10 +77,8 @@ def save_scales(path: Path, scales: Mapping[str, Scale]) -> None:
         name: {"middle": scale.middle.tolist(), "width": scale.width.tolist(), "limit": scale.limit}
         for name, scale in scales.items()
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    unfinished.write_text(json.dumps(content, indent=1) + "\n")
-    os.replace(unfinished, path)
+    with replacing(path) as unfinished:
+        unfinished.write_text(json.dumps(content, indent=1) + "\n")
 
 
 def read_scales(path: Path, conditions: Sequence[Condition], remedy: str) -> dict[str, Scale]:

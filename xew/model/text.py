@@ -10,10 +10,8 @@ Embeddings of UMT5 are computed once an instruction and kept in <cache>/text, so
 import hashlib
 import html
 import json
-import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +23,7 @@ import tokenizers
 from flax import nnx
 
 from xew.config import ConfigError
+from xew.files import replacing
 from xew.model.umt5 import UMT5S, load_umt5
 
 VOCABULARY = 8192
@@ -193,7 +192,7 @@ class _EmbeddingCache:
         return self.folder / f"{key}.npy"
 
     def write(self, instruction: str, embedding: np.ndarray) -> None:
-        with _replacing(self.path(instruction)) as temporary, temporary.open("wb") as file:
+        with replacing(self.path(instruction)) as temporary, temporary.open("wb") as file:
             np.save(file, embedding)
 
     def _fingerprint(self, path: Path) -> str:
@@ -212,7 +211,7 @@ class _EmbeddingCache:
             digest.update(_ends(file))
         if noted.get(str(path)) != digest.hexdigest():
             self.folder.mkdir(parents=True, exist_ok=True)
-            with _replacing(self.notes) as temporary:
+            with replacing(self.notes) as temporary:
                 temporary.write_text(json.dumps(noted | {str(path): digest.hexdigest()}, indent=1) + "\n")
         return digest.hexdigest()
 
@@ -222,18 +221,6 @@ def _ends(file: Path, size: int = 1 << 20) -> bytes:
         beginning = opened.read(size)
         opened.seek(max(file.stat().st_size - size, 0))
         return beginning + opened.read(size)
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """A temporary file that takes the name `path` when the block ends well."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 TEXT_ENCODERS = {

@@ -20,9 +20,10 @@ from tqdm import tqdm
 
 from xew.config import ConfigError, pick
 from xew.episode import EpisodeError, Record, episode_folder, read_states, write_video
+from xew.files import replacing
 from xew.model.conditions import command_of, optical_flow, ray_map, robot_mask
 from xew.model.frames import to_model_size
-from xew.model.pixels import ahead
+from xew.threads import in_order
 
 Episode = tuple[Path, Record]
 
@@ -61,8 +62,8 @@ def video_files(streams: Sequence[str], episodes: Sequence[Episode], cache: Path
         folder, record = episode
         return [(_file(name, folder, record, cache), record.frame_count) for name in streams]
 
-    drawn = tqdm(ahead(draw, episodes), desc="streams", total=len(episodes), unit="episode")
-    return [file for _, files in drawn for file in files]
+    drawn = tqdm(in_order(draw, episodes), desc="streams", total=len(episodes), unit="episode")
+    return [file for files in drawn for file in files]
 
 
 def _file(name: str, folder: Path, record: Record, cache: Path) -> Path:
@@ -78,10 +79,8 @@ def _file(name: str, folder: Path, record: Record, cache: Path) -> Path:
     key = hashlib.sha256(f"{name} {record.hashes['states']}".encode()).hexdigest()[:12]
     path = episode_folder(cache, record.task, record.seed, record.robot) / f"{name}-{key}.mkv"
     if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
-        write_video(temporary, DRAWN[name](command_of(folder, record, read_states(folder))))
-        os.replace(temporary, path)
+        with replacing(path) as temporary:
+            write_video(temporary, DRAWN[name](command_of(folder, record, read_states(folder))))
     return path
 
 

@@ -26,6 +26,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from xew.config import ConfigError
+from xew.files import replacing
 
 PREFIXES = ("pipe.dit.", "pipe.", "model.diffusion_model.", "model.", "module.")
 """Wrappers' names in front of keys, taken off (the longest that fits)."""
@@ -444,15 +445,11 @@ def _without_prefixes(entries: Mapping[str, Entry], path: Path) -> dict[str, Ent
 
 def _write(path: Path, tensors: dict[str, np.ndarray]) -> None:
     """All of a file or nothing of it."""
-    partial = path.with_name(f".{path.name}.partial")
-    try:
+    with replacing(path) as partial:
         save_file(tensors, partial, metadata={"format": "pt"})
         mask = os.umask(0)  # the library lets nobody else read its files; ours are as readable as any of this user's
         os.umask(mask)
         partial.chmod(0o666 & ~mask)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _write_shards(folder: Path, leaves: Mapping[str, nnx.Variable], layout: Layout) -> None:

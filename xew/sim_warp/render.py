@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 
-from xew.episode import PARSING
 from xew.sim_warp import raster_kernels as raster
 from xew.sim_warp import shading_kernels as shading
 from xew.sim_warp import stage
@@ -31,6 +30,7 @@ from xew.sim_warp.packing import (
     pack_points,
 )
 from xew.sim_warp.waiting import wait_for
+from xew.threads import PARSING
 
 __all__ = ["FLOW_LIMIT", "Body", "Frames", "Renderer", "World"]
 

@@ -1,0 +1,45 @@
+"""Threads, for all rooms: work done ahead in order, and what only one thread may do at a time."""
+
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+PARSING = threading.RLock()
+"""Held by whatever threads do that parses Python: reading .npy headers, building kernels. Python 3.11 counts the depth of all
+parsers in one place (github.com/python/cpython/issues/106905), and two at a time end in a SystemError now and then."""
+
+
+def in_order(
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    workers: int | None = None,
+    stop: threading.Event | None = None,
+) -> Iterator[Result]:
+    """Results of a function over items, in their order, computed by threads that are at most a few items ahead.
+
+    Where one raises, or whoever takes the results stops, nothing more is begun, and `stop` is set, so that what is under way
+    can end early.
+
+    Args:
+        workers: threads; as many as there are cores where left out.
+    """
+    workers = workers or os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:
+        waiting: deque[Future[Result]] = deque()
+        try:
+            for item in items:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) > 2 * workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            if stop is not None:
+                stop.set()
