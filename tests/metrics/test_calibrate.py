@@ -100,21 +100,23 @@ def test_true_grades_take_the_known_truth_and_not_an_estimate(data: Path) -> Non
 
 
 def test_references_are_what_they_are_called(data: Path) -> None:
-    folder, record = find_accepted(data)[0]
+    episodes = find_accepted(data)
+    folder, record = episodes[0]
     truth = read_truth(folder, record.frame_count, NEEDS)
-    videos = dict(reference_videos(data, record, truth, through_codec=lambda video: 255 - video))
+    videos = dict(reference_videos(episodes, record, truth, through_codec=lambda video: 255 - video))
     assert [len(video) for video in videos.values()] == [len(truth.rgb)] * 6
     np.testing.assert_array_equal(videos["truth through the codec"], 255 - truth.rgb)
     np.testing.assert_array_equal(videos["frozen first frame"], np.repeat(truth.rgb[:1], len(truth.rgb), axis=0))
-    others = {name: read_record(another(data, record, name.split()[1])) for name in ("another robot", "another seed")}
+    others = {name: read_record(another(episodes, record, name.split()[1])) for name in ("another robot", "another seed")}
     assert (others["another robot"].robot, others["another robot"].seed) == ("piper", 0)
     assert (others["another seed"].robot, others["another seed"].seed) == ("franka_panda", 1)
 
 
 def test_without_others_nothing_is_made_up(tmp_path: Path) -> None:
     write_synthetic_data(tmp_path, seeds=(0,), robots=("piper",), frames=3)
-    record = find_accepted(tmp_path)[0][1]
-    assert another(tmp_path, record, "robot") is None and another(tmp_path, record, "seed") is None
+    episodes = find_accepted(tmp_path)
+    record = episodes[0][1]
+    assert another(episodes, record, "robot") is None and another(episodes, record, "seed") is None
 
 
 def wrong_rows(estimates: list[float], truths: list[float]) -> pd.DataFrame:
@@ -169,8 +171,8 @@ def test_the_command_writes_its_tables(data: Path, tmp_path: Path, monkeypatch: 
 
 def test_a_seed_that_there_is_not_is_said(data: Path) -> None:
     with pytest.raises(ConfigError, match="holds no seed 7; it has 0, 1"):
-        choose(Args(data=data, seeds=(7,)))
-    first = choose(Args(data=data, episodes=2))
+        choose(find_accepted(data), Args(data=data, seeds=(7,)))
+    first = choose(find_accepted(data), Args(data=data, episodes=2))
     assert {(record.seed, record.robot) for _, record in first} == {(0, "franka_panda"), (1, "piper")}
 
 

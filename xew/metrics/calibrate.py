@@ -24,7 +24,7 @@ from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from xew.config import ConfigError, user_errors
-from xew.episode import EpisodeError, Record, episode_folder, find_accepted, read_video
+from xew.episode import EpisodeError, Record, find_accepted, read_video
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
 from xew.metrics.grade import Comparison, Grades, compared, grade
@@ -43,6 +43,7 @@ MOTION_STEPS = (0, 0.5, 2, 5, 10, 20, 40, 80, np.inf)
 TOLD_APART = {"px": 0.5, "": 0.005}
 """By unit, how far two true scores must lie apart that their order counts: less is no order."""
 Row = dict[str, Any]
+Episode = tuple[Path, Record]
 
 
 @dataclass(frozen=True)
@@ -85,11 +86,11 @@ def main(args: Args) -> None:
     """Grade, write, and print both tables."""
     estimators = Estimators(open_masker(args.masks, args.masks_checkpoint), open_tracker(args.tracks, args.tracks_checkpoint))
     through_codec = None if args.codec is None else open_codec(args.codec)
-    chosen = choose(args)
+    episodes = find_accepted(args.data)
     tables = {name: pd.DataFrame() for name in ("references", "wrong", "frames")}
     text = ""
-    for folder, record in tqdm(chosen, desc="calibrate", unit="episode", disable=None):
-        for name, table in calibrate(folder, record, args.data, estimators, through_codec).items():
+    for episode in tqdm(choose(episodes, args), desc="calibrate", unit="episode", disable=None):
+        for name, table in calibrate(episode, episodes, estimators, through_codec).items():
             tables[name] = pd.concat([tables[name], table], ignore_index=True)
         text = report(**tables)
         write(args.out, text, tables)  # each time, so that a run that is stopped has told something
@@ -97,19 +98,19 @@ def main(args: Args) -> None:
 
 
 def calibrate(
-    folder: Path,
-    record: Record,
-    data: Path,
+    episode: Episode,
+    episodes: Sequence[Episode],
     estimators: Estimators,
     through_codec: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> dict[str, pd.DataFrame]:
-    """The rows of one episode: references (KEY metric value), wrong (KEY metric estimate truth), frames (by frame)."""
+    """The rows of one of the episodes: references (KEY metric value), wrong (KEY metric estimate truth), frames (by frame)."""
+    folder, record = episode
     truth = read_truth(folder, record.frame_count, NEEDS)
     key: Row = {"task": record.task, "seed": record.seed, "robot": record.robot}
     references: list[Row] = []
     wrong: list[Row] = []
     frames: list[pd.DataFrame] = []
-    for case, video in reference_videos(data, record, truth, through_codec):
+    for case, video in reference_videos(episodes, record, truth, through_codec):
         values = estimators.grade(video, truth, tuple(METRICS)).values
         references += [key | {"case": case, "metric": name, "value": value} for name, value in values.items()]
     for case, shown in wrong_videos(folder):
@@ -121,17 +122,16 @@ def calibrate(
     return rows | {"frames": pd.concat(frames, ignore_index=True)}
 
 
-def choose(args: Args) -> list[tuple[Path, Record]]:
-    """The episodes to calibrate on. Raises ConfigError if the data holds none of the seeds asked for."""
-    found = find_accepted(args.data)
-    held = sorted({record.seed for _, record in found})
+def choose(episodes: Sequence[Episode], args: Args) -> list[Episode]:
+    """Those to calibrate on. Raises ConfigError if the data does not hold a seed asked for."""
+    held = sorted({record.seed for _, record in episodes})
     if unknown := [seed for seed in args.seeds if seed not in held]:
         raise ConfigError(f"{args.data} holds no seed {unknown[0]}; it has {', '.join(map(str, held[:20]))}: --seeds.")
-    chosen = [(folder, record) for folder, record in found if not args.seeds or record.seed in args.seeds]
+    chosen = [episode for episode in episodes if not args.seeds or episode[1].seed in args.seeds]
     return _mixed(chosen)[: args.episodes or None]
 
 
-def _mixed(episodes: list[tuple[Path, Record]]) -> list[tuple[Path, Record]]:
+def _mixed(episodes: Sequence[Episode]) -> list[Episode]:
     """Robots by turns, each beginning elsewhere, so that the first few are of many robots and tasks."""
     queues = []
     for index, robot in enumerate(dict.fromkeys(record.robot for _, record in episodes)):
@@ -141,7 +141,7 @@ def _mixed(episodes: list[tuple[Path, Record]]) -> list[tuple[Path, Record]]:
 
 
 def reference_videos(
-    data: Path, record: Record, truth: Truth, through_codec: Callable[[np.ndarray], np.ndarray] | None
+    episodes: Sequence[Episode], record: Record, truth: Truth, through_codec: Callable[[np.ndarray], np.ndarray] | None
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Videos to grade as predictions of an episode, by the name of the case, each uint8 [t h w 3]."""
     frames = np.arange(len(truth.rgb))
@@ -150,25 +150,24 @@ def reference_videos(
         yield "truth through the codec", through_codec(truth.rgb)
     yield "frozen first frame", truth.rgb[np.zeros_like(frames)]
     yield f"truth {LATE} frames late", truth.rgb[np.maximum(frames - LATE, 0)]
-    for case, folder in (("another robot", another(data, record, "robot")), ("another seed", another(data, record, "seed"))):
+    for differs in ("robot", "seed"):
+        folder = another(episodes, record, differs)
         if folder is not None:
             video = read_video(folder / "rgb.mkv")
-            yield case, video[np.minimum(frames, len(video) - 1)]
+            yield f"another {differs}", video[np.minimum(frames, len(video) - 1)]
 
 
-def another(data: Path, record: Record, differs: str) -> Path | None:
+def another(episodes: Sequence[Episode], record: Record, differs: str) -> Path | None:
     """The next episode that differs in robot or seed alone, the first after the last; None where there is none."""
     same = ("task", "seed") if differs == "robot" else ("task", "robot")
-    others = sorted(
-        getattr(other, differs)
-        for _, other in find_accepted(data)
+    folders = {
+        getattr(other, differs): folder
+        for folder, other in episodes
         if all(getattr(other, name) == getattr(record, name) for name in same)
-    )
-    following = others[(others.index(getattr(record, differs)) + 1) % len(others)]
-    if following == getattr(record, differs):
-        return None
-    who: Row = {"task": record.task, "seed": record.seed, "robot": record.robot} | {differs: following}
-    return episode_folder(data, **who)
+    }
+    own, others = getattr(record, differs), sorted(folders)
+    following = others[(others.index(own) + 1) % len(others)]
+    return None if following == own else folders[following]
 
 
 def open_codec(run: Path) -> Callable[[np.ndarray], np.ndarray]:
