@@ -5,7 +5,8 @@ log-likelihood ratios learnt from the true video itself:
     colour      how much more often the robot has this colour than everything else has
     background  how far the pixel is from the empty scene behind it (the camera stands still)
     shape       a true mask, carried along by optical flow onto the predicted frame: that of the same frame or, where it
-                explains a pixel better, that of the true frame which looks most like the predicted one
+                explains a pixel better, that of the true frame which looks most like the predicted one; where neither does,
+                what was found in the predicted frame before
 Shape counts only where flow explains the pixel (small residual, flow there and back closes), and there it counts for more
 than looks. Without these gates a video that stands still would be given the true masks for nothing; with them it is judged
 by what it shows.
@@ -77,7 +78,8 @@ def estimate_masks(
     for t, frame in enumerate(prediction):
         # The mask of the frame itself comes first: where both explain a pixel equally well, it is the one that counts.
         references = [(target[i], target_mask[i]) for i in dict.fromkeys((t, int(alike[t])))]
-        masks.append(_estimate_frame(appearance, frame, references))
+        before = (prediction[t - 1], masks[-1]) if t else None
+        masks.append(_estimate_frame(appearance, frame, references, before))
     return np.stack(masks)
 
 
@@ -102,8 +104,16 @@ def learn_appearance(video: np.ndarray, mask: np.ndarray) -> Appearance:
     )
 
 
-def _estimate_frame(appearance: Appearance, frame: np.ndarray, references: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+Reference = tuple[np.ndarray, np.ndarray]
+"""A frame [h w 3] uint8 and its mask [h w] bool."""
+
+
+def _estimate_frame(
+    appearance: Appearance, frame: np.ndarray, references: list[Reference], before: Reference | None
+) -> np.ndarray:
     gate, shape = functools.reduce(_better, (_carried_shape(frame, *reference) for reference in references))
+    if before is not None:
+        gate, shape = _filled_up((gate, shape), _carried_shape(frame, *before))
     looks = (1 - SHAPE_TRUST * gate) * _looks(appearance, frame)
     return _drop_specks(cv2.medianBlur((looks + SHAPE_WEIGHT * gate * shape > 0).astype(np.uint8), 3))
 
@@ -125,6 +135,16 @@ def _better(a: Shape, b: Shape) -> Shape:
     """At each pixel the shape whose flow explains it better."""
     take = b[0] > a[0]
     return np.where(take, b[0], a[0]), np.where(take, b[1], a[1])
+
+
+def _filled_up(true: Shape, before: Shape) -> Shape:
+    """What true frames leave unexplained, by the predicted frame before: things that the true robot hides are in no true frame.
+
+    It has a say only as far as it explains a pixel better, so that its errors do not live on where a true frame knows.
+    """
+    rest = np.maximum(before[0] - true[0], 0)
+    gate = true[0] + rest
+    return gate, (true[0] * true[1] + rest * before[1]) / np.maximum(gate, np.finfo(np.float32).tiny)
 
 
 def _drop_specks(mask: np.ndarray) -> np.ndarray:
