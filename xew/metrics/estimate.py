@@ -74,7 +74,7 @@ def estimate_masks(
     """
     appearance = appearance or learn_appearance(target, target_mask)
     alike, _ = most_alike(prediction, target)
-    masks = []
+    masks: list[np.ndarray] = []
     for t, frame in enumerate(prediction):
         # The mask of the frame itself comes first: where both explain a pixel equally well, it is the one that counts.
         references = [(target[i], target_mask[i]) for i in dict.fromkeys((t, int(alike[t])))]

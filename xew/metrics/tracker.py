@@ -4,7 +4,8 @@ Each predicted frame is read with the help of true frames, in which every point 
 of the same time, and the one that looks most like it, which is another where a model lags, hurries or stands still.
     proposals   optical flow from both true frames, search for the patch of image round a point, and where the predicted
                 video's own flow carries the point from the frame before
-    likeness    how well the patch at a proposal agrees with the patch round the true point
+    likeness    how well the patch at a proposal agrees with the patch round the true point, as far as both are in the image;
+                what stands at a far proposal in the true frame too is something else
     motion      how far a proposal lies from where the predicted video's flow carries the one before
 The cheapest path through all frames wins (Viterbi). Where nothing looks like the point it is lost (NaN), not left where
 the truth has it: a video that stands still is measured as standing still.
@@ -22,6 +23,8 @@ PATCH = 12
 """Half the side of the patch round a point [pixels]."""
 PATCH_STEP = 2
 """Likeness is taken over every second pixel of it."""
+SOFTNESS = 1.5
+"""Standard deviation [pixels] of the blur of what is compared, so that sharpness and grain do not count as motion."""
 FLATNESS = 10.0
 """Levels squared, added to the variances that differences are compared with, so that flat patches look alike."""
 SURE = 0.9
@@ -38,7 +41,9 @@ STRAYING = 2.0
 """Distance [pixels] from where the flow carries a point, at which half of JUMP is paid."""
 JUMP = 0.5
 """Cost of a point's jump to anywhere, and of getting lost or found; a patch just like the true one costs 0, like nothing 1."""
-LOST = 0.6
+STANDING = 0.3
+"""A place far from the true point may be likened to itself in the true frame by so much less than to the point, and is none."""
+LOST = 0.5
 """Cost of each frame in which a point is nowhere."""
 INNER_MOTION = 8.0
 """A link's origin lies inside the link and moves by so much otherwise than the surface in front of it, at most [pixels]."""
@@ -54,7 +59,8 @@ GIVEN_UP = 9.0
 class _TrueFrame:
     """A true frame and its points."""
 
-    rgb: np.ndarray
+    soft: np.ndarray
+    """[h w 3] uint8, softened."""
     grey: np.ndarray
     points: np.ndarray
     """[k 2] float32 [pixels]."""
@@ -79,7 +85,7 @@ def estimate_tracks(prediction: np.ndarray, target: np.ndarray, points: np.ndarr
         return points
     greys, true_greys = (np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in v]) for v in (prediction, target))
     alike, difference = most_alike(prediction, target)
-    truth = [_TrueFrame(*fields) for fields in zip(target, true_greys, points, visible, strict=True)]
+    truth = [_TrueFrame(_soften(frame), *rest) for frame, *rest in zip(target, true_greys, points, visible, strict=True)]
     paths = _Paths()
     carried = np.repeat(points[0][:, None], 3 + PEAKS, axis=1)
     inner = np.zeros_like(points[0])
@@ -88,7 +94,7 @@ def estimate_tracks(prediction: np.ndarray, target: np.ndarray, points: np.ndarr
             carried = _follow(paths.places[-1], greys[t - 1], greys[t])
             inner = _inner_motion(truth[t - 1], truth[t])
         same, other = truth[t], truth[alike[t]] if alike[t] != t else None
-        place, cost = _propose(frame, greys[t], same, other, paths.cheapest(carried))
+        place, cost = _propose(_soften(frame), greys[t], same, other, paths.cheapest(carried))
         if other is not None and difference[t] < SAME_MOMENT:
             hidden = ~other.visible
             place[hidden, 1], cost[hidden, 1] = other.points[hidden], HIDDEN
@@ -117,7 +123,7 @@ def _propose(
         _improve(place, cost, slice(0, 3), frame, grey, source)
     unsure = same.visible & (np.min(cost, axis=1) > 1 - SURE)
     if unsure.any():
-        place[unsure, 3:] = _search(frame, same.rgb, same.points[unsure])
+        place[unsure, 3:] = _search(frame, same.soft, same.points[unsure])
         for source in sources:
             _improve(place, cost, slice(3, None), frame, grey, source)
     return np.where(np.isfinite(place), place, 0), cost
@@ -136,29 +142,55 @@ def _improve(
     fitted = _flow_points(source, grey, point, start)
     near = np.linalg.norm(fitted - start, axis=-1) < REFINEMENT
     fitted = np.where(near[:, None], fitted, start)
-    height, width = grey.shape
-    inside = np.all((fitted > -0.5) & (fitted < (width - 0.5, height - 0.5)), axis=-1)
-    price = np.where(inside, np.clip(1 - likeness(frame, fitted, source.rgb, source.points[point]), 0, 1), GIVEN_UP)
+    like = likeness(frame, fitted, source.soft, source.points[point])
+    possible = _inside(fitted, frame) & ~_stands_there(frame, fitted, source.soft, source.points[point], like)
+    price = np.where(possible, np.clip(1 - like, 0, 1), GIVEN_UP)
     better = price < cost[point, column]
     place[point[better], column[better]] = fitted[better]
     cost[point[better], column[better]] = price[better]
+
+
+def _stands_there(
+    frame: np.ndarray, places: np.ndarray, true_frame: np.ndarray, points: np.ndarray, like: np.ndarray
+) -> np.ndarray:
+    """[n] is what a frame shows far from the true point there in the true frame too? Then it is no point that came there."""
+    far = np.linalg.norm(places - points, axis=-1) > PATCH
+    return far & (likeness(frame, places, true_frame, places) > like - STANDING)
 
 
 def likeness(image: np.ndarray, places: np.ndarray, true_image: np.ndarray, points: np.ndarray) -> np.ndarray:
     """[n] how alike the patches round places [n 2] of one image and points [n 2] of another are: 1 equal, 0 unrelated.
 
     One less the mean squared difference over the sum of both variances; brightness and colour count, not contrast alone.
+    Only what lies inside both images is compared; places and points must do so.
     """
     patch, true_patch = _patches(image, places), _patches(true_image, points)
-    variance = sum(np.mean(np.var(values, axis=1), axis=-1) for values in (patch, true_patch))
-    return 1 - np.mean(np.square(patch - true_patch), axis=(1, 2)) / (variance + FLATNESS)
+    shared = _inside(_around(places), image) & _inside(_around(points), true_image)
+    weight = (shared / np.maximum(shared.sum(axis=1, keepdims=True), 1))[..., None]
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.sum(weight * values, axis=1)
+
+    variance = sum(np.mean(mean(np.square(values - mean(values)[:, None])), axis=-1) for values in (patch, true_patch))
+    return 1 - np.mean(mean(np.square(patch - true_patch)), axis=-1) / (variance + FLATNESS)
 
 
 def _patches(image: np.ndarray, points: np.ndarray) -> np.ndarray:
     """[n p 3] float32 colours round points [n 2], read between the pixels."""
+    return _sample(image, _around(points)).astype(np.float32)
+
+
+def _around(points: np.ndarray) -> np.ndarray:
+    """[n p 2] float32, where the patches round points [n 2] are read."""
     reach = np.arange(-PATCH, PATCH + 1, PATCH_STEP, dtype=np.float32)
     offsets = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(1, -1, 2)
-    return _sample(image, (points[:, None] + offsets).astype(np.float32)).astype(np.float32)
+    return (points[:, None] + offsets).astype(np.float32)
+
+
+def _inside(points: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """[...] is each point [... 2] in a pixel of the image?"""
+    height, width = image.shape[:2]
+    return np.all((points > -0.5) & (points < (width - 0.5, height - 0.5)), axis=-1)
 
 
 def _flow_points(
@@ -214,6 +246,10 @@ def _peaks(likeness: np.ndarray) -> np.ndarray:
     y, x = np.nonzero(likeness >= cv2.dilate(likeness, np.ones((side, side), np.uint8)))
     order = np.argsort(-likeness[y, x], kind="stable")[:PEAKS]
     return np.stack([x[order], y[order]], axis=-1)
+
+
+def _soften(image: np.ndarray) -> np.ndarray:
+    return cv2.GaussianBlur(image, (0, 0), SOFTNESS)
 
 
 def _halved(image: np.ndarray, margin: int) -> np.ndarray:
