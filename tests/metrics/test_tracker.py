@@ -8,7 +8,7 @@ from tests.synthetic import write_cell
 from xew.episode import States, read_states, read_video
 from xew.metrics import coverage, keypoint_error, pck
 from xew.metrics.alike import most_alike
-from xew.metrics.tracker import estimate_tracks
+from xew.metrics.tracker import estimate_tracks, likeness
 
 FRAMES = 13
 SHOWN = {
@@ -117,3 +117,26 @@ def test_the_moment_that_a_frame_shows(episode: Episode) -> None:
     assert len(moving) > 3 and difference.max() < 0.01
     still = np.repeat(video[:1], FRAMES, axis=0)
     np.testing.assert_array_equal(most_alike(still, still)[0], np.arange(FRAMES))
+
+
+def test_patches_are_compared_as_far_as_both_are_in_the_image(episode: Episode) -> None:
+    """A point that nears the border still looks like itself: what would lie beyond the border is unknown."""
+    frame = episode[0][0]
+    point = np.float32([[160, 120]])
+    cut = frame[:, :164]
+    assert likeness(cut, point, frame, point)[0] == pytest.approx(1, abs=1e-6)
+    assert likeness(frame, point, cut, point)[0] == pytest.approx(1, abs=1e-6)
+    assert likeness(255 - cut, point, frame, point)[0] < 0.5
+
+
+def test_a_flat_point_that_leaves_the_image_is_not_found_on_flat_ground() -> None:
+    """A bright arm on a bright table: the table stands where it stood, so it is not where the arm's point has gone."""
+    rng = np.random.default_rng(0)
+    table = np.clip(225 + rng.normal(0, 1, (240, 320, 3)), 0, 255).astype(np.uint8)
+    true, shown = (np.repeat(table[None], 8, axis=0) for _ in range(2))
+    for t in range(8):
+        for video, left in ((true, 290), (shown, min(290 + 10 * t, 320))):
+            video[t, 100:140, left:] = np.clip(215 + rng.normal(0, 1, (40, 320 - left, 3)), 0, 255).astype(np.uint8)
+    points = np.tile(np.float32([[[305, 120]]]), (8, 1, 1))
+    tracks = estimate_tracks(shown, true, points, np.ones((8, 1), bool))
+    assert np.isfinite(tracks[0]).all() and np.isnan(tracks[5:]).all()

@@ -38,7 +38,7 @@ from xew.protocol import HELD_OUT_ROBOTS
 from xew.rollout import RolloutError
 from xew.threads import in_order
 
-PROTOCOL = 2
+PROTOCOL = 3
 """Goes up when any number that evaluate writes would change; scores of another protocol are graded anew."""
 DIMENSIONS = tuple(dict.fromkeys(metric.dimension for metric in METRICS.values()))
 
