@@ -162,7 +162,7 @@ def likeness(image: np.ndarray, places: np.ndarray, true_image: np.ndarray, poin
     """[n] how alike the patches round places [n 2] of one image and points [n 2] of another are: 1 equal, 0 unrelated.
 
     One less the mean squared difference over the sum of both variances; brightness and colour count, not contrast alone.
-    Only what lies inside both images is compared; places and points must do so.
+    Only what lies inside both images is compared; of a place or point far outside the answer says nothing.
     """
     patch, true_patch = _patches(image, places), _patches(true_image, points)
     shared = _inside(_around(places), image) & _inside(_around(points), true_image)
