@@ -15,7 +15,7 @@ import pytest
 from tests.synthetic import write_synthetic_data
 from xew.episode import episode_folder, read_record, read_states, read_video, write_episode
 from xew.metrics import METRICS, keypoint_error, mask_iou, psnr, ssim
-from xew.metrics.backends import Backend, Tracker, estimate_masks
+from xew.metrics.backends import Backend, estimate_masks
 from xew.metrics.contact import predicted_contact, touching_distance
 from xew.metrics.evaluate import Args, main
 from xew.metrics.grade import Comparison
@@ -35,21 +35,13 @@ def shifted(prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visi
     return np.where(visible[..., None], found, np.nan).astype(np.float32)
 
 
-def open_shifted(_: Path | None) -> Tracker:
-    return shifted
-
-
 def exact(prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
     """A tracker that says what is true, where that is visible."""
     return np.where(visible[..., None], points, np.nan).astype(np.float32)
 
 
-def open_exact(_: Path | None) -> Tracker:
-    return exact
-
-
-SHIFTED = Backend(open_shifted, None, "for tests")
-EXACT = Backend(open_exact, None, "for tests")
+SHIFTED = Backend(lambda: shifted, None, "for tests")
+EXACT = Backend(lambda: exact, None, "for tests")
 
 
 @pytest.fixture(scope="module")

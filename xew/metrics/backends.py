@@ -16,7 +16,12 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from xew.config import ConfigError, pick
+from xew.metrics.cotracker import open_cotracker
 from xew.metrics.estimate import Appearance, estimate_masks, learn_appearance
+from xew.metrics.flow import dis_flow, open_raft
+from xew.metrics.sam2 import open_sam2
+from xew.metrics.tapir import open_tapir
+from xew.metrics.tracker import estimate_tracks
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -52,8 +57,8 @@ class Flow(Protocol):
 class Backend(Generic[T_co]):
     """One entry of a registry: an estimator that is opened once and then called for many videos."""
 
-    open: Callable[[Path | None], T_co]
-    """From its checkpoint; from None where it needs none. Raises ConfigError where something is missing."""
+    open: Callable[..., T_co]
+    """Called with its checkpoint, or with nothing where it needs none. Raises ConfigError where something is missing."""
     needs: str | None
     """What checkpoint to get, from whom, under which licence; None: none."""
     summary: str
@@ -100,7 +105,7 @@ def _open(backend: Backend[T], name: str, checkpoint: Path | None, option: str) 
     if backend.needs is None:
         if checkpoint is not None:
             raise ConfigError(f"{name} has no checkpoint, {option} names {checkpoint}; leave it out, or choose another.")
-        return backend.open(None)
+        return backend.open()
     if checkpoint is None:
         raise ConfigError(f"{name} needs a checkpoint: {backend.needs}. Name its path with {option}.")
     if not checkpoint.exists():
@@ -108,10 +113,6 @@ def _open(backend: Backend[T], name: str, checkpoint: Path | None, option: str) 
             f"there is no {checkpoint}; {name} needs a checkpoint: {backend.needs}. Put it there, or name one with {option}."
         )
     return backend.open(checkpoint)
-
-
-def _open_default_masker(_: Path | None) -> Masker:
-    return ReferenceMasker()
 
 
 class ReferenceMasker:
@@ -126,75 +127,34 @@ class ReferenceMasker:
         return estimate_masks(prediction, target, target_mask, self._learnt[2])
 
 
-def _open_default_tracker(_: Path | None) -> Tracker:
-    from xew.metrics.tracker import estimate_tracks
-
-    return estimate_tracks
-
-
-def _open_sam2(checkpoint: Path | None) -> Masker:
-    from xew.metrics.sam2 import open_sam2
-
-    return open_sam2(_given(checkpoint))
-
-
-def _open_cotracker(checkpoint: Path | None) -> Tracker:
-    from xew.metrics.cotracker import open_cotracker
-
-    return open_cotracker(_given(checkpoint))
-
-
-def _open_tapir(checkpoint: Path | None) -> Tracker:
-    from xew.metrics.tapir import open_tapir
-
-    return open_tapir(_given(checkpoint))
-
-
-def _open_dis(_: Path | None) -> Flow:
-    from xew.metrics.flow import dis_flow
-
-    return dis_flow
-
-
-def _open_raft(checkpoint: Path | None) -> Flow:
-    from xew.metrics.flow import open_raft
-
-    return open_raft(_given(checkpoint))
-
-
-def _given(checkpoint: Path | None) -> Path:
-    assert checkpoint is not None, "`needs` is set, so that there is one"
-    return checkpoint
-
-
 MASKERS: Mapping[str, Backend[Masker]] = {
     "default": Backend(
-        _open_default_masker, None, "colour, background and gated flow against the true video (xew.metrics.estimate)"
+        ReferenceMasker, None, "colour, background and gated flow against the true video (xew.metrics.estimate)"
     ),
     "sam2": Backend(
-        _open_sam2,
+        open_sam2,
         "sam2.1_hiera_{tiny,small,base_plus,large}.pt of github.com/facebookresearch/sam2, or a folder of Hugging Face's "
         "facebook/sam2.1-hiera-{tiny,small,base-plus,large} (config.json, model.safetensors); Apache-2.0",
         "SAM 2, prompted with the true mask of the frame where it is largest, propagated both ways",
     ),
 }
 TRACKERS: Mapping[str, Backend[Tracker]] = {
-    "default": Backend(_open_default_tracker, None, "template search against the true video (xew.metrics.tracker)"),
+    "default": Backend(lambda: estimate_tracks, None, "template search against the true video (xew.metrics.tracker)"),
     "cotracker3": Backend(
-        _open_cotracker,
+        open_cotracker,
         "scaled_offline.pth of Hugging Face's facebook/cotracker3; CC-BY-NC 4.0: not for commercial use",
         "CoTracker3 offline, queried at the frame with most visible points, both ways",
     ),
     "tapir": Backend(
-        _open_tapir,
+        open_tapir,
         "tapir_checkpoint_panning.npy or bootstapir_checkpoint_v2.npy of github.com/google-deepmind/tapnet; Apache-2.0",
         "TAPIR, queried at the frame with most visible points",
     ),
 }
 FLOWS: Mapping[str, Backend[Flow]] = {
-    "dis": Backend(_open_dis, None, "dense inverse search, medium preset, of OpenCV"),
+    "dis": Backend(lambda: dis_flow, None, "dense inverse search, medium preset, of OpenCV"),
     "raft": Backend(
-        _open_raft,
+        open_raft,
         "raft_large_C_T_SKHT_V2-ff5fadd5.pth or raft_small_C_T_V2-01064c6d.pth of torchvision; BSD-3-Clause",
         "RAFT of torchvision, 12 updates",
     ),
