@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.grades import SEEN, row_keys
-from xew.analysis.paper import Paper, read_paper
+from xew.analysis.paper import AXES, Paper, read_paper
 from xew.analysis.tables import PAPER_METRICS
 from xew.metrics import METRICS
 from xew.protocol import HELD_OUT_ROBOTS, PARTS, ROBOT_NAMES, TEST_SEED_START, VARIANTS, Variant
@@ -88,3 +88,8 @@ def _means(paper: Paper, variant: Variant, robot: str) -> dict[str, float]:
         like = {metric: paper.score("forgetting", "none", "ur5_wsg", metric) for metric in PAPER_METRICS}
     printed = {metric: paper.score("baselines", variant.system, group, metric) for metric in PAPER_METRICS}
     return {metric: float(printed[metric] or like[metric] or 0) for metric in PAPER_METRICS}
+
+
+def paper_axes(paper: Paper) -> dict[str, np.ndarray]:
+    """The printed mean distances by axis, in the order of ROBOT_NAMES."""
+    return {axis: np.array([getattr(paper.robots[robot], axis) for robot in ROBOT_NAMES]) for axis in AXES}

@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.analysis.synthetic_study import TASKS, attributes, write_study
+from tests.analysis.synthetic_study import TASKS, attributes, paper_axes, write_study
 from xew.analysis.findings import CLAIMS, Finding, ask, findings_frame
-from xew.analysis.grades import PaperGrades, StudyGrades, paper_axes
+from xew.analysis.grades import PaperGrades, StudyGrades
 from xew.analysis.paper import read_paper
 from xew.analysis.scores import MetricInfo, Scores, read_scores
 

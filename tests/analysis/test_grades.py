@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.analysis.synthetic_study import TASKS, write_study
-from xew.analysis.grades import SEEN, PaperGrades, StudyGrades, better, find_variant, interval, paper_axes, row_keys
+from tests.analysis.synthetic_study import TASKS, paper_axes, write_study
+from xew.analysis.grades import SEEN, PaperGrades, StudyGrades, better, find_variant, interval, row_keys
 from xew.analysis.paper import read_paper
 from xew.analysis.scores import Scores, read_scores
 from xew.protocol import PAPER_PARTS, PARTS, ROBOT_NAMES, SEEN_ROBOTS

@@ -10,12 +10,12 @@ import pandas as pd
 import pytest
 
 from tests.analysis.browser import assert_readable, needs_chromium
-from tests.analysis.synthetic_study import TASKS, write_study
+from tests.analysis.synthetic_study import TASKS, paper_axes, write_study
 from tests.analysis.test_report import Page, refers_outside
 from tests.synthetic import write_synthetic_data
 from xew.analysis import formats, page
 from xew.analysis.distance_tables import correlation_table, distance_tables, read_distances
-from xew.analysis.grades import PaperGrades, StudyGrades, paper_axes
+from xew.analysis.grades import PaperGrades, StudyGrades
 from xew.analysis.paper import read_paper
 from xew.analysis.report import Args, main
 from xew.analysis.scores import read_scores

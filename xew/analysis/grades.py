@@ -17,7 +17,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 import pandas as pd
 
-from xew.analysis.paper import AXES, Paper
+from xew.analysis.paper import Paper
 from xew.analysis.scores import TRUTH, MetricInfo
 from xew.protocol import MULTI_VIEW, PARTS, ROBOT_NAMES, SPLITS, Variant
 
@@ -282,8 +282,3 @@ class PaperGrades:
         printed = np.array([getattr(self._paper.robots[robot], name) for robot in ROBOT_NAMES])
         ends = np.random.default_rng(0).choice([-1.0, 1.0], (DRAWS, len(printed))) * self._paper.half_digit
         return np.concatenate([printed[None], printed + ends])
-
-
-def paper_axes(paper: Paper) -> dict[str, np.ndarray]:
-    """The printed mean distances by axis, in the order of ROBOT_NAMES."""
-    return {axis: np.array([getattr(paper.robots[robot], axis) for robot in ROBOT_NAMES]) for axis in AXES}

@@ -209,8 +209,8 @@ def _of_training(experiment: Settings) -> Settings:
 @cache
 def source_digest(room: str) -> str:
     """Of a room's source: what is quickly done again is done again when its code changes, as grading and the report."""
-    files = sorted(Path(path, room) for path in xew.__path__)
-    content = [file.read_bytes() for folder in files for file in sorted(folder.glob("*")) if file.is_file()]
+    folders = sorted(Path(path, room) for path in xew.__path__)
+    content = [file.read_bytes() for folder in folders for file in sorted(folder.glob("*")) if file.is_file()]
     return hashlib.sha256(b"\0".join(content)).hexdigest()[:16]
 
 

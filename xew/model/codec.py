@@ -383,12 +383,6 @@ def join_patches(first: Array, later: Array, factor: int) -> Array:
     return frames.transpose(0, 1, 2, 4, 3, 5, 6).reshape(b, -1, h * factor, w * factor, 3)
 
 
-def reconstruction_psnr(codec: Codec, clips: list[np.ndarray]) -> float:
-    """Mean over clips of the PSNR [dB] of decode(encode(clip)): the ceiling of every rollout at the model's size."""
-    errors = [np.square(codec.decode(codec.encode(clip)).astype(np.float32) - clip).mean() for clip in clips]
-    return float(np.mean(10 * np.log10(255**2 / np.maximum(errors, 1e-6))))
-
-
 def _fit(patches: np.ndarray, channels: int, whitening: float, centred: bool) -> Basis:
     """Leading principal directions of patches [m p], by the eigenvectors of their second moments."""
     mean = patches.mean(0) if centred else np.zeros(patches.shape[1], np.float32)
