@@ -91,12 +91,17 @@ def check_contacts(prediction: jax.Array, target: jax.Array) -> None:
 
 
 def map_frames(function: Callable[..., Any], frames: Any, chunk: int | None) -> Any:
-    """`function` of each frame, a chunk of frames at a time, so that memory does not grow with the video.
+    """`map_chunks` for a function of one frame, the leaves of `frames` without their time axis."""
+    return map_chunks(jax.vmap(function), frames, chunk)
+
+
+def map_chunks(function: Callable[..., Any], frames: Any, chunk: int | None) -> Any:
+    """`function` of a chunk of frames at a time, so that memory does not grow with the video.
 
     Chunks are of one size, so that there is one program to compile; the last is filled up with copies of the last frame.
 
     Args:
-        function: of one frame: the leaves of `frames` without their time axis.
+        function: of some frames: the leaves of `frames` with a shorter time axis. A frame's result is its own.
         frames: arrays [t ...] in any tree.
         chunk: most frames computed at once; None for 1 on a CPU and `ACCELERATOR_CHUNK` elsewhere.
 
@@ -109,15 +114,13 @@ def map_frames(function: Callable[..., Any], frames: Any, chunk: int | None) -> 
     chunk = (1 if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK) if chunk is None else chunk
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, expected at least 1 frame.")
-    if chunk == 1:
-        return lax.map(function, frames)
     count = len(jax.tree.leaves(frames)[0])
     chunks = -(-count // chunk)
     size = -(-count // chunks)
     order = np.minimum(np.arange(chunks * size), count - 1).reshape(chunks, size)
 
     def of_chunk(rows: jax.Array) -> Any:
-        return jax.vmap(function)(jax.tree.map(lambda leaf: jnp.take(leaf, rows, axis=0, mode="clip"), frames))
+        return function(jax.tree.map(lambda leaf: jnp.take(leaf, rows, axis=0, mode="clip"), frames))
 
     values = lax.map(of_chunk, order)
     return jax.tree.map(lambda leaf: leaf.reshape(chunks * size, *leaf.shape[2:])[:count], values)

@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 
 from xew.metrics.alexnet import read_alexnet
-from xew.metrics.metric import check_masks, check_videos, map_frames
+from xew.metrics.metric import check_masks, check_videos, map_chunks
 
 SMALLEST_SIDE = 31
 """Below it the second pooling has no window and the mean over nothing would be NaN."""
@@ -177,38 +177,37 @@ def _weights() -> Weights:
 def _box_distance(weights: Weights, prediction: jax.Array, target: jax.Array, box: Box, chunk: int | None) -> jax.Array:
     """LPIPS [t] of the same box of both videos."""
 
-    def distance(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
-        layers = _features(weights, _input(jnp.stack(pair), box), *box[2:])
-        terms = [_layer_distance(weights[f"head{i}"], _unit(x), h, w) for i, (x, h, w) in enumerate(layers)]
-        return jnp.sum(jnp.stack(terms))
+    def distances(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
+        units = [(jnp.split(_unit(x), 2), h, w) for x, h, w in _features(weights, _input(jnp.concatenate(pair), box), *box[2:])]
+        return _distances(weights, [(x, y, h, w) for (x, y), h, w in units])
 
     def of_frames(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
         # Exactly 0 for equal frames: a convolution may round the two images of a pair differently.
-        return lax.cond(jnp.all(pair[0] == pair[1]), lambda _: jnp.float32(0), distance, pair)
+        equal = jnp.all(pair[0] == pair[1], axis=(1, 2, 3))
+        return jnp.where(equal, 0, lax.cond(jnp.all(equal), lambda _: jnp.zeros(len(equal), jnp.float32), distances, pair))
 
-    return map_frames(of_frames, (prediction, target), chunk)
+    return map_chunks(of_frames, (prediction, target), chunk)
 
 
 @functools.partial(jax.jit, static_argnames="chunk")
 def _box_features(weights: Weights, video: jax.Array, box: Box, chunk: int | None) -> tuple[jax.Array, ...]:
     """Unit vectors of the five layers [t h w d] of a video's box."""
 
-    def of_frame(frame: jax.Array) -> tuple[jax.Array, ...]:
-        return tuple(_unit(x)[0] for x, _, _ in _features(weights, _input(frame[None], box), *box[2:]))
+    def of_frames(frames: jax.Array) -> tuple[jax.Array, ...]:
+        return tuple(_unit(x) for x, _, _ in _features(weights, _input(frames, box), *box[2:]))
 
-    return map_frames(of_frame, video, chunk)
+    return map_chunks(of_frames, video, chunk)
 
 
 @functools.partial(jax.jit, static_argnames="chunk")
 def _distance_from_features(
     weights: Weights, prediction: jax.Array, target: tuple[jax.Array, ...], box: Box, chunk: int | None
 ) -> jax.Array:
-    def of_frame(pair: tuple[jax.Array, tuple[jax.Array, ...]]) -> jax.Array:
-        layers = _features(weights, _input(pair[0][None], box), *box[2:])
-        both = [(jnp.stack([_unit(x)[0], y]), h, w) for (x, h, w), y in zip(layers, pair[1], strict=True)]
-        return jnp.sum(jnp.stack([_layer_distance(weights[f"head{i}"], *layer) for i, layer in enumerate(both)]))
+    def of_frames(pair: tuple[jax.Array, tuple[jax.Array, ...]]) -> jax.Array:
+        layers = _features(weights, _input(pair[0], box), *box[2:])
+        return _distances(weights, [(_unit(x), y, h, w) for (x, h, w), y in zip(layers, pair[1], strict=True)])
 
-    return map_frames(of_frame, (prediction, target), chunk)
+    return map_chunks(of_frames, (prediction, target), chunk)
 
 
 def _input(frames: jax.Array, box: Box) -> jax.Array:
@@ -254,10 +253,15 @@ def _keep(x: jax.Array, height: jax.Array, width: jax.Array) -> jax.Array:
     return jnp.where((rows[:, None] & columns[None, :])[None, :, :, None], x, 0)
 
 
-def _layer_distance(head: jax.Array, unit: jax.Array, height: jax.Array, width: jax.Array) -> jax.Array:
-    """Squared difference of two images' unit vectors [2 h w d], weighted by the head [d], mean over the valid part."""
-    weighted = jnp.einsum("hwd,d->hw", jnp.square(unit[0] - unit[1]), head, precision=lax.Precision.HIGHEST)
-    return jnp.sum(jnp.sum(weighted, axis=1)) / (height * width).astype(jnp.float32)
+def _distances(weights: Weights, layers: list[tuple[jax.Array, jax.Array, jax.Array, jax.Array]]) -> jax.Array:
+    """LPIPS [n] from the layers' unit vectors of both videos [n h w d], each with the height and width that are valid."""
+    return jnp.sum(jnp.stack([_layer_distance(weights[f"head{i}"], *layer) for i, layer in enumerate(layers)]), axis=0)
+
+
+def _layer_distance(head: jax.Array, x: jax.Array, y: jax.Array, height: jax.Array, width: jax.Array) -> jax.Array:
+    """Squared difference of unit vectors [n h w d], weighted by the head [d], mean over the valid part: [n]."""
+    weighted = jnp.einsum("nhwd,d->nhw", jnp.square(x - y), head, precision=lax.Precision.HIGHEST)
+    return jnp.sum(jnp.sum(weighted, axis=2), axis=1) / (height * width).astype(jnp.float32)
 
 
 def _unit(x: jax.Array) -> jax.Array:
