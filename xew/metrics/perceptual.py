@@ -178,8 +178,9 @@ def _box_distance(weights: Weights, prediction: jax.Array, target: jax.Array, bo
     """LPIPS [t] of the same box of both videos."""
 
     def distances(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
-        units = [(jnp.split(_unit(x), 2), h, w) for x, h, w in _features(weights, _input(jnp.concatenate(pair), box), *box[2:])]
-        return _distances(weights, [(x, y, h, w) for (x, y), h, w in units])
+        layers = _features(weights, _input(jnp.concatenate(pair), box), *box[2:])
+        units, count = ((_unit(x), h, w) for x, h, w in layers), len(pair[0])
+        return _sum_of_layers(weights, [(both[:count], both[count:], h, w) for both, h, w in units])
 
     def of_frames(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
         # Exactly 0 for equal frames: a convolution may round the two images of a pair differently.
@@ -205,7 +206,7 @@ def _distance_from_features(
 ) -> jax.Array:
     def of_frames(pair: tuple[jax.Array, tuple[jax.Array, ...]]) -> jax.Array:
         layers = _features(weights, _input(pair[0], box), *box[2:])
-        return _distances(weights, [(_unit(x), y, h, w) for (x, h, w), y in zip(layers, pair[1], strict=True)])
+        return _sum_of_layers(weights, [(_unit(x), y, h, w) for (x, h, w), y in zip(layers, pair[1], strict=True)])
 
     return map_chunks(of_frames, (prediction, target), chunk)
 
@@ -253,7 +254,7 @@ def _keep(x: jax.Array, height: jax.Array, width: jax.Array) -> jax.Array:
     return jnp.where((rows[:, None] & columns[None, :])[None, :, :, None], x, 0)
 
 
-def _distances(weights: Weights, layers: list[tuple[jax.Array, jax.Array, jax.Array, jax.Array]]) -> jax.Array:
+def _sum_of_layers(weights: Weights, layers: list[tuple[jax.Array, jax.Array, jax.Array, jax.Array]]) -> jax.Array:
     """LPIPS [n] from the layers' unit vectors of both videos [n h w d], each with the height and width that are valid."""
     return jnp.sum(jnp.stack([_layer_distance(weights[f"head{i}"], *layer) for i, layer in enumerate(layers)]), axis=0)
 
