@@ -342,7 +342,7 @@ def on_gpu(pair: Pair, rounds: int) -> None:
 
     def ours(videos: Any) -> list[np.ndarray]:
         p, t = jax.device_put(videos)
-        return [np.asarray(value) for value in (psnr(p, t), ssim(p, t), lpips(p, t))]
+        return jax.device_get([psnr(p, t), ssim(p, t), lpips(p, t)])
 
     def theirs(videos: Any, batch: int, tf32: bool) -> list[np.ndarray]:
         torch.backends.cudnn.allow_tf32 = tf32

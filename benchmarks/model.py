@@ -62,6 +62,8 @@ class Args:
     """Ours: type of the tokens between blocks; diffusers' are bfloat16."""
     dtypes: tuple[str, ...] = ("bfloat16", "float32")
     """Of the autoencoder; float32 products are rounded to TF32 on both sides, as both do unless told otherwise."""
+    vae_chunks: tuple[int, ...] = (0, 8)
+    """Ours: latent frames that the autoencoder takes at once, 0 for all; 8 is `xew.model.codec`'s. Each is timed."""
     mesh: MeshArgs = field(default_factory=MeshArgs)
     size: str = "wan5b"
     """`tiny` to try the script on a CPU."""
@@ -246,7 +248,6 @@ def xew_denoise(args: Args) -> Iterator[dict[str, Any]]:
 
 def xew_vae(args: Args) -> Iterator[dict[str, Any]]:
     import jax
-    import jax.numpy as jnp
     from flax import nnx
 
     from xew.model.vae import VAES, VideoVae
@@ -256,15 +257,28 @@ def xew_vae(args: Args) -> Iterator[dict[str, Any]]:
     for dtype in args.dtypes:
         graph = nnx.split(nnx.eval_shape(lambda s=size, d=dtype: VideoVae(s, dtype=d, rngs=nnx.Rngs(0))))[0]
         state = jax.jit(lambda s=size, d=dtype: nnx.split(VideoVae(s, dtype=d, rngs=nnx.Rngs(0)))[1])()
-        encode = jax.jit(lambda p, x, g=graph: nnx.merge(g, p).encode(x))
-        decode = jax.jit(lambda p, z, g=graph: nnx.merge(g, p).decode(z))
-        latents = encode(state, frames)
-        out = decode(state, latents)
-        assert out.shape == frames.shape and bool(jnp.isfinite(out.astype(jnp.float32)).all())
-        row = {"side": "xew", "dtype": dtype, "latents": list(latents.shape)}
-        yield row | {"case": "encode", "seconds": timed(encode, state, frames, wait=jax.block_until_ready)}
-        seconds = timed(decode, state, latents, wait=jax.block_until_ready)
-        yield row | {"case": "decode", "seconds": seconds, "peak GB": peak_memory()}
+        for chunk in args.vae_chunks:
+            row = {"side": "xew", "dtype": dtype, "latent frames at once": chunk or "all"}
+            encode = jax.jit(lambda p, x, g=graph, c=chunk: nnx.merge(g, p).encode(x, c))
+            decode = jax.jit(lambda p, z, g=graph, c=chunk: nnx.merge(g, p).decode(z, c))
+            latents = jax.numpy.zeros(latent_shape(args, size))
+            passes = {"encode": (encode, frames, latents.shape), "decode": (decode, latents, frames.shape)}
+            for case, (call, given, shape) in passes.items():
+                yield or_out_of_memory(functools.partial(vae_pass, call, state, given, shape), row | {"case": case})
+
+
+def latent_shape(args: Args, size: Any) -> tuple[int, ...]:
+    return 1, (args.frames - 1) // 4 + 1, 256 // size.spatial_factor, 320 // size.spatial_factor, size.channels
+
+
+def vae_pass(call: Callable[..., Any], state: Any, given: Any, shape: tuple[int, ...]) -> dict[str, Any]:
+    """Seconds of encoding or decoding."""
+    import jax
+    import jax.numpy as jnp
+
+    out = call(state, given)
+    assert out.shape == shape and bool(jnp.isfinite(out.astype(jnp.float32)).all())
+    return {"seconds": timed(call, state, given, wait=jax.block_until_ready), "peak GB": peak_memory()}
 
 
 # ---- diffusers' side

@@ -30,7 +30,7 @@ def psnr(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) 
 
     Args:
         prediction, target: [t h w 3] uint8, or floating in [0, 1].
-        chunk: most frames computed at once; by default 1 on a CPU, where that is fastest, and 32 elsewhere.
+        chunk: most frames computed at once; by default 1 on a CPU, where that is fastest, and 64 elsewhere.
 
     Returns:
         [t] float32.

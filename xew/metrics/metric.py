@@ -13,7 +13,7 @@ INPUTS = ("video", "mask", "region", "track")
 """video: two [t h w 3]. mask: two [t h w]. region: two videos and the target's mask. track: two [t k 2], valid [t k]."""
 
 
-ACCELERATOR_CHUNK = 32
+ACCELERATOR_CHUNK = 64
 """Frames computed at once on a GPU or TPU; one is fastest on a CPU, where a frame's intermediates then stay in its cache."""
 
 

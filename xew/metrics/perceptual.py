@@ -1,7 +1,7 @@
 """Metrics, visual quality and morphology by a network: LPIPS (AlexNet, v0.1) on frames and on the robot's region.
 
-R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018. Convolutions run at
-HIGHEST precision: TF32, the default of some GPUs, changes the fourth digit.
+R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018. Convolutions are those of
+float32 everywhere: TF32, the default of some GPUs, changes the fourth digit. (xew/metrics/convolution.py)
 """
 
 import functools
@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 
 from xew.metrics.alexnet import read_alexnet
+from xew.metrics.convolution import convolve
 from xew.metrics.metric import check_masks, check_videos, map_chunks
 
 SMALLEST_SIDE = 31
@@ -54,7 +55,7 @@ def lpips(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None)
 
     Args:
         prediction, target: [t h w 3] RGB, uint8, or floating in [0, 1]; sides of at least 31 pixels.
-        chunk: most frames computed at once; by default 1 on a CPU, where that is fastest, and 32 elsewhere.
+        chunk: most frames computed at once; by default 1 on a CPU, where that is fastest, and 64 elsewhere.
 
     Returns:
         [t] float32.
@@ -234,14 +235,7 @@ def _features(
             height, width = (height - 3) // 2 + 1, (width - 3) // 2 + 1
             x = _keep(x, height, width)
         kernel = weights[f"conv{i}_kernel"]
-        x = lax.conv_general_dilated(
-            x,
-            kernel,
-            (stride, stride),
-            [(padding, padding)] * 2,
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-            precision=lax.Precision.HIGHEST,
-        )
+        x = convolve(x, kernel, stride, padding)
         height, width = ((side + 2 * padding - kernel.shape[0]) // stride + 1 for side in (height, width))
         x = _keep(jax.nn.relu(x + weights[f"conv{i}_bias"].reshape(1, 1, 1, -1)), height, width)
         layers.append((x, height, width))
