@@ -9,7 +9,8 @@ import trimesh
 
 from xew.config import ConfigError
 from xew.sim_warp.camera import HEAD_CAMERA, project
-from xew.sim_warp.kinematics import joint_positions, link_matrices, link_poses, matrix_from_pose, tool_pose
+from xew.sim_warp.kinematics import joint_positions, link_matrices, link_poses, tool_pose
+from xew.sim_warp.poses import matrix_from_pose
 from xew.sim_warp.robots import ROBOTS, RobotSpec, UrdfError, get_robot, load_urdf
 from xew.sim_warp.robots.author import authored_files
 

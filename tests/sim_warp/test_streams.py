@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from xew.config import ConfigError
 from xew.sim_warp import geometry
 from xew.sim_warp.camera import HEAD_CAMERA, project
-from xew.sim_warp.kinematics import forward_kinematics, joint_positions, matrix_from_pose, tool_pose
+from xew.sim_warp.kinematics import forward_kinematics, joint_positions, tool_pose
 from xew.sim_warp.observe import Recording, keypoint_names, keypoint_positions, observe, scene_things
+from xew.sim_warp.poses import matrix_from_pose
 from xew.sim_warp.render import Body, Renderer
 from xew.sim_warp.robots import ROBOTS, load_urdf
 from xew.sim_warp.robots.bodies import body_names, keypoint_links, robot_bodies, robot_pose

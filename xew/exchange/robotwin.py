@@ -26,8 +26,9 @@ from xew.episode import EpisodeError, Record, States, episode_folder, read_recor
 from xew.exchange.hdf5 import Recorded, read_robotwin
 from xew.protocol import ACTION_DIM, ARMS
 from xew.sim_warp.camera import Camera
-from xew.sim_warp.kinematics import matrix_from_pose, pose_from_matrix, tool_matrix
+from xew.sim_warp.kinematics import tool_matrix
 from xew.sim_warp.observe import Recording, keypoint_names, observe
+from xew.sim_warp.poses import matrix_from_pose, pose_from_matrix
 from xew.sim_warp.robots import RobotSpec, get_robot, is_path, keep_robot, use_robots_of
 from xew.sim_warp.robots.draft import find_description, read_draft
 from xew.sim_warp.streams import command_renders, default_renderer

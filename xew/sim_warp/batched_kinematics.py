@@ -14,9 +14,8 @@ import numpy as np
 import warp as wp
 
 from xew.protocol import ACTION_DIM, ARMS
-from xew.sim_warp.geometry import Pose
-from xew.sim_warp.kinematics import pose_from_matrix
 from xew.sim_warp.kinematics_kernels import FIXED, SLIDING, TURNING, kinematics_kernels
+from xew.sim_warp.poses import Pose, pose_from_matrix
 from xew.sim_warp.robots.spec import Arm, RobotSpec
 from xew.sim_warp.robots.urdf import Joint, Urdf, load_urdf
 

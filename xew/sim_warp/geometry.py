@@ -11,8 +11,6 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-Pose = tuple[float, float, float, float, float, float, float]
-"""x y z [m], quaternion x y z w."""
 Color = tuple[int, int, int]
 """sRGB, 0 to 255."""
 

@@ -13,7 +13,8 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp.kinematics import matrix_from_pose, pose_from_matrix, tool_matrix
+from xew.sim_warp.kinematics import tool_matrix
+from xew.sim_warp.poses import matrix_from_pose, pose_from_matrix
 from xew.sim_warp.robots.spec import Arm, RobotSpec
 from xew.sim_warp.robots.urdf import load_urdf
 from xew.sim_warp.waiting import wait_for

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xew.protocol import ARMS
-from xew.sim_warp.geometry import Pose
+from xew.sim_warp.poses import matrix_from_pose, pose_from_matrix
 from xew.sim_warp.robots.spec import Arm, RobotSpec
 from xew.sim_warp.robots.urdf import Joint, Urdf, load_urdf
 
@@ -124,19 +124,3 @@ def link_poses(robot: RobotSpec, action: np.ndarray) -> tuple[dict[str, np.ndarr
         root = matrix_from_pose(arm.root_pose)
         placed.append({name: pose_from_matrix(root @ frame) for name, frame in link_matrices(urdf, joint_pos).items()})
     return tuple(placed)
-
-
-def pose_from_matrix(matrix: np.ndarray) -> np.ndarray:
-    """[... 4 4] to [... 7]; of the two quaternions of a rotation the one with w >= 0."""
-    quaternion = Rotation.from_matrix(matrix[..., :3, :3]).as_quat(canonical=True)
-    return np.concatenate([matrix[..., :3, 3], quaternion], -1)
-
-
-def matrix_from_pose(pose: Pose | np.ndarray) -> np.ndarray:
-    """[... 7] to [... 4 4]."""
-    pose = np.asarray(pose, float)
-    matrix = np.zeros((*pose.shape[:-1], 4, 4))
-    matrix[..., :3, :3] = Rotation.from_quat(pose[..., 3:]).as_matrix()
-    matrix[..., :3, 3] = pose[..., :3]
-    matrix[..., 3, 3] = 1
-    return matrix

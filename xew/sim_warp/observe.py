@@ -11,7 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xew.sim_warp.camera import HEAD_CAMERA, Camera, project
-from xew.sim_warp.kinematics import link_poses, matrix_from_pose, pose_from_matrix
+from xew.sim_warp.kinematics import link_poses
+from xew.sim_warp.poses import matrix_from_pose, pose_from_matrix
 from xew.sim_warp.render import Body, Frames, Renderer, World
 from xew.sim_warp.robots.bodies import body_names, keypoint_links, nearby_links, robot_bodies, robot_pose
 from xew.sim_warp.robots.spec import RobotSpec

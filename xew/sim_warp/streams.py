@@ -15,7 +15,8 @@ import numpy as np
 from xew.protocol import ARMS
 from xew.sim_warp.camera import HEAD_CAMERA, Camera, look_at, project
 from xew.sim_warp.geometry import Color
-from xew.sim_warp.kinematics import matrix_from_pose, tool_pose
+from xew.sim_warp.kinematics import tool_pose
+from xew.sim_warp.poses import matrix_from_pose
 from xew.sim_warp.render import FLOW_LIMIT, Body, Renderer, World
 from xew.sim_warp.robots import get_robot
 from xew.sim_warp.robots.bodies import robot_bodies, robot_pose

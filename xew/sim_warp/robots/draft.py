@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError, parse, read_yaml
-from xew.sim_warp.geometry import Pose
+from xew.sim_warp.poses import Pose
 
 OWN, ROBOTWIN = "robot.yaml", "config.yml"
 """The file that describes a robot in our own way, and in RoboTwin's."""

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError
-from xew.sim_warp.geometry import Pose
 from xew.sim_warp.kinematics import link_matrices
+from xew.sim_warp.poses import Pose
 from xew.sim_warp.robots.urdf import Joint, Urdf
 
 ARM_JOINTS = (6, 7)

@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError
 from xew.sim_warp.inverse_kinematics import ArmSolver
-from xew.sim_warp.kinematics import link_poses, matrix_from_pose
+from xew.sim_warp.kinematics import link_poses
 from xew.sim_warp.plan import ASIDE, HOME
+from xew.sim_warp.poses import matrix_from_pose
 from xew.sim_warp.robots.reach import GRASP_TILT, WORK_X, WORK_Y, WORK_Z, radial_yaw, reached
 from xew.sim_warp.robots.spec import RobotSpec
 from xew.sim_warp.robots.urdf import load_urdf

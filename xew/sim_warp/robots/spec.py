@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from xew.sim_warp.geometry import Pose
+from xew.sim_warp.poses import Pose
 
 
 @dataclass(frozen=True)
