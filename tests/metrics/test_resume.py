@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 from collections.abc import Callable
 from pathlib import Path
 
@@ -119,14 +120,54 @@ def graded(out: Path) -> list[Path]:
 
 def test_workers_are_shared_out_to_the_devices() -> None:
     """Each thread takes the next device; one that has an estimator of its own keeps it."""
-    devices = iter(["first", "second", "first"])  # the thread that opens it takes one too
-    bench = Bench(object, object, devices)
+    first, second = (types.SimpleNamespace(local_hardware_id=number) for number in range(2))
+    bench = Bench(lambda _: object(), lambda _: object(), iter([first, second, first]))  # who opens it takes one too
     found = []
     threads = [threading.Thread(target=lambda: found.append((bench.device, bench.masker is bench.masker))) for _ in range(2)]
     for thread in threads:
         thread.start()
         thread.join()
-    assert sorted(found) == [("first", True), ("second", True)]
+    assert [kept for _, kept in found] == [True, True] and {device.local_hardware_id for device, _ in found} == {0, 1}
+
+
+SHARING = """
+import threading, time
+from pathlib import Path
+import jax
+from xew.metrics.backends import Backend
+from xew.metrics.workers import opener
+
+opened, busy, overlaps = [], set(), []
+
+def open_network(name, checkpoint):
+    number = len(opened)
+    opened.append(jax.numpy.zeros(1).devices())
+    def call():
+        overlaps.append(number in busy)
+        busy.add(number)
+        time.sleep(0.01)
+        busy.discard(number)
+        return number
+    return call
+
+network = opener("mine", {"mine": Backend(open_network, "weights", "")}, open_network, Path("x"))
+found = []
+
+def work(device):
+    for _ in range(3):
+        found.append((device.id, network(device)()))
+
+threads = [threading.Thread(target=work, args=(device,)) for device in (*jax.devices(), *jax.devices())]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+assert len(opened) == 2 and opened[0] != opened[1] and len(found) == 12 and len(set(found)) == 2, (opened, found)
+assert not any(overlaps)
+"""
+
+
+def test_a_network_is_opened_once_on_each_device_and_used_in_turn() -> None:
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    subprocess.run([sys.executable, "-c", SHARING], env=environment, check=True, timeout=120)
 
 
 def test_a_second_run_grades_nothing_anew_and_metrics_come_beside_those_that_are_there(

@@ -6,6 +6,7 @@ is unpickled freely.
 
 import importlib
 import pickle
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -58,8 +59,15 @@ def load_state_dict(network: Any, state: Mapping[str, Any], path: Path, user: st
         raise ConfigError(f"{path} is no checkpoint of {user}: {' '.join(faults)[:300]}") from error
 
 
+def use_torch_device(number: int) -> None:
+    """Make this GPU PyTorch's own in the calling thread, where PyTorch is in use and sees GPUs."""
+    torch = sys.modules.get("torch")
+    if torch is not None and torch.cuda.is_available():
+        torch.cuda.set_device(number % torch.cuda.device_count())
+
+
 def torch_device() -> str:
-    """The first GPU that PyTorch sees, else the CPU."""
+    """The calling thread's GPU, which is the first unless `use_torch_device` chose another; the CPU where there is none."""
     return "cuda" if importlib.import_module("torch").cuda.is_available() else "cpu"
 
 

@@ -24,7 +24,7 @@ SHORTEST_OFFLINE = 17
 
 
 def open_cotracker(checkpoint: Path) -> "CoTracker":
-    """CoTracker3 offline from a local `scaled_offline.pth`, on the first GPU or else the CPU; says its licence on stderr.
+    """CoTracker3 offline from a local `scaled_offline.pth`, on the thread's GPU or else the CPU; says its licence on stderr.
 
     Raises:
         ConfigError: PyTorch or the package `cotracker` is absent, or the file is damaged or of another network.

@@ -12,7 +12,7 @@ Writes scores.parquet, one row per model, condition, task, seed, robot and metri
 import functools
 import itertools
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -26,14 +26,14 @@ from tqdm import tqdm
 from xew.config import ConfigError, pick, suggestion, user_errors
 from xew.episode import EpisodeError, verify_episode
 from xew.metrics import METRICS
-from xew.metrics.backends import MASKERS, TRACKERS, identity, open_masker, open_tracker
+from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, identity, open_masker, open_tracker
 from xew.metrics.bundle import demand_none, differences, disagreements, read_bundle, write_bundle
 from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, compared, grade
 from xew.metrics.jobs import BASELINES, Job, plan, prediction_of, shown_of
 from xew.metrics.scores import CellStore, beside, check_out, describe, write_diagnostics, write_tables, write_whole
 from xew.metrics.summary import summarise, to_markdown
 from xew.metrics.truth import Truth, read_truth
-from xew.metrics.workers import Bench, compile_cache, not_needed, per_thread, worker_count
+from xew.metrics.workers import Bench, compile_cache, not_needed, opener, worker_count
 from xew.protocol import HELD_OUT_ROBOTS
 from xew.rollout import RolloutError
 from xew.threads import in_order
@@ -183,11 +183,12 @@ def find_jobs(args: Args, problems: list[str] | None = None) -> list[Job]:
 def open_bench(args: Args, metrics: Sequence[str]) -> Bench:
     """A bench with the chosen estimators, as far as these metrics need them. Raises ConfigError if weights are missing."""
     kinds = {compared(name) for name in metrics}
-    masker, tracker = not_needed, not_needed
+    masker: Callable[[jax.Device], Masker] = not_needed
+    tracker: Callable[[jax.Device], Tracker] = not_needed
     if "mask" in kinds:
-        masker = per_thread(args.masks, MASKERS, open_masker, args.masks_checkpoint)
+        masker = opener(args.masks, MASKERS, open_masker, args.masks_checkpoint)
     if kinds & {"keypoints", "objects", "contact"}:
-        tracker = per_thread(args.tracks, TRACKERS, open_tracker, args.tracks_checkpoint)
+        tracker = opener(args.tracks, TRACKERS, open_tracker, args.tracks_checkpoint)
     return Bench(masker, tracker, itertools.cycle(jax.local_devices()))
 
 

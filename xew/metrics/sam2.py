@@ -7,6 +7,7 @@ Hugging Face; which one is used follows from the checkpoint.
 """
 
 import contextlib
+import itertools
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -31,7 +32,7 @@ Propagate = Callable[["Frames", int, np.ndarray, bool], dict[int, np.ndarray]]
 
 
 def open_sam2(checkpoint: Path, side: int | None = None) -> "Sam2":
-    """SAM 2 or 2.1 from a local checkpoint, on the first GPU or else the CPU.
+    """SAM 2 or 2.1 from a local checkpoint, on the thread's GPU or else the CPU.
 
     Args:
         checkpoint: a .pt of the authors (needs the package `sam2`), or a folder with config.json and model.safetensors of
@@ -106,11 +107,14 @@ def _open_authors(checkpoint: Path, side: int) -> Sam2:
     def propagate(frames: Frames, start: int, mask: np.ndarray, backwards: bool) -> dict[int, np.ndarray]:
         # It reads nothing but mp4 and JPEG, so our frames go in where its reader's would. Its progress bar stays quiet.
         ours = {"load_video_frames": lambda **_: (frames, *mask.shape), "tqdm": lambda order, **_: order}
-        with _autocast(), _replaced(module, ours):
-            session = predictor.init_state(video_path="")
-            predictor.add_new_mask(session, frame_idx=start, obj_id=ROBOT, mask=mask)
-            order = predictor.propagate_in_video(session, start_frame_idx=start, reverse=backwards)
-            return {frame: (logits[0, 0] > 0).cpu().numpy() for frame, _, logits in order}
+        with _autocast():
+            with _replaced(module, ours):
+                session = predictor.init_state(video_path="")
+                predictor.add_new_mask(session, frame_idx=start, obj_id=ROBOT, mask=mask)
+                order = predictor.propagate_in_video(session, start_frame_idx=start, reverse=backwards)
+                first = next(order)  # by now it has its progress bar; the rest needs no turn
+            found = itertools.chain([first], order)
+            return {frame: (logits[0, 0] > 0).cpu().numpy() for frame, _, logits in found}
 
     return Sam2(propagate, side)
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from xew.config import ConfigError, pick
 from xew.files import cache_folder
+from xew.metrics.adapters import use_torch_device
 from xew.metrics.backends import Masker, Tracker
 
 MOST_WORKERS = 32
@@ -28,30 +29,53 @@ def worker_count(asked: int) -> int:
 
 
 class Bench(threading.local):
-    """What each worker thread has for itself: a device, and estimators that keep notes of the episode at hand."""
+    """What each worker thread has for itself: a device, and who finds robots and points there."""
 
-    def __init__(self, masker: Callable[[], Masker], tracker: Callable[[], Tracker], devices: Iterator[jax.Device]) -> None:
-        self.masker, self.tracker, self.device = masker(), tracker(), next(devices)
+    def __init__(
+        self,
+        masker: Callable[[jax.Device], Masker],
+        tracker: Callable[[jax.Device], Tracker],
+        devices: Iterator[jax.Device],
+    ) -> None:
+        self.device = next(devices)
+        use_torch_device(self.device.local_hardware_id or 0)
+        self.masker, self.tracker = masker(self.device), tracker(self.device)
 
 
-def not_needed() -> Any:
+def not_needed(_: jax.Device) -> Any:
     """In place of an estimator that no metric asks."""
 
 
 E = TypeVar("E", bound=Callable[..., np.ndarray])
 
 
-def per_thread(name: str, registry: Any, open_: Callable[[str, Path | None], E], checkpoint: Path | None) -> Callable[[], E]:
-    """How a thread comes by an estimator: its own, or, of one with weights, the only one, which they use in turn."""
+def opener(
+    name: str, registry: Any, open_: Callable[[str, Path | None], E], checkpoint: Path | None
+) -> Callable[[jax.Device], E]:
+    """How a thread on a device comes by an estimator: its own, or, of one with weights, the device's, used in turn."""
     if pick(registry, name, "estimator").needs is None:
-        return lambda: open_(name, checkpoint)
-    opened, turn = open_(name, checkpoint), threading.Lock()
+        return lambda _: open_(name, checkpoint)
+    opened: dict[jax.Device, E] = {}
+    opening = threading.Lock()
 
-    def in_turn(*arrays: np.ndarray) -> np.ndarray:
+    def of_device(device: jax.Device) -> E:
+        with opening, jax.default_device(device):
+            if device not in opened:
+                opened[device] = in_turn(open_(name, checkpoint))
+            return opened[device]
+
+    return of_device
+
+
+def in_turn(estimator: E) -> E:
+    """The same estimator for one thread at a time; estimators keep notes of the episode at hand."""
+    turn = threading.Lock()
+
+    def call(*arrays: np.ndarray) -> np.ndarray:
         with turn:
-            return opened(*arrays)
+            return estimator(*arrays)
 
-    return lambda: in_turn  # type: ignore[return-value]
+    return call  # type: ignore[return-value]
 
 
 def compile_cache() -> None:
