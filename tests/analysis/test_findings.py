@@ -11,6 +11,7 @@ from xew.analysis.findings import CLAIMS, Finding, ask, findings_frame
 from xew.analysis.grades import PaperGrades, StudyGrades
 from xew.analysis.paper import read_paper
 from xew.analysis.scores import MetricInfo, Scores, read_scores
+from xew.protocol import HELD_OUT_ROBOTS, SHOTS
 
 UNRESOLVED_BY_ROUNDING = {"views saturate"}
 """A change of LPIPS by under 1 % is less than its third decimal tells."""
@@ -80,6 +81,30 @@ def test_a_difference_inside_the_noise_floor_is_not_resolved(scores: Scores) -> 
     exact = with_near.assign(value=with_near["value"].where(~truth, 1.0))
     found = asked(exact, "mask keeps outlines", scores.metrics)
     assert next(a for a in found.answers if a.label == answer.label).verdict == "holds"
+
+
+def test_a_share_of_a_gap_that_is_not_there_is_no_answer(scores: Scores) -> None:
+    """Where both steps lead the wrong way, their ratio looks like a long way gone."""
+    worse = scores.rows
+    for row, factor in (("fixed-ray_map-none", 3.0), ("fixed-optical_flow-none", 6.0)):
+        worse = changed(worse, row, "lpips", factor)
+    for robot in HELD_OUT_ROBOTS:
+        for shots in SHOTS:
+            worse = changed(worse, f"few_shot-{robot}-{shots}", "lpips", 4.0 + 0.1 * shots, robot)
+        worse = changed(worse, "fixed-optical_flow-none", "region_lpips", 0.05, robot)
+        worse = changed(worse, "fixed-optical_flow-robot_render", "region_lpips", 0.2, robot)
+    for name in ("rays recover", "returns diminish", "only alignment closes the gap"):
+        found = asked(worse, name, scores.metrics)
+        assert found.verdict == "unresolved" and all("no gap to close" in a.numbers for a in found.answers), name
+
+
+def test_a_render_that_gains_nothing_does_not_gain_more_than_views_that_harm(scores: Scores) -> None:
+    worse = scores.rows
+    for robot in HELD_OUT_ROBOTS:
+        worse = changed(worse, "fixed-optical_flow-nine_views", "region_lpips", 3.0, robot)
+        worse = changed(worse, "fixed-optical_flow-robot_render", "region_lpips", 4.0, robot)
+    found = asked(worse, "render gains most", scores.metrics)
+    assert {a.verdict for a in found.answers if "Region" in a.label} == {"fails"}
 
 
 def test_few_scenes_resolve_nothing(tmp_path: Path) -> None:
