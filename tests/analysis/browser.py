@@ -37,6 +37,9 @@ LOOK = """() => {
     contrast: Math.min(...seen.map((e) => contrast(paint(e)))),
     dark: ground < 0.5,
     tables: [...document.querySelectorAll("td .mean")].filter((e) => e.getBoundingClientRect().width === 0).length,
+    sideways: [...document.querySelectorAll(".wide")].filter((e) => e.scrollWidth > e.clientWidth).length,
+    spilt: [...document.querySelectorAll(".claim li span")].filter(
+      (e) => e.getBoundingClientRect().right > e.closest("div").getBoundingClientRect().right + 1).length,
   };
 }"""
 """Everything folded is opened first. Sizes are of text as it stands on the screen, in pixels."""
@@ -63,6 +66,10 @@ class Sight:
     dark: bool
     tables: int
     """Values of tables that have no width."""
+    sideways: int
+    """Tables that have to be moved sideways to be read whole."""
+    spilt: int
+    """Numbers of claims that run into the next column."""
 
 
 def look_at(page: Path, shots: Path | None = None) -> dict[tuple[str, str], Sight]:
@@ -102,4 +109,5 @@ def assert_readable(page: Path, images: int, charts: int) -> None:
         assert len(sight.charts) == charts and all(width > 250 for width in sight.charts), (place, sight.charts[:3])
         assert sight.smallest >= 9.5, (place, sight.smallest)
         assert sight.contrast >= 4.5, (place, sight.contrast)
-        assert sight.dark == (place[1] == "dark") and sight.tables == 0, place
+        assert sight.dark == (place[1] == "dark") and sight.tables == 0 and sight.spilt == 0, place
+        assert sight.sideways == 0 or place[0] == "phone", place

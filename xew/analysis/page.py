@@ -125,7 +125,7 @@ def chart(shown: Chart) -> str:
 
 
 def _swatch(series: Series) -> str:
-    kind = {"-": "line", "--": "dashed", ":": "dashed", "o": "ring"}[series.dash]
+    kind = {"-": "line", "--": "dashed", ":": "dotted", "o": "ring"}[series.dash]
     return f'<i class="{kind}" style="border-color: {themed(series.colour)}"></i>'
 
 
