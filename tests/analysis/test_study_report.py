@@ -237,14 +237,14 @@ def assert_well_formed(tex: str, width: int) -> None:
         if line.endswith(r"\\"):
             spans = sum(int(count) - 1 for count in re.findall(r"\\multicolumn\{(\d+)\}", line))
             assert len(re.findall(r"(?<!\\)&", line)) + 1 + spans == width, line
-    assert tex.isascii() or not re.search(r"[^\x00-\x7f]", tex), re.findall(r"[^\x00-\x7f]", tex)[:3]
+    assert tex.isascii(), re.findall(r"[^\x00-\x7f]", tex)[:3]
 
 
 def test_every_tex_file_of_the_report_is_ascii_and_well_formed(folder: Path) -> None:
     for path in (folder / "report" / "tables").glob("*.tex"):
         tex = path.read_text()
         assert tex.isascii(), (path.name, re.findall(r"[^\x00-\x7f]", tex)[:5])
-        assert tex.count(r"\begin{") == tex.count(r"\end{") == 2
+        assert tex.count(r"\begin{") == tex.count(r"\end{") == (2 if path.stem == "findings" else 3)
 
 
 def test_figures_lie_beside_their_numbers(folder: Path) -> None:

@@ -9,12 +9,14 @@ from xew.analysis.findings import Finding
 from xew.analysis.tables import Cell, Row, Table
 
 MARK = {"better": "▲", "worse": "▼", "unresolved": "≈", "": ""}
+AGREES = {None: "", True: "✓", False: "✗"}
 LATEX_MARK = {"better": r"$^{\blacktriangle}$", "worse": r"$^{\blacktriangledown}$", "unresolved": r"$^{\approx}$", "": ""}
 LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "−": "$-$", "–": "--",
     "³": "$^3$", "ρ": r"$\rho$", "≈": r"$\approx$", "▲": r"$\blacktriangle$", "▼": r"$\blacktriangledown$", "…": r"\dots{}",
-    "·": r"$\cdot$", "×": r"$\times$", "±": r"$\pm$", "\u00a0": "~", "<": "$<$", ">": "$>$",
+    "·": r"$\cdot$", "×": r"$\times$", "±": r"$\pm$", "✓": r"$\checkmark$", "✗": r"$\times$", "\u00a0": "~",
+    "<": "$<$", ">": "$>$",
 }  # fmt: skip
 """What stands for characters that LaTeX reads otherwise, or does not have."""
 
@@ -42,20 +44,21 @@ def _markdown_line(cells: Sequence[str]) -> str:
 def _markdown_cell(cell: Cell) -> str:
     text = f"**{cell.text}**" if cell.best else cell.text
     interval = f"[{cell.interval}]" if cell.interval else ""
-    agrees = "" if cell.agrees is None else "✓" if cell.agrees else "✗"
-    return " ".join(
-        filter(None, (text, interval, MARK[cell.verdict], f"(paper {cell.published})" if cell.published else "", agrees))
-    )
+    paper = f"(paper {cell.published})" if cell.published else ""
+    return " ".join(filter(None, (text, interval, MARK[cell.verdict], paper, AGREES[cell.agrees])))
 
 
 def latex(table: Table) -> str:
-    """A table environment for the packages booktabs and amssymb; ours, the paper's small below it."""
+    """A table for the packages booktabs, amssymb and adjustbox; small under each number stand its interval and the paper's.
+
+    It is scaled down where it is wider than the page.
+    """
     stubs, width = len(table.stubs), len(table.stubs) + len(table.columns)
     lines = [
-        r"% \usepackage{booktabs,amssymb,graphicx}",
+        r"% \usepackage{booktabs,amssymb,adjustbox}",
         r"\begin{table*}[t]",
-        r"\centering\footnotesize",
-        r"\resizebox{\textwidth}{!}{%",
+        r"\centering\footnotesize\setlength{\tabcolsep}{4pt}",
+        r"\begin{adjustbox}{max width=\textwidth}",
         rf"\begin{{tabular}}{{@{{}}{'l' * stubs}{'c' * len(table.columns)}@{{}}}}",
         r"\toprule",
         *_latex_groups(table),
@@ -64,12 +67,15 @@ def latex(table: Table) -> str:
     ]
     for i, block in enumerate(table.blocks):
         lines += [r"\addlinespace"] if i else []
-        for text in filter(None, (block.title, block.note)):
-            lines.append(rf"\multicolumn{{{width}}}{{@{{}}l}}{{\textit{{{_escape(text)}}}}} \\")
+        if block.title:
+            lines.append(rf"\multicolumn{{{width}}}{{@{{}}l}}{{\textit{{{_escape(block.title)}}}}} \\")
         for row, above in zip(block.rows, (None, *block.rows), strict=False):
             lines += _latex_rows(row, above)
-    caption = rf"\textbf{{{_escape(table.title)}.}} {_escape(table.caption)}"
-    lines += [r"\bottomrule", r"\end{tabular}}", rf"\caption{{{caption}}}", rf"\label{{tab:{table.name}}}", r"\end{table*}", ""]
+    # Notes are too long for a row: they would stretch the table.
+    notes = [": ".join(filter(None, (block.title, block.note))) for block in table.blocks if block.note]
+    caption = rf"\textbf{{{_escape(table.title)}.}} {_escape(' '.join([table.caption, *notes]))}"
+    lines += [r"\bottomrule", r"\end{tabular}", r"\end{adjustbox}"]
+    lines += [rf"\caption{{{caption}}}", rf"\label{{tab:{table.name}}}", r"\end{table*}", ""]
     return "\n".join(lines)
 
 
@@ -91,15 +97,16 @@ def _latex_rows(row: Row, above: Row | None) -> Iterator[str]:
     same = [bool(above and above.labels[i] == label and label != row.labels[-1]) for i, label in enumerate(row.labels)]
     labels = ["" if repeated else _escape(label) for label, repeated in zip(row.labels, same, strict=True)]
     yield _latex_line([*labels, *map(_latex_cell, row.cells)])
-    if any(cell.published for cell in row.cells):
-        paper = [rf"{{\tiny ({_escape(cell.published)})}}" if cell.published else "" for cell in row.cells]
-        yield _latex_line([*[""] * len(row.labels), *paper])
+    intervals = [f"[{cell.interval}]" if cell.interval else "" for cell in row.cells]
+    papers = [f"({cell.published}){AGREES[cell.agrees]}" if cell.published else "" for cell in row.cells]
+    for below in filter(any, (intervals, papers)):
+        small = (rf"{{\tiny {_escape(text)}}}" if text else "" for text in below)
+        yield _latex_line([*[""] * len(row.labels), *small])
 
 
 def _latex_cell(cell: Cell) -> str:
     text = _escape(cell.text)
-    interval = rf" {{\tiny [{_escape(cell.interval)}]}}" if cell.interval else ""
-    return (rf"\textbf{{{text}}}" if cell.best else text) + LATEX_MARK[cell.verdict] + interval
+    return (rf"\textbf{{{text}}}" if cell.best else text) + LATEX_MARK[cell.verdict]
 
 
 def _latex_line(cells: Sequence[str]) -> str:
@@ -107,7 +114,8 @@ def _latex_line(cells: Sequence[str]) -> str:
 
 
 def _escape(text: str) -> str:
-    return "".join(LATEX.get(character, character) for character in text)
+    """Also two hyphens, of a command's option, which LaTeX would draw as a dash."""
+    return "-{}-".join("".join(LATEX.get(character, character) for character in part) for part in text.split("--"))
 
 
 def frame(table: Table) -> pd.DataFrame:
@@ -165,7 +173,7 @@ def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = ()) 
             r"% \usepackage{booktabs,amssymb}",
             r"\begin{table*}[t]",
             r"\centering\footnotesize",
-            rf"\begin{{tabular}}{{@{{}}p{{0.38\textwidth}}p{{0.38\textwidth}}l{'l' * bool(papers)}@{{}}}}",
+            rf"\begin{{tabular}}{{@{{}}p{{0.36\textwidth}}p{{0.36\textwidth}}l{'l' * bool(papers)}@{{}}}}",
             r"\toprule",
             _latex_line(["claim", "test", "verdict", *beside[0]]),
             r"\midrule",
