@@ -111,6 +111,32 @@ def test_what_is_there_is_not_imported_again(imported: Path, monkeypatch: pytest
     assert import_all(find_episodes(root), Args(root, root / "out")) == ([read_record(imported)], [])
 
 
+def test_two_configurations_of_a_task_are_not_taken_for_one(tmp_path: Path) -> None:
+    """Both count their seeds from 0: the second file must not pass for imported."""
+    clean, randomized = tmp_path / LEGACY, tmp_path / str(LEGACY).replace("clean_50", "randomized_500")
+    made.write_legacy(clean)
+    made.write_legacy(randomized)
+    with h5py.File(randomized, "r+") as file:
+        file["joint_action/left_gripper"][:] = 0.5
+    records, refused = import_all([clean, randomized], Args(tmp_path, tmp_path / "out"))
+    assert len(records) == 1 and len(refused) == 1
+    assert refused[0].startswith(f"{randomized}: ") and "holds another recording of that task, seed and robot" in refused[0]
+    records, refused = import_all([randomized], Args(tmp_path, tmp_path / "out", task="place_cup_randomized"))
+    assert not refused and records[0].task == "place_cup_randomized"
+
+
+def test_files_may_be_named_from_their_own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made.write_legacy(tmp_path / LEGACY)
+    beside = tmp_path / LEGACY.parents[1]
+    (beside / "instructions").mkdir()
+    (beside / "instructions" / "episode3.json").write_text('["put the block on the mat"]')
+    (beside / "seed.txt").write_text("0 1 5 17")
+    monkeypatch.chdir(tmp_path / LEGACY.parent)
+    records, refused = import_all(find_episodes(Path()), Args(Path(), tmp_path / "out"))
+    assert not refused and (records[0].task, records[0].seed) == ("place_cup", 17)
+    assert records[0].instruction == "put the block on the mat"
+
+
 def test_another_robot_is_not_taken_for_it(tmp_path: Path) -> None:
     recorded = read_robotwin(made.write_legacy(tmp_path / LEGACY))
     assert fitted(ROBOTS["arx_x5"], recorded) is not None
@@ -213,12 +239,14 @@ def test_the_command_imports_what_it_can_and_names_the_rest(
     made.write_legacy(tmp_path / LEGACY)
     broken = tmp_path / LEGACY.with_name("episode4.hdf5")
     broken.write_bytes((tmp_path / LEGACY).read_bytes()[:3000])
+    unnamed = made.write_legacy(tmp_path / "somewhere" / "episode0.hdf5")
     monkeypatch.setattr("sys.argv", ["robotwin", str(tmp_path), "--out", str(tmp_path / "out")])
     with pytest.raises(SystemExit) as left:
         main()
     told = capsys.readouterr()
     assert left.value.code == 2 and "1 episodes under" in told.out
-    assert f"error: {broken} cannot be read as HDF5" in told.err and "1 files were not imported." in told.err
+    assert f"error: {broken} cannot be read as HDF5" in told.err and "2 files were not imported." in told.err
+    assert f"{unnamed}: no folder above it is named after a robot" in told.err
     assert len(find_accepted(tmp_path / "out")) == 1
 
 

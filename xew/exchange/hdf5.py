@@ -241,7 +241,7 @@ class _Reader:
         found = self.file.get("instructions")
         if isinstance(found, h5py.Dataset):
             return _first_instruction(_text(found[()]))
-        beside = self.path.parents[1] / "instructions" / f"{self.path.stem}.json"
+        beside = self.path.absolute().parent.parent / "instructions" / f"{self.path.stem}.json"
         return _first_instruction(beside.read_text()) if beside.is_file() else ""
 
     def wrong(self, found: str, expected: str) -> EpisodeError:

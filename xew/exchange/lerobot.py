@@ -163,7 +163,7 @@ def _write(
                 row |= films[key].add(video)
                 counts = color_counts(video)
                 statistics[key] = _color_statistics(counts, len(video))
-                totals.add_colors(key, counts, len(video))
+                totals.add_colors(key, counts)
             totals.add(columns)
             row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
             row |= {"xew/robot": record.robot, "xew/task": record.task, "xew/seed": record.seed}
@@ -307,7 +307,7 @@ class _Totals:
             self.columns.setdefault(name, []).append(values)
         self.frames += len(columns["index"])
 
-    def add_colors(self, key: str, counts: np.ndarray, frames: int) -> None:
+    def add_colors(self, key: str, counts: np.ndarray) -> None:
         self.colors[key] = self.colors.get(key, 0) + counts
 
     def statistics(self) -> dict[str, dict[str, Any]]:

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 import xew
 from xew.config import ConfigError, user_errors
-from xew.episode import EpisodeError, Record, States, episode_folder, read_record, write_episode
+from xew.episode import EpisodeError, Record, States, episode_folder, read_record, read_states, write_episode
 from xew.exchange.hdf5 import Recorded, read_robotwin
 from xew.protocol import ACTION_DIM, ARMS
 from xew.sim_warp.camera import Camera
@@ -76,16 +76,24 @@ def find_episodes(source: Path) -> list[Path]:
 def import_episode(path: Path, args: Args) -> Record:
     """Read one file and write one episode; what is there already is not made again.
 
+    RoboTwin numbers the seeds of each configuration anew, so that files of two (clean and randomized) may claim one episode:
+    the second is refused.
+
     Raises:
         EpisodeError, ConfigError: the file or the robot cannot be used.
     """
     recorded = read_robotwin(path)
     name, robot = _robot(path, recorded, args)
     task, seed = args.task or _task(path), _seed(path)
+    action = canonical_action(recorded)
     folder = episode_folder(args.out, task, seed, name)
     if (folder / "episode.json").is_file():
+        if not np.array_equal(read_states(folder).action, action):
+            raise EpisodeError(
+                f"{path}: {folder} holds another recording of that task, seed and robot; import this one as another --task or "
+                "into another --out."
+            )
         return read_record(folder)
-    action = canonical_action(recorded)
     states, names, video = _seen(robot, action, recorded)
     record = Record(
         task=task,
@@ -191,8 +199,8 @@ def _seed(path: Path) -> int:
     digits = "".join(filter(str.isdigit, path.stem))
     if not digits:
         raise EpisodeError(f"{path}: the file's name has no number; RoboTwin calls them episode0.hdf5 and so on.")
-    listed = path.parents[1] / "seed.txt" if len(path.parents) > 1 else path
-    seeds = listed.read_text().split() if listed.name == "seed.txt" and listed.is_file() else []
+    listed = path.absolute().parent.parent / "seed.txt"
+    seeds = listed.read_text().split() if listed.is_file() else []
     number = int(digits)
     return int(seeds[number]) if number < len(seeds) and seeds[number].isdigit() else number
 
@@ -234,7 +242,7 @@ def import_all(paths: Sequence[Path], args: Args) -> tuple[list[Record], list[st
     for path in tqdm(paths, desc="importing", unit="episode"):
         try:
             records.append(import_episode(path, args))
-        except EpisodeError as error:
+        except (EpisodeError, ConfigError) as error:
             refused.append(str(error))
     return records, refused
 
@@ -243,8 +251,8 @@ def import_all(paths: Sequence[Path], args: Args) -> tuple[list[Record], list[st
 def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
-    if args.robot and not is_path(args.robot):
-        get_robot(args.robot)
+    if args.robot:
+        get_robot(args.robot)  # a mistake in it is told once, not for every file
     records, refused = import_all(find_episodes(args.source), args)
     rendered = sum("robot" in record.hashes for record in records)
     print(f"{len(records)} episodes under {args.out}, {rendered} with the robot's own kinematics")
