@@ -150,6 +150,7 @@ def test_a_full_disk_in_a_worker_is_one_line(tmp_path: Path) -> None:
         (("--robots", "tests.sim_warp.small:CLOSE"), "is a Task; expected a RobotSpec"),
         (("--train-seeds", "-1"), "tasks, 5 robots, -1 training"),
         (("--batch", "0"), "batches from 1"),
+        (("--device", "gpu"), "error: --device gpu: not on this machine, which has cpu"),
     ],
 )
 def test_mistakes_are_told_in_a_line(

@@ -3,6 +3,7 @@
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import fields, replace
 from pathlib import Path
 
 import cv2
@@ -10,14 +11,14 @@ import numpy as np
 import pytest
 
 from tests.sim_warp.small import SLOW, TASK
-from xew.episode import episode_folder, read_video
+from xew.episode import States, episode_folder, read_record, read_states, read_video, write_episode
 from xew.sim_warp.inspect import (
     GAP,
     LABEL_HEIGHT,
     LABEL_WIDTH,
     SHEET_TIMES,
     STRIP_FRAMES,
-    busy_instant,
+    busy_instants,
     contact_sheet,
     grid,
     main,
@@ -151,11 +152,23 @@ def test_a_grid_has_bands_of_equal_length(made: Path) -> None:
 
 def test_the_instant_of_a_grid_is_one_at_which_all_robots_touch_something() -> None:
     contact = np.zeros((2, 21, 2, 1), bool)
-    assert busy_instant(list(contact)) == 12
+    assert busy_instants(list(contact)) == [12, 12]
     contact[0, 3:11], contact[1, 8:20] = True, True
-    assert busy_instant(list(contact)) == 10
+    assert busy_instants(list(contact)) == [10, 10]
     contact[0, 11:15] = True
-    assert busy_instant(list(contact)) == 12
+    assert busy_instants(list(contact)) == [12, 12]
+
+
+def test_imported_episodes_of_one_seed_may_differ_in_length(made: Path, data: Path) -> None:
+    """They share no clock: each is shown at its own instant, and drawing them does not fail."""
+    assert busy_instants([np.zeros((21, 2, 0), bool), np.zeros((11, 2, 1), bool)]) == [12, 6]
+    short = episode_folder(data, TASK, 0, SLOW)
+    states = read_states(short)
+    halved = {field.name: getattr(states, field.name) for field in fields(States)}
+    halved = {name: array[:6] if len(array) == states.frame_count else array for name, array in halved.items()}
+    write_episode(data, replace(read_record(short), frame_count=6), States(**halved), read_video(short / "rgb.mkv")[:6])
+    cells = [(folder, record) for folder, record in read_headers(data)[0] if record.hashes]
+    assert grid([cells]).shape == (LABEL_HEIGHT + 2 * (120 + GAP), LABEL_WIDTH + 160 + GAP, 3)
 
 
 def test_tiles_lie_in_rows_with_white_between() -> None:

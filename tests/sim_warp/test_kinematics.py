@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from xew.sim_warp.inverse_kinematics import ArmSolver, inverse_kinematics
 from xew.sim_warp.kinematics import finger_positions, forward_kinematics, joint_positions, link_matrices, link_poses, tool_pose
 from xew.sim_warp.plan import tool
 from xew.sim_warp.robots import ROBOTS, RobotSpec, load_urdf
+from xew.sim_warp.robots.reach import main as reach
 from xew.sim_warp.robots.reach import work_reach
 
 CHAINS = json.loads((Path(__file__).parent / "data" / "chains.json").read_text())["robots"]
@@ -242,3 +244,12 @@ def test_both_arms_reach_the_work_area(robot: RobotSpec, arm: int) -> None:
     assert found.mean() > 0.95
     straight = found[len(found) // 2]
     assert straight[:-1].mean() > 0.98, "hand pointing away from the shoulder, all but the column past the middle"
+
+
+def test_the_reach_of_an_unknown_robot_is_refused_in_a_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["reach", "--robots", "pipper"])
+    with pytest.raises(SystemExit) as left:
+        reach()
+    assert left.value.code == 2 and "did you mean 'piper'" in capsys.readouterr().err

@@ -170,7 +170,7 @@ def test_unknown_tasks_are_told_with_the_nearest_name() -> None:
 def test_the_page_tells_what_the_docstrings_tell(name: str) -> None:
     assert all(described(TASKS[name]).get(part) for part in PARTS)
     assert description(TASKS[name]) in PAGE.read_text(), (
-        "write docs/tasks.md anew: python -m xew.sim_warp.yields --page docs/tasks.md"
+        "write docs/tasks.md anew: python -m xew.sim_warp.yields --seeds 50 --page docs/tasks.md"
     )
 
 
@@ -208,6 +208,7 @@ def test_yields_try_every_robot_and_write_nothing(tmp_path: Path, monkeypatch: p
     assert (
         f"| `{TASK}` | 2/2 (100 %) | 1/2 (50 %) | 1/2 (50 %) |" in text
         and "2 seeds from 0 of each task, in physics, on CPU:" in text
+        and "python -m xew.sim_warp.yields --seeds 2 --page docs/tasks.md`" in text
     )
     assert not list(tmp_path.iterdir())
 
@@ -217,3 +218,7 @@ def test_yields_of_nothing_or_of_the_unknown_are_refused() -> None:
         next(attempts(Args(seeds=0)))
     with pytest.raises(ConfigError, match="unknown robot 'ur5'"):
         next(attempts(Args(robots=("ur5",))))
+    with pytest.raises(EpisodeError, match="1 robots and 20 seeds from -1; name"):
+        next(attempts(Args(robots=("piper",), first_seed=-1)))
+    with pytest.raises(ConfigError, match="--device cuda:99: not on this machine, which has cpu"):
+        next(attempts(Args(device="cuda:99")))

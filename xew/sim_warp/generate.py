@@ -32,7 +32,7 @@ from xew.sim_warp.produce import Job, produce
 from xew.sim_warp.render import Renderer
 from xew.sim_warp.robots import ROBOTS, adopt_robots, get_robot, is_path
 from xew.sim_warp.tasks import TASKS, get_task
-from xew.sim_warp.workers import Workers, has_kernels, quiet_warp, worker_count
+from xew.sim_warp.workers import Workers, has_kernels, named_device, quiet_warp, worker_count
 
 TRIES_PER_SEED = 3
 SPARE_TRIES = 20
@@ -127,7 +127,7 @@ Made = tuple[list[Record], float]
 @contextmanager
 def maker(args: Args) -> Iterator[Callable[[Sequence[Job]], Iterator[Made]]]:
     """What runs jobs on the device at hand: in worker processes, one job at a time on a CPU, in large batches on a GPU."""
-    device = wp.get_device(args.device)
+    device = named_device(args.device)
     size = max(1, args.batch // len(args.robots)) if device.is_cuda else 1
     make = partial(_make, out=args.out, device=device.alias, batch=args.batch, videos=not args.states_only)
     with Workers(args.workers or worker_count(device), first_alone=not has_kernels(device)) as workers:
@@ -264,7 +264,7 @@ def _demand_enough(families: Sequence[Family]) -> None:
 
 def _tell_device(name: str | None) -> None:
     """On what it runs, and why the first run seems to stand still."""
-    device = wp.get_device(name)
+    device = named_device(name)
     print(f"device: {device.name}")
     if not has_kernels(device):
         wait = "five minutes" if device.is_cuda else "a minute"

@@ -177,7 +177,7 @@ def draw_grid(cells: list[tuple[Path, Record]], path: Path) -> None:
 def grid(seeds: list[list[tuple[Path, Record]]]) -> np.ndarray:
     """One seed of every task, a column each under its name, and a robot a row, at half size: uint8 [h w 3].
 
-    In a column all robots are shown at the same instant, see `busy_instant`. Columns stand in bands of equal length, one
+    In a column all robots are shown at the same instant, see `busy_instants`. Columns stand in bands of equal length, one
     under the other, about as many as make the picture as wide as high.
     """
     shown = {record.robot for cells in seeds for _, record in cells}
@@ -197,21 +197,25 @@ def grid(seeds: list[list[tuple[Path, Record]]]) -> np.ndarray:
 def _column(cells: list[tuple[Path, Record]], robots: list[str]) -> np.ndarray:
     """A task's name over one picture a robot: [h w 3]."""
     folders = {record.robot: folder for folder, record in cells}
-    instant = busy_instant([read_states(folder).contact for folder in folders.values()])
-    images = [_half(read_video(folders[robot] / "rgb.mkv")[instant]) if robot in folders else BLANK for robot in robots]
+    instants = dict(zip(folders, busy_instants([read_states(folder).contact for folder in folders.values()]), strict=True))
+    images = [_half(read_video(folders[robot] / "rgb.mkv")[instants[robot]]) if robot in folders else BLANK for robot in robots]
     name = cells[0][1].task.rsplit(":", 1)[-1]
     return np.concatenate([_label(name, WIDTH // 2 + GAP), tiled([[image] for image in images])])
 
 
-def busy_instant(contacts: list[np.ndarray]) -> int:
-    """The frame nearest to 60 % of the episodes at which every robot touches something, or that at 60 %.
+def busy_instants(contacts: list[np.ndarray]) -> list[int]:
+    """For every robot the frame nearest to 60 % of the episodes at which all of them touch something, or that at 60 %.
+
+    It is one frame for all, but for episodes of different lengths, as imported ones are: those share no clock.
 
     Args:
-        contacts: [t 2 o] bool of every robot, all of one length.
+        contacts: [t 2 o] bool of every robot.
     """
+    if len({len(contact) for contact in contacts}) > 1:
+        return [instant for contact in contacts for instant in busy_instants([contact])]
     wanted = round(AT_WORK * (len(contacts[0]) - 1))
     touching = np.flatnonzero(np.logical_and.reduce([contact.any((1, 2)) for contact in contacts]))
-    return int(touching[np.abs(touching - wanted).argmin()]) if touching.size else wanted
+    return [int(touching[np.abs(touching - wanted).argmin()]) if touching.size else wanted] * len(contacts)
 
 
 def _label(text: str, width: int, height: int = LABEL_HEIGHT) -> np.ndarray:

@@ -19,6 +19,7 @@ from typing import TypeVar
 
 import warp
 
+from xew.config import ConfigError
 from xew.episode import EpisodeError
 
 Job = TypeVar("Job")
@@ -27,6 +28,15 @@ Result = TypeVar("Result")
 
 MEMORY_PER_WORKER = 9e9
 """Of a GPU [bytes]: a batch of 256 worlds, 512 frames in flight and what CUDA itself takes."""
+
+
+def named_device(name: str | None) -> warp.Device:
+    """The device that a command's --device names, or the one that Warp prefers. Raises ConfigError if it is not there."""
+    try:
+        return warp.get_device(name)
+    except (ValueError, RuntimeError) as error:
+        known = ", ".join(device.alias for device in warp.get_devices())
+        raise ConfigError(f"--device {name}: not on this machine, which has {known}.") from error
 
 
 def worker_count(device: warp.Device) -> int:

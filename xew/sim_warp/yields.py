@@ -26,7 +26,7 @@ from xew.episode import EpisodeError, Record
 from xew.sim_warp.produce import Job, header, plan_cells, simulate_cells
 from xew.sim_warp.robots import ROBOTS, get_robot
 from xew.sim_warp.tasks import TASKS, Task, get_task
-from xew.sim_warp.workers import Workers, has_kernels, quiet_warp, worker_count
+from xew.sim_warp.workers import Workers, has_kernels, named_device, quiet_warp, worker_count
 
 PARTS = ("Task", "Randomisation", "Success", "After")
 """How the paragraphs of a task's module docstring begin."""
@@ -40,7 +40,7 @@ class Args:
     tasks: tuple[str, ...] = tuple(TASKS)
     """Keys of the registry, or module:NAME."""
     robots: tuple[str, ...] = tuple(ROBOTS)
-    """Keys of the registry, or module:NAME."""
+    """Keys of the registry, module:NAME, or paths of your own (docs/add_a_robot.md)."""
     seeds: int = 20
     """Seeds of each task, all of which count."""
     first_seed: int = 0
@@ -58,7 +58,7 @@ def attempts(args: Args) -> Iterator[list[Record]]:
     """Headers of all robots of a seed, as they come.
 
     Raises:
-        ConfigError: an unknown task or robot.
+        ConfigError: an unknown task, robot or device.
         EpisodeError: nothing to try.
     """
     tasks, robots = dict.fromkeys(args.tasks), tuple(dict.fromkeys(args.robots))
@@ -67,9 +67,12 @@ def attempts(args: Args) -> Iterator[list[Record]]:
     for name in robots:
         get_robot(name)
     jobs = [Job(task, args.first_seed + index, robots) for task in tasks for index in range(args.seeds)]
-    if not jobs or not robots:
-        raise EpisodeError("nothing to try: name at least one task and one robot, and --seeds of at least 1.")
-    device = wp.get_device(args.device)
+    if not jobs or not robots or args.first_seed < 0:
+        raise EpisodeError(
+            f"nothing to try of {len(tasks)} tasks, {len(robots)} robots and {args.seeds} seeds from {args.first_seed}; name "
+            "tasks and robots, --seeds from 1 and --first-seed from 0."
+        )
+    device = named_device(args.device)
     size = max(1, args.batch // len(robots)) if device.is_cuda else 1
     batches = [jobs[start : start + size] for start in range(0, len(jobs), size)]
     attempt = partial(attempt_batch, device=device.alias, batch=args.batch)
@@ -153,13 +156,14 @@ def page(records: Sequence[Record], args: Args) -> str:
     """docs/tasks.md."""
     tasks = "\n\n".join(description(get_task(name)) for name in sorted(args.tasks))
     seeds = f"{args.seeds} seeds from {args.first_seed}"
+    first = f" --first-seed {args.first_seed}" if args.first_seed else ""
     device = next(record.device for record in records)
     return f"""# The tasks
 
-This page is written by `{COMMAND} --page docs/tasks.md`; the descriptions are
-the docstrings of `xew/sim_warp/tasks/`. Lengths are in metres,
+This page is written by `{COMMAND} --seeds {args.seeds}{first} --page docs/tasks.md`;
+the descriptions are the docstrings of `xew/sim_warp/tasks/`. Lengths are in metres,
 x to the right, y away from the robot, the origin under the table's centre; the table's top is at z = 0.74.
-Words in braces stand for colours of the scene.
+Words in braces stand for what the scene has: things, their kinds and colours.
 
 {tasks}
 

@@ -11,6 +11,7 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation, Slerp
 
+from xew.config import user_errors
 from xew.sim_warp.inverse_kinematics import ArmSolver
 from xew.sim_warp.kinematics import tool_pose
 from xew.sim_warp.plan import tool
@@ -103,9 +104,10 @@ class Args:
     """Print which tool poses robots reach, as Markdown."""
 
     robots: tuple[str, ...] = tuple(ROBOTS)
-    """Registry keys or import paths module:NAME."""
+    """Registry keys, import paths module:NAME or paths."""
 
 
+@user_errors
 def main() -> None:
     quiet_warp()
     args = tyro.cli(Args)
