@@ -12,8 +12,12 @@ import pytest
 
 from tests.analysis.browser import assert_readable, needs_chromium
 from tests.analysis.conftest import FRAMES, Study
+from xew.analysis import pictures
 from xew.analysis.report import Args, main
 from xew.analysis.scores import read_scores
+from xew.episode import write_video
+from xew.metrics import evaluate
+from xew.rollout import find_rollouts, read_rollout_video
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 
@@ -119,6 +123,34 @@ def test_markdown_and_figures_stand_beside_the_page(report: Path) -> None:
 def test_a_strip_shows_the_first_and_the_last_frame(report: Path) -> None:
     page = Page((report / "index.html").read_text())
     assert f"frame {FRAMES - 1}" in str(page.images[0]["alt"]) and "frame 0" in str(page.images[0]["alt"])
+
+
+@pytest.mark.parametrize("frame_zero", ["given", "absent"])
+def test_a_rollout_is_shown_as_it_was_graded(frame_zero: str) -> None:
+    """At the episode's size, frame by frame, and no longer than the episode."""
+    truth = np.full((FRAMES, 24, 32, 3), 40, np.uint8) + np.arange(FRAMES, dtype=np.uint8)[:, None, None, None] * 10
+    for size in ((24, 32), (12, 16), (48, 64)):
+        first = 0 if frame_zero == "given" else 1
+        video = np.stack([cv2.resize(frame, size[::-1]) for frame in (*truth[first:], truth[0])])
+        assert np.array_equal(pictures.as_graded(video, truth, frame_zero), truth)
+
+
+def test_a_report_shows_rollouts_of_another_size_that_begin_with_frame_1(study: Study, tmp_path: Path) -> None:
+    for rollout in find_rollouts(study.rollouts):
+        if (rollout.robot, rollout.task) == ("piper", "open_laptop"):
+            small = np.stack([frame[::2, ::2] for frame in read_rollout_video(rollout)[1:]])
+            folder = tmp_path / "rollouts" / rollout.task / str(rollout.seed) / rollout.robot
+            folder.mkdir(parents=True)
+            write_video(folder / "rgb.mkv", small)
+    args = ((tmp_path / "rollouts",), study.data, tmp_path / "scores.parquet", ("psnr", "lpips"))
+    evaluate.main(evaluate.Args(*args, allow=("resize",), frame_zero="absent"))
+    main(Args(tmp_path / "scores.parquet", study.data, (tmp_path / "rollouts",), tmp_path / "report"))
+    strips = list((tmp_path / "report" / "figures").glob("rollouts__open_laptop_*.png"))
+    assert len(strips) == 2
+    text = (tmp_path / "report" / "index.html").read_text()
+    assert "its videos leave out" in text and "<dt>changed to fit</dt><dd>resize</dd>" in text
+    observed, predicted, _ = np.split(cv2.imread(str(strips[0]))[:, :320].astype(int), [244, 488])
+    assert np.array_equal(observed[:240], predicted[:240])  # frame 0 was given
 
 
 def edit(study: Study, out: Path, change: object) -> Path:

@@ -22,6 +22,23 @@ def difference_picture(predicted: np.ndarray, observed: np.ndarray) -> np.ndarra
     return cv2.rectangle(picture, (0, 0), (width - 1, height - 1), FRAME, 1)  # else white on white has no edge
 
 
+def as_graded(video: np.ndarray, truth: np.ndarray, frame_zero: str) -> np.ndarray:
+    """A rollout's video [t h w 3] beside its episode's as it was graded: frame by frame, at the episode's size.
+
+    Args:
+        video: the rollout's, as it is stored.
+        truth: the episode's.
+        frame_zero: what the score table says; where it is 'absent' the video begins with frame 1.
+    """
+    height, width = truth.shape[1:3]
+    if video.shape[1:3] != (height, width):
+        method = cv2.INTER_AREA if video.shape[1] > height else cv2.INTER_CUBIC
+        video = np.stack([cv2.resize(frame, (width, height), interpolation=method) for frame in video])
+    if frame_zero == "absent":
+        video = np.concatenate([truth[:1], video])
+    return video[: len(truth)]
+
+
 def strip_times(frame_count: int, count: int = 5) -> list[int]:
     """Frames shown of a video: the given one, the last, and some between."""
     return np.unique(np.linspace(0, frame_count - 1, count).round().astype(int)).tolist()

@@ -40,6 +40,11 @@ from xew.rollout import Rollout, find_rollouts, read_rollout_video
 TITLE = "Can the model render a robot that it has never seen?"
 STRIP_METRIC = "lpips"
 """By which episodes are ranked, so that strips show the best, the median and the worst."""
+FRAME_ZERO = {
+    "given": "frame 0 is given to the model and never scored",
+    "absent": "frame 0, which the model was given and its videos leave out, is never scored",
+    "predicted": "frame 0 is predicted too, and scored as all others",
+}
 CURVE_METRICS = ("lpips", "psnr", "mask_iou")
 SHEET_TASKS = 8
 
@@ -221,7 +226,7 @@ def _strip_section(strips: Sequence[Picture]) -> str:
         )
     text = (
         "Best, median and worst episode of each held-out robot by LPIPS. The difference is the largest of the three "
-        f"channels, white for none, black for {pictures.DIFFERENCE_FULL} of 255 levels or more. Frame 0 is given."
+        f"channels, white for none, black for {pictures.DIFFERENCE_FULL} of 255 levels or more."
     )
     return page.section("What it looks like", page.paragraph(text), *(strip.html for strip in strips))
 
@@ -237,11 +242,12 @@ def _data_section(sheets: Sequence[Picture], records: Sequence[Record]) -> str:
 def _method_section(scores: Scores, args: Args) -> str:
     definitions = {METRIC_TITLES.get(metric.name, metric.name): metric.reference for metric in scores.metrics}
     notes = (
-        "Every metric is a mean over the predicted frames; frame 0 is given to the model and never scored. Masks in "
-        "predicted video are estimated with the help of the true episode, by the same estimator for every row."
+        f"Every metric is a mean over the predicted frames; {FRAME_ZERO[scores.frame_zero]}. Masks in predicted video are "
+        "estimated with the help of the true episode, by the same estimator for every row."
     )
-    made = {"scores": str(args.scores), "data": str(args.data or "not given"), "protocol": str(scores.protocol)}
+    made = {"scores": str(args.scores), "data": str(args.data or "not given")}
     made["rollouts"] = ", ".join(map(str, args.rollouts)) or "not given"
+    made |= scores.measured_by
     return page.section("How it was measured", page.paragraph(notes), page.definitions(definitions), page.definitions(made))
 
 
@@ -252,7 +258,8 @@ def _strips(scores: Scores, args: Args) -> list[Picture]:
     rows = scores.rows[(scores.rows["metric"] == STRIP_METRIC) & scores.rows["robot"].isin(args.held_out)]
     rows = rows[~rows["model"].isin([COPY, TRUTH])]
     chosen = [pair for _, group in rows.groupby(["robot", "model", "condition"]) for pair in _ranked(group)]
-    return [_strip(row, word, rollouts, args.data) for word, row in tqdm(chosen, desc="strips", unit="strip", disable=None)]
+    chosen = tqdm(chosen, desc="strips", unit="strip", disable=None)
+    return [_strip(row, word, rollouts, args.data, scores.frame_zero) for word, row in chosen]
 
 
 def _ranked(group: pd.DataFrame) -> list[tuple[str, pd.Series]]:
@@ -264,12 +271,14 @@ def _ranked(group: pd.DataFrame) -> list[tuple[str, pd.Series]]:
     return [(word, ordered.iloc[place]) for place, word in sorted(places.items())]
 
 
-def _strip(row: pd.Series, word: str, rollouts: dict[tuple[str, str, str, int, str], Rollout], data: Path) -> Picture:
+def _strip(
+    row: pd.Series, word: str, rollouts: dict[tuple[str, str, str, int, str], Rollout], data: Path, frame_zero: str
+) -> Picture:
     key = (row["model"], row["condition"], row["task"], int(row["seed"]), row["robot"])
     if key not in rollouts:
         raise ConfigError(f"the rollout {' '.join(map(str, key))} is graded but not under --rollouts; name its tree too.")
-    predicted = read_rollout_video(rollouts[key])
     observed = read_video(episode_folder(data, *key[2:]) / "rgb.mkv")
+    predicted = pictures.as_graded(read_rollout_video(rollouts[key]), observed, frame_zero)
     times = pictures.strip_times(int(row["frames"]))
     image = pictures.png(pictures.strip(observed, predicted, times))
     caption = (

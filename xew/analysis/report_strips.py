@@ -4,13 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pandas as pd
 
 from xew.analysis import pictures
 from xew.analysis.grades import find_variant
-from xew.analysis.scores import VARIANT
+from xew.analysis.scores import VARIANT, Scores
 from xew.analysis.tables import ACTIONS, LADDER, SHORT_ROBOTS
 from xew.config import ConfigError
 from xew.episode import episode_folder, read_video
@@ -33,11 +32,11 @@ class Strip:
     rows: Sequence[str]
 
 
-def study_strips(rows: pd.DataFrame, data: Path, rollouts: Sequence[Path]) -> dict[str, Strip]:
+def study_strips(scores: Scores, data: Path, rollouts: Sequence[Path]) -> dict[str, Strip]:
     """A strip for each comparison of which at least two variants can be shown.
 
     Args:
-        rows: the study's scores; the scene whose mean LPIPS over what is shown is the median is taken.
+        scores: the study's; the scene whose mean LPIPS over what is shown is the median is taken.
         data: the data set.
         rollouts: trees named after their variants, or folders of such trees.
 
@@ -51,7 +50,7 @@ def study_strips(rows: pd.DataFrame, data: Path, rollouts: Sequence[Path]) -> di
         "ladder": {label: dict.fromkeys(HELD_OUT_ROBOTS, row) for row, label in LADDER.items()},
         "few_shot": adapted,
     }
-    made = {part: _strip(part, columns, rows, data, videos) for part, columns in wanted.items()}
+    made = {part: _strip(part, columns, scores, data, videos) for part, columns in wanted.items()}
     return {part: strip for part, strip in made.items() if strip is not None}
 
 
@@ -74,24 +73,24 @@ def _children(folder: Path) -> list[Path]:
     return sorted(child for child in folder.iterdir() if child.is_dir()) if folder.is_dir() else []
 
 
-def _strip(part: str, columns: Mapping[str, Mapping[str, str]], rows: pd.DataFrame, data: Path, videos: Videos) -> Strip | None:
+def _strip(part: str, columns: Mapping[str, Mapping[str, str]], scores: Scores, data: Path, videos: Videos) -> Strip | None:
     """Observed frame and all variants of a part, for each held-out robot; None where fewer than two can be shown."""
     names = {
         label: {robot: find_variant(part, row).name for robot, row in by_robot.items()} for label, by_robot in columns.items()
     }
-    scene = _median_scene(names, rows, videos)
+    scene = _median_scene(names, scores.rows, videos)
     if scene is None:
         return None
     task, seed, robots = scene
     labels = [label for label, by_robot in names.items() if all((by_robot[r], task, seed, r) in videos for r in robots)]
-    shown = {r: [read_rollout_video(videos[names[label][r], task, seed, r]) for label in labels] for r in robots}
-    moment = min(len(video) for row in shown.values() for video in row) - 1
-    sheet = []
+    shown = []
     for robot in robots:
-        truth = read_video(episode_folder(data, task, seed, robot) / "rgb.mkv")[moment]
-        sheet.append([truth, *(_fitted(video[moment], truth) for video in shown[robot])])
+        truth = read_video(episode_folder(data, task, seed, robot) / "rgb.mkv")
+        predicted = [read_rollout_video(videos[names[label][robot], task, seed, robot]) for label in labels]
+        shown.append([truth, *(pictures.as_graded(video, truth, scores.frame_zero) for video in predicted)])
+    moment = min(len(video) for row in shown for video in row) - 1
     caption = f"{task.replace('_', ' ')}, seed {seed}, frame {moment}: the scene whose LPIPS is the median of those shown."
-    image = pictures.png(pictures.sheet(sheet))
+    image = pictures.png(pictures.sheet([[video[moment] for video in row] for row in shown]))
     return Strip(image, caption, ["observed", *labels], [SHORT_ROBOTS[robot] for robot in robots])
 
 
@@ -110,10 +109,3 @@ def _median_scene(
     middle = full.iloc[len(full) // 2]
     there = chosen[(chosen["task"] == middle["task"]) & (chosen["seed"] == middle["seed"])]
     return str(middle["task"]), int(middle["seed"]), [robot for robot in HELD_OUT_ROBOTS if robot in set(there["robot"])]
-
-
-def _fitted(frame: np.ndarray, like: np.ndarray) -> np.ndarray:
-    """A frame at another's size; models may predict at their own."""
-    if frame.shape == like.shape:
-        return frame
-    return cv2.resize(frame, (like.shape[1], like.shape[0]), interpolation=cv2.INTER_AREA)

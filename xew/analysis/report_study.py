@@ -95,7 +95,7 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
     """
     paper = read_paper()
     known = read_distances(distances) if distances else printed_distances(paper)
-    strips = study_strips(scores.rows, data, rollouts) if data and rollouts else {}
+    strips = study_strips(scores, data, rollouts) if data and rollouts else {}
     grades = StudyGrades(scores.rows, scores.metrics, {axis: known.of(axis) for axis in AXES}, known.measured)
     printed = PaperGrades(paper, scores.metrics)
     planned = scores.attributes.get("study", {}).get("variants", {})
@@ -262,10 +262,7 @@ def _part_section(content: Content, part: str) -> str:
 
 
 def _method_section(content: Content, scores: Scores) -> str:
-    attributes = scores.attributes
-    made = {"protocol": str(scores.protocol), "scenes graded": str(len(scores.rows[["task", "seed"]].drop_duplicates()))}
-    made |= {f"estimator of {name}": str(used) for name, used in attributes.get("estimators", {}).items()}
-    made |= {"frame 0": str(attributes["frame_zero"])} if "frame_zero" in attributes else {}
+    made = {"scenes graded": str(len(scores.rows[["task", "seed"]].drop_duplicates())), **scores.measured_by}
     definitions = {METRIC_TITLES.get(metric.name, metric.name): metric.reference for metric in scores.metrics}
     return page.section(
         "How it was measured",

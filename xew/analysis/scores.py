@@ -66,6 +66,18 @@ class Scores:
         return self.attributes.get("versions", {})
 
     @property
+    def frame_zero(self) -> str:
+        """What became of frame 0: given (and not scored), absent from the videos, or predicted."""
+        return self.attributes.get("frame_zero", "given")
+
+    @property
+    def measured_by(self) -> dict[str, str]:
+        """What a reader has to know of how it was graded, in words."""
+        estimators = {f"estimator of {name}": str(used) for name, used in self.attributes.get("estimators", {}).items()}
+        allowed = ", ".join(self.attributes.get("allowed", ())) or "nothing"
+        return {"protocol": str(self.protocol), **estimators, "frame 0": self.frame_zero, "changed to fit": allowed}
+
+    @property
     def of_study(self) -> bool:
         """Does the table hold several variants, or one ordinary run?"""
         return VARIANT in self.rows
