@@ -165,6 +165,14 @@ def test_what_does_not_exist_is_told_with_the_way_to_make_it(tmp_path: Path) -> 
         find_accepted(tmp_path)
 
 
+@pytest.mark.parametrize("inside", ["grab_roller", "grab_roller/0000003", "grab_roller/0000003/piper"])
+def test_a_part_of_a_data_set_is_told_from_an_empty_folder(inside: str, tmp_path: Path) -> None:
+    write_episode(tmp_path, Record("grab_roller", 3, "piper", False, "grasp"))
+    with pytest.raises(EpisodeError) as error:
+        find_accepted(tmp_path / inside)
+    assert str(error.value) == f"{tmp_path / inside} lies inside of a data set; name the whole of it: {tmp_path}."
+
+
 def cells(data: Path, seed: int, **successes: bool | None) -> None:
     """Write cells of one seed: True with an episode, False failed, None succeeded but without pictures."""
     for robot, success in successes.items():

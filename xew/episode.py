@@ -320,15 +320,24 @@ def find_records(data: Path) -> Iterator[tuple[Path, Record]]:
 def find_accepted(data: Path) -> list[tuple[Path, Record]]:
     """Episodes of seeds in which every robot tried has succeeded: the paired data set.
 
-    Raises EpisodeError if there is none, and names the command that makes them.
+    Raises EpisodeError if there is none, and says what to do.
     """
     cells = list(find_records(data))
     # Where somebody failed the others have no pictures, also if the run was stopped before it wrote who had failed.
     failed = {(record.task, record.seed) for _, record in cells if not record.success or not record.hashes}
     accepted = [(folder, record) for folder, record in cells if (record.task, record.seed) not in failed]
     if not accepted:
-        raise EpisodeError(f"no accepted episode under {data}; make some: python -m xew.sim_warp.generate --out {data}")
+        raise none_under(data, "accepted episode")
     return accepted
+
+
+def none_under(data: Path, what: str = "episode") -> EpisodeError:
+    """What is told of a folder without episodes: to make some or, if it lies inside of a data set, to name that."""
+    for levels, pattern in enumerate(("*/*/episode.json", "*/episode.json", "episode.json")):
+        if next(Path(data).glob(pattern), None):
+            root = Path(data).absolute().parents[levels]
+            return EpisodeError(f"{data} lies inside of a data set; name the whole of it: {root}.")
+    return EpisodeError(f"no {what} under {data}; make some: python -m xew.sim_warp.generate --out {data}")
 
 
 def remove_left_overs(data: Path) -> None:

@@ -1,14 +1,15 @@
 """The manifest: written from headers, read strictly, and obeyed by generate."""
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
-from xew.episode import EpisodeError, Record
+from xew.episode import EpisodeError, Record, write_episode
 from xew.protocol import TEST_SEED_START
 from xew.sim_warp.generate import Family
-from xew.sim_warp.manifest import PACKAGED, Manifest, manifest_of, read_manifest, to_json
+from xew.sim_warp.manifest import PACKAGED, Manifest, main, manifest_of, read_manifest, to_json
 
 ROBOTS = ("piper", "ur5_wsg")
 
@@ -96,3 +97,26 @@ def test_a_manifest_that_is_not_there_is_told(tmp_path: Path) -> None:
     with pytest.raises(EpisodeError, match="is no manifest of seeds"):
         read_manifest(tmp_path / "none.json")
     assert Manifest().failing("grab_roller", ROBOTS) == frozenset()
+
+
+def test_the_command_writes_where_it_is_told_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """And only there: the packaged manifest knows all tasks, a user's data set some."""
+    packaged, out = PACKAGED.read_bytes(), tmp_path / "new" / "seeds.json"
+    for record in RECORDS:
+        write_episode(tmp_path / "data", record)
+    monkeypatch.setattr(sys, "argv", ["manifest", str(tmp_path / "data"), "--out", str(out)])
+    main()
+    assert read_manifest(out) == manifest_of(RECORDS)
+    assert "grab_roller: 3 training and 1 test seeds, 2 rejected" in capsys.readouterr().out
+    for flags, told in (
+        ((str(tmp_path / "data"),), "--out"),
+        ((str(tmp_path / "none"), "--out", str(out)), "no episode under"),
+        ((str(tmp_path / "data"), "--out", str(tmp_path)), "Choose another file with --out."),
+    ):
+        monkeypatch.setattr(sys, "argv", ["manifest", *flags])
+        with pytest.raises(SystemExit) as left:
+            main()
+        assert left.value.code == 2 and told in capsys.readouterr().err
+    assert PACKAGED.read_bytes() == packaged

@@ -21,7 +21,18 @@ from PIL import Image
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, find_folders, read_record, read_states, read_video, verify_episode
+from xew.episode import (
+    HEIGHT,
+    WIDTH,
+    EpisodeError,
+    Record,
+    find_folders,
+    none_under,
+    read_record,
+    read_states,
+    read_video,
+    verify_episode,
+)
 from xew.sim_warp.generate import yield_table
 from xew.sim_warp.produce import add_videos, demand_plausible, render_again
 from xew.sim_warp.render import Renderer
@@ -96,7 +107,7 @@ def read_headers(data: Path) -> tuple[list[tuple[Path, Record]], list[str]]:
         except EpisodeError as error:
             damaged.append(str(error))
     if not cells and not damaged:
-        raise EpisodeError(f"no episode under {data}; make some: python -m xew.sim_warp.generate --out {data}")
+        raise none_under(data)
     return cells, damaged
 
 

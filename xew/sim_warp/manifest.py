@@ -21,7 +21,8 @@ import cattrs
 import tyro
 
 from xew.config import user_errors
-from xew.episode import EpisodeError, Record, find_records
+from xew.episode import EpisodeError, Record, find_records, none_under
+from xew.files import replacing
 from xew.protocol import TEST_SEED_START
 
 PACKAGED = Path(__file__).with_name("seeds.json")
@@ -149,7 +150,8 @@ class Args:
     """From which data to which file."""
 
     data: Annotated[Path, tyro.conf.Positional]
-    out: Path = PACKAGED
+    out: Path
+    """JSON file to write; name the packaged one only to replace what is known of all tasks."""
 
 
 @user_errors
@@ -157,9 +159,10 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     manifest = manifest_of([record for _, record in find_records(args.data)])
     if not manifest.tasks:
-        raise EpisodeError(f"no episode under {args.data}; make some: python -m xew.sim_warp.generate --out {args.data}")
+        raise none_under(args.data)
     try:
-        args.out.write_text(to_json(manifest))
+        with replacing(args.out) as file:
+            file.write_text(to_json(manifest))
     except OSError as error:
         raise EpisodeError(f"cannot write {args.out}: {error.strerror}. Choose another file with --out.") from error
     for task, seeds in manifest.tasks.items():
