@@ -12,7 +12,7 @@ from xew.metrics.evaluate import Args, main
 from xew.protocol import seed_split
 from xew.rollout import write_rollout
 
-TASKS, SEEDS, FRAMES = ("place_empty_cup", "open_laptop"), (0, 1_000_000, 1_000_001), 9
+TASKS, SEEDS, FRAMES = ("place_empty_cup", "open_laptop"), (0, 1_000_000, 1_000_001, 1_000_002), 9
 ROBOTS = ("aloha_agilex", "franka_panda", "piper")
 
 

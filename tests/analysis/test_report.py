@@ -93,7 +93,7 @@ def test_the_finding_comes_first_and_names_both_robots(report: Path) -> None:
     finding = re.search(r'<ul class="finding">(.*?)</ul>', text, re.DOTALL)
     assert finding and finding.start() < text.index("<table")
     for robot in ("Franka Panda", "Piper"):
-        assert f"{robot} (4 episodes): late · by one &lt;frame&gt; beats a frozen first frame on" in finding[1]
+        assert f"{robot} (6 episodes): late · by one &lt;frame&gt; beats a frozen first frame on" in finding[1]
     assert "distance from the truth (on seen robots" in finding[1]
 
 
@@ -106,9 +106,9 @@ def test_the_numbers_are_those_of_the_scores(report: Path, study: Study) -> None
         line = summary[(summary["robots"] == robot) & (summary["metric"] == "lpips") & (summary["model"] == "late")]
         assert line["mean"].item() == pytest.approx(mean, rel=1e-9)
         assert line["low"].item() <= mean <= line["high"].item()
-        assert line["episodes"].item() == line["expected"].item() == 4
+        assert line["episodes"].item() == line["expected"].item() == 6
         assert f">{mean:.3f}<" in text
-    assert "4 of 4 test episodes" in text and "Incomplete" not in text
+    assert "6 of 6 test episodes" in text and "Incomplete" not in text
 
 
 def test_markdown_and_figures_stand_beside_the_page(report: Path) -> None:
@@ -146,7 +146,7 @@ def test_a_report_shows_rollouts_of_another_size_that_begin_with_frame_1(study: 
     evaluate.main(evaluate.Args(*args, allow=("resize",), frame_zero="absent"))
     main(Args(tmp_path / "scores.parquet", study.data, (tmp_path / "rollouts",), tmp_path / "report"))
     strips = list((tmp_path / "report" / "figures").glob("rollouts__open_laptop_*.png"))
-    assert len(strips) == 2
+    assert len(strips) == 3
     text = (tmp_path / "report" / "index.html").read_text()
     assert "its videos leave out" in text and "<dt>changed to fit</dt><dd>resize</dd>" in text
     observed, predicted, _ = np.split(cv2.imread(str(strips[0]))[:, :320].astype(int), [244, 488])
@@ -167,9 +167,10 @@ def test_an_incomplete_table_says_so(study: Study, tmp_path: Path) -> None:
     piper = lambda rows: rows[~((rows["robot"] == "piper") & (rows["seed"] == 1_000_001))]  # noqa: E731
     main(Args(edit(study, tmp_path, piper), study.data, (study.rollouts,), tmp_path / "report"))
     text = (tmp_path / "report" / "index.html").read_text()
-    assert text.count("Incomplete: 2 of 4 test episodes are scored.") == 1
+    assert text.count("Incomplete: 4 of 6 test episodes are scored.") == 1
+    assert "Piper (4 episodes): late · by one &lt;frame&gt; cannot be told" in text and "Fewer than 6 scenes" in text
     for name in ("report.md", "tables/piper.tex"):
-        assert "Incomplete: 2 of 4 test episodes are scored." in (tmp_path / "report" / name).read_text()
+        assert "Incomplete: 4 of 6 test episodes are scored." in (tmp_path / "report" / name).read_text()
 
 
 def test_without_data_there_are_numbers_and_a_word_on_the_missing_pictures(study: Study, tmp_path: Path) -> None:

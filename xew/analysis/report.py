@@ -26,6 +26,7 @@ from tqdm import tqdm
 
 from xew.analysis import formats, page, paper_report, pictures, report_study
 from xew.analysis.charts import Chart, chart_files
+from xew.analysis.grades import MIN_SCENES
 from xew.analysis.paper import read_paper
 from xew.analysis.report_charts import run_chart
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, missing_cells, read_scores
@@ -162,8 +163,10 @@ def _expected(records: Sequence[Record], robots: Sequence[str]) -> int:
 def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> str:
     if not tables:
         return page.section("Robots never seen in training", page.note("No held-out robot has been graded yet."))
-    few = min(table.count for table in tables) < 10
-    caution = page.note("Fewer than ten episodes a robot: intervals and verdicts are rough.") if few else ""
+    few = min(table.count for table in tables)
+    caution = page.note("Fewer than ten episodes a robot: intervals and verdicts are rough.") if few < 10 else ""
+    if few < MIN_SCENES:
+        caution = page.note(f"Fewer than {MIN_SCENES} scenes: no intervals, and nothing is resolved.")
     return page.section(
         "Robots never seen in training",
         page.paragraph(
@@ -258,8 +261,8 @@ def _strips(scores: Scores, args: Args) -> list[Picture]:
     rows = scores.rows[(scores.rows["metric"] == STRIP_METRIC) & scores.rows["robot"].isin(args.held_out)]
     rows = rows[~rows["model"].isin([COPY, TRUTH])]
     chosen = [pair for _, group in rows.groupby(["robot", "model", "condition"]) for pair in _ranked(group)]
-    chosen = tqdm(chosen, desc="strips", unit="strip", disable=None)
-    return [_strip(row, word, rollouts, args.data, scores.frame_zero) for word, row in chosen]
+    shown = tqdm(chosen, desc="strips", unit="strip", disable=None)
+    return [_strip(row, word, rollouts, args.data, scores.frame_zero) for word, row in shown]
 
 
 def _ranked(group: pd.DataFrame) -> list[tuple[str, pd.Series]]:

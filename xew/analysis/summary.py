@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from xew.analysis.grades import LEVEL, interval, resample
+from xew.analysis.grades import LEVEL, MIN_SCENES, interval, resample
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores
 
 ROBOT_TITLES = {
@@ -35,7 +35,7 @@ METRIC_TITLES = {
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean over episodes and its bootstrap interval; the ends are NaN where there is one episode only."""
+    """A mean over episodes and its bootstrap interval; the ends are NaN where there are fewer than MIN_SCENES scenes."""
 
     mean: float
     low: float
@@ -98,7 +98,7 @@ def mean_interval(scores: pd.Series) -> Interval:
     """
     mean = resample(scores.unstack("robot").to_numpy(np.float64))
     assert mean is not None, "no episode"
-    if mean.scenes < 2:
+    if mean.scenes < MIN_SCENES:
         return Interval(mean.value, np.nan, np.nan, mean.count)
     if np.ptp(scores) == 0:
         return Interval(mean.value, mean.value, mean.value, mean.count)
@@ -109,10 +109,10 @@ def verdict(model: pd.Series, copy: pd.Series, higher_is_better: bool, floor: fl
     """Is a model better than the frozen first frame on the episodes that both have? Series are indexed as above.
 
     'unresolved' where the interval of the mean paired difference holds 0, where the difference is inside the estimators' noise
-    floor, or where there are fewer than two scenes.
+    floor, or where there are fewer than MIN_SCENES scenes.
     """
     difference = (model - copy).dropna() * (1 if higher_is_better else -1)
-    if len(difference.unstack("robot")) < 2:
+    if len(difference.unstack("robot")) < MIN_SCENES:
         return "unresolved"
     found = mean_interval(difference)
     if found.low > 0 and found.mean > floor:
@@ -196,6 +196,8 @@ def progress(table: RobotTable, row: Row, metric: str) -> float | None:
 
 
 def _compare(row: Row, metrics: Sequence[MetricInfo]) -> str:
+    if all(np.isnan(score.low) for score in row.scores.values()):
+        return f"cannot be told from a frozen first frame by fewer than {MIN_SCENES} scenes"
     parts = []
     for word, phrase in (("better", "beats"), ("worse", "falls behind"), ("unresolved", "cannot be told from")):
         names = [METRIC_TITLES.get(m.name, m.name) for m in metrics if row.verdicts.get(m.name) == word]
