@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import cv2
 import jax
 import numpy as np
 import pandas as pd
@@ -104,6 +105,7 @@ WRITTEN = {
 def main(args: Args) -> None:
     """Grade, write, and print what came out; or check a bundle."""
     compile_cache()
+    cv2.setNumThreads(1)  # episodes are shared out to threads; OpenCV's own would only get in their way
     if args.check is not None:
         check(args, args.check)
         return
