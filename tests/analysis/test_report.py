@@ -9,12 +9,14 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 
 from tests.analysis.browser import assert_readable, needs_chromium
 from tests.analysis.conftest import FRAMES, Study
 from xew.analysis import pictures
 from xew.analysis.report import Args, main
-from xew.analysis.scores import read_scores
+from xew.analysis.report_charts import run_chart
+from xew.analysis.scores import MetricInfo, read_scores
 from xew.episode import write_video
 from xew.metrics import evaluate
 from xew.rollout import find_rollouts, read_rollout_video
@@ -78,6 +80,16 @@ def test_the_page_is_well_formed_and_needs_no_network(report: Path) -> None:
 @needs_chromium
 def test_a_browser_shows_it_on_a_phone_and_a_desk_in_light_and_dark(report: Path) -> None:
     assert_readable(report / "index.html", images=3 * 2 + 1, charts=3 * 2)
+
+
+def test_curves_go_from_frame_to_frame_though_the_first_episode_begins_late() -> None:
+    frames = [(1_000_000, 3), (1_000_000, 4), (1_000_001, 1), (1_000_001, 2), (1_000_001, 3), (1_000_001, 4)]
+    curves = pd.DataFrame(frames, columns=["seed", "frame"]).assign(
+        model="m", condition="", task="lift_pot", robot="piper", metric="lpips", value=0.5
+    )
+    axes = Figure().subplots()
+    run_chart(curves, [MetricInfo("lpips", "visual", "", False, 0, None, "")], ["piper"]).panels[0].draw(axes)
+    assert list(axes.lines[0].get_xdata()) == [1, 2, 3, 4]
 
 
 def test_each_held_out_robot_has_its_own_table_and_the_seen_are_pooled(report: Path) -> None:
@@ -217,6 +229,8 @@ def test_missing_inputs_name_the_command_that_makes_them(study: Study, tmp_path:
         (Args(study.scores, tmp_path / "void"), "xew.sim_warp.generate"),
         (Args(study.scores, study.data, (tmp_path / "void",)), "xew.model.rollout"),
         (Args(study.scores, held_out=("panda",)), "franka_panda"),
+        (Args(study.scores, distances=tmp_path), "--distances is for the report of a study"),
+        (Args(distances=tmp_path, paper=True), "leave out scores"),
     ):
         with pytest.raises(SystemExit):
             main(args)

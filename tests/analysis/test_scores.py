@@ -186,6 +186,9 @@ def test_conflicts_between_tables_are_named(tmp_path: Path) -> None:
     a = written(tmp_path / "a.parquet", rows)
     with pytest.raises(ConfigError, match="more than once, 16 rows: a flow open_laptop"):
         merge_scores([("a", a), ("a", a)])
+    other = written(tmp_path / "other.parquet", rows[rows["model"] == "flow"].assign(condition="other"))
+    with pytest.raises(ConfigError, match="more than once, 16 rows: a flow open_laptop"):
+        merge_scores([("a", a), ("a", other)])
     truth_of_other_data = rows.assign(content=rows["content"].str.replace("ground_truth lift_pot piper", "other"))
     with pytest.raises(ConfigError, match="more than once, 4 rows: ground_truth lift_pot 1000000 piper lpips"):
         merge_scores([("a", a), ("b", written(tmp_path / "b.parquet", truth_of_other_data))])

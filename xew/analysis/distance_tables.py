@@ -115,7 +115,7 @@ def distance_tables(distances: Distances) -> list[Table]:
             distances,
             "distances",
             "Distance of each robot to the other four",
-            f"Held-out robots below the line.{spread}{origin}",
+            f"{spread}{origin}".strip(),
             {axis: AXIS_TITLES[axis] for axis in distances.axes},
         ),
         _robot_table(

@@ -94,13 +94,17 @@ def main(args: Args) -> None:
 
 
 def _report_paper(args: Args) -> None:
-    if args.scores or args.data or args.rollouts:
-        raise ConfigError("--paper reports on the paper's own figures; leave out scores, --data and --rollouts.")
+    if args.scores or args.data or args.rollouts or args.distances:
+        raise ConfigError("--paper reports on the paper's own figures; leave out scores, --data, --rollouts and --distances.")
     report = paper_report.build(read_paper(), _footer({}))
     _write(args.out, report.html, (report.markdown, report.files), report.summary)
 
 
 def _report_study(args: Args, scores: Scores) -> None:
+    if args.held_out != HELD_OUT_ROBOTS:
+        raise ConfigError(
+            f"--held-out is for one run; {args.scores} is a study's table, whose variants say whom they have seen."
+        )
     if args.data and not any(find_records(args.data)):
         raise ConfigError(f"{args.data} holds no episode; make some: python -m xew.sim_warp.generate --out {args.data}")
     report = report_study.build(scores, args.data, args.rollouts, args.distances, _footer(scores.versions))
@@ -108,6 +112,8 @@ def _report_study(args: Args, scores: Scores) -> None:
 
 
 def _report_scores(args: Args, scores: Scores) -> None:
+    if args.distances:
+        raise ConfigError(f"--distances is for the report of a study, and {args.scores} is the table of one run; leave it out.")
     own = [robot for robot in dict.fromkeys(scores.rows["robot"]) if robot not in ROBOT_NAMES]
     for robot in args.held_out:
         if robot not in (*ROBOT_NAMES, *own):

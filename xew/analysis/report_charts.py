@@ -220,6 +220,7 @@ def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Seque
         lines = []
         for style in styles:
             line = data[(data["metric"] == metric.name) & (data["robot"] == robot) & (data["row"] == style.label)]
+            line = line.sort_values("frame")  # the first episode may lack early frames
             if len(line):
                 band = line[["low", "high"]].to_numpy() if style.colour != SOFT else None
                 lines.append((style, line["frame"].to_numpy(), line["mean"].to_numpy(), band))

@@ -212,7 +212,9 @@ def _described(path: Path, described: Mapping[str, Mapping[str, Any]]) -> tuple[
 
 def _wrong_cells(rows: pd.DataFrame, metrics: Sequence[MetricInfo], robots: set[str]) -> dict[str, pd.DataFrame]:
     """Rows that cannot be averaged over, by what is wrong with them."""
-    key = [column for column in (VARIANT, *KEY, "metric") if column in rows]
+    # Of a variant, model and condition are no more than names; two of them would be two scores of one cell.
+    named = rows.assign(**{VARIANT: rows[VARIANT].where(rows[VARIANT] != "", rows["model"])}) if VARIANT in rows else rows
+    key = [*([VARIANT, *EPISODE] if VARIANT in rows else KEY), "metric"]
     value = pd.to_numeric(rows["value"], errors="coerce")
     low = rows["metric"].map({metric.name: -np.inf if metric.low is None else metric.low for metric in metrics})
     high = rows["metric"].map({metric.name: np.inf if metric.high is None else metric.high for metric in metrics})
@@ -223,7 +225,7 @@ def _wrong_cells(rows: pd.DataFrame, metrics: Sequence[MetricInfo], robots: set[
         "the metric is not described": ~rows["metric"].isin([metric.name for metric in metrics]),
         "the value is NaN": value.isna(),
         "the value is outside of the metric's range": out | np.isinf(value),
-        "a cell occurs more than once": rows.duplicated(key, keep=False),
+        "a cell occurs more than once": named.duplicated(key, keep=False),
         "an episode is graded over different numbers of frames": rows.groupby(EPISODE)["frames"].transform("nunique") > 1,
     }
     return {reason: rows[mask] for reason, mask in found.items() if mask.any()}
