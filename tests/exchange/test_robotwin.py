@@ -13,12 +13,14 @@ from xew.episode import (
     HEIGHT,
     WIDTH,
     EpisodeError,
+    Record,
     demand_known,
     find_accepted,
     read_record,
     read_states,
     read_video,
     verify_episode,
+    write_episode,
 )
 from xew.exchange import robotwin
 from xew.exchange.hdf5 import decode_picture, read_robotwin, tool_center
@@ -123,6 +125,16 @@ def test_two_configurations_of_a_task_are_not_taken_for_one(tmp_path: Path) -> N
     assert refused[0].startswith(f"{randomized}: ") and "holds another recording of that task, seed and robot" in refused[0]
     records, refused = import_all([randomized], Args(tmp_path, tmp_path / "out", task="place_cup_randomized"))
     assert not refused and records[0].task == "place_cup_randomized"
+
+
+def test_a_seed_that_was_simulated_is_another_scene(tmp_path: Path) -> None:
+    path = made.write_legacy(tmp_path / LEGACY)
+    write_episode(tmp_path / "out", Record("place_cup", 3, "piper", False, "plan"))
+    records, refused = import_all([path], Args(tmp_path, tmp_path / "out"))
+    assert not records and "was simulated here; RoboTwin's seed 3 is another scene" in refused[0]
+    assert len(list((tmp_path / "out" / "place_cup").glob("*/*"))) == 1
+    records, refused = import_all([path], Args(tmp_path, tmp_path / "out", task="place_cup_robotwin"))
+    assert len(records) == 1 and not refused
 
 
 def test_files_may_be_named_from_their_own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

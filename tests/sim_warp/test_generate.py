@@ -13,7 +13,7 @@ import pytest
 
 from tests.sim_warp.small import SLOW, TASK
 from xew.config import ConfigError
-from xew.episode import EpisodeError, Record, episode_folder, find_accepted, find_records, verify_episode
+from xew.episode import EpisodeError, Record, episode_folder, find_accepted, find_records, verify_episode, write_episode
 from xew.protocol import TEST_SEED_START
 from xew.sim_warp import generate as command
 from xew.sim_warp.generate import Args, Family, generate, main, yield_table
@@ -179,6 +179,15 @@ def test_a_damaged_header_is_told_before_any_work(
     shutil.rmtree(broken.parent)
     broken.parent.with_name("franka_panda").rename(broken.parent)
     assert "move or delete it" in refused(monkeypatch, capsys, *FLAGS, "--out", str(out))
+
+
+def test_an_imported_episode_does_not_pass_for_a_robot_of_the_same_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    record = Record(TASK, 0, "piper_robotwin", True, hashes={"rgb": "0"}, source="elsewhere")
+    folder = write_episode(tmp_path, record)
+    line = refused(monkeypatch, capsys, *FLAGS, "--out", str(tmp_path))
+    assert line.startswith(f"error: {folder} was imported (elsewhere)") and line.endswith("Choose another --out.")
 
 
 # --- Families: which seeds are tried.

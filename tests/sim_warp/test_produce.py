@@ -133,6 +133,20 @@ def test_accepted_states_are_held_to_what_is_plausible(data: Path, tmp_path: Pat
         demand_plausible(write_episode(tmp_path, record, sunk))
 
 
+def test_an_episode_of_a_task_that_has_changed_is_told(data: Path, renderer: Renderer, tmp_path: Path) -> None:
+    """It has another number of objects than its seed gives now."""
+    folder, record = find_accepted(data)[0]
+    states = read_states(folder)
+    twice = {name: np.repeat(getattr(states, name), 2, axis=1) for name in ("object_pose", "object_joint", "penetration")}
+    older = replace(record, object_names=("block", "mat"))
+    changed = write_episode(tmp_path, older, replace(states, contact=np.repeat(states.contact, 2, axis=2), **twice))
+    told = "has the objects block, mat, .* makes block of its seed now: the task has changed"
+    with pytest.raises(EpisodeError, match=told):
+        demand_plausible(changed)
+    with pytest.raises(EpisodeError, match=told):
+        render_again(changed, renderer)
+
+
 def test_an_episode_without_videos_gets_them_on_demand(data: Path, renderer: Renderer, tmp_path: Path) -> None:
     record = produce(JOBS[:1], tmp_path, renderer, videos=False)[0][0]
     folder, full = (

@@ -94,6 +94,12 @@ def import_episode(path: Path, args: Args) -> Record:
                 "into another --out."
             )
         return read_record(folder)
+    for beside in folder.parent.glob("[!.]*/episode.json"):
+        if not read_record(beside.parent).source:
+            raise EpisodeError(
+                f"{path}: {beside.parent} was simulated here; RoboTwin's seed {seed} is another scene. Import it as another "
+                "--task or into another --out."
+            )
     states, names, video = _seen(robot, action, recorded)
     record = Record(
         task=task,

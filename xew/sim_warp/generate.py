@@ -221,6 +221,11 @@ def _read_existing(families: list[Family], args: Args) -> None:
             if record.task == family.task and same_side:
                 if folder != episode_folder(out, record.task, record.seed, record.robot):
                     raise EpisodeError(f"{folder} holds {record.task}/{record.seed}/{record.robot}; move or delete it.")
+                if record.source:
+                    raise EpisodeError(
+                        f"{folder} was imported ({record.source}): its seed is another scene than that of {record.task} here. "
+                        "Choose another --out."
+                    )
                 family.add(record)
 
 

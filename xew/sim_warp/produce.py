@@ -292,13 +292,22 @@ def add_videos(folder: Path, renderer: Renderer) -> None:
 def demand_plausible(folder: Path) -> None:
     """Raises EpisodeError if an accepted episode's states hold what could not have happened (plausibility.py)."""
     record, states = read_record(folder), read_states(folder)
-    task = get_task(record.task)
-    scene = task.sample(scene_rng(record.task, record.seed), record.seed)
-    problem = implausible(
-        scene, task.plan(scene).path().holds, states.object_pose, states.penetration, states.tool_pose, record.frame_rate
-    )
+    scene = _scene_again(folder, record)
+    holds = get_task(record.task).plan(scene).path().holds
+    problem = implausible(scene, holds, states.object_pose, states.penetration, states.tool_pose, record.frame_rate)
     if problem:
         raise EpisodeError(f"{folder}: {problem}; delete it and run generate again.")
+
+
+def _scene_again(folder: Path, record: Record) -> Scene:
+    """The scene of an episode. Raises EpisodeError if its task has other objects now."""
+    scene = get_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
+    if scene.names != record.object_names:
+        raise EpisodeError(
+            f"{folder} has the objects {', '.join(record.object_names)}, {record.task} makes {', '.join(scene.names)} of its "
+            "seed now: the task has changed. Use the xew that made the episode, or delete it and run generate again."
+        )
+    return scene
 
 
 def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarray]:
@@ -314,7 +323,7 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
     use_robots_of(folder.absolute().parents[2])
     record, states = read_record(folder), read_states(folder)
     robot = get_robot(record.robot)
-    scene = get_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
+    scene = _scene_again(folder, record)
     view = observe(renderer, [recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)])[0]
     render = command_renders([(record.robot, states.action)], renderer=renderer)[0]
     again = replace(states, keypoints=view.keypoints, keypoint_visible=view.keypoint_visible, robot_mask=view.robot_mask)
