@@ -123,9 +123,12 @@ def test_pictures_are_drawn(made: Path, tmp_path: Path, inspect: Inspect) -> Non
     assert {f"{TASK}_0.png", *(f"{TASK}_0_{robot}.png" for robot in ROBOTS)} <= names
     assert not any(name.startswith(f"{TASK}_1") for name in names), "the rejected seed has no pictures"
     sheet = cv2.imread(str(tmp_path / "sheets" / f"{TASK}_0.png"))
-    assert sheet.shape == (len(ROBOTS) * (240 + GAP), len(SHEET_TIMES) * (320 + GAP), 3)
+    assert sheet.shape == (LABEL_HEIGHT + len(ROBOTS) * (240 + GAP), LABEL_WIDTH + len(SHEET_TIMES) * (320 + GAP), 3)
     folders = [episode_folder(made, TASK, 0, robot) for robot in ROBOTS]
-    np.testing.assert_array_equal(sheet[..., ::-1], contact_sheet(folders))
+    np.testing.assert_array_equal(sheet[..., ::-1], contact_sheet([(folder, read_record(folder)) for folder in folders]))
+    last = read_video(folders[1] / "rgb.mkv")[-1]
+    np.testing.assert_array_equal(sheet[-240 - GAP : -GAP, -320 - GAP : -GAP, ::-1], last)
+    assert (sheet[:LABEL_HEIGHT] < 128).any() and (sheet[LABEL_HEIGHT:, :LABEL_WIDTH] < 128).any(), "instruction and names"
     assert strip(folders[0]).shape == (2 * (240 + GAP), STRIP_FRAMES * (320 + GAP), 3)
 
 

@@ -49,7 +49,7 @@ GAP = 4
 AT_WORK = 0.6
 """How far an episode has gone when the hands are at work."""
 LABEL_WIDTH, LABEL_HEIGHT, TEXT_SCALE = 96, 24, 0.42
-"""Of the names in a grid [pixels], and of their letters."""
+"""Of the names in a grid or sheet [pixels], and of their letters."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def draw(cells: list[tuple[Path, Record]], out: Path, seeds: int) -> None:
     _make_folder(out, "--pictures")
     for task, of_task in tqdm(by_task.items(), desc="drawing", unit="task"):
         for seed in sorted(of_task)[:seeds]:
-            save_png(out / f"{task}_{seed}.png", contact_sheet([folder for folder, _ in of_task[seed]]))
+            save_png(out / f"{task}_{seed}.png", contact_sheet(of_task[seed]))
             for folder, record in of_task[seed]:
                 save_png(out / f"{task}_{seed}_{record.robot}.png", strip(folder))
 
@@ -242,13 +242,17 @@ def _half(image: np.ndarray) -> np.ndarray:
     return cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
 
 
-def contact_sheet(folders: list[Path]) -> np.ndarray:
-    """Episodes one under the other, each at its start, middle and end: uint8 [h w 3]."""
+def contact_sheet(cells: list[tuple[Path, Record]]) -> np.ndarray:
+    """A seed's robots one under the other by name, each at its start, middle and end, under the instruction: uint8 [h w 3]."""
     rows = []
-    for folder in folders:
+    for folder, _ in cells:
         video = read_video(folder / "rgb.mkv")
         rows.append([video[round(time * (len(video) - 1))] for time in SHEET_TIMES])
-    return tiled(rows)
+    names = np.concatenate([_label(record.robot, LABEL_WIDTH, HEIGHT + GAP) for _, record in cells])
+    pictures = np.concatenate([names, tiled(rows)], 1)
+    record = cells[0][1]
+    told = f"{record.task}, seed {record.seed}: {record.instruction}"
+    return np.concatenate([_label(told, pictures.shape[1]), pictures])
 
 
 def strip(folder: Path) -> np.ndarray:
