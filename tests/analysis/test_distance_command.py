@@ -81,7 +81,7 @@ def test_one_seed_has_no_spread(tmp_path: Path, capsys: pytest.CaptureFixture) -
     main(Args(out=tmp_path, seeds=1, looks=False, workers=1))
     assert (pd.read_csv(tmp_path / "distances.csv")["spread"] == 0).all()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["distances.csv", "robots.csv"]
-    assert "standard deviation" not in capsys.readouterr().out
+    assert "±" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -76,6 +76,12 @@ def test_a_wrong_cell_is_named(message: str, tmp_path: Path) -> None:
     assert message in str(error.value) and "--overwrite" in str(error.value)
 
 
+def test_nobody_is_told_to_delete_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="is a folder; name a score table") as error:
+        read_scores(tmp_path)
+    assert "delete it" not in str(error.value)
+
+
 def test_all_that_is_wrong_is_named_at_once(tmp_path: Path) -> None:
     rows = changed(changed(graded(), 0, robot="my_robot"), 5, value=float("nan"))
     with pytest.raises(ConfigError) as error:

@@ -83,7 +83,8 @@ def test_a_subset_keeps_what_it_starts_from(study: Study) -> None:
     [
         (["--parts", "ladders"], "did you mean 'ladder'"),
         (["--robots", "pipr"], "did you mean 'piper'"),
-        (["--variants", "nothing"], "no variant"),
+        (["--variants", "loeo_*", "leo_*"], "variants 'leo_\\*' matches none of the parts"),
+        (["--variants", "few_shot-piper-3"], "no variant"),
         (["--train-seeds", "0"], "expected at least 1 and 1"),
         (["--machine.workers", "0"], "at least 1"),
     ],

@@ -172,6 +172,7 @@ def scatter(axes: Axes, distance: np.ndarray, score: np.ndarray, robots: Sequenc
         side, shift = ("right", -7) if x > ends.mean() else ("left", 7)
         text = axes.annotate(robot, (x, y), xytext=(shift, 0), textcoords="offset points", ha=side, va="center")
         text.set_path_effects([patheffects.withStroke(linewidth=3, foreground=GROUND)])
+    axes.locator_params(axis="x", nbins=5)  # more run into one another where they have three decimals
     axes.set_xlabel(xlabel)
     axes.set_ylabel(ylabel)
 

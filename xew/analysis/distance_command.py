@@ -87,7 +87,7 @@ def main(args: Args) -> None:
     pairs, singles = distance_frame(axes), robot_frame(features, axes, floor)
     for title, axis in axes.items():
         print(f"\n{TITLES[title].format(args.perceptual)}\n{matrix_text(pairs[pairs['axis'] == title], axis.robots)}")
-    print(f"\nRobots\n{robot_text(singles)}\n\n{_legend(args.seeds)}")
+    print(f"\nRobots\n{robot_text(singles)}\n\n{_legend(args.seeds, args.looks)}")
     for name, frame in (("robots", singles), ("distances", pairs)):  # where the second stands, both do
         path = args.out / f"{name}.csv"
         _write(frame, path)
@@ -167,11 +167,12 @@ def _text(row: Mapping[Hashable, Any]) -> str:
     return text if np.isnan(row["published"]) else f"{text} ({row['published']:.{digits}f})"
 
 
-def _legend(seeds: int) -> str:
-    drawn = f"the standard deviation of one draw over {seeds} seeds (kinematic) and " if seeds > 1 else ""
+def _legend(seeds: int, looks: bool) -> str:
+    spreads = [f"the standard deviation of one draw over {seeds} seeds (kinematic)"] * (seeds > 1)
+    spreads += ["the jackknife's standard error over nine views (appearance, perceptual)"] * looks
+    said = f"± is {' and '.join(spreads)}. " if spreads else ""
     return (
-        f"± is {drawn}the jackknife's standard error over nine views (appearance). "
-        "floor: kinematic distance of two draws of the same robot. "
+        f"{said}floor: kinematic distance of two draws of the same robot. "
         "In brackets: the paper's, from its own models of the robots and its own renders."
     )
 

@@ -193,6 +193,8 @@ def describe_cells(cells: pd.DataFrame, most: int = LISTED) -> str:
 
 
 def _read(path: Path, command: str) -> pd.DataFrame:
+    if path.is_dir():
+        raise ConfigError(f"{path} is a folder; name a score table, or make one: {EVALUATE.format(path='scores.parquet')}")
     try:
         return pd.read_parquet(path)
     except FileNotFoundError as error:

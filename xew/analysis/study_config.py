@@ -157,6 +157,13 @@ def load_study(path: Path, overrides: Iterable[str] = ()) -> Study:
             raise ConfigError(
                 f"{path}: unknown robot {robot!r};{suggestion(robot, ROBOT_NAMES)} known: {', '.join(ROBOT_NAMES)}"
             )
+    names = [variant.name for part in study.parts for variant in PARTS[part]]
+    for pattern in study.variants:
+        if not fnmatch.filter(names, pattern):
+            raise ConfigError(
+                f"{path}: variants {pattern!r} matches none of the parts {', '.join(study.parts)};{suggestion(pattern, names)} "
+                f"there are {', '.join(dict.fromkeys(names))}."
+            )
     if not study.planned:
         raise ConfigError(f"{path}: no variant of the parts {', '.join(study.parts)} is left; widen variants, robots or shots.")
     shots = max((variant.shots for variant in study.planned), default=0)
