@@ -13,6 +13,7 @@ from tests.synthetic import write_synthetic_data
 from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, States, find_accepted, read_states, read_video, write_episode
 from xew.exchange import lerobot
 from xew.exchange.lerobot import Args, _color_statistics, color_counts, export, main
+from xew.protocol import TEST_SEED_START
 
 TASKS, SEEDS, ROBOTS = ("place_empty_cup", "beat_block_hammer"), (0, 1), ("piper", "arx_x5")
 
@@ -158,6 +159,17 @@ def test_mistakes_are_told_in_a_line(
     with pytest.raises(SystemExit) as left:
         main()
     assert left.value.code == 2 and told in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_training_seeds_go_without_test_seeds(tmp_path: Path) -> None:
+    write_synthetic_data(tmp_path / "data", TASKS[:1], (0, TEST_SEED_START), ROBOTS[:1])
+    for split, seed in (("train", 0), ("test", TEST_SEED_START)):
+        out = tmp_path / split
+        assert export(Args(tmp_path / "data", out, split=split)) == (1, [])
+        assert parquet.read_table(out / "meta/episodes")["xew/seed"].to_pylist() == [seed]
+    write_synthetic_data(tmp_path / "one", TASKS[:1], (0,), ROBOTS[:1])
+    with pytest.raises(EpisodeError, match="has no episode of these robots, tasks and seeds"):
+        export(Args(tmp_path / "one", tmp_path / "none", split="test"))
 
 
 def test_nothing_half_written_remains(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ Writes DIR: meta/ (info, tasks, episodes, statistics), data/ (parquet) and video
 The table of episodes says of each its robot, task and seed (columns xew/…). What an imported episode does not know is left out
 of the whole set. Frames are 0.06 s apart, so `fps` is 50 / 3; video is lossy, everything else is exact.
 
-Command: python -m xew.exchange.lerobot DATA --out DIR [--robots … --tasks … --robot-video]
+Command: python -m xew.exchange.lerobot DATA --out DIR [--robots … --tasks … --split train --robot-video]
 """
 
 import json
@@ -19,7 +19,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import av
 import numpy as np
@@ -41,6 +41,7 @@ from xew.episode import (
     read_states,
     read_video,
 )
+from xew.protocol import seed_split
 
 VERSION = "v3.0"
 RATE = Fraction(50, 3)
@@ -75,6 +76,8 @@ class Args:
     """Default: all in the data."""
     tasks: tuple[str, ...] = ()
     """Default: all in the data."""
+    split: Literal["train", "test"] | None = None
+    """Only training seeds, or only test seeds; default: both. Who trains on the set and grades on ours exports the first."""
     robot_video: bool = False
     """Also the robot alone, as observation.images.robot."""
 
@@ -129,10 +132,12 @@ def _chosen(args: Args) -> list[tuple[Path, Record]]:
     found = [
         (folder, record)
         for folder, record in accepted
-        if (not args.robots or record.robot in args.robots) and (not args.tasks or record.task in args.tasks)
+        if (not args.robots or record.robot in args.robots)
+        and (not args.tasks or record.task in args.tasks)
+        and args.split in (None, seed_split(record.seed))
     ]
     if not found:
-        raise EpisodeError(f"{args.data} has no episode of these robots and tasks; name fewer.")
+        raise EpisodeError(f"{args.data} has no episode of these robots, tasks and seeds; name fewer.")
     return found
 
 
