@@ -44,6 +44,7 @@ def test_the_papers_figures_bear_out_what_it_claims_but_for_what_rounding_hides(
     values = {answer.label: answer.value for answer in found["flow gains much"].answers}
     assert [round(100 * value) for value in values.values()] == [29, 57, 25, 116]
     assert found["catastrophic forgetting"].answers[0].value == pytest.approx((0.073 - 0.043) / 0.043)
+    assert found["views saturate"].answers[1].numbers.startswith("0.0\u00a0%")  # no zero is negative
     assert found["looks predict"].answers[0].value == pytest.approx(0.8176, abs=1e-3)
     failing = {a.label for a in found["pixel systems lead in all"].answers if a.verdict == "fails"}
     assert failing == {"EnerVerse-AC over Ctrl-World, Franka PCK", "EnerVerse-AC over Ctrl-World, Franka Object error"}

@@ -199,7 +199,7 @@ def certainty_table(grades: Grades, distances: Distances, paper: Paper | None) -
 
 
 def signed(value: float) -> str:
-    return f"{value:+.3f}".replace("-", "−")
+    return f"{value:+z.3f}".replace("-", "−")
 
 
 def _loeo_scores(grades: Grades, metric: str) -> list[float] | None:

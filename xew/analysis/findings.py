@@ -190,11 +190,11 @@ def _answer(comparison: Comparison, level: float) -> Answer:
 
 def _percent(value: float) -> str:
     digits = 1 if abs(value) < 0.0995 else 0
-    return f"{100 * value:.{digits}f}\u00a0%".replace("-", "−")
+    return f"{100 * value:z.{digits}f}\u00a0%".replace("-", "−")
 
 
 def _plain(value: float) -> str:
-    return f"{value:.3f}".replace("-", "−")
+    return f"{value:z.3f}".replace("-", "−")
 
 
 def findings_frame(findings: Sequence[Finding], of: str) -> pd.DataFrame:

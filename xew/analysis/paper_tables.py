@@ -244,7 +244,7 @@ def _row_title(part: str, key: str, robot: str) -> str:
 
 
 def percent(value: float, digits: int = 1) -> str:
-    return f"{value:+.{digits}f} %".replace("-", "−")
+    return f"{value:+z.{digits}f} %".replace("-", "−")
 
 
 def robot_table(paper: Paper, means: Sequence[Cell]) -> Table:

@@ -195,7 +195,7 @@ def _distance_sentence(grades: Grades, distances: Distances) -> Iterator[str]:
 
 
 def _change(share: float) -> str:
-    return f"{100 * share:+.0f}\u00a0%".replace("-", "−")
+    return f"{100 * share:+z.0f}\u00a0%".replace("-", "−")
 
 
 def _gain(grades: Grades, part: str, row: str, base: str, robot: str) -> float | None:
