@@ -1,5 +1,6 @@
 """Conditions are made of commands alone, by structure and by trial."""
 
+import os
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -23,8 +24,10 @@ from xew.model.conditions import (
     tool_deltas,
     tool_poses,
 )
+from xew.model.latents import episode_command
 from xew.model.scales import apply_scales, fit_scales, read_scales, save_scales
 from xew.protocol import ACTION_DIM, ROBOT_NAMES
+from xew.sim_warp.robots.own import FOLDERS
 
 STORED = [condition for condition in (ACTIONS["joints"], CONDITIONS["robot_render"]) if isinstance(condition, Condition)]
 SYSTEMS = {name: entry for name, entry in ACTIONS.items() if isinstance(entry, tuple)}
@@ -40,6 +43,15 @@ def test_a_command_holds_nothing_measured() -> None:
     """`rendered` is the video at `render_path`, at hand or rendered anew from the commands (pixels.py)."""
     named = {"robot", "action", "intrinsics", "extrinsics", "render_path", "rendered"}
     assert {field.name for field in fields(Command)} == named
+
+
+def test_robots_of_ones_own_are_those_of_the_data_set_of_the_episode(
+    episode: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A rollout's data need not be those of its run."""
+    monkeypatch.setenv(FOLDERS, "")
+    episode_command(episode, read_record(episode))
+    assert os.environ[FOLDERS].split(os.pathsep)[0] == str((tmp_path / "robots").resolve())
 
 
 @pytest.mark.parametrize("condition", [*STORED, *NUMBERS], ids=lambda condition: condition.name)

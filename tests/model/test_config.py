@@ -105,6 +105,37 @@ def test_pick_suggests_and_imports() -> None:
         config.pick(registry, "math:sin", "action")
 
 
+CONDITIONS_OF_TEST = """
+from xew.model.conditions import Condition, joints, robot_render
+
+SYSTEM = (Condition("still", "embodiment", robot_render), Condition("joints", "joints", joints))
+LOST = Condition("lost", "embodimnt", robot_render)
+"""
+
+
+@pytest.mark.parametrize(
+    ("action", "said"),
+    [
+        ("SYSTEM", "still and robot_render both feed embodiment"),
+        ("LOST", "the condition lost feeds 'embodimnt'; conditions feed action, embodiment"),
+    ],
+)
+def test_conditions_that_would_not_reach_the_network_are_told(
+    action: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "conditions_of_test.py").write_text(CONDITIONS_OF_TEST)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    chosen = ["--model.action", f"conditions_of_test:{action}"]
+    with pytest.raises(ConfigError, match=said):
+        load_experiment(MODEL_CONFIGS[0], chosen)
+    if action == "SYSTEM":
+        alone = load_experiment(MODEL_CONFIGS[0], [*chosen, "--model.embodiment", "none"])
+        assert {stream: condition.name for stream, condition in alone.conditions.items()} == {
+            "embodiment": "still",
+            "joints": "joints",
+        }
+
+
 @pytest.mark.parametrize("path", MODEL_CONFIGS, ids=lambda path: path.stem)
 def test_shipped_configs_load_and_survive_saving(path: Path, tmp_path: Path) -> None:
     experiment = load_experiment(path)

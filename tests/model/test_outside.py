@@ -68,7 +68,7 @@ def test_a_model_is_told_commands_only(data: Path) -> None:
     from xew.sim_warp.robots import ROBOTS
 
     folder, record = next((f, r) for f, r in find_records(data) if r.robot == "arx_x5")
-    inputs = read_inputs(data, (folder, record), max_frames=5)
+    inputs = read_inputs((folder, record), max_frames=5)
     assert (inputs.task, inputs.seed, inputs.robot, inputs.frame_count) == (record.task, record.seed, "arx_x5", 5)
     assert inputs.instruction == record.instruction and inputs.first_frame.shape == (240, 320, 3)
     assert inputs.joints.shape == (5, 16) and inputs.grippers.shape == (5, 2)
@@ -84,7 +84,7 @@ def test_masks_and_flow_are_rendered_from_the_commands(data: Path) -> None:
     from xew.sim_warp.camera import HEAD_CAMERA
 
     folder, record = next((f, r) for f, r in find_records(data) if r.robot == "arx_x5")
-    told = read_inputs(data, (folder, record), max_frames=2)
+    told = read_inputs((folder, record), max_frames=2)
     real = replace(told.command, intrinsics=HEAD_CAMERA.intrinsics, extrinsics=HEAD_CAMERA.extrinsics)
     inputs = replace(told, command=real)
     assert inputs.robot_mask.shape == (2, 240, 320) and inputs.robot_mask.dtype == bool and inputs.robot_mask.any()

@@ -137,6 +137,8 @@ def test_stale_stream_is_an_error(
     victim.rename(victim.with_name("rgb-000000000000.safetensors"))
     config = [str(world / "config.yaml"), "--cache", str(tmp_path / "cache"), "--out", str(tmp_path / "run")]
     assert "was encoded from other data" in fails(train.main, config, capsys)
+    victim.write_bytes(b"cut off")
+    assert f"{victim} is damaged" in fails(train.main, config, capsys)
 
 
 def test_training_sees_training_robots_and_seeds_only(experiment: Experiment) -> None:

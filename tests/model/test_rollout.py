@@ -148,7 +148,18 @@ def test_sampler_and_grid_are_chosen_by_name(predictor: Predictor) -> None:
     settings = replace(predictor.experiment.rollout, sampler="unipc", grid="wan_official")
     other = replace(predictor, experiment=replace(predictor.experiment, rollout=settings))
     episodes = latents.test_episodes(predictor.experiment.data, ROBOT_NAMES)[:1]
-    assert np.abs(other.predict(episodes, 5).astype(int) - predictor.predict(episodes, 5)).max() > 0
+    plain = predictor.predict(episodes, 5)
+    assert np.abs(other.predict(episodes, 5).astype(int) - plain).max() > 0
+    settings = replace(settings, sampler="xew.model.samplers:euler", grid="xew.model.samplers:flowwam")
+    from_outside = replace(predictor, experiment=replace(predictor.experiment, rollout=settings))
+    np.testing.assert_array_equal(from_outside.predict(episodes, 5), plain)
+
+
+def test_a_codec_may_come_from_outside(world: Path) -> None:
+    config = [str(world / "config.yaml"), "--codec.name", "xew.model.codec:PatchCodec"]
+    latents.main(config)
+    experiment = load_experiment(config[0], config[1:])
+    assert load_codec(experiment, training_episodes(experiment)).channels == 4
 
 
 DEVICES = """
@@ -223,6 +234,18 @@ def test_mistakes_end_in_one_clear_error(
     assert "did you mean 'unipc'" in fails([str(published), "--rollout.sampler", "unipcc"], capsys)
     assert "did you mean 'flowwam'" in fails([str(published), "--rollout.grid", "flowam"], capsys)
     assert "xew.sim_warp.generate" in fails([str(published), "--data", str(tmp_path)], capsys)
+    assert "rollout.steps is 0; it must be at least 1" in fails([str(published), "--rollout.steps", "0"], capsys)
+
+
+def test_rollouts_never_take_the_place_of_episodes(world: Path, published: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "rollouts would replace them" in fails([str(published), "--out", str(world / "data")], capsys)
+    assert latents.test_episodes(world / "data", ROBOT_NAMES)
+
+
+def test_rollouts_are_called_as_their_run() -> None:
+    assert rollout.name_of(Path("runs/rate_0.1")) == "rate_0.1"
+    assert rollout.name_of(Path("configs/fixed.yaml")) == "fixed"
+    assert rollout.name_of(Path(".")) == Path.cwd().name
 
 
 def test_a_run_allows_rollout_overrides_only(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -237,6 +260,13 @@ def test_a_run_allows_rollout_overrides_only(world: Path, tmp_path: Path, capsys
     rollout.main([run, "--checkpoint", "1", "--out", str(out), "--robots", "piper", "--rollout.steps", "3"])
     header = json.loads(next(out.glob("*/*/*/rollout.json")).read_text())
     assert header["config"]["rollout"]["steps"] == 3 and header["checkpoint_step"] == 1
+    made = capsys.readouterr().out
+    again = [run, "--checkpoint", "1", "--out", str(out), "--robots", "piper", "--rollout.steps", "3"]
+    rollout.main(again)
+    assert "1 rollouts new" in made and "0 rollouts new" in capsys.readouterr().out
+    train.main([str(world / "config.yaml"), "--out", run, "--train.sample-every", "0", "--overwrite"])
+    rollout.main(again)
+    assert "1 rollouts new" in capsys.readouterr().out, "the same config trained anew makes other rollouts"
     for file in (tmp_path / "run" / "codec").iterdir():
         file.unlink()
     assert "lacks its codec" in fails([run], capsys)

@@ -5,7 +5,6 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -24,7 +23,7 @@ from xew.model.experiment import Experiment, load_experiment
 from xew.model.flow_matching import sample_losses
 from xew.model.latents import LatentCache, first_of_each, load_codec, replay_episodes, training_episodes
 from xew.model.memory import estimate_memory
-from xew.model.optimizer import with_steps
+from xew.model.optimizer import learning_rate, with_steps
 from xew.model.samples import sample_episodes
 from xew.model.sharding import make_mesh, place_batch
 from xew.model.training_step import (
@@ -343,7 +342,10 @@ def test_epochs_are_passes_over_the_new_samples(experiment: Experiment) -> None:
         (["--train.batch", "3", "--train.accumulate", "2"], "train.batch is 3; it must be a multiple of"),
         (["--mesh.fsdp", "3"], "mesh is data -1 x fsdp 3, there are 1 devices"),
         (["--adapt.start-from", "x"], "adapt needs the robots"),
-        (["--adapt.start-from", "x", "--adapt.robots", "pipr"], "did you mean 'piper'"),
+        (["--train.log-every", "0"], "train.log_every is 0; it must be at least 1"),
+        (["--train.batch", "0"], "train.batch is 0; it must be at least 1"),
+        (["--train.ema-decay", "1"], "train.ema_decay is 1; it must be under 1"),
+        (["--adapt.robots", "piper"], "adapt.start_from not which run to adapt"),
         (["--adapt.start-from", "x", "--adapt.robots", "piper", "--adapt.replay", "0.9"], "a part that leaves room"),
         (["--adapt.start-from", "nowhere", "--adapt.robots", "piper"], "nowhere holds no run"),
     ],
@@ -355,7 +357,47 @@ def test_mistakes_are_told(
     assert not (tmp_path / "run").exists()
 
 
+def test_the_rate_has_decayed_at_the_last_step(experiment: Experiment) -> None:
+    settings = replace(experiment.train, steps=50, warmup_steps=10, learning_rate=1e-2, decay_to=0.1)
+    rates = [float(learning_rate(settings)(step)) for step in range(51)]
+    assert rates[0] == 0 and np.argmax(rates) == 10
+    np.testing.assert_allclose([rates[10], rates[30], rates[50]], [1e-2, 5.5e-3, 1e-3], rtol=1e-5)
+
+
+def test_arithmetic_that_one_way_streams_save_is_not_counted(experiment: Experiment) -> None:
+    one_way = replace(experiment, model=replace(experiment.model, visibility="one_way"))
+    assert memory.flops_of_step(one_way) < memory.flops_of_step(experiment)
+
+
+def test_episodes_without_videos_are_told_before_training(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Data made with --states-only: a sample begins with a stored picture, and would end a run in its middle."""
+    shutil.copytree(world / "data", tmp_path / "data")
+    shutil.copytree(world / "data-latents", tmp_path / "data-latents")
+    for path in (tmp_path / "data").glob("*/*/*/episode.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"videos": False}))
+    arguments = [str(world / "config.yaml"), "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")]
+    assert "--train.sample-every 0" in fails(train.main, [*arguments, "--train.sample-every", "1"], capsys)
+    assert not (tmp_path / "run").exists()
+    train.main([*arguments, "--train.steps", "1"])
+
+
 # Adaptation.
+
+
+def test_a_robot_to_adapt_to_that_the_data_lack_is_told(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start = ["--adapt.start-from", str(world / "run"), "--adapt.robots", "pipr", "--out", str(tmp_path / "run")]
+    said = fails(train.main, [str(world / "config.yaml"), *start], capsys)
+    assert "has no training episode of pipr; did you mean 'piper'?" in said
+
+
+def test_the_run_that_an_adaptation_starts_from_is_not_overwritten(world: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    start = ["--adapt.start-from", str(world / "run"), *ADAPT, "--overwrite"]
+    assert "choose another --out" in fails(train.main, [str(world / "config.yaml"), *start], capsys)
+    assert network(world / "run")[1] == 2
 
 
 def adapt(world: Path, out: Path, *options: str) -> list[str]:
@@ -386,7 +428,7 @@ def test_adapted_run_starts_from_the_trained_weights(world: Path, tmp_path: Path
 
 def test_samples_of_an_adapted_run_are_named_by_role(experiment: Experiment) -> None:
     adapted = replace(experiment, adapt=replace(experiment.adapt, start_from=Path("runs/x"), robots=("piper",)))
-    names = sample_episodes(SimpleNamespace(experiment=adapted))
+    names = sample_episodes(adapted)
     seen = {"seen/aloha_agilex", "seen/arx_x5", "seen/ur5_wsg"}
     assert set(names) == seen | {"target/piper", "unseen/franka_panda"}
 

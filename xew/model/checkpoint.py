@@ -22,7 +22,7 @@ from jax.sharding import Mesh, NamedSharding
 from xew import config
 from xew.config import ConfigError
 from xew.model.adaptation import corrected, init_corrections
-from xew.model.codec import CODECS, Codec
+from xew.model.codec import Codec, codec_of
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.sharding import state_shardings
 
@@ -44,6 +44,7 @@ FREE_TO_CHANGE = (
     "train.log_every",
     "train.save_every",
     "train.sample_every",
+    "train.keep_checkpoints",
     "rollout.",
 )
 """What a resumed run may set anew; everything else would make it another experiment."""
@@ -203,9 +204,11 @@ def _restore_kept(out: Path, like: Any, step: int | None) -> tuple[Any, int]:
 
 
 def check_start(experiment: Experiment) -> None:
-    """Raises ConfigError unless `adapt.start_from` holds a run of the same network on the same clips and codec."""
+    """Raises ConfigError unless `adapt.start_from` holds another run, of the same network on the same clips and codec."""
     run = experiment.adapt.start_from
     assert run is not None
+    if run.resolve() == experiment.out.resolve():
+        raise ConfigError(f"out is {experiment.out}, the run that adapt.start_from names; choose another --out.")
     before, after = dict(_flat(load_run(run)[0])), dict(_flat(experiment))
     compared = [key for key in after if key.startswith(("clip.", "codec.", "model.")) and not key.startswith(FREE_TO_CHANGE)]
     changed = [key for key in compared if before[key] != after[key] and key not in ("model.dtype", "model.weights")]
@@ -222,7 +225,7 @@ def note_start(experiment: Experiment) -> None:
         step = checkpoints.latest_step()
     if step is None:
         raise ConfigError(f"{run} has no checkpoint to start from; train it: python -m xew.model.train CONFIG --out {run}")
-    note = {"run": str(run), "step": step, "saved": _saved_at(run, step)}
+    note = {"run": str(run), "step": step, "saved": saved_at(run, step)}
     (experiment.out / START).write_text(json.dumps(note, indent=1) + "\n")
 
 
@@ -235,7 +238,7 @@ def restore_start(experiment: Experiment, like: Any) -> Any:
     run = experiment.adapt.start_from
     assert run is not None
     note = json.loads((experiment.out / START).read_text())
-    if not (run / "config.yaml").exists() or _saved_at(run, note["step"]) != note["saved"]:
+    if not (run / "config.yaml").exists() or saved_at(run, note["step"]) != note["saved"]:
         raise ConfigError(
             f"{experiment.out} was adapted from step {note['step']} of {run}, which is not there any more or was trained anew; "
             "put that run back (a longer train.keep_checkpoints keeps it), or adapt again with --overwrite."
@@ -243,7 +246,7 @@ def restore_start(experiment: Experiment, like: Any) -> Any:
     return restore_params(run, like, note["step"])[0]
 
 
-def _saved_at(run: Path, step: int) -> int | None:
+def saved_at(run: Path, step: int) -> int | None:
     """When a checkpoint was begun [ns], which tells it from another of the same step; None if there is none."""
     try:
         return json.loads((run / "checkpoints" / str(step) / "_CHECKPOINT_METADATA").read_text())["init_timestamp_nsecs"]
@@ -262,11 +265,19 @@ def _placed_beside(shapes: Any, like: Any) -> Any:
 
 
 def load_run(out: Path) -> tuple[Experiment, Codec]:
-    """Config and codec of a run. Raises ConfigError if the folder holds none."""
+    """Config and codec of a run. Raises ConfigError if the folder lacks them."""
+    experiment = load_run_config(out)
+    try:
+        return experiment, codec_of(experiment.codec).load(out / "codec")
+    except FileNotFoundError as error:
+        raise ConfigError(f"{out} lacks its codec ({error.filename}); copy the whole run, or train again.") from error
+
+
+def load_run_config(out: Path) -> Experiment:
+    """The config that a run was trained with. Raises ConfigError if the folder holds none."""
     if not (out / "config.yaml").exists():
         raise ConfigError(f"{out} holds no run; train one: python -m xew.model.train CONFIG --out {out}")
-    experiment = load_experiment(out / "config.yaml")
-    return experiment, CODECS[experiment.codec.name].load(out / "codec")
+    return load_experiment(out / "config.yaml")
 
 
 def _abstract(tree: Any) -> Any:

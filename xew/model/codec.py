@@ -225,6 +225,8 @@ class PatchCodec(BatchCodec):
                 f"codec.channels is {settings.channels}; square patches of codec.spatial_factor {settings.spatial_factor}"
                 f" have {directions} directions, so give 1 to {directions}."
             )
+        if settings.fit_clips < 2:
+            raise ConfigError(f"codec.fit_clips is {settings.fit_clips}; it must be at least 2, a scene's and a robot's.")
 
     @classmethod
     def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> "PatchCodec":
@@ -345,6 +347,11 @@ class WanVaeCodec(BatchCodec):
 
 
 CODECS: dict[str, type[Codec]] = {"patch_pca": PatchCodec, "wan_vae": WanVaeCodec}
+
+
+def codec_of(settings: CodecSettings) -> type[Codec]:
+    """The kind of codec that a config names. Raises ConfigError if there is none of that name."""
+    return pick(CODECS, settings.name, "codec")
 
 
 def over_last(vector: Array, ndim: int) -> Array:

@@ -1,25 +1,26 @@
 """The config of a world-model experiment: what configs/*.yaml hold. Fields without a default must be given."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from xew.config import ConfigError, load, pick, suggestion
+from xew.config import ConfigError, load, pick
 from xew.files import cache_folder
-from xew.model.codec import CODECS, TEMPORAL_FACTOR, CodecSettings, latent_frames
+from xew.model.codec import TEMPORAL_FACTOR, CodecSettings, codec_of, latent_frames
 from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition
-from xew.model.dit import MODELS, PATCH, AttentionName, ModelSize, RematName, TimeEmbedding, Visibility, WorldModel
+from xew.model.dit import MODELS, PATCH, STREAMS, AttentionName, ModelSize, RematName, TimeEmbedding, Visibility, WorldModel
 from xew.model.mechanisms import MECHANISMS
 from xew.model.samplers import GRIDS, SAMPLERS
 from xew.model.sharding import MeshSettings
 from xew.model.text import TEXT_ENCODERS, VOCABULARY, TextEncoder, TextSource, encode_instructions
-from xew.protocol import ACTION_DIM, ROBOT_NAMES, SPLITS, Split
+from xew.protocol import ACTION_DIM, SPLITS, Split
 
 
 @dataclass(frozen=True)
@@ -168,10 +169,7 @@ class Experiment:
     @property
     def conditions(self) -> dict[str, Condition]:
         """What the network is told beside rgb, by the stream or mechanism that each feeds; `.name` is its name in the cache."""
-        action = pick(ACTIONS, self.model.action, "action")
-        system = action if isinstance(action, tuple) else (action,)
-        chosen = (*system, pick(CONDITIONS, self.model.embodiment, "embodiment"), HISTORY if self.model.history else None)
-        return {condition.stream: condition for condition in chosen if condition is not None}
+        return {condition.stream: condition for condition in chosen_conditions(self.model)}
 
     @property
     def size(self) -> ModelSize:
@@ -205,17 +203,72 @@ class Experiment:
         return latent_frames(self.clip.frames), self.clip.height // factor, self.clip.width // factor, self.codec.channels
 
 
+def chosen_conditions(settings: ModelSettings) -> list[Condition]:
+    """The action's, the embodiment's and the history's. Raises ConfigError for a name that does not exist."""
+    action = pick(ACTIONS, settings.action, "action")
+    system = action if isinstance(action, tuple) else (action,)
+    chosen = (*system, pick(CONDITIONS, settings.embodiment, "embodiment"), HISTORY if settings.history else None)
+    return [condition for condition in chosen if condition is not None]
+
+
+LEAST = {
+    "clip.height": 1,
+    "clip.width": 1,
+    "model.unroll": 1,
+    "train.batch": 1,
+    "train.accumulate": 1,
+    "train.learning_rate": 0,
+    "train.warmup_steps": 0,
+    "train.clip_norm": 0,
+    "train.ema_decay": 0,
+    "train.history_noise": 0,
+    "train.log_every": 1,
+    "train.save_every": 1,
+    "train.sample_every": 0,
+    "train.keep_checkpoints": 1,
+    "adapt.lora_rank": 0,
+    "rollout.steps": 1,
+    "rollout.batch": 1,
+    "rollout.max_frames": 0,
+}
+"""Numbers of an experiment that mean nothing below."""
+
+
 def load_experiment(path: Path | str, overrides: list[str] | None = None) -> Experiment:
     """Read and check a config. Raises ConfigError with every choice that does not exist or does not fit."""
     experiment = load(Experiment, path, overrides or [])
-    pick(CODECS, experiment.codec.name, "codec").check(experiment.codec)
+    demand_at_least(LEAST, experiment, str(path))
+    codec_of(experiment.codec).check(experiment.codec)
     pick(SAMPLERS, experiment.rollout.sampler, "sampler")
     pick(GRIDS, experiment.rollout.grid, "grid of noise levels")
-    _ = experiment.size, experiment.robots, experiment.conditions
+    _ = experiment.size, experiment.robots
+    _check_conditions(experiment, str(path))
     _check_sizes(experiment, str(path))
     _check_training(experiment, str(path))
     _check_history(experiment, str(path))
     return experiment
+
+
+def demand_at_least(least: Mapping[str, float], settings: Any, source: str) -> None:
+    """Raise ConfigError where a number of some settings, named as "train.batch", is under the least that it may be."""
+    for name, smallest in least.items():
+        value = attrgetter(name)(settings)
+        if not value >= smallest:
+            raise ConfigError(f"{source}: {name} is {value:g}; it must be at least {smallest:g}.")
+
+
+def _check_conditions(experiment: Experiment, source: str) -> None:
+    feeders: dict[str, str] = {}
+    for condition in chosen_conditions(experiment.model):
+        if condition.stream == "rgb" or condition.stream not in {**STREAMS, **MECHANISMS}:
+            known = ", ".join(name for name in (*STREAMS, *MECHANISMS) if name != "rgb")
+            raise ConfigError(f"{source}: the condition {condition.name} feeds {condition.stream!r}; conditions feed {known}.")
+        if condition.stream in feeders:
+            raise ConfigError(
+                f"{source}: {feeders[condition.stream]} and {condition.name} both feed {condition.stream}; choose one of them "
+                "(model.action, model.embodiment)."
+            )
+        feeders[condition.stream] = condition.name
 
 
 def _check_sizes(experiment: Experiment, source: str) -> None:
@@ -232,11 +285,12 @@ def _check_training(experiment: Experiment, source: str) -> None:
     train, adapt = experiment.train, experiment.adapt
     if (train.steps > 0) == (train.epochs > 0):
         raise ConfigError(f"{source}: train.steps is {train.steps}, train.epochs {train.epochs:g}; give one of them, over 0.")
+    if train.ema_decay >= 1:
+        raise ConfigError(f"{source}: train.ema_decay is {train.ema_decay:g}; it must be under 1.")
     if adapt.start_from is None:
+        if adapt != AdaptSettings():
+            raise ConfigError(f"{source}: adapt says how, but adapt.start_from not which run to adapt; give that, or no adapt.")
         return
-    for robot in adapt.robots:
-        if robot not in ROBOT_NAMES:
-            raise ConfigError(f"{source}: adapt.robots: unknown robot {robot!r};{suggestion(robot, ROBOT_NAMES)}")
     if not adapt.robots or adapt.episodes < 1:
         raise ConfigError(f"{source}: adapt needs the robots to adapt to and at least one episode of each task and robot.")
     if not 0 <= adapt.replay < 1 or (adapt.replay and replayed(train.batch, adapt.replay) >= train.batch):

@@ -15,10 +15,11 @@ import jax.numpy as jnp
 from flax import nnx
 
 from xew.config import ConfigError, user_errors
-from xew.model.checkpoint import restore_params
+from xew.model.checkpoint import load_run_config, restore_params
 from xew.model.dit import parameter_count
 from xew.model.dit_layouts import Naming, save_dit, wan_layout
-from xew.model.experiment import create_model, load_experiment
+from xew.model.experiment import create_model
+from xew.model.tokens import WAVELENGTH_BASE
 from xew.model.weights import checkpoint_shapes
 
 
@@ -28,7 +29,7 @@ def export(run: Path, out: Path, naming: Naming = "diffusers", dtype: str = "flo
     Raises:
         ConfigError: there is no such run or checkpoint, or the place is taken or cannot be written.
     """
-    experiment = load_experiment(run / "config.yaml")
+    experiment = load_run_config(run)
     if out.exists() and (out.is_file() or any(out.iterdir())):
         raise ConfigError(f"{out} exists already; choose another --out.")
     graph, shapes = nnx.split(nnx.eval_shape(lambda: create_model(experiment)), nnx.Param)
@@ -41,6 +42,9 @@ def export(run: Path, out: Path, naming: Naming = "diffusers", dtype: str = "flo
     added = total - sum(math.prod(shape) for shape in checkpoint_shapes(model, wan_layout(model, naming)).values())
     beside = f"; {added:,} of them belong to streams, mechanisms or words, which Wan does not have" if added else ""
     print(f"{out}: {total:,} parameters of step {step} under the names of {naming}, {dtype}{beside}")
+    base = experiment.size.rotary_base
+    if base != WAVELENGTH_BASE:
+        print(f"its positions turn with base {base:g}; code with Wan's {WAVELENGTH_BASE:g} does not compute the same")
     return step
 
 

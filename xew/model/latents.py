@@ -19,16 +19,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 from tqdm import tqdm
 
-from xew.config import ConfigError, digest, user_errors
+from xew.config import ConfigError, digest, suggestion, user_errors
 from xew.episode import Record, complete_folder, episode_folder, find_accepted, read_states
 from xew.files import replacing
 from xew.model.ceiling import measure_ceiling, spread
 from xew.model.checkpoint import load_run
-from xew.model.codec import CODECS, Codec, check_clip_shape, encode_pictures
+from xew.model.codec import Codec, check_clip_shape, codec_of, encode_pictures
 from xew.model.conditions import Command, Condition, clip_numbers, command_of, robot_render
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.frames import to_model_size
@@ -89,8 +89,9 @@ class LatentCache:
         except FileNotFoundError:
             stale = list(path.parent.glob(f"{path.stem.rpartition('-')[0]}-*.safetensors"))
             found = "was encoded from other data, with another codec or other clips" if stale else "is not in the cache"
-            command = f"python -m xew.model.latents CONFIG --data {self.experiment.data}"
-            raise ConfigError(f"{path.parent}: the stream {stream} {found}; encode it with `{command}`.") from None
+            raise ConfigError(f"{path.parent}: the stream {stream} {found}; {remedy(self.experiment)}.") from None
+        except SafetensorError as error:
+            raise ConfigError(f"{path} is damaged ({error}); delete it and {remedy(self.experiment)}.") from error
 
     def missing(self, record: Record) -> list[str]:
         """Streams of an episode that are not encoded yet."""
@@ -150,6 +151,11 @@ def sample_starts(frame_count: int, frames: int, chunks: int = 1) -> tuple[tuple
     return tuple(itertools.pairwise(starts)) or (starts,)
 
 
+def remedy(experiment: Experiment) -> str:
+    """What to do where the cache lacks something."""
+    return f"run `python -m xew.model.latents CONFIG --data {experiment.data}`, with the other choices of this command too"
+
+
 def clip_starts(frame_count: int, frames: int, chunks: int = 1) -> tuple[int, ...]:
     """First frames of all clips of an episode that any training sample has."""
     samples = sample_starts(frame_count, frames, chunks)
@@ -177,17 +183,17 @@ def stream_videos(
     conditions = {name: condition for name, condition in experiment.conditions.items() if name in streams}
     videos = {name: pixels["rgb"] for name in streams if name == "rgb" or conditions[name].make is None}
     if len(videos) < len(streams):
-        command = episode_command(experiment.data, folder, record, pixels.get("robot"))
+        command = episode_command(folder, record, pixels.get("robot"))
         videos |= {name: condition.make(command) for name, condition in conditions.items() if condition.make is not None}
     clip = experiment.clip
     return {name: to_model_size(v, clip.height, clip.width) if v.ndim == 4 else v for name, v in videos.items()}
 
 
-def episode_command(data: Path, folder: Path, record: Record, rendered: np.ndarray | None = None) -> Command:
+def episode_command(folder: Path, record: Record, rendered: np.ndarray | None = None) -> Command:
     """What conditions may be made from, of an episode of a data set."""
     from xew.sim_warp.robots import use_robots_of
 
-    use_robots_of(data)  # a robot of a user's own is kept beside its data
+    use_robots_of(folder.absolute().parents[2])  # a robot of a user's own is kept beside its data
     return command_of(folder, record, read_states(folder), rendered)
 
 
@@ -249,8 +255,9 @@ def _training_episodes_of(experiment: Experiment, robots: Sequence[str]) -> list
     chosen = [(f, r) for f, r in accepted if r.robot in robots and seed_split(r.seed) == "train"]
     missing = [robot for robot in robots if robot not in {record.robot for _, record in chosen}]
     if missing and (experiment.adapt.start_from is not None or not chosen):
+        meant = suggestion(missing[0], {record.robot for _, record in accepted})
         command = f"python -m xew.sim_warp.generate --robots {' '.join(robots)} --out {experiment.data}"
-        raise ConfigError(f"{experiment.data} has no training episode of {', '.join(missing)}; make some: {command}")
+        raise ConfigError(f"{experiment.data} has no training episode of {', '.join(missing)};{meant} make some: {command}")
     return chosen
 
 
@@ -288,13 +295,12 @@ def load_codec(experiment: Experiment, episodes: Sequence[Episode]) -> Codec:
     """
     if experiment.adapt.start_from is not None:
         return load_run(experiment.adapt.start_from)[1]
-    kind = CODECS[experiment.codec.name]
+    kind = codec_of(experiment.codec)
     if not kind.fitted:
         return kind.prepare(experiment.codec, list)
     path = codec_path(experiment, episodes)
     if not path.exists():
-        command = f"python -m xew.model.latents CONFIG --data {experiment.data}"
-        raise ConfigError(f"no codec fitted on {experiment.data} as it is now under {path.parent}; run `{command}`.")
+        raise ConfigError(f"no codec fitted on {experiment.data} as it is now under {path.parent}; {remedy(experiment)}.")
     return kind.load(path)
 
 
@@ -315,8 +321,7 @@ def load_scales(experiment: Experiment, episodes: Sequence[Episode]) -> dict[str
     start = experiment.adapt.start_from
     if start is not None:
         return load_run_scales(experiment, start)
-    command = f"python -m xew.model.latents CONFIG --data {experiment.data}"
-    return read_scales(scales_path(experiment, episodes), tuple(experiment.conditions.values()), f"run `{command}`")
+    return read_scales(scales_path(experiment, episodes), tuple(experiment.conditions.values()), remedy(experiment))
 
 
 def keep_scales(experiment: Experiment, episodes: Sequence[Episode]) -> None:
@@ -324,13 +329,13 @@ def keep_scales(experiment: Experiment, episodes: Sequence[Episode]) -> None:
     path = scales_path(experiment, episodes)
     needed = any(condition.scale != "none" for condition in experiment.conditions.values())
     if needed and experiment.adapt.start_from is None and not path.exists():
-        commands = (episode_command(experiment.data, folder, record) for folder, record in episodes)
+        commands = (episode_command(folder, record) for folder, record in episodes)
         save_scales(path, fit_scales(experiment.conditions.values(), commands))
 
 
 def fit_codec(experiment: Experiment, episodes: Sequence[Episode], source: PixelSource = stored_pixels) -> Codec:
     """Fit the codec on clips of training episodes, and keep it."""
-    codec = CODECS[experiment.codec.name].prepare(experiment.codec, lambda: _clips_to_fit(experiment, episodes, source))
+    codec = codec_of(experiment.codec).prepare(experiment.codec, lambda: _clips_to_fit(experiment, episodes, source))
     path = codec_path(experiment, episodes)
     with complete_folder(path) as unfinished:
         codec.save(unfinished)
@@ -379,11 +384,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--from-states", action="store_true", help="render the episodes anew; no video needs to be there")
     parser.add_argument("--batch", type=int, default=4, help="clips that the codec encodes at once (default: 4)")
     args, overrides = parser.parse_known_args(arguments)
+    if args.batch < 1:
+        raise ConfigError(f"--batch is {args.batch}; expected at least one clip.")
     experiment = load_experiment(args.config, overrides)
     episodes = training_episodes(experiment)
     source = rendered_pixels() if args.from_states else stored_pixels
     adapts = experiment.adapt.start_from is not None
-    to_fit = CODECS[experiment.codec.name].fitted and not adapts and not codec_path(experiment, episodes).exists()
+    to_fit = codec_of(experiment.codec).fitted and not adapts and not codec_path(experiment, episodes).exists()
     codec = fit_codec(experiment, episodes, source) if to_fit else load_codec(experiment, episodes)
     keep_scales(experiment, episodes)
     experiment.encode_instructions((record.instruction for _, record in find_accepted(experiment.data)))
@@ -392,9 +399,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip), "streams": list(cache.streams)}
     header |= {"episodes": len(episodes), "ceiling": ceiling(experiment, codec, episodes, source)}
     (experiment.cache_folder / "header.json").write_text(json.dumps(header, indent=1) + "\n")
-    print(
-        f"{experiment.cache_folder}: {len(episodes)} episodes, streams {', '.join(cache.streams)}, {written / 1e6:.1f} MB new"
-    )
+    robots, streams = sorted({record.robot for _, record in episodes}), ", ".join(cache.streams)
+    print(f"{experiment.cache_folder}: {len(episodes)} episodes of {', '.join(robots)}")
+    print(f"streams {streams}, {written / 1e6:.1f} MB new")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from xew.config import ConfigError
+from xew.config import ConfigError, pick
 from xew.model.codec import TEMPORAL_FACTOR, latent_frames
 from xew.model.data import fake_batch
 from xew.model.dit import STREAMS, ModelSize, RematName, flops, token_grid
@@ -102,7 +102,7 @@ def codec_bytes(experiment: Experiment, samples: float) -> float:
     settings, clip = experiment.codec, experiment.clip
     if settings.name != "wan_vae":
         return 0.0
-    size = VAES[settings.vae]
+    size = pick(VAES, settings.vae, "autoencoder")
     frames = TEMPORAL_FACTOR * min(settings.chunk or latent_frames(clip.frames), latent_frames(clip.frames))
     widest = size.decoder_widths[-1] * frames * (clip.height * clip.width // size.patch**2) * jnp.dtype(settings.dtype).itemsize
     return cut_bytes(nnx.state(abstract_vae(size), nnx.Param), 1) + 4 * samples * widest
@@ -142,8 +142,9 @@ def stream_grids(experiment: Experiment) -> list[tuple[int, int, int]]:
 def flops_of_step(experiment: Experiment) -> float:
     """Model FLOPs of one training step over all devices: three times the forward pass, recomputation not counted."""
     settings, size = experiment.train, experiment.size
-    channels = experiment.codec.channels
-    return 3 * settings.chunks * flops(size, stream_grids(experiment), batch=settings.batch, channels=channels)
+    channels, visibility = experiment.codec.channels, experiment.model.visibility
+    forward = flops(size, stream_grids(experiment), batch=settings.batch, channels=channels, visibility=visibility)
+    return 3 * settings.chunks * forward
 
 
 def peak_flops(device_kind: str) -> float | None:

@@ -11,7 +11,8 @@ from xew.model.experiment import Experiment, TrainSettings, replayed
 
 def learning_rate(settings: TrainSettings) -> optax.Schedule:
     """Step -> learning rate: optional warm-up, then constant or decaying by a cosine."""
-    decay = optax.cosine_decay_schedule(settings.learning_rate, max(settings.steps, 1), alpha=settings.decay_to)
+    decaying = max(settings.steps - settings.warmup_steps, 1)
+    decay = optax.cosine_decay_schedule(settings.learning_rate, decaying, alpha=settings.decay_to)
     schedule = optax.constant_schedule(settings.learning_rate) if settings.decay_to == 1 else decay
     if settings.warmup_steps:
         warmup = optax.linear_schedule(0.0, settings.learning_rate, settings.warmup_steps)

@@ -6,6 +6,7 @@ Writes <out>/<task>/<seed>/<robot>/rgb.mkv (lossless, the model's own size) and 
 A model is anything that can be called with an `EpisodeInputs` and returns its video; it is named by `module:NAME`. Where NAME
 is a class it is made once, without arguments: there weights are loaded. Models that cannot run in this environment need none
 of this: `python -m xew.metrics.evaluate` grades any folder tree of their videos (`xew.rollout`).
+Rollouts that are there are not made again: where the model has changed, delete them or give another --out.
 Command: python -m xew.model.outside module:NAME --data DATA --split test --out rollouts/NAME
 """
 
@@ -25,7 +26,7 @@ from xew.config import ConfigError, user_errors
 from xew.episode import Record, read_video
 from xew.model.conditions import Command
 from xew.model.latents import Episode, episode_command
-from xew.model.rollout import RolloutWriter, common_header, is_done, select_episodes
+from xew.model.rollout import RolloutWriter, check_out, common_header, is_done, select_episodes
 from xew.protocol import LEFT_GRIPPER, RIGHT_GRIPPER
 
 
@@ -135,11 +136,11 @@ def load_model(name: str) -> OutsideModel:
     return model
 
 
-def read_inputs(data: Path, episode: Episode, max_frames: int = 0) -> EpisodeInputs:
+def read_inputs(episode: Episode, max_frames: int = 0) -> EpisodeInputs:
     """What a model may know of an episode, or of its first `max_frames` frames."""
     folder, record = episode
     frames = min(record.frame_count, max_frames) if max_frames else record.frame_count
-    return EpisodeInputs(episode, episode_command(data, folder, record), frames)
+    return EpisodeInputs(episode, episode_command(folder, record), frames)
 
 
 def predict(model: OutsideModel, name: str, inputs: EpisodeInputs) -> np.ndarray:
@@ -164,8 +165,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--condition", default="", help="what the model is told of the robot, for the tables")
     parser.add_argument("--out", type=Path, help="default: rollouts/NAME")
     args = parser.parse_args(arguments)
+    if args.max_frames < 0:
+        raise ConfigError(f"--max-frames is {args.max_frames}; expected a number of frames, or 0 for all.")
     name = args.model.rpartition(":")[2]
     out = args.out or Path("rollouts") / name
+    check_out(out, args.data)
     episodes = select_episodes(args.data, args.split, args.robots)
     told = [(e, common_header(name, args.condition, e[1], args.max_frames) | {"outside": args.model}) for e in episodes]
     pending = [item for item in told if not is_done(out, *item)]
@@ -175,7 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         RolloutWriter(out, progress.update, resize=None) as writer,
     ):
         for episode, header in pending:
-            writer.write(episode[1], predict(model, args.model, read_inputs(args.data, episode, args.max_frames)), header)
+            writer.write(episode[1], predict(model, args.model, read_inputs(episode, args.max_frames)), header)
     print(f"{out}: {len(pending)} rollouts new, {len(told) - len(pending)} there before, {args.model}")
 
 

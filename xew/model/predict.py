@@ -22,6 +22,7 @@ from flax import nnx
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from xew.config import pick
 from xew.model.codec import Codec, encode_pictures, to_pictures, to_signed
 from xew.model.conditions import Condition, clip_numbers
 from xew.model.dit import WorldModel, compute_params
@@ -119,7 +120,7 @@ class Predictor:
     @property
     def _sampling(self) -> Sampling:
         settings = self.experiment.rollout
-        grid = GRIDS[settings.grid](settings.steps, settings.shift or self.experiment.train.shift)
+        grid = pick(GRIDS, settings.grid, "grid of noise levels")(settings.steps, settings.shift or self.experiment.train.shift)
         return Sampling(settings.sampler, grid, settings.guidance, self.experiment.latent_shape)
 
     def _read(self, episode: Episode) -> Streams:
@@ -201,8 +202,8 @@ def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInp
     reference = codec.encode_batch(to_signed(inputs.reference))
     keys = jax.random.wrap_key_data(inputs.keys)
     noise = jax.vmap(lambda key: jax.random.normal(key, sampling.latent_shape, jnp.float32))(keys)
-    velocity = guided_velocity(model, inputs, sampling.guidance)
-    frames = to_pictures(codec.decode_batch(SAMPLERS[sampling.sampler](velocity, reference, noise, sampling.grid)))
+    velocity, sampler = guided_velocity(model, inputs, sampling.guidance), pick(SAMPLERS, sampling.sampler, "sampler")
+    frames = to_pictures(codec.decode_batch(sampler(velocity, reference, noise, sampling.grid)))
     return jax.lax.with_sharding_constraint(frames, PartitionSpec()) if jax.process_count() > 1 else frames
 
 

@@ -25,8 +25,8 @@ from tqdm import tqdm
 
 from xew.config import CONVERTER, ConfigError, suggestion, user_errors
 from xew.episode import EpisodeError, Record, episode_folder, find_accepted
-from xew.model.checkpoint import load_run, restore_params
-from xew.model.codec import CODECS
+from xew.model.checkpoint import load_run, restore_params, saved_at
+from xew.model.codec import codec_of
 from xew.model.dit import compute_params
 from xew.model.dit_layouts import load_dit_params
 from xew.model.experiment import Experiment, compile_cache, create_model, load_experiment
@@ -58,12 +58,9 @@ def load_predictor(run: Path, step: int | None = None, overrides: Sequence[str] 
     Raises:
         ConfigError: there is no such run, checkpoint or weights, or an override would make it another model.
     """
-    if run.suffix in (".yaml", ".yml"):
+    if is_config(run):
         return load_published(load_experiment(run, list(overrides)), run), None
-    try:
-        experiment, codec = load_run(run)
-    except FileNotFoundError as error:
-        raise ConfigError(f"{run} lacks its codec ({error.filename}); copy the whole run, or train again.") from error
+    experiment, codec = load_run(run)
     _check_overrides(overrides)
     chosen = load_experiment(run / "config.yaml", list(overrides)).rollout
     mesh = make_mesh(MeshSettings())
@@ -73,6 +70,17 @@ def load_predictor(run: Path, step: int | None = None, overrides: Sequence[str] 
     params = jax.jit(compute_params, static_argnums=0)(graph, params)
     codec = jax.device_put(codec, replicated(mesh))
     return Predictor(replace(experiment, rollout=chosen), codec, graph, params, load_run_scales(experiment, run)), step
+
+
+def is_config(run: Path) -> bool:
+    """Whether it is a config with published weights, and not the folder of a run."""
+    return run.suffix in (".yaml", ".yml")
+
+
+def name_of(run: Path) -> str:
+    """What its rollouts are called by default."""
+    run = run.resolve()
+    return run.stem if is_config(run) else run.name
 
 
 def load_published(experiment: Experiment, source: Path) -> Predictor:
@@ -89,7 +97,7 @@ def load_published(experiment: Experiment, source: Path) -> Predictor:
     mesh = make_mesh(MeshSettings())
     graph, params = random_params(experiment, mesh)
     params = load_dit_params(graph, params, experiment.model.weights)
-    kind = CODECS[experiment.codec.name]
+    kind = codec_of(experiment.codec)
     fitted = kind.fitted
     codec = load_codec(experiment, training_episodes(experiment)) if fitted else kind.prepare(experiment.codec, list)
     params = jax.jit(compute_params, static_argnums=0)(graph, params)
@@ -97,7 +105,7 @@ def load_published(experiment: Experiment, source: Path) -> Predictor:
 
 
 def _check_overrides(overrides: Sequence[str]) -> None:
-    wrong = [word for word in overrides if word.startswith("-") and not word.startswith("--rollout.")]
+    wrong = [word for word in overrides if word.startswith("--") and not word.startswith("--rollout.")]
     if wrong:
         raise ConfigError(f"{' '.join(wrong)}: of a trained run only --rollout.… can be chosen anew (see --help for the rest).")
 
@@ -116,8 +124,19 @@ def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None)
     return chosen
 
 
-def rollout_header(experiment: Experiment, step: int | None, episode: Episode) -> dict[str, Any]:
-    """rollout.json: what was predicted, from what, with what. How many were predicted at once is no part of it."""
+def check_out(out: Path, data: Path) -> None:
+    """Raise ConfigError where rollouts would take the place of the episodes that they predict."""
+    if out.resolve() == data.resolve():
+        raise ConfigError(f"--out is {out}, where the episodes are; rollouts would replace them, choose another folder.")
+
+
+def rollout_header(experiment: Experiment, step: int | None, saved: int | None, episode: Episode) -> dict[str, Any]:
+    """rollout.json: what was predicted, from what, with what. How many were predicted at once is no part of it.
+
+    Args:
+        step, saved: of the checkpoint and when it was saved (`checkpoint.saved_at`), which tells it from that of another
+            training of the same config; None of published weights.
+    """
     _, record = episode
     action, embodiment = experiment.model.action, experiment.model.embodiment
     header = common_header(
@@ -126,7 +145,8 @@ def rollout_header(experiment: Experiment, step: int | None, episode: Episode) -
         record,
         experiment.rollout.max_frames,
     )
-    return header | {"checkpoint_step": step, "config": CONVERTER.unstructure(_without_batch(experiment))}
+    made_by = {"checkpoint_step": step, "checkpoint_saved": saved, "config": CONVERTER.unstructure(_without_batch(experiment))}
+    return header | made_by
 
 
 def _without_batch(experiment: Experiment) -> Experiment:
@@ -235,9 +255,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     compile_cache()
     predictor, step = load_predictor(args.run, args.checkpoint, overrides)
     experiment = predictor.experiment
-    out = args.out or Path("rollouts") / args.run.stem
-    episodes = select_episodes(args.data or experiment.data, args.split, args.robots)
-    headers = [(episode, rollout_header(experiment, step, episode)) for episode in episodes]
+    data, out = args.data or experiment.data, args.out or Path("rollouts") / name_of(args.run)
+    check_out(out, data)
+    episodes = select_episodes(data, args.split, args.robots)
+    saved = None if step is None else saved_at(args.run, step)
+    headers = [(episode, rollout_header(experiment, step, saved, episode)) for episode in episodes]
     pending = [item for item in headers if not is_done(out, *item)]
     experiment.encode_instructions([record.instruction for (_, record), _ in pending])  # all at once, where that costs
     with (

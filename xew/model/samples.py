@@ -2,7 +2,9 @@
 
 import numpy as np
 
+from xew.config import ConfigError
 from xew.episode import read_video
+from xew.model.experiment import Experiment
 from xew.model.frames import to_model_size
 from xew.model.latents import Episode, test_episodes, training_episodes
 from xew.model.predict import Predictor
@@ -11,15 +13,25 @@ from xew.model.tensorboard import RunLog
 STRIP_FRAMES = 5
 
 
-def sample_episodes(predictor: Predictor) -> dict[str, Episode]:
+def check_samples(experiment: Experiment) -> None:
+    """Raise ConfigError where sample videos are asked for and the episodes to draw them of have no videos themselves."""
+    bare = [folder for folder, record in sample_episodes(experiment).values() if not record.videos]
+    if experiment.train.sample_every and bare:
+        raise ConfigError(
+            f"{bare[0]} was made with --states-only and has no video to begin a sample with; draw none with "
+            f"--train.sample-every 0, or make videos: python -m xew.sim_warp.inspect {experiment.data} --render"
+        )
+
+
+def sample_episodes(experiment: Experiment) -> dict[str, Episode]:
     """An episode of each robot of the split by role and robot, of test seeds where there are any.
 
     In an adapted run the robots adapted to are the target, and seen are those of the run that it started from.
     """
-    robots, targets = predictor.experiment.robots, predictor.experiment.adapt.robots
+    robots, targets = experiment.robots, experiment.adapt.robots
     roles = dict.fromkeys(robots.train_robots, "seen") | dict.fromkeys(robots.held_out_robots, "unseen")
     roles |= dict.fromkeys(targets, "target")
-    found = test_episodes(predictor.experiment.data, tuple(roles)) or training_episodes(predictor.experiment)
+    found = test_episodes(experiment.data, tuple(roles)) or training_episodes(experiment)
     first = {record.robot: (folder, record) for folder, record in reversed(found)}
     return {f"{roles[robot]}/{robot}": first[robot] for robot in roles if robot in first}
 
@@ -29,7 +41,7 @@ def log_samples(log: RunLog | None, predictor: Predictor, step: int) -> None:
 
     Every process predicts, for each has a part of the parameters; the one with a log writes.
     """
-    named = sample_episodes(predictor)
+    named = sample_episodes(predictor.experiment)
     clip = predictor.experiment.clip
     predicted = predictor.predict(list(named.values()), clip.frames)
     if log is None:

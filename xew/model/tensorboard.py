@@ -11,19 +11,30 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from tensorboard.compat.proto.event_pb2 import Event
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
+
+from xew.files import replacing
 
 FRAME_MILLISECONDS = 120
 
 
 class RunLog:
-    """Writes scalars and pictures of a run under its folder."""
+    """Writes scalars and pictures of a run under its folder.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        folder: of the run.
+        step: from which the run goes on; what an earlier try has logged of steps after it, and lost, is taken back.
+    """
+
+    def __init__(self, folder: Path, step: int) -> None:
         self.events = EventFileWriter(str(folder))
-        self.lines = (folder / "metrics.jsonl").open("a")
+        path = folder / "metrics.jsonl"
+        if path.exists():
+            _keep_until(path, step)
+            self.events.add_event(Event(wall_time=time.time(), step=step + 1, session_log=SessionLog(status=SessionLog.START)))
+        self.lines = path.open("a")
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
         """Log numbers by name, such as train/loss."""
@@ -46,6 +57,15 @@ class RunLog:
     def _add(self, step: int, values: list[Summary.Value]) -> None:
         self.events.add_event(Event(wall_time=time.time(), step=step, summary=Summary(value=values)))
         self.events.flush()
+
+
+def _keep_until(path: Path, step: int) -> None:
+    """Leave out of metrics.jsonl the lines of later steps, and one that was cut off."""
+    lines = path.read_text().splitlines(keepends=True)
+    kept = [line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= step]
+    if kept != lines:
+        with replacing(path) as temporary:
+            temporary.write_text("".join(kept))
 
 
 def _encoded(frames: list[np.ndarray], kind: str) -> Summary.Image:

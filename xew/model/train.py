@@ -25,7 +25,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 from tqdm import tqdm
 
-from xew.config import user_errors
+from xew.config import ConfigError, user_errors
 from xew.model.adaptation import corrected
 from xew.model.blocks import choose_attention
 from xew.model.checkpoint import (
@@ -47,7 +47,7 @@ from xew.model.latents import LatentCache, load_codec, replay_episodes, training
 from xew.model.memory import check_memory, estimate_memory, flops_of_step, peak_flops
 from xew.model.optimizer import learning_rate, make_optimizer, with_steps
 from xew.model.predict import Predictor
-from xew.model.samples import log_samples
+from xew.model.samples import check_samples, log_samples
 from xew.model.scales import SCALES, Scale, load_run_scales, save_scales
 from xew.model.sharding import check_batch, make_mesh, mesh_shape, place_batch, process_rows, start_processes, state_shardings
 from xew.model.tensorboard import RunLog
@@ -167,6 +167,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def print_estimate(experiment: Experiment, devices: int, memory_gb: float | None) -> None:
     """The memory of a run on devices that need not be there, with the arithmetic."""
+    if devices < 1:
+        raise ConfigError(f"--devices is {devices}; expected at least one.")
     _, fsdp = mesh_shape(experiment.mesh, devices)
     check_batch(experiment.train.batch, experiment.train.accumulate, devices)
     memory = estimate_memory(experiment, devices, fsdp)
@@ -182,6 +184,7 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     check_batch(experiment.train.batch, experiment.train.accumulate, mesh.size)
     check_network(experiment)
     source, codec = open_data(experiment)
+    check_samples(experiment)
     experiment, asked = with_steps(experiment, source.fresh), experiment
     check_memory(estimate_memory(experiment, mesh.size, mesh.shape["fsdp"]), ignore=ignore_memory)
     begin_run(asked, codec, resume=resume, overwrite=overwrite)
@@ -216,10 +219,10 @@ def run_steps(experiment: Experiment, run: Run, state: TrainState, batches: Any)
         batches: an iterator of this process's batches, with its position.
     """
     settings, train_step = experiment.train, make_train_step(experiment, run.graph, run.mesh, run.codec)
-    log = RunLog(experiment.out) if jax.process_index() == 0 else None
+    begin = int(state.step)
+    log = RunLog(experiment.out, begin) if jax.process_index() == 0 else None
     stop, schedule = StopSignal(), learning_rate(settings)
     meter = Meter(flops_of_step(experiment), settings.batch)
-    begin = int(state.step)
     progress = tqdm(range(begin, settings.steps), desc="train", initial=begin, total=settings.steps, file=sys.stderr)
     for step in (number + 1 for number in progress):
         asking = time.perf_counter()

@@ -29,7 +29,7 @@ from xew.episode import find_accepted, read_video
 from xew.model.ceiling import Ceiling, measure_ceiling, spread
 from xew.model.checkpoint import TrainState, claim_run, open_checkpoints, restore_state, save_state
 from xew.model.codec import WanVaeCodec, to_signed
-from xew.model.experiment import Clip, TrainSettings, compile_cache
+from xew.model.experiment import Clip, TrainSettings, compile_cache, demand_at_least
 from xew.model.latents import Episode, test_episodes
 from xew.model.optimizer import learning_rate, make_optimizer
 from xew.model.samples import strip
@@ -124,9 +124,30 @@ class VaeExperiment:
         return Cut(self.train.clips_of_a_video, self.train.frames, size, crop)
 
 
+LEAST = {
+    "clip.frames": 1,
+    "train.steps": 1,
+    "train.batch": 1,
+    "train.frames": 1,
+    "train.clips_of_a_video": 1,
+    "train.learning_rate": 0,
+    "train.warmup_steps": 0,
+    "train.ema_decay": 0,
+    "train.lpips": 0,
+    "train.kl": 0,
+    "train.statistics_clips": 1,
+    "train.log_every": 1,
+    "train.save_every": 1,
+    "train.sample_every": 0,
+    "train.keep_checkpoints": 1,
+}
+"""Numbers of a config that mean nothing below."""
+
+
 def load_vae_experiment(path: Path | str, overrides: list[str] | None = None) -> VaeExperiment:
     """Read and check a config. Raises ConfigError with what does not exist or does not fit."""
     experiment = load(VaeExperiment, path, overrides or [])
+    demand_at_least(LEAST, experiment, str(path))
     check_streams(experiment.streams)
     _ = experiment.robots
     factor, clip, train = experiment.size.spatial_factor, experiment.clip, experiment.train
@@ -141,8 +162,6 @@ def load_vae_experiment(path: Path | str, overrides: list[str] | None = None) ->
             )
     if train.batch % train.clips_of_a_video:
         raise ConfigError(f"{path}: train.batch is {train.batch}; it must be a multiple of train.clips_of_a_video.")
-    if train.steps < 1:
-        raise ConfigError(f"{path}: train.steps is {train.steps}; it must be over 0.")
     return experiment
 
 
@@ -247,10 +266,11 @@ def train_vae(experiment: VaeExperiment, *, resume: bool = False, overwrite: boo
         state, position = restore_state(checkpoints, state)
         batches.set_state(position)
     step = make_vae_step(graph, statistics, experiment)
-    log, stop = RunLog(experiment.out), StopSignal()
+    begin = int(state.step)
+    log, stop = RunLog(experiment.out, begin), StopSignal()
     sample = sample_clip(experiment, episodes)
 
-    begin, meter, schedule = int(state.step), Meter(), learning_rate(experiment.optimizer)
+    meter, schedule = Meter(), learning_rate(experiment.optimizer)
     progress = tqdm(range(begin, settings.steps), desc="train", initial=begin, total=settings.steps, file=sys.stderr)
     for number in (done + 1 for done in progress):
         last = number == settings.steps
@@ -354,7 +374,14 @@ def finish(experiment: VaeExperiment, vae: VideoVae, files: Sequence[tuple[Path,
         "reconstruction": {name: asdict(ceiling) for name, ceiling in ceilings.items()},
     }
     (experiment.out / "vae.json").write_text(json.dumps(report, indent=1) + "\n")
-    print(f"{experiment.out / 'vae.safetensors'}: use it by codec.name wan_vae, codec.vae {experiment.vae}, codec.weights")
+    print(f"{experiment.out / 'vae.safetensors'}: use it by {codec_options(experiment)}")
+
+
+def codec_options(experiment: VaeExperiment) -> str:
+    """What tells `latents` and `train` to use the autoencoder."""
+    size = experiment.size
+    chosen = f"--codec.name wan_vae --codec.vae {experiment.vae} --codec.weights {experiment.out}"
+    return f"{chosen} --codec.spatial-factor {size.spatial_factor} --codec.channels {size.channels}"
 
 
 def ceiling_of(experiment: VaeExperiment, codec: WanVaeCodec, episodes: Sequence[Episode]) -> Ceiling:

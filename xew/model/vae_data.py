@@ -19,13 +19,12 @@ import numpy as np
 from tqdm import tqdm
 
 from xew.config import ConfigError, pick
-from xew.episode import EpisodeError, Record, episode_folder, read_states, write_video
+from xew.episode import EpisodeError, Record, episode_folder, write_video
 from xew.files import replacing
-from xew.model.conditions import command_of, optical_flow, ray_map, robot_mask
+from xew.model.conditions import optical_flow, ray_map, robot_mask
 from xew.model.frames import to_model_size
+from xew.model.latents import Episode, episode_command
 from xew.threads import in_order
-
-Episode = tuple[Path, Record]
 
 PASSES = 1_000_000
 """Over the videos: without end, and yet a number that Grain can count with."""
@@ -80,7 +79,7 @@ def _file(name: str, folder: Path, record: Record, cache: Path) -> Path:
     path = episode_folder(cache, record.task, record.seed, record.robot) / f"{name}-{key}.mkv"
     if not path.exists():
         with replacing(path) as temporary:
-            write_video(temporary, DRAWN[name](command_of(folder, record, read_states(folder))))
+            write_video(temporary, DRAWN[name](episode_command(folder, record)))
     return path
 
 
