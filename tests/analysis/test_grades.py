@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.analysis.synthetic_study import TASKS, paper_axes, write_study
-from xew.analysis.grades import SEEN, PaperGrades, StudyGrades, better, find_variant, interval, row_keys
+from xew.analysis.grades import SEEN, PaperGrades, StudyGrades, better, find_variant, interval, resample, row_keys
 from xew.analysis.paper import read_paper
 from xew.analysis.scores import Scores, read_scores
 from xew.protocol import PAPER_PARTS, PARTS, ROBOT_NAMES, SEEN_ROBOTS
@@ -51,6 +51,14 @@ def test_intervals_are_those_of_resampled_scenes(grades: StudyGrades, scores: Sc
     assert mean.values[1:].std() == pytest.approx(by_scene.std(ddof=0) / np.sqrt(12), rel=0.06)
     low, high = interval(mean.values, 0.95)
     assert low < mean.value < high
+
+
+@pytest.mark.parametrize(("scenes", "share"), [(6, 0.15), (10, 0.11), (20, 0.08), (100, 0.05)])
+def test_chance_resolves_as_often_as_is_said(scenes: int, share: float) -> None:
+    differences = np.random.default_rng(1).normal(size=(1500, scenes, 1))
+    means = [mean for mean in map(resample, differences) if mean]
+    ends = np.array([interval(mean.values, 0.95) for mean in means])
+    assert np.mean((ends[:, 0] > 0) | (ends[:, 1] < 0)) == pytest.approx(share, abs=0.02)
 
 
 def test_differences_are_paired_by_scene(grades: StudyGrades) -> None:

@@ -120,6 +120,9 @@ def test_the_numbers_are_those_of_the_scores(report: Path, study: Study) -> None
         assert line["low"].item() <= mean <= line["high"].item()
         assert line["episodes"].item() == line["expected"].item() == 6
         assert f">{mean:.3f}<" in text
+        table = pd.read_csv(report / "tables" / f"{robot}.csv")
+        cell = table[table["row"].str.startswith("late") & table["column"].str.contains("LPIPS")]
+        assert cell["value"].item() == pytest.approx(mean, rel=1e-9) and cell["episodes"].item() == 6
     assert "6 of 6 test episodes" in text and "Incomplete" not in text
 
 

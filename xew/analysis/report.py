@@ -1,7 +1,7 @@
 """Stage 11 of 11: report. A score table to one page that opens without a network.
 
 Reads  scores.parquet and its curves; the data set and the rollouts for pictures
-Writes <out>/index.html (self-contained), report.md with figures/, tables/ (LaTeX), summary.csv; of a study also findings.csv
+Writes <out>/index.html (self-contained), report.md with figures/, tables/ (LaTeX, CSV) and summary.csv; of a study findings.csv
 
 A table with the column `variant` is a study's (xew.analysis.study writes it) and becomes the report of `report_study`.
 
@@ -359,6 +359,7 @@ def _markdown(
     lines += ["", "## Figures", "", *(f"![{name}](figures/{name})" for name in files if name.endswith(".png"))]
     made_tables = [run_table(table, scores.metrics) for table in (*held_out, *seen)]
     written = {f"tables/{table.name}.tex": formats.latex(table).encode() for table in made_tables}
+    written |= {f"tables/{table.name}.csv": formats.frame(table).to_csv(index=False).encode() for table in made_tables}
     return "\n".join(lines) + "\n", written | {f"figures/{name}": content for name, content in files.items()}
 
 
