@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from xew.config import ConfigError
 from xew.sim_warp.batched_kinematics import BatchedKinematics
 from xew.sim_warp.inverse_kinematics import ArmSolver, inverse_kinematics
 from xew.sim_warp.kinematics import finger_positions, forward_kinematics, joint_positions, link_matrices, link_poses, tool_pose
@@ -193,6 +195,13 @@ def test_inverse_undoes_forward(robot: RobotSpec) -> None:
     assert (found >= lower).all() and (found <= upper).all()
     again = np.stack([tool_pose(robot, side, row[None])[0] for side, row in zip(arm, found, strict=True)])
     assert np.linalg.norm(again[:, :3] - wanted[:, :3], axis=-1) == pytest.approx(position_error, abs=1e-9)
+
+
+def test_arms_that_differ_are_refused() -> None:
+    left, right = ROBOTS["piper"].arms
+    longer = replace(right, tool_pose=(*np.add(right.tool_pose[:3], 0.05).tolist(), *right.tool_pose[3:]))
+    with pytest.raises(ConfigError, match=r"piper.urdf: the arms of piper differ beyond their bases; expected two alike"):
+        ArmSolver(replace(ROBOTS["piper"], arms=(left, longer)))
 
 
 def test_out_of_reach_is_reported() -> None:

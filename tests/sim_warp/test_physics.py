@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.sim_warp.small import at_home
+from xew.config import ConfigError
 from xew.protocol import ARMS, FRAME_RATE
 from xew.sim_warp import physics_gpu
 from xew.sim_warp.expert import joint_commands
@@ -125,7 +126,7 @@ def test_a_lid_stays_where_it_is_left(share: float) -> None:
 def test_a_scene_beyond_the_template_is_refused() -> None:
     scene = scene_of("blocks_ranking_rgb")
     crowded = replace(scene, objects=(*scene.objects, replace(scene.objects[0], name="fourth")))
-    with pytest.raises(ValueError, match=f"has 4 free and 0 hinged objects; the template holds {FREE_SLOTS} free ones"):
+    with pytest.raises(ConfigError, match=f"has 4 free and 0 hinged objects; the template holds {FREE_SLOTS} free ones"):
         standing(ROBOTS["piper"], crowded, 1)
 
 

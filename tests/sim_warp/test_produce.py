@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.sim_warp.small import SLOW, TASK
+from xew.config import ConfigError
 from xew.episode import (
     EpisodeError,
     Record,
@@ -24,7 +25,9 @@ from xew.sim_warp import produce as stage
 from xew.sim_warp.physics import Motion, World, simulate
 from xew.sim_warp.produce import Job, add_videos, demand_plausible, produce, render_again
 from xew.sim_warp.render import Renderer
+from xew.sim_warp.scene import scene_rng
 from xew.sim_warp.streams import command_streams_batch
+from xew.sim_warp.tasks import get_task
 
 ROBOTS = ("franka_panda", SLOW)
 JOBS = [Job(TASK, seed, ROBOTS) for seed in (0, 1, 2)]
@@ -145,6 +148,13 @@ def test_an_episode_of_a_task_that_has_changed_is_told(data: Path, renderer: Ren
         demand_plausible(changed)
     with pytest.raises(EpisodeError, match=told):
         render_again(changed, renderer)
+
+
+@pytest.mark.parametrize("instruction", ["close both {color} hands", "close {} hands", "close {both hands"])
+def test_an_instruction_that_its_scene_cannot_fill_is_told(instruction: str) -> None:
+    wordless = replace(get_task(TASK), instruction=instruction)
+    with pytest.raises(ConfigError, match=r"cannot be filled .* from the words of its scene \(none\)"):
+        stage._instruction(wordless, wordless.sample(scene_rng(TASK, 0), 0))
 
 
 def test_an_episode_without_videos_gets_them_on_demand(data: Path, renderer: Renderer, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from xew.config import ConfigError
 from xew.sim_warp.kinematics import tool_matrix
 from xew.sim_warp.poses import matrix_from_pose, pose_from_matrix
 from xew.sim_warp.robots.spec import Arm, RobotSpec
@@ -53,6 +54,9 @@ class ArmSolver:
             robot: whose arms.
             device: Warp's name of the device; its default if left out.
             iterations: Levenberg-Marquardt steps a call.
+
+        Raises:
+            ConfigError: the arms are not alike.
         """
         self.robot = robot
         self.iterations = iterations
@@ -173,7 +177,7 @@ def _arm_model(robot: RobotSpec, device: str | None) -> tuple[newton.Model, np.n
     """The arm from its first joint on as a Newton model of seven joints, and its tool frame [7] in the last real link."""
     left, right = (_segments(robot, arm) for arm in robot.arms)
     if not np.allclose(left[1:], right[1:], atol=1e-6):
-        raise ValueError(f"{robot.key}: the arms differ beyond their bases; inverse kinematics expects two alike.")
+        raise ConfigError(f"{robot.urdf}: the arms of {robot.key} differ beyond their bases; expected two alike.")
     joints = [load_urdf(robot.urdf).joints[name] for name in robot.arms[0].joints]
     builder = newton.ModelBuilder()
     handles = []

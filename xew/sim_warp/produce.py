@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 import xew
+from xew.config import ConfigError
 from xew.episode import (
     EpisodeError,
     Record,
@@ -248,7 +249,7 @@ def header(cell: Cell, device: wp.Device) -> Record:
         success=reason is None,
         failure=reason,
         failure_detail=detail,
-        instruction=cell.task.instruction.format(**cell.scene.words),
+        instruction=_instruction(cell.task, cell.scene),
         frame_count=cell.path.frame_count,
         object_names=cell.scene.names,
         keypoint_names=keypoint_names(cell.robot),
@@ -256,6 +257,17 @@ def header(cell: Cell, device: wp.Device) -> Record:
         versions=_versions(),
         device=device.name,
     )
+
+
+def _instruction(task: Task, scene: Scene) -> str:
+    """What the robot is told to do in this scene. Raises ConfigError where the scene has no word for a slot."""
+    try:
+        return task.instruction.format(**scene.words)
+    except (KeyError, IndexError, ValueError) as error:
+        raise ConfigError(
+            f"the instruction of {scene.task}, {task.instruction!r}, cannot be filled ({error}) from the words of its scene "
+            f"({', '.join(scene.words) or 'none'}); add to Scene.words what it has in braces."
+        ) from error
 
 
 @cache

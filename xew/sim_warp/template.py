@@ -21,6 +21,7 @@ import warp as wp
 from newton import JointTargetMode
 from scipy.spatial.transform import Rotation
 
+from xew.config import ConfigError
 from xew.sim_warp.robots import RobotSpec, load_urdf
 from xew.sim_warp.robots.spec import Arm
 from xew.sim_warp.robots.urdf import Joint, Urdf
@@ -157,7 +158,7 @@ def new_builder() -> newton.ModelBuilder:
 
 
 def add_world(builder: newton.ModelBuilder, robot: RobotSpec, scene: Scene) -> None:
-    """Append one world of the template: `robot` before `scene`."""
+    """Append one world of the template: `robot` before `scene`. Raises ConfigError if the scene has more than it holds."""
     builder.begin_world(label=f"{scene.task}/{scene.seed}/{robot.key}")
     for side, arm in zip(SIDES, robot.arms, strict=True):
         _add_arm(builder, side, arm, robot.urdf)
@@ -266,7 +267,7 @@ def _add_objects(builder: newton.ModelBuilder, scene: Scene) -> None:
     free = [thing for thing in scene.objects if not thing.is_fixed]
     hinged = [thing for thing in scene.objects if thing.hinge]
     if len(free) > FREE_SLOTS or len(hinged) > 1 or any(not thing.is_fixed for thing in hinged):
-        raise ValueError(
+        raise ConfigError(
             f"the scene of {scene.task} has {len(free)} free and {len(hinged)} hinged objects; the template holds "
             f"{FREE_SLOTS} free ones and one hinge on a fixed object: raise its slots in {__name__}."
         )

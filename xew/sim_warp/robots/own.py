@@ -203,10 +203,7 @@ def _settled(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
             return placement.with_distance(robot, near, draft.distance)
         return placement.with_home(robot, near)
 
-    try:
-        return settle(robot) if left.tool_pose else placement.better_turned(robot, settle)
-    except ValueError as error:  # the solver's: the arms differ
-        raise ConfigError(f"{source}: {error}") from error
+    return settle(robot) if left.tool_pose else placement.better_turned(robot, settle)
 
 
 def _posture(arm: ArmDraft, robot: RobotSpec, source: str) -> np.ndarray | None:
