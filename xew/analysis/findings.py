@@ -307,7 +307,7 @@ def _forgets(reader: Reader) -> Iterator[Comparison]:
     for robot in HELD_OUT_ROBOTS:
         for shots in SHOTS:
             made = reader.gain("forgetting", "none", f"{robot}-{shots}", FORGETTING_ROBOT, "lpips", above=0)
-            yield _named(made, f"after {SHORT_ROBOTS[robot]}, M = {shots}")
+            yield _named(made, f"M = {shots}, after {SHORT_ROBOTS[robot]}")
 
 
 def _catastrophe(reader: Reader) -> Iterator[Comparison]:
@@ -321,7 +321,7 @@ def _remedies(reader: Reader) -> Iterator[Comparison]:
             for shots in SHOTS:
                 row = f"{robot}-{shots}"
                 made = reader.gain("forgetting", f"{row}-{remedy}", row, FORGETTING_ROBOT, "lpips", above=0)
-                yield _named(made, f"{remedy}, {SHORT_ROBOTS[robot]}, M = {shots}")
+                yield _named(made, f"{remedy}, M = {shots}, {SHORT_ROBOTS[robot]}")
 
 
 def _appearance_strong(reader: Reader) -> Iterator[Comparison]:
