@@ -22,6 +22,7 @@ from newton import JointTargetMode
 from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError
+from xew.sim_warp.poses import matrix_from_pose
 from xew.sim_warp.robots import RobotSpec, load_urdf
 from xew.sim_warp.robots.spec import Arm
 from xew.sim_warp.robots.urdf import Joint, Urdf
@@ -276,7 +277,7 @@ def _add_objects(builder: newton.ModelBuilder, scene: Scene) -> None:
     _add_hinge_slot(builder, hinged[0] if hinged else None, scene)
     for thing in scene.objects:
         if thing.is_fixed:
-            pose = _matrix(thing.pose)
+            pose = matrix_from_pose(thing.pose)
             for points in thing.shape.hulls:
                 points = points @ pose[:3, :3].T + pose[:3, 3]
                 _add_hull(builder, -1, points, thing.friction, OBJECT_GROUP, object_label(scene, thing))
@@ -383,10 +384,3 @@ def _convex(points: bytes) -> trimesh.Trimesh:
 
 def _transform(matrix: np.ndarray) -> wp.transform:
     return wp.transform(tuple(matrix[:3, 3]), wp.quat(*Rotation.from_matrix(matrix[:3, :3]).as_quat()))
-
-
-def _matrix(pose: tuple[float, ...]) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(pose[3:]).as_matrix()
-    matrix[:3, 3] = pose[:3]
-    return matrix
