@@ -186,6 +186,7 @@ def test_an_incomplete_table_says_so(study: Study, tmp_path: Path) -> None:
     assert "Piper (4 episodes): late · by one &lt;frame&gt; cannot be told" in text and "Fewer than 6 scenes" in text
     for name in ("report.md", "tables/piper.tex"):
         assert "Incomplete: 4 of 6 test episodes are scored." in (tmp_path / "report" / name).read_text()
+    assert "> Fewer than 6 scenes" in (tmp_path / "report" / "report.md").read_text()
 
 
 def test_without_data_there_are_numbers_and_a_word_on_the_missing_pictures(study: Study, tmp_path: Path) -> None:

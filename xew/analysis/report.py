@@ -127,7 +127,7 @@ def _report_scores(args: Args, scores: Scores) -> None:
     missing = missing_cells(scores.rows)
     strips = _strips(scores, args) if args.data and args.rollouts else []
     curves = _curves(scores, args.held_out)
-    sheets = [_contact_sheet(args.data, records)] if args.data else []
+    sheets = [_contact_sheet(args.data, records)] if args.data and any(record.success for record in records) else []
     sections = [
         *map(page.note, report_study.missing_note(missing)),
         _held_out_section(held_out, scores.metrics),
@@ -139,8 +139,8 @@ def _report_scores(args: Args, scores: Scores) -> None:
     ]
     sentences = finding(held_out, seen, scores.metrics)
     html = page.page(TITLE, sentences, [text for text in sections if text], _footer(scores.versions))
-    markdown = _markdown(sentences, held_out, seen, scores, [*strips, *sheets], chart_files(curves))
-    text, files = markdown
+    notes = [*report_study.missing_note(missing), *_caution(held_out)]
+    text, files = _markdown(sentences, notes, held_out, seen, scores, [*strips, *sheets], chart_files(curves))
     if len(missing):
         files["missing.csv"] = missing.to_csv(index=False).encode()
     _write(args.out, html, (text, files), flat_summary(held_out + seen))
@@ -169,10 +169,6 @@ def _expected(records: Sequence[Record], robots: Sequence[str]) -> int:
 def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> str:
     if not tables:
         return page.section("Robots never seen in training", page.note("No held-out robot has been graded yet."))
-    few = min(table.count for table in tables)
-    caution = page.note("Fewer than ten episodes a robot: intervals and verdicts are rough.") if few < 10 else ""
-    if few < MIN_SCENES:
-        caution = page.note(f"Fewer than {MIN_SCENES} scenes: no intervals, and nothing is resolved.")
     return page.section(
         "Robots never seen in training",
         page.paragraph(
@@ -180,9 +176,17 @@ def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo
             "frame, paired by episode: ▲ better, ▼ worse, ≈ not resolved. The ceiling is the true video graded in the model's "
             "place: what it lacks is the estimators' own error, and a smaller difference is not resolved."
         ),
-        caution,
+        *map(page.note, _caution(tables)),
         *(page.table(run_table(table, metrics)) for table in tables),
     )
+
+
+def _caution(tables: Sequence[RobotTable]) -> list[str]:
+    """What to say of few episodes; none where there are enough."""
+    few = min((table.count for table in tables), default=np.inf)
+    if few < MIN_SCENES:
+        return [f"Fewer than {MIN_SCENES} scenes: no intervals, and nothing is resolved."]
+    return ["Fewer than ten episodes a robot: intervals and verdicts are rough."] if few < 10 else []
 
 
 def _seen_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> str:
@@ -342,6 +346,7 @@ def _footer(graded_with: Mapping[str, str]) -> str:
 
 def _markdown(
     sentences: Sequence[str],
+    notes: Sequence[str],
     held_out: Sequence[RobotTable],
     seen: Sequence[RobotTable],
     scores: Scores,
@@ -349,7 +354,7 @@ def _markdown(
     charts: Mapping[str, bytes],
 ) -> tuple[str, dict[str, bytes]]:
     """report.md and the files that it shows."""
-    lines = [f"# {TITLE}", "", *(f"- {sentence}" for sentence in sentences)]
+    lines = [f"# {TITLE}", "", *(f"- {sentence}" for sentence in sentences), *(f"\n> {note}" for note in notes)]
     for heading, tables in (("Robots never seen in training", held_out), ("Robots seen in training", seen)):
         lines += ["", f"## {heading}"]
         for table in tables:
