@@ -83,6 +83,10 @@ def test_a_subset_keeps_what_it_starts_from(study: Study) -> None:
     [
         (["--parts", "ladders"], "did you mean 'ladder'"),
         (["--robots", "pipr"], "did you mean 'piper'"),
+        (["--robots", "piper", "piper"], "a robot stands twice in piper, piper"),
+        (["--tasks", "lift_pott"], "did you mean 'lift_pot'"),
+        (["--tasks", "lift_pot", "lift_pot"], "a task stands twice"),
+        (["--shots", "1", "5"], "unknown number of shots '5'; known: 1, 2, 3"),
         (["--variants", "loeo_*", "leo_*"], "variants 'leo_\\*' matches none of the parts"),
         (["--variants", "few_shot-piper-3"], "no variant"),
         (["--train-seeds", "0"], "expected at least 1 and 1"),

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from xew.config import ConfigError, load, pick, read_yaml, suggestion
+from xew.config import ConfigError, load, read_yaml, suggestion
 from xew.protocol import (
     PAPER_PARTS,
     PARTS,
@@ -25,6 +25,7 @@ from xew.protocol import (
     expected_counts,
     training_counts,
 )
+from xew.sim_warp.tasks import get_task
 
 Settings = dict[str, Any]
 """A part of an experiment's config, nested as in its file."""
@@ -150,20 +151,7 @@ class Study:
 def load_study(path: Path, overrides: Iterable[str] = ()) -> Study:
     """Read and check a study's config. Raises ConfigError with every choice that does not exist or does not fit."""
     study = load(Study, path, list(overrides))
-    for part in study.parts:
-        pick(PARTS, part, "part")
-    for robot in study.robots:
-        if robot not in ROBOT_NAMES:
-            raise ConfigError(
-                f"{path}: unknown robot {robot!r};{suggestion(robot, ROBOT_NAMES)} known: {', '.join(ROBOT_NAMES)}"
-            )
-    names = [variant.name for part in study.parts for variant in PARTS[part]]
-    for pattern in study.variants:
-        if not fnmatch.filter(names, pattern):
-            raise ConfigError(
-                f"{path}: variants {pattern!r} matches none of the parts {', '.join(study.parts)};{suggestion(pattern, names)} "
-                f"there are {', '.join(dict.fromkeys(names))}."
-            )
+    _check_names(study, path)
     if not study.planned:
         raise ConfigError(f"{path}: no variant of the parts {', '.join(study.parts)} is left; widen variants, robots or shots.")
     shots = max((variant.shots for variant in study.planned), default=0)
@@ -174,6 +162,31 @@ def load_study(path: Path, overrides: Iterable[str] = ()) -> Study:
     if study.machine.workers < 1 or study.machine.gpus_per_training < 1:
         raise ConfigError(f"{path}: machine.workers and machine.gpus_per_training must be at least 1.")
     return study
+
+
+def _check_names(study: Study, path: Path) -> None:
+    """Raises ConfigError with the first name that does not exist, or that stands twice."""
+    for task in study.tasks:
+        get_task(task)
+    shots, known_shots = tuple(map(str, study.shots)), tuple(map(str, SHOTS))
+    for kind, names, known in (
+        ("part", study.parts, tuple(PARTS)),
+        ("robot", study.robots, ROBOT_NAMES),
+        ("number of shots", shots, known_shots),
+        ("task", study.tasks, study.tasks),  # known: asked above, and may be of one's own
+    ):
+        for name in names:
+            if name not in known:
+                raise ConfigError(f"{path}: unknown {kind} {name!r};{suggestion(name, known)} known: {', '.join(known)}.")
+        if len(set(names)) < len(names):
+            raise ConfigError(f"{path}: a {kind} stands twice in {', '.join(names)}; name each once.")
+    variants = list(dict.fromkeys(variant.name for part in study.parts for variant in PARTS[part]))
+    for pattern in study.variants:
+        if not fnmatch.filter(variants, pattern):
+            raise ConfigError(
+                f"{path}: variants {pattern!r} matches none of the parts {', '.join(study.parts)};"
+                f"{suggestion(pattern, variants)} there are {', '.join(variants)}."
+            )
 
 
 def experiment_of(study: Study, variant: Variant) -> Settings:
