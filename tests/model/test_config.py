@@ -8,7 +8,7 @@ import pytest
 
 from xew import config
 from xew.config import ConfigError
-from xew.model.experiment import load_experiment
+from xew.model.experiment import beside, load_experiment
 
 REPOSITORY = Path(__file__).parents[2]
 CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
@@ -141,6 +141,15 @@ def test_shipped_configs_load_and_survive_saving(path: Path, tmp_path: Path) -> 
     experiment = load_experiment(path)
     config.save(experiment, tmp_path / "saved.yaml")
     assert load_experiment(tmp_path / "saved.yaml") == experiment
+
+
+def test_what_lies_beside_the_data_does_so_wherever_one_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "data" / "task").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "data" / "task")
+    assert beside(Path(".."), "latents") == (tmp_path / "data-latents").resolve()
+    monkeypatch.chdir(tmp_path / "data")
+    assert beside(Path("."), "latents") == (tmp_path / "data-latents").resolve()
+    assert beside(Path("data"), "latents") == Path("data-latents")
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from xew.model.dit_layouts import (
     wan_layout,
 )
 from xew.model.mechanisms import MECHANISMS
-from xew.model.weights import Source, checkpoint_shapes, load_weights, read_tensors, save_weights
+from xew.model.weights import Source, checkpoint_shapes, fill, read_tensors, save_weights
 
 REFERENCE = Path(__file__).parent / "reference"
 CHANNELS = 3
@@ -76,7 +76,7 @@ def wan_arrays(naming: str = "official", *streams: str) -> Arrays:
 
 def fails(path: Path, module: nnx.Module | None = None) -> str:
     with pytest.raises(ConfigError) as error:
-        load_weights(module or Leaves(nnx.Rngs(0)), path, LAYOUT)
+        fill(module or Leaves(nnx.Rngs(0)), read_tensors(path), LAYOUT)
     return str(error.value)
 
 
@@ -99,7 +99,7 @@ def test_shapes_of_the_other_project() -> None:
 def test_every_layout_goes_in_and_out(arrays: Arrays, tmp_path: Path) -> None:
     save_file(arrays, tmp_path / "in.safetensors")
     module = Leaves(nnx.Rngs(0))
-    load_weights(module, tmp_path / "in.safetensors", LAYOUT)
+    fill(module, read_tensors(tmp_path / "in.safetensors"), LAYOUT)
     np.testing.assert_array_equal(module.linear.kernel[...], arrays["a.weight"].T)
     np.testing.assert_array_equal(module.convolution.kernel[1, 0, 1], arrays["conv"][:, :, 1, 0, 1].T)
     np.testing.assert_array_equal(module.patches.kernel[...], arrays["patch"].reshape(3, 8).T)
@@ -126,7 +126,7 @@ def test_an_abstract_module_becomes_real(arrays: Arrays, tmp_path: Path) -> None
     save_file(arrays, tmp_path / "in.safetensors")
     module, real = nnx.eval_shape(lambda: Leaves(nnx.Rngs(0))), Leaves(nnx.Rngs(1))
     for target in (module, real):
-        load_weights(target, tmp_path / "in.safetensors", LAYOUT)
+        fill(target, read_tensors(tmp_path / "in.safetensors"), LAYOUT)
     jax.tree.map(np.testing.assert_array_equal, nnx.state(module, nnx.Param), nnx.state(real, nnx.Param))
 
 
@@ -138,7 +138,7 @@ def test_types_of_files(dtype: type, arrays: Arrays, tmp_path: Path) -> None:
     rounded = {key: array.astype(dtype) for key, array in arrays.items()}
     save_file(rounded, tmp_path / "in.safetensors")
     module = Leaves(nnx.Rngs(0))
-    load_weights(module, tmp_path / "in.safetensors", LAYOUT)
+    fill(module, read_tensors(tmp_path / "in.safetensors"), LAYOUT)
     assert module.linear.kernel.dtype == jnp.float32
     np.testing.assert_array_equal(module.linear.kernel[...], rounded["a.weight"].T.astype(np.float32))
 
@@ -270,11 +270,11 @@ def test_optional_leaves_and_keys(arrays: Arrays, tmp_path: Path) -> None:
     path = tmp_path / "in.safetensors"
     save_file({key: array for key, array in arrays.items() if "blocks" not in key} | {"head.x": arrays["conv"]}, path)
     module = Leaves(nnx.Rngs(0))
-    load_weights(module, path, LAYOUT, optional=("layers.*", "head.*"))
+    fill(module, read_tensors(path), LAYOUT, optional=("layers.*", "head.*"))
     np.testing.assert_array_equal(module.layers[0][...], 1)
     save_file({key: array for key, array in arrays.items() if key != "blocks.1.w"}, path)
     with pytest.raises(ConfigError, match=r"1 missing: blocks\.1\.w"):
-        load_weights(module, path, LAYOUT, optional=("layers.*",))
+        fill(module, read_tensors(path), LAYOUT, optional=("layers.*",))
 
 
 def test_layouts_that_do_not_fit_the_module() -> None:

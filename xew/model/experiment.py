@@ -160,7 +160,7 @@ class Experiment:
 
     @property
     def cache_folder(self) -> Path:
-        return self.cache or self.data.with_name(f"{self.data.name}-latents")
+        return self.cache or beside(self.data, "latents")
 
     @property
     def robots(self) -> Split:
@@ -201,6 +201,12 @@ class Experiment:
         """Of one RGB clip [t h w c]."""
         factor = self.codec.spatial_factor
         return latent_frames(self.clip.frames), self.clip.height // factor, self.clip.width // factor, self.codec.channels
+
+
+def beside(data: Path, ending: str) -> Path:
+    """The folder next to the data that is called as they are, with an ending; also where they are "." or ".."."""
+    named = data.resolve() if data.name in ("", "..") else data
+    return named.with_name(f"{named.name}-{ending}")
 
 
 def chosen_conditions(settings: ModelSettings) -> list[Condition]:

@@ -205,11 +205,6 @@ class Objective:
         return self.place(gradients), losses, predicted
 
 
-def rounded(graph: nnx.GraphDef, base: Any, learned: Any) -> Any:
-    """The network's parameters as its products take them; differentiable in what is learned."""
-    return compute_params(graph, corrected(base, learned))
-
-
 def sample_pairs(keys: Array, latents: Array, shift: float) -> TrainingPair:
     """`training_pair` of each sample with its own key [b]."""
     pairs = jax.vmap(lambda key, sample: training_pair(key, sample[None], shift))(keys, latents)

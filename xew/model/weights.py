@@ -118,7 +118,7 @@ def read_tensors(path: Path) -> Tensors:
         raise ConfigError(f"cannot read the weights {path}: {error.strerror or error}.") from error
 
 
-def load_weights(module: nnx.Module, path: Path, layout: Layout, *, optional: Collection[str] = ()) -> None:
+def fill(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Collection[str] = ()) -> None:
     """Fill the leaves of a module in place from a checkpoint, in each leaf's own type and on its own devices.
 
     Leaves that the layout does not name keep their values. An abstract module (of `nnx.eval_shape`) becomes a real one
@@ -126,18 +126,13 @@ def load_weights(module: nnx.Module, path: Path, layout: Layout, *, optional: Co
 
     Args:
         module: whose leaves are filled.
-        path: as for `read_tensors`.
+        tensors: of the checkpoint, from `read_tensors`.
         layout: where each leaf comes from.
         optional: patterns (as "flow_stream.*") of leaves that the checkpoint may lack, and of its keys that may be left.
 
     Raises:
         ConfigError: tensors are missing, left over or misshapen; the first few are named. Nothing has been filled then.
     """
-    fill(module, read_tensors(path), layout, optional=optional)
-
-
-def fill(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Collection[str] = ()) -> None:
-    """`load_weights` of tensors that have been opened already."""
     wanted = check_fit(module, tensors, layout, optional=optional)
     leaves = _leaves(module, layout)
     for path, source in wanted.items():
