@@ -14,7 +14,13 @@ from tests.analysis.synthetic_study import TASKS, paper_axes, write_study
 from tests.analysis.test_report import Page, refers_outside
 from tests.synthetic import write_synthetic_data
 from xew.analysis import formats, page
-from xew.analysis.distance_tables import correlation_table, distance_tables, read_distances
+from xew.analysis.distance_tables import (
+    correlation_table,
+    distance_tables,
+    own_correlation_tables,
+    printed_distances,
+    read_distances,
+)
 from xew.analysis.grades import PaperGrades, StudyGrades
 from xew.analysis.paper import read_paper
 from xew.analysis.report import Args, main
@@ -291,10 +297,27 @@ def test_measured_distances_take_the_place_of_the_printed(folder: Path, tmp_path
     assert [cell.text for row in made["distances"].blocks[1].rows for cell in row.cells] == ["4.000"] * 3 + ["5.000"] * 3
     matrix = formats.frame(made["matrices"])
     assert matrix[matrix["value"] == 0.5]["paper"].tolist() == [0.034, 0.034]
-    correlated = correlation_table(builder(folder / "scores.parquet").ours, distances, read_paper())
-    assert len(correlated.columns) == 3 * 2 + 1 and all(
-        cell.text != "–" for row in correlated.blocks[0].rows for cell in row.cells
-    )
+    grades = builder(folder / "scores.parquet").ours
+    correlated, [own] = correlation_table(grades, distances, read_paper()), own_correlation_tables(grades, distances)
+    assert (len(correlated.columns), len(own.columns)) == (2 * 2 + 1, 3)
+    assert all(cell.text != "–" for table in (correlated, own) for row in table.blocks[0].rows for cell in row.cells)
+    scores = [mean.value for r in ROBOT_NAMES if (mean := grades.mean("loeo", f"loeo_{r}", r, "lpips"))]
+    lpips = next(row for row in own.blocks[0].rows if row.labels == ("LPIPS",))
+    assert lpips.cells[0].value == pytest.approx(np.corrcoef(distances.of("perceptual"), scores)[0, 1])
+    assert own_correlation_tables(grades, printed_distances(read_paper())) == []
+
+
+@needs_chromium
+def test_all_distances_fit_a_desk(folder: Path, tmp_path: Path) -> None:
+    features = ("dof", "links", "reach", "volume", "kinematic", "appearance", "arm_base", "arm_alone", "perceptual")
+    singles = [(robot, feature, 0.1 + i * i, 0.1, 0.1) for i, robot in enumerate(ROBOT_NAMES) for feature in features]
+    pd.DataFrame(singles, columns=["robot", "feature", "value", "spread", "published"]).to_csv(tmp_path / "robots.csv")
+    pairs = [("kinematic", "piper", "arx_x5", 0.5, 0.01, 0.034)]
+    pd.DataFrame(pairs, columns=["axis", "robot", "other", "value", "spread", "published"]).to_csv(tmp_path / "distances.csv")
+    main(Args(folder / "scores.parquet", out=tmp_path / "report", distances=tmp_path))
+    text = (tmp_path / "report" / "index.html").read_text()
+    assert "Correlation of our own distances" in text
+    assert_readable(tmp_path / "report" / "index.html", images=0, charts=text.count("<svg"))
 
 
 def test_wrong_inputs_name_what_to_do(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -129,27 +129,24 @@ def distance_tables(distances: Distances) -> list[Table]:
     ]
 
 
-def correlation_table(grades: Grades, distances: Distances, paper: Paper | None) -> Table:
-    """The paper's layout: r and leave-one-out range for each axis, then r with the number of joints."""
+def correlation_table(grades: Grades, distances: Distances, paper: Paper) -> Table:
+    """The paper's layout: r and leave-one-out range for each of its axes, then r with the number of joints."""
     found = correlate(grades, distances)
-    axes = [axis for axis in ("appearance", "kinematic") if axis in distances.axes]
-    own = [axis for axis in distances.axes if axis not in axes] if paper else []
 
     def row(metric: str) -> Row:
         cells = []
-        for axis in (*axes, *own):
-            result = found.get((metric, axis))
-            printed = getattr(paper.metrics[metric], axis) if paper and axis in axes else None
+        for axis in AXES:
+            result, printed = found.get((metric, axis)), getattr(paper.metrics[metric], axis)
             cells += [
-                _signed_cell([result.r] if result else [], [printed.r] if printed else []),
-                _signed_cell([result.low, result.high] if result else [], [printed.low, printed.high] if printed else []),
+                _signed_cell([result.r] if result else [], [printed.r]),
+                _signed_cell([result.low, result.high] if result else [], [printed.low, printed.high]),
             ]
         scores = _loeo_scores(grades, metric)
         dof = [dof_correlation(distances.of("dof").tolist(), scores, grades.metrics[metric].higher_is_better)] if scores else []
-        cells.append(_signed_cell(dof, [paper.metrics[metric].dof_r] if paper else []))
+        cells.append(_signed_cell(dof, [paper.metrics[metric].dof_r]))
         return Row((METRIC_TITLES[metric],), tuple(cells))
 
-    columns = [Column(title, AXIS_TITLES[axis]) for axis in (*axes, *own) for title in ("Pearson r", "leave one out")]
+    columns = [Column(title, AXIS_TITLES[axis]) for axis in AXES for title in ("Pearson r", "leave one out")]
     shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
     return Table(
         "correlations",
@@ -162,16 +159,43 @@ def correlation_table(grades: Grades, distances: Distances, paper: Paper | None)
     )
 
 
-def certainty_table(grades: Grades, distances: Distances, paper: Paper | None) -> Table:
-    """What five points can say: exact p, Spearman, bootstrap over robots, stability of the sign."""
+def own_correlation_tables(grades: Grades, distances: Distances) -> list[Table]:
+    """The same of distances that the paper does not have; none where none were measured."""
     found = correlate(grades, distances)
-    axes = [axis for axis in ("appearance", "kinematic") if axis in distances.axes]
+    own = [axis for axis in distances.axes if axis not in AXES]
+    shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
 
     def row(metric: str) -> Row:
         cells: list[Cell] = []
-        for axis in axes:
+        for axis in own:
             result = found.get((metric, axis))
-            printed = getattr(paper.metrics[metric], axis).p_value if paper else None
+            p = Cell(f"{result.p_value:.3f}", value=result.p_value) if result else Cell()
+            cells += [
+                _signed_cell([result.r] if result else [], []),
+                _signed_cell([result.low, result.high] if result else [], []),
+                p,
+            ]
+        return Row((METRIC_TITLES[metric],), tuple(cells))
+
+    table = Table(
+        "correlations_own",
+        "Correlation of our own distances with scores",
+        "As above; p is exact and two-sided over all 120 pairings.",
+        ("metric",),
+        tuple(Column(title, AXIS_TITLES[axis]) for axis in own for title in ("Pearson r", "leave one out", "p")),
+        (Block("", tuple(row(metric) for metric in shown), _missing_folds(grades, shown)),),
+    )
+    return [table] if own else []
+
+
+def certainty_table(grades: Grades, distances: Distances, paper: Paper) -> Table:
+    """What five points can say: exact p, Spearman, bootstrap over robots, stability of the sign."""
+    found = correlate(grades, distances)
+
+    def row(metric: str) -> Row:
+        cells: list[Cell] = []
+        for axis in AXES:
+            result, printed = found.get((metric, axis)), getattr(paper.metrics[metric], axis).p_value
             p = Cell(published=f"{printed:.3f}" if printed else "", printed=printed or np.nan)
             if result is None:
                 cells += [p, Cell(), Cell(), Cell()]
@@ -193,7 +217,7 @@ def certainty_table(grades: Grades, distances: Distances, paper: Paper | None) -
         "p is two-sided over all 120 pairings; ρ and the 95 % bootstrap over robots are ours; the sign is stable where it "
         f"survives leaving out any one robot.{_standing_in(distances)}",
         ("metric",),
-        tuple(Column(head, AXIS_TITLES[axis]) for axis in axes for head in heads),
+        tuple(Column(head, AXIS_TITLES[axis]) for axis in AXES for head in heads),
         (Block("", tuple(row(metric) for metric in shown), _missing_folds(grades, shown)),),
     )
 

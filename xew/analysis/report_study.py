@@ -18,6 +18,7 @@ from xew.analysis.distance_tables import (
     correlate,
     correlation_table,
     distance_tables,
+    own_correlation_tables,
     printed_distances,
     read_distances,
     signed,
@@ -46,7 +47,11 @@ SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]]
     "actions": (("gains_actions",), ("actions",), ("actions_full",)),
     "ladder": (("gains_ladder",), ("ladder",), ("ladder_full",)),
     "few_shot": (("forgetting", "gains_few_shot"), ("few_shot",), ("few_shot_full", "forgetting_full")),
-    "loeo": (("distance",), ("correlations", "loeo_full"), ("certainty", "distances", "features", "matrices")),
+    "loeo": (
+        ("distance",),
+        ("correlations", "correlations_own", "loeo_full"),
+        ("certainty", "distances", "features", "matrices"),
+    ),
     "baselines": ((), ("baselines",), ()),
 }
 """By part: charts, tables that stand open, and tables that are folded away."""
@@ -102,7 +107,8 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
     tables = [*build_tables(builder), count_table(builder), *distance_tables(known)]
     if builder.present("loeo"):
-        tables += [correlation_table(grades, known, paper), certainty_table(grades, known, paper)]
+        tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
+        tables.append(certainty_table(grades, known, paper))
     findings = ask(grades)
     missing = missing_cells(scores.rows)
     content = Content(
