@@ -180,7 +180,7 @@ def own_correlation_tables(grades: Grades, distances: Distances) -> list[Table]:
     table = Table(
         "correlations_own",
         "Correlation of our own distances with scores",
-        "As above; p is exact and two-sided over all 120 pairings.",
+        "r, its range when one robot is left out, and the exact two-sided p over all 120 pairings. Positive: farther is worse.",
         ("metric",),
         tuple(Column(title, AXIS_TITLES[axis]) for axis in own for title in ("Pearson r", "leave one out", "p")),
         (Block("", tuple(row(metric) for metric in shown), _missing_folds(grades, shown)),),
