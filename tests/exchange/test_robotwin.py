@@ -245,6 +245,16 @@ def test_a_bad_file_ends_in_one_line(damage: Callable[[Path], None], told: str, 
     assert "\n" not in str(error.value) and str(path) in str(error.value)
 
 
+@pytest.mark.parametrize("name", ["seed.txt", "instructions/episode3.json"])
+def test_a_bad_file_beside_it_is_named(name: str, tmp_path: Path) -> None:
+    beside = tmp_path / LEGACY.parents[1] / name
+    path = made.write_legacy(tmp_path / LEGACY)
+    beside.parent.mkdir(exist_ok=True)
+    beside.write_bytes(b"\xff\xfe\x00")
+    records, refused = import_all([path], Args(tmp_path, tmp_path / "out"))
+    assert not records and len(refused) == 1 and refused[0].startswith(f"{beside} cannot be read as text")
+
+
 def test_the_command_imports_what_it_can_and_names_the_rest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:

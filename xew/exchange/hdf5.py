@@ -241,11 +241,19 @@ class _Reader:
         found = self.file.get("instructions")
         if isinstance(found, h5py.Dataset):
             return _first_instruction(_text(found[()]))
-        beside = self.path.absolute().parent.parent / "instructions" / f"{self.path.stem}.json"
-        return _first_instruction(beside.read_text()) if beside.is_file() else ""
+        return _first_instruction(text_beside(self.path, f"instructions/{self.path.stem}.json"))
 
     def wrong(self, found: str, expected: str) -> EpisodeError:
         return EpisodeError(f"{self.path}: {found}; expected {expected}.")
+
+
+def text_beside(episode: Path, name: str) -> str:
+    """A text file of the folder that holds RoboTwin's data/ with the episodes; empty where there is none."""
+    path = episode.absolute().parent.parent / name
+    try:
+        return path.read_text() if path.is_file() else ""
+    except (OSError, UnicodeDecodeError) as error:
+        raise EpisodeError(f"{path} cannot be read as text ({error}); copy it again, or remove it.") from error
 
 
 def _text(value: object) -> str:

@@ -23,7 +23,7 @@ from tqdm import tqdm
 import xew
 from xew.config import ConfigError, user_errors
 from xew.episode import EpisodeError, Record, States, episode_folder, read_record, read_states, write_episode
-from xew.exchange.hdf5 import Recorded, read_robotwin
+from xew.exchange.hdf5 import Recorded, read_robotwin, text_beside
 from xew.protocol import ACTION_DIM, ARMS
 from xew.sim_warp.camera import Camera
 from xew.sim_warp.kinematics import tool_matrix
@@ -205,8 +205,7 @@ def _seed(path: Path) -> int:
     digits = "".join(filter(str.isdigit, path.stem))
     if not digits:
         raise EpisodeError(f"{path}: the file's name has no number; RoboTwin calls them episode0.hdf5 and so on.")
-    listed = path.absolute().parent.parent / "seed.txt"
-    seeds = listed.read_text().split() if listed.is_file() else []
+    seeds = text_beside(path, "seed.txt").split()
     number = int(digits)
     return int(seeds[number]) if number < len(seeds) and seeds[number].isdigit() else number
 
