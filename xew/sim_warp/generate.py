@@ -208,7 +208,12 @@ def _check(args: Args) -> None:
 
 
 def _read_existing(families: list[Family], args: Args) -> None:
-    """Take in what is on disk. Raises EpisodeError at a damaged header and where videos are wanted that were left out."""
+    """Take in what is on disk.
+
+    Raises:
+        EpisodeError: a header is damaged or in another's place, an episode of these tasks was imported, or videos are wanted
+            that were left out.
+    """
     out = args.out
     for folder, record in find_records(out):
         if not record.videos and not args.states_only:
