@@ -87,7 +87,9 @@ def test_sigterm_saves_and_the_rest_repeats(world: Path, run: Path, tmp_path: Pa
             os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(RunLog, "scalars", interrupt)
-    train.main([config, "--out", str(out)])
+    with pytest.raises(SystemExit) as stop:
+        train.main([config, "--out", str(out)])
+    assert stop.value.code == 143, "a study must not take it for done"
     assert len(lines(out, "train/loss")) == 3
     monkeypatch.undo()
     train.main([config, "--out", str(out), "--resume"])

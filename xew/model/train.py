@@ -40,12 +40,12 @@ from xew.model.checkpoint import (
     save_state,
 )
 from xew.model.codec import Codec
-from xew.model.data import ClipSource, fake_batch, make_dataset
+from xew.model.data import ClipSource, make_dataset
 from xew.model.dit_layouts import check_dit, load_dit_params
 from xew.model.experiment import Experiment, compile_cache, create_model, load_experiment
 from xew.model.latents import LatentCache, load_codec, replay_episodes, training_episodes
 from xew.model.memory import check_memory, estimate_memory, flops_of_step, peak_flops
-from xew.model.optimizer import learning_rate, make_optimizer, with_steps
+from xew.model.optimizer import learning_rate, with_steps
 from xew.model.predict import Predictor
 from xew.model.samples import check_samples, log_samples
 from xew.model.scales import SCALES, Scale, load_run_scales, save_scales
@@ -53,10 +53,10 @@ from xew.model.sharding import check_batch, make_mesh, mesh_shape, place_batch, 
 from xew.model.tensorboard import RunLog
 from xew.model.training_step import StepResult, abstract_state, init_train_state, make_train_step, random_params
 
-__all__ = ["fake_batch", "init_train_state", "make_mesh", "make_optimizer", "make_train_step", "place_batch", "train"]
-
 NOISE_LEVEL_EDGES = (0.0, 0.5, 0.8, 0.95, 1.0)
 """Bins of the noise level in which the loss is shown apart."""
+STOPPED = 128 + signal.SIGTERM
+"""Exit status of a run that was asked to stop before its last step: it is saved, but nobody may take it for done."""
 
 
 @dataclass
@@ -162,7 +162,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     start_processes(args.distributed)
     compile_cache()
-    train(experiment, resume=args.resume, overwrite=args.overwrite, ignore_memory=args.ignore_memory)
+    if not train(experiment, resume=args.resume, overwrite=args.overwrite, ignore_memory=args.ignore_memory):
+        sys.exit(STOPPED)
 
 
 def print_estimate(experiment: Experiment, devices: int, memory_gb: float | None) -> None:
@@ -177,8 +178,8 @@ def print_estimate(experiment: Experiment, devices: int, memory_gb: float | None
         print(f"{'fits' if memory.total < memory_gb * 1e9 else 'does not fit'} in {memory_gb:g} GB a device")
 
 
-def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = False, ignore_memory: bool = False) -> None:
-    """Train an experiment to its last step, from the start or from its latest checkpoint."""
+def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = False, ignore_memory: bool = False) -> bool:
+    """Train an experiment to its last step, from the start or from its latest checkpoint; returns whether it came there."""
     # Everything that can be missing or too small is found before a run folder is made.
     mesh = make_mesh(experiment.mesh)
     check_batch(experiment.train.batch, experiment.train.accumulate, mesh.size)
@@ -200,7 +201,7 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
         else:
             graph, state, position = left_state(experiment, mesh, checkpoints)
             batches.set_state(position)
-        run_steps(experiment, Run(mesh, codec, graph, checkpoints), state, batches)
+        return run_steps(experiment, Run(mesh, codec, graph, checkpoints), state, batches)
 
 
 class Run(NamedTuple):
@@ -212,11 +213,14 @@ class Run(NamedTuple):
     checkpoints: Any
 
 
-def run_steps(experiment: Experiment, run: Run, state: TrainState, batches: Any) -> None:
+def run_steps(experiment: Experiment, run: Run, state: TrainState, batches: Any) -> bool:
     """From the given state to the last step; logs, saves and draws samples as the settings say.
 
     Args:
         batches: an iterator of this process's batches, with its position.
+
+    Returns:
+        Whether the last step was reached; where a signal asked to stop before, what was reached is saved.
     """
     settings, train_step = experiment.train, make_train_step(experiment, run.graph, run.mesh, run.codec)
     begin = int(state.step)
@@ -244,15 +248,16 @@ def run_steps(experiment: Experiment, run: Run, state: TrainState, batches: Any)
             stops = stops or stop.agreed()
         if saves or stops:
             save_state(run.checkpoints, state, batches.get_state())
+        if stops and not last:  # whoever asked will not wait for samples
+            print(f"stopped at step {step} of {settings.steps} and saved; continue with --resume", file=sys.stderr)
+            break
         if settings.sample_every and (step % settings.sample_every == 0 or last):
             with meter.paused():
                 draw_samples(log, experiment, run, state, step)
-        if stops:
-            print(f"stopped at step {step} and saved; continue with --resume", file=sys.stderr)
-            break
     stop.release()
     if log:
         log.close()
+    return int(state.step) >= settings.steps
 
 
 def check_network(experiment: Experiment) -> None:

@@ -29,12 +29,12 @@ from xew.episode import find_accepted, read_video
 from xew.model.ceiling import Ceiling, measure_ceiling, spread
 from xew.model.checkpoint import TrainState, claim_run, open_checkpoints, restore_state, save_state
 from xew.model.codec import WanVaeCodec, to_signed
-from xew.model.experiment import Clip, TrainSettings, compile_cache, demand_at_least
+from xew.model.experiment import Clip, TrainSettings, beside, compile_cache, demand_at_least
 from xew.model.latents import Episode, test_episodes
 from xew.model.optimizer import learning_rate, make_optimizer
 from xew.model.samples import strip
 from xew.model.tensorboard import RunLog
-from xew.model.train import StopSignal
+from xew.model.train import STOPPED, StopSignal
 from xew.model.vae import VAES, LatentStatistic, VaeSize, VideoVae
 from xew.model.vae_data import Cut, check_streams, make_dataset, random_clips, video_files
 from xew.model.vae_layouts import save_vae
@@ -107,7 +107,7 @@ class VaeExperiment:
 
     @property
     def cache_folder(self) -> Path:
-        return self.cache or self.data.with_name(f"{self.data.name}-frames")
+        return self.cache or beside(self.data, "frames")
 
     @property
     def optimizer(self) -> TrainSettings:
@@ -249,11 +249,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args, overrides = parser.parse_known_args(arguments)
     experiment = load_vae_experiment(args.config, overrides)
     compile_cache()
-    train_vae(experiment, resume=args.resume, overwrite=args.overwrite)
+    if not train_vae(experiment, resume=args.resume, overwrite=args.overwrite):
+        sys.exit(STOPPED)
 
 
-def train_vae(experiment: VaeExperiment, *, resume: bool = False, overwrite: bool = False) -> None:
-    """Train to the last step, from the start or from the latest checkpoint; then measure, and write the weights."""
+def train_vae(experiment: VaeExperiment, *, resume: bool = False, overwrite: bool = False) -> bool:
+    """Train to the last step, from the start or from the latest checkpoint; then measure, and write the weights.
+
+    Returns:
+        Whether the last step was reached.
+    """
     settings = experiment.train
     episodes = training_episodes(experiment)
     files = video_files(experiment.streams, episodes, experiment.cache_folder)
@@ -290,13 +295,15 @@ def train_vae(experiment: VaeExperiment, *, resume: bool = False, overwrite: boo
             codec = WanVaeCodec.of(nnx.merge(graph, state.ema, statistics))
             log.image(number, "sample/unseen", strip(sample, codec.decode(codec.encode(sample))))
         if stop.received and not last:
-            print(f"stopped at step {number} and saved; continue with --resume", file=sys.stderr)
+            print(f"stopped at step {number} of {settings.steps} and saved; continue with --resume", file=sys.stderr)
             break
     stop.release()
     checkpoints.close()
-    if int(state.step) >= settings.steps:
+    ended = int(state.step) >= settings.steps
+    if ended:
         finish(experiment, nnx.merge(graph, state.ema, statistics), files, log)
     log.close()
+    return ended
 
 
 @dataclass
