@@ -170,6 +170,8 @@ def fails(command: Callable[[list[str]], None], arguments: list[str], capsys: py
     [
         (["--train.crop", "36"], "multiple of 8"),
         (["--train.frames", "8"], "4 k + 1"),
+        (["--train.clips-of-a-video", "0"], "train.clips_of_a_video is 0; it must be at least 1"),
+        (["--train.statistics-clips", "0"], "train.statistics_clips is 0; it must be at least 1"),
         (["--vae", "smal"], "did you mean 'small'"),
         (["--streams", "rbg"], "did you mean 'rgb'"),
         (["--train.batch", "3"], "multiple of train.clips_of_a_video"),

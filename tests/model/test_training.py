@@ -342,6 +342,7 @@ def test_epochs_are_passes_over_the_new_samples(experiment: Experiment) -> None:
         (["--train.batch", "3", "--train.accumulate", "2"], "train.batch is 3; it must be a multiple of"),
         (["--mesh.fsdp", "3"], "mesh is data -1 x fsdp 3, there are 1 devices"),
         (["--adapt.start-from", "x"], "adapt needs the robots"),
+        (["--rollout.shift", "0"], "rollout.shift is 0; it must be over 0"),
         (["--train.log-every", "0"], "train.log_every is 0; it must be at least 1"),
         (["--train.batch", "0"], "train.batch is 0; it must be at least 1"),
         (["--train.ema-decay", "1"], "train.ema_decay is 1; it must be under 1"),
@@ -392,6 +393,18 @@ def test_a_robot_to_adapt_to_that_the_data_lack_is_told(
     start = ["--adapt.start-from", str(world / "run"), "--adapt.robots", "pipr", "--out", str(tmp_path / "run")]
     said = fails(train.main, [str(world / "config.yaml"), *start], capsys)
     assert "has no training episode of pipr; did you mean 'piper'?" in said
+
+
+def test_a_robot_of_ones_own_is_adapted_to(world: Path, tmp_path: Path) -> None:
+    shutil.copytree(world / "data", tmp_path / "data")
+    for folder in (tmp_path / "data").glob("*/*/piper"):
+        header = folder.rename(folder.with_name("my_arm")) / "episode.json"
+        header.write_text(json.dumps(json.loads(header.read_text()) | {"robot": "my_arm"}))
+    start = ["--adapt.start-from", str(world / "run"), "--adapt.robots", "my_arm", "--train.steps", "1"]
+    arguments = [str(world / "config.yaml"), "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run"), *start]
+    latents.main(arguments)
+    train.main(arguments)
+    assert network(tmp_path / "run")[1] == 1
 
 
 def test_the_run_that_an_adaptation_starts_from_is_not_overwritten(world: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -503,9 +516,14 @@ def test_run_with_corrections_resumes_and_is_read(world: Path, tmp_path: Path, c
         if not np.array_equal(ours.get_value(), theirs.get_value())
     ]
     assert len(moved) == 10 and all(path.startswith("blocks.") and path.endswith(".kernel") for path in moved)
+    elsewhere = (tmp_path / "run").rename(tmp_path / "elsewhere")
+    jax.tree.map(np.testing.assert_array_equal, network(elsewhere)[0], after)
     shutil.rmtree(base / "checkpoints" / "2")
     with pytest.raises(ConfigError, match="not there any more or was trained anew"):
-        network(tmp_path / "run")
+        network(elsewhere)
+    (elsewhere / "start.json").unlink()
+    with pytest.raises(ConfigError, match="does not tell from which checkpoint"):
+        network(elsewhere)
 
 
 def test_checkpoint_of_a_step_that_is_not_there_is_told(world: Path) -> None:

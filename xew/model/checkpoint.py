@@ -183,7 +183,7 @@ def restore_params(out: Path, like: Any, step: int | None = None) -> tuple[Any, 
     experiment = load_experiment(out / "config.yaml")
     if not experiment.adapt.lora_rank:
         return _restore_kept(out, like, step)
-    base = restore_start(experiment, like)
+    base = restore_start(dataclasses.replace(experiment, out=out), like)  # a run may have been moved
     shapes = jax.eval_shape(lambda: init_corrections(like, experiment.adapt.lora_rank, jax.random.key(0)))
     corrections, step = _restore_kept(out, _placed_beside(shapes, like), step)
     return jax.jit(corrected)(base, corrections), step
@@ -233,11 +233,17 @@ def restore_start(experiment: Experiment, like: Any) -> Any:
     """The parameters that an adapted run starts from, as noted when it began.
 
     Raises:
-        ConfigError: they have gone or were trained anew since.
+        ConfigError: they have gone or were trained anew since, or the note is lost.
     """
     run = experiment.adapt.start_from
     assert run is not None
-    note = json.loads((experiment.out / START).read_text())
+    try:
+        note = json.loads((experiment.out / START).read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"{experiment.out} does not tell from which checkpoint of {run} it was adapted ({error}); copy the whole run, or "
+            "adapt again with --overwrite."
+        ) from error
     if not (run / "config.yaml").exists() or saved_at(run, note["step"]) != note["saved"]:
         raise ConfigError(
             f"{experiment.out} was adapted from step {note['step']} of {run}, which is not there any more or was trained anew; "

@@ -293,6 +293,9 @@ def _check_training(experiment: Experiment, source: str) -> None:
         raise ConfigError(f"{source}: train.steps is {train.steps}, train.epochs {train.epochs:g}; give one of them, over 0.")
     if train.ema_decay >= 1:
         raise ConfigError(f"{source}: train.ema_decay is {train.ema_decay:g}; it must be under 1.")
+    for name, shift in {"train": train.shift, "rollout": experiment.rollout.shift}.items():
+        if shift is not None and not shift > 0:
+            raise ConfigError(f"{source}: {name}.shift is {shift:g}; it must be over 0 (1 leaves the levels as they are).")
     if adapt.start_from is None:
         if adapt != AdaptSettings():
             raise ConfigError(f"{source}: adapt says how, but adapt.start_from not which run to adapt; give that, or no adapt.")
