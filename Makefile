@@ -44,7 +44,7 @@ RUN := $(DEMO)/runs/debug
 ROLLOUTS := $(DEMO)/rollouts
 
 demo: $(STAMP)
-	$(BIN)/python -m xew.sim_warp.generate --tasks $(TASKS) --train-seeds 4 --test-seeds 2 --out $(DATA)
+	$(BIN)/python -m xew.sim_warp.generate --tasks $(TASKS) --train-seeds 4 --test-seeds 3 --out $(DATA)
 	$(BIN)/python -m xew.model.latents configs/debug.yaml --data $(DATA)
 	$(BIN)/python -m xew.model.train configs/debug.yaml --data $(DATA) --out $(RUN) --resume
 	$(BIN)/python -m xew.model.rollout $(RUN) --data $(DATA) --split test --out $(ROLLOUTS)
