@@ -249,7 +249,7 @@ def run_steps(experiment: Experiment, run: Run, state: TrainState, batches: Any)
         if saves or stops:
             save_state(run.checkpoints, state, batches.get_state())
         if stops and not last:  # whoever asked will not wait for samples
-            print(f"stopped at step {step} of {settings.steps} and saved; continue with --resume", file=sys.stderr)
+            progress.write(f"stopped at step {step} of {settings.steps} and saved; continue with --resume", file=sys.stderr)
             break
         if settings.sample_every and (step % settings.sample_every == 0 or last):
             with meter.paused():

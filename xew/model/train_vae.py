@@ -295,7 +295,7 @@ def train_vae(experiment: VaeExperiment, *, resume: bool = False, overwrite: boo
             codec = WanVaeCodec.of(nnx.merge(graph, state.ema, statistics))
             log.image(number, "sample/unseen", strip(sample, codec.decode(codec.encode(sample))))
         if stop.received and not last:
-            print(f"stopped at step {number} of {settings.steps} and saved; continue with --resume", file=sys.stderr)
+            progress.write(f"stopped at step {number} of {settings.steps} and saved; continue with --resume", file=sys.stderr)
             break
     stop.release()
     checkpoints.close()
