@@ -167,7 +167,8 @@ assert not any(overlaps)
 
 def test_a_network_is_opened_once_on_each_device_and_used_in_turn() -> None:
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
-    subprocess.run([sys.executable, "-c", SHARING], env=environment, check=True, timeout=120)
+    run = subprocess.run([sys.executable, "-c", SHARING], env=environment, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr
 
 
 def test_a_second_run_grades_nothing_anew_and_metrics_come_beside_those_that_are_there(
