@@ -148,6 +148,14 @@ def read_rollout_video(rollout: Rollout, frame_rate: float | None = None) -> np.
     return _checked(first, video)
 
 
+def resized(video: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """Frames [t h w 3] at another height and width, as they are graded where that is allowed: by areas where it is smaller."""
+    if video.shape[1:3] == size:
+        return video
+    method = cv2.INTER_AREA if video.shape[1] > size[0] else cv2.INTER_CUBIC
+    return np.stack([cv2.resize(frame, size[::-1], interpolation=method) for frame in video])
+
+
 def _check_inside(root: Path, file: Path) -> None:
     """Raise RolloutError where links lead out of the tree."""
     try:

@@ -7,6 +7,8 @@ import cv2
 import matplotlib
 import numpy as np
 
+from xew.rollout import resized
+
 GAP = 4
 """White pixels between the pictures of a sheet."""
 DIFFERENCE_FULL = 96
@@ -30,10 +32,7 @@ def as_graded(video: np.ndarray, truth: np.ndarray, frame_zero: str) -> np.ndarr
         truth: the episode's.
         frame_zero: what the score table says; where it is 'absent' the video begins with frame 1.
     """
-    height, width = truth.shape[1:3]
-    if video.shape[1:3] != (height, width):
-        method = cv2.INTER_AREA if video.shape[1] > height else cv2.INTER_CUBIC
-        video = np.stack([cv2.resize(frame, (width, height), interpolation=method) for frame in video])
+    video = resized(video, truth.shape[1:3])
     if frame_zero == "absent":
         video = np.concatenate([truth[:1], video])
     return video[: len(truth)]

@@ -12,7 +12,7 @@ from xew.config import ConfigError
 from xew.episode import EpisodeError, Record, episode_folder, read_record
 from xew.metrics.scores import Cell, file_digest
 from xew.metrics.truth import Truth
-from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video
+from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video, resized
 from xew.threads import in_order
 
 BASELINES: dict[str, Callable[[Truth], np.ndarray]] = {
@@ -171,7 +171,7 @@ def prediction_of(job: Job, truth: Truth, allow: Collection[str] = (), frame_zer
         return BASELINES[job.cell.model](truth)
     video = read_rollout_video(job.rollout, None if "rate" in allow else job.frame_rate)
     if "resize" in allow:
-        video = _resized(video, truth.rgb.shape[1:3])
+        video = resized(video, truth.rgb.shape[1:3])
     if frame_zero == "absent" and video.shape[1:] == truth.rgb.shape[1:]:
         video = np.concatenate([truth.rgb[:1], video])
     if "trim" in allow:
@@ -190,14 +190,6 @@ def shown_of(job: Job, truth: Truth) -> np.ndarray | None:
     if job.rollout is not None or job.cell.model != "ground_truth":
         return None
     return np.stack([cv2.GaussianBlur(frame, (0, 0), SOFTNESS) for frame in truth.rgb])
-
-
-def _resized(video: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """Frames of another height and width, by areas where that is smaller."""
-    if video.shape[1:3] == size:
-        return video
-    method = cv2.INTER_AREA if video.shape[1] > size[0] else cv2.INTER_CUBIC
-    return np.stack([cv2.resize(frame, size[::-1], interpolation=method) for frame in video])
 
 
 def _size(video: np.ndarray) -> str:
