@@ -27,13 +27,13 @@ import warp as wp
 
 from xew.episode import Record, find_accepted, find_records, verify_episode
 from xew.sim_warp import generate
-from xew.sim_warp.observe import observe
-from xew.sim_warp.produce import Cell, Job, plan_cells, simulate_cells, write_cell
-from xew.sim_warp.render import Renderer
+from xew.sim_warp.devices.workers import has_kernels, worker_count
+from xew.sim_warp.production.produce import Cell, Job, plan_cells, simulate_cells, write_cell
+from xew.sim_warp.rendering.observe import observe
+from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.rendering.streams import command_renders
 from xew.sim_warp.robots import ROBOTS
-from xew.sim_warp.streams import command_renders
 from xew.sim_warp.tasks import TASKS
-from xew.sim_warp.workers import has_kernels, worker_count
 
 PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "numpy", "av")
 SAMPLE = 200

@@ -22,7 +22,7 @@ import tyro
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp.batched_kinematics import BatchedKinematics
+from xew.sim_warp.kinematics.batched import BatchedKinematics
 from xew.sim_warp.robots import Urdf, get_robot, load_urdf
 
 TOLERANCE = 1e-5

@@ -32,7 +32,7 @@ import numpy as np
 import tyro
 
 from xew.metrics import METRICS, lpips, lpips_features, lpips_from_features, mask_scores, ndtw, psnr, ssim
-from xew.metrics.alexnet import read_alexnet
+from xew.metrics.networks.alexnet import read_alexnet
 
 HEIGHT, WIDTH, LINKS, POINTS = 240, 320, 5, 16
 BATCHES = (1, 8, 32, 128)

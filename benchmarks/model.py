@@ -11,7 +11,7 @@ AutoencoderKLWan, as its users run it.
 Every side runs in a process of its own, one after another, on the same machine.
 
 Before a figure is told, the work is checked: numbers of parameters and tokens, finite losses, shapes of what comes out.
-FLOPs are those of the model (`xew.model.dit.flops`, three times forward for training), not what recomputation adds; their share
+FLOPs are those of the model (`dit.flops`, three times forward for training), not what recomputation adds; their share
 is of a bfloat16 product of 8192x8192 matrices, measured in the same run.
 
 With several GPUs, `--cases train --no-peer --mesh.data 2` (or `--mesh.fsdp 2`) times the sharded step; `--batches` is per GPU.
@@ -57,13 +57,13 @@ class Args:
     accumulate: int = 1
     """Ours: parts in which a GPU's samples of a training step are computed, one after another."""
     remat: tuple[str, ...] = ("full",)
-    """Ours, each is timed (xew.model.dit.REMAT)."""
+    """Ours, each is timed (xew.model.network.dit.REMAT)."""
     residual: tuple[str, ...] = ("bfloat16",)
     """Ours: type of the tokens between blocks; diffusers' are bfloat16."""
     dtypes: tuple[str, ...] = ("bfloat16", "float32")
     """Of the autoencoder; float32 products are rounded to TF32 on both sides, as both do unless told otherwise."""
     vae_chunks: tuple[int, ...] = (0, 8)
-    """Ours: latent frames that the autoencoder takes at once, 0 for all; 8 is `xew.model.codec`'s. Each is timed."""
+    """Ours: latent frames that the autoencoder takes at once, 0 for all; 8 is `xew.model.codecs.codec`'s. Each is timed."""
     mesh: MeshArgs = field(default_factory=MeshArgs)
     size: str = "wan5b"
     """`tiny` to try the script on a CPU."""
@@ -162,7 +162,7 @@ def experiment_of(args: Args, streams: int, batch: int, remat: str, residual: st
 
 
 def forward_flops(experiment: Any, samples: int, **options: Any) -> float:
-    from xew.model.dit import MODELS, flops, token_grid
+    from xew.model.network.dit import MODELS, flops, token_grid
 
     grid = token_grid((1, *experiment.latent_shape))
     streams = 1 + len(experiment.conditions)
@@ -195,9 +195,9 @@ def xew_train_step(args: Args, experiment: Any, batch: int) -> dict[str, Any]:
     """Seconds of a step whose state stays on the devices; `batch` is a GPU's."""
     import jax
 
-    from xew.model.data import fake_batch
-    from xew.model.sharding import make_mesh, place_batch
-    from xew.model.training_step import init_train_state, make_train_step
+    from xew.model.devices.sharding import make_mesh, place_batch
+    from xew.model.training.data import fake_batch
+    from xew.model.training.step import init_train_state, make_train_step
 
     devices = jax.devices()[: args.mesh.data * args.mesh.fsdp]
     mesh = make_mesh(experiment.mesh, devices)
@@ -221,9 +221,9 @@ def xew_denoise(args: Args) -> Iterator[dict[str, Any]]:
     import jax.numpy as jnp
     from flax import nnx
 
-    from xew.model.data import fake_batch
-    from xew.model.dit import compute_params
     from xew.model.experiment import create_model
+    from xew.model.network.dit import compute_params
+    from xew.model.training.data import fake_batch
 
     for streams, visibility in itertools.product(args.streams, ("joint", "one_way")):
         experiment = experiment_of(args, streams, 1, "none", "bfloat16", f"--model.visibility={visibility}")
@@ -250,7 +250,7 @@ def xew_vae(args: Args) -> Iterator[dict[str, Any]]:
     import jax
     from flax import nnx
 
-    from xew.model.vae import VAES, VideoVae
+    from xew.model.codecs.vae import VAES, VideoVae
 
     frames = jax.random.uniform(jax.random.key(0), (1, args.frames, 256, 320, 3), minval=-1, maxval=1)
     size = VAES[args.vae]
@@ -302,7 +302,7 @@ def peer_model(args: Args, where: str) -> Any:
     import torch
     from diffusers import WanTransformer3DModel
 
-    from xew.model.dit import MODELS
+    from xew.model.network.dit import MODELS
 
     size = MODELS[args.size]
     config = {"patch_size": (1, 2, 2), "in_channels": 48, "out_channels": 48, "freq_dim": 256, "num_layers": size.depth}
@@ -318,7 +318,7 @@ def peer_inputs(args: Args, streams: int, batch: int, where: str) -> dict[str, A
     """As many latent frames as all streams have, and a time for every token, as TI2V has."""
     import torch
 
-    from xew.model.dit import MODELS
+    from xew.model.network.dit import MODELS
 
     size = MODELS[args.size]
     frames, h, w = ((args.frames - 1) // 4 + 1) * streams, *LATENT[1:]
@@ -394,7 +394,7 @@ def peer_train_step(model: Any, optimizer: Any, inputs: dict[str, Any]) -> dict[
 
 
 def peer_flops(args: Args, streams: int, samples: int) -> float:
-    from xew.model.dit import MODELS, flops
+    from xew.model.network.dit import MODELS, flops
 
     grid = ((args.frames - 1) // 4 + 1, LATENT[1] // 2, LATENT[2] // 2)
     return flops(MODELS[args.size], [grid] * streams, batch=samples)

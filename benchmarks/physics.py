@@ -28,11 +28,11 @@ import tyro
 import warp as wp
 
 from xew.sim_warp.physics import simulate
-from xew.sim_warp.physics_gpu import Batch
-from xew.sim_warp.produce import Cell, Job, plan_cells
+from xew.sim_warp.physics.gpu import Batch
+from xew.sim_warp.physics.worlds import STEPS_PER_FRAME, Motion, World
+from xew.sim_warp.production.produce import Cell, Job, plan_cells
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.tasks import TASKS, get_task
-from xew.sim_warp.worlds import STEPS_PER_FRAME, Motion, World
 
 PACKAGES = ("newton", "mujoco-warp", "warp-lang", "numpy")
 LEAST_SUCCESS = 0.9

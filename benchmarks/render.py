@@ -29,13 +29,13 @@ from newton.sensors import SensorCamera
 from scipy.spatial.transform import Rotation
 
 from xew.protocol import ARMS
-from xew.sim_warp import geometry
-from xew.sim_warp.camera import HEAD_CAMERA
-from xew.sim_warp.geometry import Color, Mesh
-from xew.sim_warp.observe import keypoint_positions
-from xew.sim_warp.render import Body, Frames, Renderer, World
+from xew.sim_warp.geometry import meshes
+from xew.sim_warp.geometry.camera import HEAD_CAMERA
+from xew.sim_warp.geometry.meshes import Color, Mesh
+from xew.sim_warp.rendering.bodies import robot_bodies, robot_pose
+from xew.sim_warp.rendering.observe import keypoint_positions
+from xew.sim_warp.rendering.render import Body, Frames, Renderer, World
 from xew.sim_warp.robots import ROBOTS
-from xew.sim_warp.robots.bodies import robot_bodies, robot_pose
 from xew.sim_warp.stage import stage_mesh
 
 FRAMES_PER_WORLD = 24
@@ -89,8 +89,8 @@ class Capsule:
 
     def mesh(self, color: Color) -> Mesh:
         if self.half_length == 0:
-            return geometry.sphere(self.radius, color).transformed(self.center)
-        return geometry.capsule(self.radius, 2 * self.half_length, color, 24).transformed(self.center, self.rpy)
+            return meshes.sphere(self.radius, color).transformed(self.center)
+        return meshes.capsule(self.radius, 2 * self.half_length, color, 24).transformed(self.center, self.rpy)
 
 
 @dataclass(frozen=True)

@@ -29,20 +29,20 @@ import tyro
 import warp as wp
 
 from xew.sim_warp import stage
-from xew.sim_warp.camera import HEAD_CAMERA
-from xew.sim_warp.expert import joint_commands
-from xew.sim_warp.geometry import Mesh
+from xew.sim_warp.geometry.camera import HEAD_CAMERA
+from xew.sim_warp.geometry.meshes import Mesh
 from xew.sim_warp.kinematics import joint_positions
-from xew.sim_warp.observe import scene_things
 from xew.sim_warp.physics import Motion, simulate
-from xew.sim_warp.render import Body, Frames, Renderer
-from xew.sim_warp.render import World as RenderedWorld
+from xew.sim_warp.physics.template import PAD_FRICTION
+from xew.sim_warp.physics.worlds import STEPS_PER_FRAME, TIME_STEP, World
+from xew.sim_warp.production.expert import joint_commands
+from xew.sim_warp.rendering.bodies import robot_bodies, robot_pose
+from xew.sim_warp.rendering.observe import scene_things
+from xew.sim_warp.rendering.render import Body, Frames, Renderer
+from xew.sim_warp.rendering.render import World as RenderedWorld
 from xew.sim_warp.robots import RobotSpec, get_robot, load_urdf
-from xew.sim_warp.robots.bodies import robot_bodies, robot_pose
 from xew.sim_warp.scene import Scene, scene_rng
 from xew.sim_warp.tasks import get_task
-from xew.sim_warp.template import PAD_FRICTION
-from xew.sim_warp.worlds import STEPS_PER_FRAME, TIME_STEP, World
 
 PATH_DEPTH = 8
 DRIVE = (1000.0, 200.0)

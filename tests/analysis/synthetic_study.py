@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from xew.analysis.grades import SEEN, row_keys
 from xew.analysis.paper import AXES, Paper, read_paper
-from xew.analysis.tables import PAPER_METRICS
+from xew.analysis.statistics.grades import SEEN, row_keys
+from xew.analysis.tables.layouts import PAPER_METRICS
 from xew.metrics import METRICS
 from xew.protocol import HELD_OUT_ROBOTS, PARTS, ROBOT_NAMES, TEST_SEED_START, VARIANTS, Variant
 

@@ -11,11 +11,11 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from tests.analysis.browser import assert_readable, needs_chromium
 from tests.analysis.conftest import FRAMES, Study
-from xew.analysis import pictures
+from tests.analysis.reports.browser import assert_readable, needs_chromium
 from xew.analysis.report import Args, main
-from xew.analysis.report_charts import run_chart
+from xew.analysis.reports import pictures
+from xew.analysis.reports.study_charts import run_chart
 from xew.analysis.scores import MetricInfo, read_scores
 from xew.episode import write_video
 from xew.metrics import evaluate

@@ -14,12 +14,12 @@ import pytest
 
 from tests.synthetic import write_synthetic_data
 from xew.analysis import study as runner
-from xew.analysis import study_ledger
-from xew.analysis.study_cell import last_lines, start_cell
-from xew.analysis.study_config import Study, load_study
-from xew.analysis.study_ledger import Ledger
-from xew.analysis.study_machines import Machines, RayCluster, ThisMachine, open_machines, visible_gpus
-from xew.analysis.study_plan import Cell
+from xew.analysis.studies import ledger as study_ledger
+from xew.analysis.studies.cell import last_lines, start_cell
+from xew.analysis.studies.config import Study, load_study
+from xew.analysis.studies.ledger import Ledger
+from xew.analysis.studies.machines import Machines, RayCluster, ThisMachine, open_machines, visible_gpus
+from xew.analysis.studies.plan import Cell
 from xew.config import ConfigError
 
 ROOT = Path(__file__).parents[2]

@@ -26,7 +26,7 @@ from xew.exchange import robotwin
 from xew.exchange.hdf5 import decode_picture, read_robotwin, tool_center
 from xew.exchange.robotwin import Args, find_episodes, fitted, import_all, main
 from xew.protocol import LEFT_ARM, LEFT_GRIPPER, RIGHT_ARM, RIGHT_GRIPPER
-from xew.sim_warp.camera import HEAD_CAMERA
+from xew.sim_warp.geometry.camera import HEAD_CAMERA
 from xew.sim_warp.robots import ROBOTS, get_robot
 
 LEGACY = Path("place_cup/ARX-X5_clean_50/data/episode3.hdf5")

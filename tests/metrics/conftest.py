@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from xew.metrics.alexnet import read_alexnet
+from xew.metrics.networks.alexnet import read_alexnet
 
 
 @pytest.fixture(scope="session")

@@ -25,8 +25,8 @@ from xew.metrics.calibrate import (
     reference_videos,
     true_grades,
 )
+from xew.metrics.calibration.wrong import MOTIONS, WrongVideo, wrong_videos
 from xew.metrics.truth import NEEDS, read_truth
-from xew.metrics.wrong import MOTIONS, WrongVideo, wrong_videos
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +40,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An episode of the simulation, twelve frames."""
-    from xew.sim_warp.produce import Job, produce
-    from xew.sim_warp.render import Renderer
+    from xew.sim_warp.production.produce import Job, produce
+    from xew.sim_warp.rendering.render import Renderer
 
     root = tmp_path_factory.mktemp("simulated")
     produce([Job(TASK, 1, ("piper",))], root, Renderer("cpu"))

@@ -16,7 +16,7 @@ from tests.synthetic import write_synthetic_data
 from xew.episode import episode_folder, read_record, read_states, read_video, write_episode
 from xew.metrics import METRICS, keypoint_error, mask_iou, psnr, ssim
 from xew.metrics.backends import Backend, estimate_masks
-from xew.metrics.contact import predicted_contact, touching_distance
+from xew.metrics.estimators.contact import predicted_contact, touching_distance
 from xew.metrics.evaluate import Args, main
 from xew.metrics.grade import Comparison
 from xew.metrics.grade import grade as grade_one

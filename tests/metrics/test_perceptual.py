@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from xew.metrics import alexnet, lpips, lpips_features, lpips_from_features, region_lpips, region_lpips_frames
-from xew.metrics.alexnet import _package_file, read_alexnet, read_arrays
+from xew.metrics import lpips, lpips_features, lpips_from_features, region_lpips, region_lpips_frames
+from xew.metrics.networks import alexnet
+from xew.metrics.networks.alexnet import _package_file, read_alexnet, read_arrays
 from xew.metrics.perceptual import SMALLEST_SIDE, union_box
 
 rng = np.random.default_rng(3)

@@ -1,13 +1,9 @@
 """Strict session for the model room: no silent type promotion, no silent broadcasting over missing axes."""
 
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import jax
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 
 @pytest.fixture(autouse=True)

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import synthetic
 from scipy.spatial.transform import Rotation
 
+from tests import synthetic
 from xew.config import ConfigError
 from xew.episode import read_record, read_states, read_video, write_episode
+from xew.model.cache.scales import apply_scales, fit_scales, read_scales, save_scales
 from xew.model.conditions import (
     ACTIONS,
     CONDITIONS,
@@ -25,9 +26,8 @@ from xew.model.conditions import (
     tool_poses,
 )
 from xew.model.latents import episode_command
-from xew.model.scales import apply_scales, fit_scales, read_scales, save_scales
 from xew.protocol import ACTION_DIM, ROBOT_NAMES
-from xew.sim_warp.robots.own import FOLDERS
+from xew.sim_warp.robots.user.own import FOLDERS
 
 STORED = [condition for condition in (ACTIONS["joints"], CONDITIONS["robot_render"]) if isinstance(condition, Condition)]
 SYSTEMS = {name: entry for name, entry in ACTIONS.items() if isinstance(entry, tuple)}
@@ -103,8 +103,8 @@ def wandering(frames: int = 12) -> np.ndarray:
 
 @pytest.mark.parametrize("robot", ["aloha_agilex", "franka_panda"])
 def test_tool_poses_are_forward_kinematics_of_commands(tmp_path: Path, robot: str) -> None:
+    from xew.sim_warp.geometry.poses import matrix_from_pose
     from xew.sim_warp.kinematics import joint_positions, link_matrices
-    from xew.sim_warp.poses import matrix_from_pose
     from xew.sim_warp.robots import ROBOTS, load_urdf
 
     folder = synthetic.write_cell(tmp_path, "place_empty_cup", 0, robot, frames=5)
@@ -131,8 +131,8 @@ def test_a_tool_that_points_down_has_no_angles() -> None:
 @pytest.mark.parametrize("robot", ROBOT_NAMES)
 def test_no_angle_is_near_a_jump_where_tools_rest(tmp_path: Path, robot: str) -> None:
     """Angles wrap at pi and are ambiguous at a pitch of pi / 2."""
+    from xew.sim_warp.rendering.streams import home_action
     from xew.sim_warp.robots import ROBOTS
-    from xew.sim_warp.streams import home_action
 
     home = home_action(ROBOTS[robot])[None].astype(np.float32)
     poses = tool_poses(Command(robot, home, np.eye(3), np.eye(4), tmp_path))[0]

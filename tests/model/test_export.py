@@ -11,11 +11,11 @@ from safetensors.numpy import load_file, save_file
 
 from xew.config import ConfigError
 from xew.model import export, train
-from xew.model.checkpoint import TrainState, open_checkpoints, save_state
-from xew.model.dit_layouts import load_dit
+from xew.model.devices.sharding import make_mesh
 from xew.model.experiment import create_model, load_experiment
-from xew.model.sharding import make_mesh
-from xew.model.weights import read_tensors
+from xew.model.network.dit_layouts import load_dit
+from xew.model.runs.checkpoint import TrainState, open_checkpoints, save_state
+from xew.model.weights.tensors import read_tensors
 
 CONFIG = """
 data: data

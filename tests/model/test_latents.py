@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import synthetic
 
+from tests import synthetic
 from xew.episode import EpisodeError, read_record, write_video
 from xew.model import latents
-from xew.model.codec import PatchCodec
+from xew.model.codecs.codec import PatchCodec
 from xew.model.conditions import Command
 from xew.model.experiment import load_experiment
 from xew.model.latents import encode_many, needed_pixels
-from xew.model.pixels import stored_pixels
+from xew.model.video.pixels import stored_pixels
 
 CONFIG = """
 clip: {frames: 17, height: 64, width: 80}

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import synthetic
 
+from tests import synthetic
 from xew.episode import find_records, read_video
 from xew.model import outside
 from xew.model.outside import read_inputs
@@ -81,7 +81,7 @@ def test_a_model_is_told_commands_only(data: Path) -> None:
 
 
 def test_masks_and_flow_are_rendered_from_the_commands(data: Path) -> None:
-    from xew.sim_warp.camera import HEAD_CAMERA
+    from xew.sim_warp.geometry.camera import HEAD_CAMERA
 
     folder, record = next((f, r) for f, r in find_records(data) if r.robot == "arx_x5")
     told = read_inputs((folder, record), max_frames=2)

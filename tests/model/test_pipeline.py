@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import synthetic
 
+from tests import synthetic
 from xew.episode import HEIGHT, WIDTH, find_records, read_video
 from xew.model import latents, rollout, train
-from xew.model.data import ClipSource, fake_batch, make_dataset
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.latents import LatentCache, clip_starts, load_codec, training_episodes
-from xew.model.tensorboard import RunLog
+from xew.model.training.data import ClipSource, fake_batch, make_dataset
+from xew.model.training.tensorboard import RunLog
 from xew.protocol import SEEN_ROBOTS
 from xew.rollout import find_rollouts, read_rollout_video
 

@@ -11,17 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import synthetic
 from flax import nnx
 
+from tests import synthetic
 from xew.episode import EpisodeError, read_video
 from xew.model import latents, rollout
-from xew.model.codec import encode_pictures
-from xew.model.dit_layouts import save_dit
+from xew.model.codecs.codec import encode_pictures
 from xew.model.experiment import Experiment, create_model, load_experiment
 from xew.model.latents import load_codec, training_episodes
-from xew.model.predict import ChunkInputs, Predictor, guided_velocity
+from xew.model.network.dit_layouts import save_dit
 from xew.model.rollout import RolloutWriter
+from xew.model.sampling.predict import ChunkInputs, Predictor, guided_velocity
 from xew.protocol import ROBOT_NAMES
 from xew.rollout import find_rollouts, read_rollout_video
 
@@ -150,13 +150,13 @@ def test_sampler_and_grid_are_chosen_by_name(predictor: Predictor) -> None:
     episodes = latents.test_episodes(predictor.experiment.data, ROBOT_NAMES)[:1]
     plain = predictor.predict(episodes, 5)
     assert np.abs(other.predict(episodes, 5).astype(int) - plain).max() > 0
-    settings = replace(settings, sampler="xew.model.samplers:euler", grid="xew.model.samplers:flowwam")
+    settings = replace(settings, sampler="xew.model.diffusion.samplers:euler", grid="xew.model.diffusion.samplers:flowwam")
     from_outside = replace(predictor, experiment=replace(predictor.experiment, rollout=settings))
     np.testing.assert_array_equal(from_outside.predict(episodes, 5), plain)
 
 
 def test_a_codec_may_come_from_outside(world: Path) -> None:
-    config = [str(world / "config.yaml"), "--codec.name", "xew.model.codec:PatchCodec"]
+    config = [str(world / "config.yaml"), "--codec.name", "xew.model.codecs.codec:PatchCodec"]
     latents.main(config)
     experiment = load_experiment(config[0], config[1:])
     assert load_codec(experiment, training_episodes(experiment)).channels == 4
@@ -167,8 +167,8 @@ import sys
 sys.path[:0] = {path!r}
 import jax, numpy as np
 from pathlib import Path
-from test_rollout import FRAMES, ROBOT_NAMES, load_experiment, make_predictor, latents
-from xew.model.sharding import MeshSettings, make_mesh, replicated
+from tests.model.test_rollout import FRAMES, ROBOT_NAMES, load_experiment, make_predictor, latents
+from xew.model.devices.sharding import MeshSettings, make_mesh, replicated
 from dataclasses import replace
 assert len(jax.devices()) == 2
 predictor = make_predictor(load_experiment({config!r}))
@@ -183,7 +183,7 @@ np.save({out!r}, begun.fetch())
 
 def test_two_devices_share_a_batch_and_give_the_same(predictor: Predictor, world: Path, tmp_path: Path) -> None:
     """Three episodes on two devices: the batch is filled up, cut, and what filled it is left out."""
-    path = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
+    path = [str(Path(__file__).parents[2])]
     script = DEVICES.format(path=path, config=str(world / "config.yaml"), out=str(tmp_path / "frames.npy"))
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)

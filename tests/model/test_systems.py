@@ -7,17 +7,17 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-import synthetic
 from flax import nnx
 
+from tests import synthetic
 from xew.config import ConfigError
 from xew.episode import find_accepted, read_record, read_states, read_video, write_episode
 from xew.model import latents, rollout, train
 from xew.model.conditions import ACTIONS
-from xew.model.data import ClipSource, fake_batch
 from xew.model.experiment import create_model, load_experiment
 from xew.model.latents import LatentCache, load_codec, load_scales, scales_path, training_episodes
-from xew.model.predict import Predictor
+from xew.model.sampling.predict import Predictor
+from xew.model.training.data import ClipSource, fake_batch
 from xew.rollout import find_rollouts
 
 pytestmark = pytest.mark.usefixtures("quick_compile")

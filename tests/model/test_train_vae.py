@@ -7,16 +7,16 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-import synthetic
 
+from tests import synthetic
 from xew.episode import EpisodeError, find_accepted, read_video
 from xew.model import latents, train_vae
-from xew.model.codec import CodecSettings, WanVaeCodec
+from xew.model.codecs.codec import CodecSettings, WanVaeCodec
 from xew.model.experiment import load_experiment
-from xew.model.frames import to_model_size
 from xew.model.latents import LatentCache, load_codec
 from xew.model.train_vae import init_vae_state, load_vae_experiment, make_vae_step, training_episodes
-from xew.model.vae_data import Cut, make_dataset, random_clips, read_frames, video_files
+from xew.model.training.vae_data import Cut, make_dataset, random_clips, read_frames, video_files
+from xew.model.video.frames import to_model_size
 from xew.protocol import seed_split
 
 CONFIG = """

@@ -9,9 +9,9 @@ import numpy as np
 
 from xew.protocol import ACTION_DIM, ARMS
 from xew.sim_warp import objects
+from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.plan import HOME, LEFT, RIGHT, Timeline
 from xew.sim_warp.robots import ROBOTS
-from xew.sim_warp.robots.spec import RobotSpec
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks.task import Moment, Task

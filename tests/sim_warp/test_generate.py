@@ -16,10 +16,10 @@ from xew.config import ConfigError
 from xew.episode import EpisodeError, Record, episode_folder, find_accepted, find_records, verify_episode, write_episode
 from xew.protocol import TEST_SEED_START
 from xew.sim_warp import generate as command
+from xew.sim_warp.devices.workers import Workers
 from xew.sim_warp.generate import Args, Family, generate, main, yield_table
-from xew.sim_warp.produce import Job, produce
-from xew.sim_warp.render import Renderer
-from xew.sim_warp.workers import Workers
+from xew.sim_warp.production.produce import Job, produce
+from xew.sim_warp.rendering.render import Renderer
 
 ROOT = Path(__file__).parents[2]
 ROBOTS = ("franka_panda", SLOW)

@@ -26,8 +26,8 @@ from xew.sim_warp.inspect import (
     strip,
     tiled,
 )
-from xew.sim_warp.produce import Job, produce
-from xew.sim_warp.render import Renderer
+from xew.sim_warp.production.produce import Job, produce
+from xew.sim_warp.rendering.render import Renderer
 
 ROBOTS = ("franka_panda", SLOW)
 Inspect = Callable[..., tuple[int, str, str]]

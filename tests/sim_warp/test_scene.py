@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from tests.sim_warp.small import at_home
 from xew.sim_warp.objects import PALETTE
-from xew.sim_warp.observe import scene_things
 from xew.sim_warp.physics import World, simulate
-from xew.sim_warp.render import Renderer
-from xew.sim_warp.render import World as Rendered
+from xew.sim_warp.rendering.observe import scene_things
+from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.rendering.render import World as Rendered
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.scene import Scene, SceneObject, draw, scene_hash, scene_rng
 from xew.sim_warp.stage import TABLE_TOP

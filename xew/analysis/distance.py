@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from scipy.spatial import ConvexHull, KDTree
 
-from xew.sim_warp.kinematics import link_matrices
+from xew.sim_warp.kinematics.forward import link_matrices
 from xew.sim_warp.robots import RobotSpec, Urdf, UrdfError, load_urdf
 
 CONFIGURATIONS = 1500

@@ -197,7 +197,7 @@ def _mean_to_the_fleet(robots: Sequence[str], matrices: np.ndarray) -> np.ndarra
 
 def _looks(names: Mapping[str, str], distance: ImageDistance | None) -> dict[str, Axis]:
     """Distances of appearance between robots, which are given by the names that find them, under their keys."""
-    from xew.sim_warp.streams import VIEW_COUNT, nine_views  # loads Warp, which no other part of the analysis needs
+    from xew.sim_warp.rendering.streams import VIEW_COUNT, nine_views  # loads Warp, which no other part of the analysis needs
 
     renders, robots = [nine_views(name) for name in names.values()], tuple(names)
     without_one = [appearance_matrix([np.delete(views, i, axis=0) for views in renders]) for i in range(VIEW_COUNT)]

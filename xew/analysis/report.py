@@ -24,15 +24,18 @@ import pandas as pd
 import tyro
 from tqdm import tqdm
 
-from xew.analysis import formats, page, paper_report, pictures, report_study
-from xew.analysis.charts import Chart, chart_files
-from xew.analysis.grades import MIN_SCENES
 from xew.analysis.paper import read_paper
-from xew.analysis.report_charts import run_chart
+from xew.analysis.reports import page, pictures
+from xew.analysis.reports import paper as paper_report
+from xew.analysis.reports import study as report_study
+from xew.analysis.reports.charts import Chart, chart_files
+from xew.analysis.reports.study_charts import run_chart
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, missing_cells, read_scores
-from xew.analysis.summary import METRIC_TITLES, RobotTable, Row, finding, flat_summary, robot_table, robot_title
-from xew.analysis.tables import Block, Cell, Table, interval_text, metric_columns, number
-from xew.analysis.tables import Row as TableRow
+from xew.analysis.statistics.grades import MIN_SCENES
+from xew.analysis.statistics.summary import METRIC_TITLES, RobotTable, Row, finding, flat_summary, robot_table, robot_title
+from xew.analysis.tables import formats
+from xew.analysis.tables.layouts import Block, Cell, Table, interval_text, metric_columns, number
+from xew.analysis.tables.layouts import Row as TableRow
 from xew.config import ConfigError, user_errors
 from xew.episode import Record, episode_folder, find_records, read_video
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split

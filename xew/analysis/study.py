@@ -23,12 +23,12 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any, NoReturn
 
-from xew.analysis.study_cell import last_lines
-from xew.analysis.study_config import Study, load_study
-from xew.analysis.study_cost import corrected, cost_table, duration, estimate, longest_ways
-from xew.analysis.study_ledger import Ledger
-from xew.analysis.study_machines import Machines, gpus_of, open_machines
-from xew.analysis.study_plan import STAGES, Cell, in_order, plan, write_configs
+from xew.analysis.studies.cell import last_lines
+from xew.analysis.studies.config import Study, load_study
+from xew.analysis.studies.cost import corrected, cost_table, duration, estimate, longest_ways
+from xew.analysis.studies.ledger import Ledger
+from xew.analysis.studies.machines import Machines, gpus_of, open_machines
+from xew.analysis.studies.plan import STAGES, Cell, in_order, plan, write_configs
 from xew.config import ConfigError, save, user_errors
 from xew.episode import find_accepted
 from xew.protocol import seed_split

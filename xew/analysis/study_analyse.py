@@ -18,7 +18,7 @@ import tyro
 
 from xew.analysis import report
 from xew.analysis.scores import VARIANT, Scores, merge_scores, write_scores
-from xew.analysis.study_config import Study, load_study
+from xew.analysis.studies.config import Study, load_study
 from xew.config import ConfigError, user_errors
 from xew.protocol import TASK_COUNT, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expected_counts
 

@@ -25,14 +25,14 @@ from xew.config import ConfigError, user_errors
 from xew.episode import EpisodeError, Record, States, episode_folder, read_record, read_states, write_episode
 from xew.exchange.hdf5 import Recorded, read_robotwin, text_beside
 from xew.protocol import ACTION_DIM, ARMS
-from xew.sim_warp.camera import Camera
-from xew.sim_warp.kinematics import tool_matrix
-from xew.sim_warp.observe import Recording, keypoint_names, observe
-from xew.sim_warp.poses import matrix_from_pose, pose_from_matrix
+from xew.sim_warp.devices.workers import quiet_warp
+from xew.sim_warp.geometry.camera import Camera
+from xew.sim_warp.geometry.poses import matrix_from_pose, pose_from_matrix
+from xew.sim_warp.kinematics.forward import tool_matrix
+from xew.sim_warp.rendering.observe import Recording, keypoint_names, observe
+from xew.sim_warp.rendering.streams import command_renders, default_renderer
 from xew.sim_warp.robots import RobotSpec, get_robot, is_path, keep_robot, use_robots_of
-from xew.sim_warp.robots.draft import find_description, read_draft
-from xew.sim_warp.streams import command_renders, default_renderer
-from xew.sim_warp.workers import quiet_warp
+from xew.sim_warp.robots.user.draft import find_description, read_draft
 
 EMBODIMENTS = {
     "aloha-agilex": "aloha_agilex",

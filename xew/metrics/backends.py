@@ -16,12 +16,12 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from xew.config import ConfigError, pick
-from xew.metrics.cotracker import open_cotracker
-from xew.metrics.estimate import Appearance, estimate_masks, learn_appearance
-from xew.metrics.flow import dis_flow, open_raft
-from xew.metrics.sam2 import open_sam2
-from xew.metrics.tapir import open_tapir
-from xew.metrics.tracker import estimate_tracks
+from xew.metrics.estimators.cotracker import open_cotracker
+from xew.metrics.estimators.flow import dis_flow, open_raft
+from xew.metrics.estimators.masks import Appearance, estimate_masks, learn_appearance
+from xew.metrics.estimators.sam2 import open_sam2
+from xew.metrics.estimators.tapir import open_tapir
+from xew.metrics.estimators.tracks import estimate_tracks
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -129,7 +129,7 @@ class ReferenceMasker:
 
 MASKERS: Mapping[str, Backend[Masker]] = {
     "default": Backend(
-        ReferenceMasker, None, "colour, background and gated flow against the true video (xew.metrics.estimate)"
+        ReferenceMasker, None, "colour, background and gated flow against the true video (xew.metrics.estimators.masks)"
     ),
     "sam2": Backend(
         open_sam2,
@@ -139,7 +139,7 @@ MASKERS: Mapping[str, Backend[Masker]] = {
     ),
 }
 TRACKERS: Mapping[str, Backend[Tracker]] = {
-    "default": Backend(lambda: estimate_tracks, None, "template search against the true video (xew.metrics.tracker)"),
+    "default": Backend(lambda: estimate_tracks, None, "template search against the true video (xew.metrics.estimators.tracks)"),
     "cotracker3": Backend(
         open_cotracker,
         "scaled_offline.pth of Hugging Face's facebook/cotracker3; CC-BY-NC 4.0: not for commercial use",

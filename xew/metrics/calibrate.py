@@ -27,9 +27,9 @@ from xew.config import ConfigError, user_errors
 from xew.episode import EpisodeError, Record, find_accepted, read_video
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
+from xew.metrics.calibration.wrong import WrongVideo, wrong_videos
 from xew.metrics.grade import Comparison, Grades, compared, grade
 from xew.metrics.truth import NEEDS, Truth, read_truth
-from xew.metrics.wrong import WrongVideo, wrong_videos
 
 LATE = 8
 """Frames of the time-shifted truth, half a second."""
@@ -173,8 +173,8 @@ def another(episodes: Sequence[Episode], record: Record, differs: str) -> Path |
 def open_codec(run: Path) -> Callable[[np.ndarray], np.ndarray]:
     """What a run's codec leaves of a video uint8 [t h w 3]. Raises ConfigError if there is no such run."""
     # Only here: the metrics load without the model.
-    from xew.model.checkpoint import load_run
-    from xew.model.frames import to_camera_size, to_model_size
+    from xew.model.runs.checkpoint import load_run
+    from xew.model.video.frames import to_camera_size, to_model_size
 
     try:
         experiment, codec = load_run(run)

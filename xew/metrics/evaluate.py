@@ -28,13 +28,13 @@ from xew.config import ConfigError, pick, suggestion, user_errors
 from xew.episode import EpisodeError, verify_episode
 from xew.metrics import METRICS
 from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, identity, open_masker, open_tracker
-from xew.metrics.bundle import demand_none, differences, disagreements, read_bundle, write_bundle
 from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, compared, grade
-from xew.metrics.jobs import BASELINES, Job, plan, prediction_of, shown_of
-from xew.metrics.scores import CellStore, beside, check_out, describe, write_diagnostics, write_tables, write_whole
-from xew.metrics.summary import summarise, to_markdown
+from xew.metrics.grading.bundle import demand_none, differences, disagreements, read_bundle, write_bundle
+from xew.metrics.grading.jobs import BASELINES, Job, plan, prediction_of, shown_of
+from xew.metrics.grading.scores import CellStore, beside, check_out, describe, write_diagnostics, write_tables, write_whole
+from xew.metrics.grading.summary import summarise, to_markdown
+from xew.metrics.grading.workers import Bench, compile_cache, not_needed, opener, worker_count
 from xew.metrics.truth import Truth, read_truth
-from xew.metrics.workers import Bench, compile_cache, not_needed, opener, worker_count
 from xew.protocol import HELD_OUT_ROBOTS
 from xew.rollout import RolloutError
 from xew.threads import in_order

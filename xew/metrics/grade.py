@@ -12,7 +12,7 @@ import numpy as np
 
 from xew.metrics import METRICS, contact_f1
 from xew.metrics.backends import Masker, Tracker
-from xew.metrics.contact import predicted_contact
+from xew.metrics.estimators.contact import predicted_contact
 from xew.metrics.metric import ACCELERATOR_CHUNK, Metric
 from xew.metrics.perceptual import SMALLEST_SIDE, union_box
 from xew.metrics.truth import Truth, inside

@@ -1,7 +1,7 @@
 """Metrics, visual quality and morphology by a network: LPIPS (AlexNet, v0.1) on frames and on the robot's region.
 
 R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018. Convolutions are those of
-float32 everywhere: TF32, the default of some GPUs, changes the fourth digit. (xew/metrics/convolution.py)
+float32 everywhere: TF32, the default of some GPUs, changes the fourth digit. (xew/metrics/networks/convolution.py)
 """
 
 import functools
@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from xew.metrics.alexnet import read_alexnet
-from xew.metrics.convolution import convolve
 from xew.metrics.metric import check_masks, check_videos, map_chunks
+from xew.metrics.networks.alexnet import read_alexnet
+from xew.metrics.networks.convolution import convolve
 
 SMALLEST_SIDE = 31
 """Below it the second pooling has no window and the mean over nothing would be NaN."""

@@ -19,12 +19,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xew.episode import Record, States, read_video
-from xew.model.mechanisms import GROUP
+from xew.model.network.mechanisms import GROUP
 from xew.protocol import ARMS
 
 if TYPE_CHECKING:
-    from xew.sim_warp.camera import Camera
-    from xew.sim_warp.streams import CommandStreams
+    from xew.sim_warp.geometry.camera import Camera
+    from xew.sim_warp.rendering.streams import CommandStreams
 
 
 @dataclass(frozen=True)
@@ -51,14 +51,14 @@ class Command:
     @cached_property
     def streams(self) -> "CommandStreams":
         """Render, mask and optical flow of the commands; Warp is imported when first asked for."""
-        from xew.sim_warp.streams import command_streams
+        from xew.sim_warp.rendering.streams import command_streams
 
         return command_streams(self.robot, self.action, self.camera)
 
     @cached_property
     def tools(self) -> np.ndarray:
         """float64 [t 2 7], commanded world poses of the left and right tool, x y z w quaternions, by forward kinematics."""
-        from xew.sim_warp.kinematics import tool_pose
+        from xew.sim_warp.kinematics.forward import tool_pose
         from xew.sim_warp.robots import get_robot
 
         robot = get_robot(self.robot)
@@ -68,7 +68,7 @@ class Command:
     @property
     def camera(self) -> "Camera":
         """The simulator's own camera object."""
-        from xew.sim_warp.camera import Camera
+        from xew.sim_warp.geometry.camera import Camera
 
         return Camera(self.intrinsics, self.extrinsics)
 
@@ -142,35 +142,35 @@ def robot_mask(command: Command) -> np.ndarray:
 
 def optical_flow(command: Command) -> np.ndarray:
     """The robot's exact motion as a colour wheel; white where nothing moves."""
-    from xew.sim_warp.streams import flow_to_rgb
+    from xew.sim_warp.rendering.streams import flow_to_rgb
 
     return flow_to_rgb(command.streams.optical_flow)
 
 
 def ray_map(command: Command) -> np.ndarray:
     """The commanded tool frames drawn into the image."""
-    from xew.sim_warp import streams
+    from xew.sim_warp.rendering import streams
 
     return streams.ray_map(command.robot, command.action, command.camera)
 
 
 def reference_image(command: Command) -> np.ndarray:
     """One front view of the robot at home."""
-    from xew.sim_warp import streams
+    from xew.sim_warp.rendering import streams
 
     return streams.reference_image(command.robot)[None]
 
 
 def nine_views(command: Command) -> np.ndarray:
     """The robot at home from nine sides."""
-    from xew.sim_warp import streams
+    from xew.sim_warp.rendering import streams
 
     return streams.nine_views(command.robot)
 
 
 def articulation_clip(command: Command) -> np.ndarray:
     """A clip of the robot that moves all its joints."""
-    from xew.sim_warp import streams
+    from xew.sim_warp.rendering import streams
 
     return streams.articulation_clip(command.robot)
 

@@ -13,13 +13,23 @@ from flax import nnx
 
 from xew.config import ConfigError, load, pick
 from xew.files import cache_folder
-from xew.model.codec import TEMPORAL_FACTOR, CodecSettings, codec_of, latent_frames
+from xew.model.codecs.codec import TEMPORAL_FACTOR, CodecSettings, codec_of, latent_frames
 from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition
-from xew.model.dit import MODELS, PATCH, STREAMS, AttentionName, ModelSize, RematName, TimeEmbedding, Visibility, WorldModel
-from xew.model.mechanisms import MECHANISMS
-from xew.model.samplers import GRIDS, SAMPLERS
-from xew.model.sharding import MeshSettings
-from xew.model.text import TEXT_ENCODERS, VOCABULARY, TextEncoder, TextSource, encode_instructions
+from xew.model.devices.sharding import MeshSettings
+from xew.model.diffusion.samplers import GRIDS, SAMPLERS
+from xew.model.network.dit import (
+    MODELS,
+    PATCH,
+    STREAMS,
+    AttentionName,
+    ModelSize,
+    RematName,
+    TimeEmbedding,
+    Visibility,
+    WorldModel,
+)
+from xew.model.network.mechanisms import MECHANISMS
+from xew.model.text.instructions import TEXT_ENCODERS, VOCABULARY, TextEncoder, TextSource, encode_instructions
 from xew.protocol import ACTION_DIM, SPLITS, Split
 
 

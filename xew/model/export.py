@@ -15,12 +15,12 @@ import jax.numpy as jnp
 from flax import nnx
 
 from xew.config import ConfigError, user_errors
-from xew.model.checkpoint import load_run_config, restore_params
-from xew.model.dit import parameter_count
-from xew.model.dit_layouts import Naming, save_dit, wan_layout
 from xew.model.experiment import create_model
-from xew.model.tokens import WAVELENGTH_BASE
-from xew.model.weights import checkpoint_shapes
+from xew.model.network.dit import parameter_count
+from xew.model.network.dit_layouts import Naming, save_dit, wan_layout
+from xew.model.network.tokens import WAVELENGTH_BASE
+from xew.model.runs.checkpoint import load_run_config, restore_params
+from xew.model.weights.tensors import checkpoint_shapes
 
 
 def export(run: Path, out: Path, naming: Naming = "diffusers", dtype: str = "float32", step: int | None = None) -> int:

@@ -26,14 +26,14 @@ from tqdm import tqdm
 from xew.config import ConfigError, digest, suggestion, user_errors
 from xew.episode import Record, complete_folder, episode_folder, find_accepted, read_states
 from xew.files import replacing
-from xew.model.ceiling import measure_ceiling, spread
-from xew.model.checkpoint import load_run
-from xew.model.codec import Codec, check_clip_shape, codec_of, encode_pictures
+from xew.model.cache.scales import Scale, fit_scales, load_run_scales, read_scales, save_scales
+from xew.model.codecs.ceiling import measure_ceiling, spread
+from xew.model.codecs.codec import Codec, check_clip_shape, codec_of, encode_pictures
 from xew.model.conditions import Command, Condition, clip_numbers, command_of, robot_render
 from xew.model.experiment import Experiment, load_experiment
-from xew.model.frames import to_model_size
-from xew.model.pixels import Pixels, PixelSource, rendered_pixels, stored_pixels
-from xew.model.scales import Scale, fit_scales, load_run_scales, read_scales, save_scales
+from xew.model.runs.checkpoint import load_run
+from xew.model.video.frames import to_model_size
+from xew.model.video.pixels import Pixels, PixelSource, rendered_pixels, stored_pixels
 from xew.protocol import seed_split
 from xew.threads import in_order
 

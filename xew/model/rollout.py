@@ -25,17 +25,17 @@ from tqdm import tqdm
 
 from xew.config import CONVERTER, ConfigError, suggestion, user_errors
 from xew.episode import EpisodeError, Record, episode_folder, find_accepted
-from xew.model.checkpoint import load_run, restore_params, saved_at
-from xew.model.codec import codec_of
-from xew.model.dit import compute_params
-from xew.model.dit_layouts import load_dit_params
+from xew.model.cache.scales import load_run_scales
+from xew.model.codecs.codec import codec_of
+from xew.model.devices.sharding import MeshSettings, make_mesh, replicated
 from xew.model.experiment import Experiment, compile_cache, create_model, load_experiment
-from xew.model.frames import to_camera_size
 from xew.model.latents import Episode, load_codec, training_episodes
-from xew.model.predict import Prediction, Predictor
-from xew.model.scales import load_run_scales
-from xew.model.sharding import MeshSettings, make_mesh, replicated
-from xew.model.training_step import random_params
+from xew.model.network.dit import compute_params
+from xew.model.network.dit_layouts import load_dit_params
+from xew.model.runs.checkpoint import load_run, restore_params, saved_at
+from xew.model.sampling.predict import Prediction, Predictor
+from xew.model.training.step import random_params
+from xew.model.video.frames import to_camera_size
 from xew.protocol import seed_split
 from xew.rollout import write_rollout
 

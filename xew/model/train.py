@@ -26,9 +26,23 @@ from jax.sharding import Mesh
 from tqdm import tqdm
 
 from xew.config import ConfigError, user_errors
-from xew.model.adaptation import corrected
-from xew.model.blocks import choose_attention
-from xew.model.checkpoint import (
+from xew.model.cache.scales import SCALES, Scale, load_run_scales, save_scales
+from xew.model.codecs.codec import Codec
+from xew.model.devices.sharding import (
+    check_batch,
+    make_mesh,
+    mesh_shape,
+    place_batch,
+    process_rows,
+    start_processes,
+    state_shardings,
+)
+from xew.model.experiment import Experiment, compile_cache, create_model, load_experiment
+from xew.model.latents import LatentCache, load_codec, replay_episodes, training_episodes
+from xew.model.network.blocks import choose_attention
+from xew.model.network.dit_layouts import check_dit, load_dit_params
+from xew.model.network.lora import corrected
+from xew.model.runs.checkpoint import (
     START,
     TrainState,
     check_start,
@@ -39,19 +53,13 @@ from xew.model.checkpoint import (
     restore_state,
     save_state,
 )
-from xew.model.codec import Codec
-from xew.model.data import ClipSource, make_dataset
-from xew.model.dit_layouts import check_dit, load_dit_params
-from xew.model.experiment import Experiment, compile_cache, create_model, load_experiment
-from xew.model.latents import LatentCache, load_codec, replay_episodes, training_episodes
-from xew.model.memory import check_memory, estimate_memory, flops_of_step, peak_flops
-from xew.model.optimizer import learning_rate, with_steps
-from xew.model.predict import Predictor
-from xew.model.samples import check_samples, log_samples
-from xew.model.scales import SCALES, Scale, load_run_scales, save_scales
-from xew.model.sharding import check_batch, make_mesh, mesh_shape, place_batch, process_rows, start_processes, state_shardings
-from xew.model.tensorboard import RunLog
-from xew.model.training_step import StepResult, abstract_state, init_train_state, make_train_step, random_params
+from xew.model.sampling.predict import Predictor
+from xew.model.training.data import ClipSource, make_dataset
+from xew.model.training.memory import check_memory, estimate_memory, flops_of_step, peak_flops
+from xew.model.training.optimizer import learning_rate, with_steps
+from xew.model.training.samples import check_samples, log_samples
+from xew.model.training.step import StepResult, abstract_state, init_train_state, make_train_step, random_params
+from xew.model.training.tensorboard import RunLog
 
 NOISE_LEVEL_EDGES = (0.0, 0.5, 0.8, 0.95, 1.0)
 """Bins of the noise level in which the loss is shown apart."""

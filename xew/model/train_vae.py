@@ -26,18 +26,18 @@ from tqdm import tqdm
 
 from xew.config import ConfigError, load, pick, user_errors
 from xew.episode import find_accepted, read_video
-from xew.model.ceiling import Ceiling, measure_ceiling, spread
-from xew.model.checkpoint import TrainState, claim_run, open_checkpoints, restore_state, save_state
-from xew.model.codec import WanVaeCodec, to_signed
+from xew.model.codecs.ceiling import Ceiling, measure_ceiling, spread
+from xew.model.codecs.codec import WanVaeCodec, to_signed
+from xew.model.codecs.vae import VAES, LatentStatistic, VaeSize, VideoVae
+from xew.model.codecs.vae_layouts import save_vae
 from xew.model.experiment import Clip, TrainSettings, beside, compile_cache, demand_at_least
 from xew.model.latents import Episode, test_episodes
-from xew.model.optimizer import learning_rate, make_optimizer
-from xew.model.samples import strip
-from xew.model.tensorboard import RunLog
+from xew.model.runs.checkpoint import TrainState, claim_run, open_checkpoints, restore_state, save_state
 from xew.model.train import STOPPED, StopSignal
-from xew.model.vae import VAES, LatentStatistic, VaeSize, VideoVae
-from xew.model.vae_data import Cut, check_streams, make_dataset, random_clips, video_files
-from xew.model.vae_layouts import save_vae
+from xew.model.training.optimizer import learning_rate, make_optimizer
+from xew.model.training.samples import strip
+from xew.model.training.tensorboard import RunLog
+from xew.model.training.vae_data import Cut, check_streams, make_dataset, random_clips, video_files
 from xew.protocol import SPLITS, Split, seed_split
 
 CEILING_CLIPS = 16

@@ -27,12 +27,12 @@ from tqdm import tqdm
 from xew.config import user_errors
 from xew.episode import EpisodeError, Record, episode_folder, find_records, remove_left_overs
 from xew.protocol import TEST_SEED_START, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK
+from xew.sim_warp.devices.workers import Workers, has_kernels, named_device, quiet_warp, worker_count
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
-from xew.sim_warp.produce import Job, produce
-from xew.sim_warp.render import Renderer
+from xew.sim_warp.production.produce import Job, produce
+from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS, adopt_robots, get_robot, is_path
 from xew.sim_warp.tasks import TASKS, get_task
-from xew.sim_warp.workers import Workers, has_kernels, named_device, quiet_warp, worker_count
 
 TRIES_PER_SEED = 3
 SPARE_TRIES = 20

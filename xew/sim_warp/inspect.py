@@ -33,11 +33,11 @@ from xew.episode import (
     read_video,
     verify_episode,
 )
+from xew.sim_warp.devices.workers import Workers, quiet_warp
 from xew.sim_warp.generate import yield_table
-from xew.sim_warp.produce import add_videos, demand_plausible, render_again
-from xew.sim_warp.render import Renderer
+from xew.sim_warp.production.produce import add_videos, demand_plausible, render_again
+from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS
-from xew.sim_warp.workers import Workers, quiet_warp
 
 EPISODES_PER_WORKER = 32
 """So many are verified in the time in which a process starts."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from xew.sim_warp import geometry
-from xew.sim_warp.geometry import Color, Mesh
+from xew.sim_warp.geometry import meshes
+from xew.sim_warp.geometry.meshes import Color, Mesh
 
 WALL_SEGMENTS = 6
 """Convex wedges round the wall of a hollow object: few enough that a finger pad lies on the flat of one."""
@@ -40,7 +40,7 @@ class Shape:
 
 def merge(*shapes: Shape) -> Shape:
     """One rigid piece out of several in the same frame."""
-    return Shape(geometry.merge([s.mesh for s in shapes]), tuple(h for s in shapes for h in s.hulls))
+    return Shape(meshes.merge([s.mesh for s in shapes]), tuple(h for s in shapes for h in s.hulls))
 
 
 def moved(shape: Shape, xyz: tuple[float, float, float]) -> Shape:
@@ -55,7 +55,7 @@ def darker(color: Color, share: float) -> Color:
 
 def block(size: tuple[float, float, float], color: Color) -> Shape:
     """A box of full edge lengths `size` [m]."""
-    mesh = geometry.box(size, color).transformed((0, 0, size[2] / 2))
+    mesh = meshes.box(size, color).transformed((0, 0, size[2] / 2))
     return Shape(mesh, (mesh.vertices,))
 
 
@@ -65,17 +65,17 @@ def prism(radius: float, length: float, color: Color, end_color: Color | None = 
     ring = radius / np.cos(np.pi / sides) * np.stack([np.cos(angle), np.sin(angle)], -1)
     points = np.concatenate([np.column_stack([np.full(sides, x), ring]) for x in (-length / 2, length / 2)])
     points[:, 2] += radius
-    body = geometry.hull(points, color)
+    body = meshes.hull(points, color)
     caps = [
-        geometry.cylinder(radius * 1.04, 0.02, end_color or color).transformed((x, 0, radius), (0, np.pi / 2, 0))
+        meshes.cylinder(radius * 1.04, 0.02, end_color or color).transformed((x, 0, radius), (0, np.pi / 2, 0))
         for x in (-length / 2 + 0.005, length / 2 - 0.005)
     ]
-    return Shape(geometry.merge([body, *caps]) if end_color else body, (points.astype(np.float32),))
+    return Shape(meshes.merge([body, *caps]) if end_color else body, (points.astype(np.float32),))
 
 
 def disc(radius: float, height: float, color: Color, sides: int = 24) -> Shape:
     """A flat round plate."""
-    mesh = geometry.cylinder(radius, height, color, sections=sides).transformed((0, 0, height / 2))
+    mesh = meshes.cylinder(radius, height, color, sections=sides).transformed((0, 0, height / 2))
     return Shape(mesh, (mesh.vertices,))
 
 
@@ -89,7 +89,7 @@ def vessel(outline: list[tuple[float, float]], wall: float, color: Color, inside
     """
     outer = np.asarray(outline, float)
     inner = np.stack([outer[:, 0] - wall, np.maximum(outer[:, 1], wall)], -1)
-    shell = geometry.revolve([(0, 0), *outer, *inner[::-1], (0, wall)], color)
+    shell = meshes.revolve([(0, 0), *outer, *inner[::-1], (0, wall)], color)
     centres = shell.vertices[shell.triangles].mean(1)
     outward = (shell.normals.mean(1)[:, :2] * centres[:, :2]).sum(-1) >= 0
     colors = np.where(outward[:, None], np.array(color, np.uint8), np.array(inside or color, np.uint8))

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from xew.episode import array_hash
+from xew.sim_warp.geometry.poses import Pose
 from xew.sim_warp.objects import Shape
-from xew.sim_warp.poses import Pose
 
 Point = Sequence[float] | np.ndarray
 """x y or x y z [m]."""

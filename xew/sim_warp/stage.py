@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from xew.sim_warp.geometry import Color, Mesh, box, merge
+from xew.sim_warp.geometry.meshes import Color, Mesh, box, merge
 
 TABLE_TOP = 0.74
 """Height of the table's surface [m]."""

@@ -23,10 +23,10 @@ from tqdm import tqdm
 
 from xew.config import user_errors
 from xew.episode import EpisodeError, Record
-from xew.sim_warp.produce import Job, header, plan_cells, simulate_cells
+from xew.sim_warp.devices.workers import Workers, has_kernels, named_device, quiet_warp, worker_count
+from xew.sim_warp.production.produce import Job, header, plan_cells, simulate_cells
 from xew.sim_warp.robots import ROBOTS, get_robot
 from xew.sim_warp.tasks import TASKS, Task, get_task
-from xew.sim_warp.workers import Workers, has_kernels, named_device, quiet_warp, worker_count
 
 PARTS = ("Task", "Randomisation", "Success", "After")
 """How the paragraphs of a task's module docstring begin."""

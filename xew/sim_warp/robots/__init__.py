@@ -6,10 +6,10 @@ embodiment (docs/add_a_robot.md).
 """
 
 from xew.config import ConfigError, pick
+from xew.sim_warp.embodiment.spec import Arm, RobotSpec
+from xew.sim_warp.embodiment.urdf import Urdf, UrdfError, load_urdf
 from xew.sim_warp.robots import aloha_agilex, arx_x5, franka_panda, piper, ur5_wsg
-from xew.sim_warp.robots.own import FOLDERS, adopt_robots, is_path, keep_robot, kept_robot, load_robot, use_robots_of
-from xew.sim_warp.robots.spec import Arm, RobotSpec
-from xew.sim_warp.robots.urdf import Urdf, UrdfError, load_urdf
+from xew.sim_warp.robots.user.own import FOLDERS, adopt_robots, is_path, keep_robot, kept_robot, load_robot, use_robots_of
 
 __all__ = [
     "ROBOTS",
@@ -36,7 +36,7 @@ ROBOTS: dict[str, RobotSpec] = {
 
 
 def get_robot(name: str) -> RobotSpec:
-    """The robot of a registry key, of an import path `module:NAME`, at a path, or kept beside data (`xew.sim_warp.robots.own`).
+    """The robot of a registry key, of an import path `module:NAME`, at a path, or kept beside data.
 
     Raises:
         ConfigError: there is none, or it cannot be used.

@@ -6,7 +6,7 @@ Limits that experts keep: real-stanford/arx5-sdk, configuration X5: the front ar
 from dataclasses import replace
 from pathlib import Path
 
-from xew.sim_warp.robots.spec import Arm, RobotSpec
+from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 
 LEFT = Arm(
     root_pose=(0, -0.62, 0, 0, 0, 0.7071067812, 0.7071067812),

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import trimesh
 
-from xew.sim_warp.geometry import Color
+from xew.sim_warp.geometry.meshes import Color
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.robots.shapes.solids import Box, Part
 

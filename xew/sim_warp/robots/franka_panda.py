@@ -6,7 +6,7 @@ Limits that experts keep: frankaemika/franka_description robots/fer/joint_limits
 from dataclasses import replace
 from pathlib import Path
 
-from xew.sim_warp.robots.spec import Arm, RobotSpec
+from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 
 LEFT = Arm(
     root_pose=(-0.28, -0.68, 0.53, 0, 0, 0.7071067812, 0.7071067812),

@@ -7,7 +7,7 @@ The arms stand leaning back by 10 degrees, which its short wrist range asks for.
 from dataclasses import replace
 from pathlib import Path
 
-from xew.sim_warp.robots.spec import Arm, RobotSpec
+from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 
 LEFT = Arm(
     root_pose=(-0.18, -0.37, 0.75, 0.06162841672, -0.06162841672, 0.7044160264, 0.7044160264),

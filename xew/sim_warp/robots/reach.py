@@ -12,11 +12,11 @@ import tyro
 from scipy.spatial.transform import Rotation, Slerp
 
 from xew.config import user_errors
-from xew.sim_warp.inverse_kinematics import ArmSolver
-from xew.sim_warp.kinematics import tool_pose
+from xew.sim_warp.devices.workers import quiet_warp
+from xew.sim_warp.kinematics.forward import tool_pose
+from xew.sim_warp.kinematics.inverse import ArmSolver
 from xew.sim_warp.plan import tool
 from xew.sim_warp.robots import ROBOTS, RobotSpec, get_robot
-from xew.sim_warp.workers import quiet_warp
 
 X, Y, Z = np.linspace(-0.32, 0.10, 6), np.linspace(-0.25, 0.15, 5), np.array([0.76, 0.85, 0.95])
 """The work volume of the left arm [m]; the right arm's is its mirror image."""

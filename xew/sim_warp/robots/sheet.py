@@ -18,11 +18,11 @@ import tyro
 
 from xew.config import user_errors
 from xew.episode import EpisodeError, write_video
-from xew.sim_warp.camera import HEAD_CAMERA
-from xew.sim_warp.render import Renderer
-from xew.sim_warp.robots import ROBOTS, get_robot
-from xew.sim_warp.robots.bodies import robot_bodies, robot_pose
-from xew.sim_warp.streams import (
+from xew.sim_warp.devices.workers import quiet_warp
+from xew.sim_warp.geometry.camera import HEAD_CAMERA
+from xew.sim_warp.rendering.bodies import robot_bodies, robot_pose
+from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.rendering.streams import (
     VIEW_COUNT,
     articulation_action,
     articulation_clip,
@@ -31,7 +31,7 @@ from xew.sim_warp.streams import (
     ray_map,
     reference_image,
 )
-from xew.sim_warp.workers import quiet_warp
+from xew.sim_warp.robots import ROBOTS, get_robot
 
 
 def sheet(views: np.ndarray) -> np.ndarray:

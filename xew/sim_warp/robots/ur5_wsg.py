@@ -7,7 +7,7 @@ Limits that experts keep: the URDF's, inside those of the UR5 manual (ur_descrip
 from dataclasses import replace
 from pathlib import Path
 
-from xew.sim_warp.robots.spec import Arm, RobotSpec
+from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 
 LEFT = Arm(
     root_pose=(-0.35, -0.65, 0.75, 0, 0, 0, 1),

@@ -8,7 +8,7 @@ After RoboTwin 2.0's lift_pot.
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp import containers
+from xew.sim_warp.assets import containers
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP

@@ -11,7 +11,7 @@ passes over its handle.
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp import containers
+from xew.sim_warp.assets import containers
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP

@@ -9,7 +9,7 @@ After RoboTwin 2.0's move_pillbottle_pad, whose pads are all blue.
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp import containers, household
+from xew.sim_warp.assets import containers, household
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP

@@ -11,7 +11,7 @@ After RoboTwin 2.0's move_stapler_pad, whose stapler lies at any yaw; here both 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp import household
+from xew.sim_warp.assets import household
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP

@@ -11,8 +11,8 @@ After RoboTwin 2.0's place_a2b_left, whose expert puts A 13 cm beside B; here up
 
 import numpy as np
 
-from xew.sim_warp import household
-from xew.sim_warp.household import Thing
+from xew.sim_warp.assets import household
+from xew.sim_warp.assets.household import Thing
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw
 from xew.sim_warp.tasks.task import Moment, Task, carry, easy_turn, graspable_yaw

@@ -15,9 +15,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp import geometry, household, objects
-from xew.sim_warp.geometry import Color, Mesh
-from xew.sim_warp.household import Thing
+from xew.sim_warp import objects
+from xew.sim_warp.assets import household
+from xew.sim_warp.assets.household import Thing
+from xew.sim_warp.geometry import meshes
+from xew.sim_warp.geometry.meshes import Color, Mesh
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
@@ -64,7 +66,7 @@ def basket(form: str, color: Color) -> Shape:
         outside = [((RADIUS + WALL) * np.cos(a), (RADIUS + WALL) * np.sin(a), a + np.pi / 2) for a in angle]
         inside = [(RADIUS * np.cos(a), RADIUS * np.sin(a), a + np.pi / 2) for a in angle]
         seen = [body.mesh, _weave(outside, color), _weave(inside, color), *_cloth()]
-        return Shape(geometry.merge(seen), body.hulls)
+        return Shape(meshes.merge(seen), body.hulls)
     x, y = HALF
     floor = objects.block((2 * x + WALL, 2 * y + WALL, FLOOR), shade)
     walls = [objects.moved(objects.block((2 * x + 2 * WALL, WALL, RIM), color), (0, s * (y + WALL / 2), 0)) for s in (-1, 1)]
@@ -72,30 +74,30 @@ def basket(form: str, color: Color) -> Shape:
     along, deep = (np.linspace(-half + 0.01, half - 0.01, count) for half, count in ((x, 12), (y, 9)))
     spots = [(u, s * w, 0.0) for s in (-1, 1) for w in (y, y + WALL) for u in along]
     spots += [(s * w, v, np.pi / 2) for s in (-1, 1) for w in (x, x + WALL) for v in deep]
-    return objects.merge(floor, *walls, Shape(geometry.merge([_weave(spots, color), *_cloth()])))
+    return objects.merge(floor, *walls, Shape(meshes.merge([_weave(spots, color), *_cloth()])))
 
 
 def _weave(spots: Sequence[tuple[float, float, float]], color: Color) -> Mesh:
     """Dark and light withies on a wall at (x, y, direction along the wall [rad]), in turn over and under; only seen."""
     dark, light = objects.darker(color, 0.72), objects.darker(color, 0.94)
     withies = [
-        geometry.box((0.0165, 0.0024, 0.008), dark if (number + row) % 2 else light).transformed((x, y, z), (0, 0, angle))
+        meshes.box((0.0165, 0.0024, 0.008), dark if (number + row) % 2 else light).transformed((x, y, z), (0, 0, angle))
         for number, (x, y, angle) in enumerate(spots)
         for row, z in enumerate((0.009, 0.018, 0.027))
     ]
-    return geometry.merge(withies)
+    return meshes.merge(withies)
 
 
 def _cloth() -> list[Mesh]:
     """A checked cloth on the floor; it is only seen."""
-    cloth = geometry.box((0.13, 0.11, 0.001), (244, 240, 230)).transformed((0, 0, FLOOR))
+    cloth = meshes.box((0.13, 0.11, 0.001), (244, 240, 230)).transformed((0, 0, FLOOR))
     stripes = [
-        geometry.box((0.008, 0.11, 0.0016), (196, 74, 66)).transformed((x, 0, FLOOR)) for x in (-0.045, -0.015, 0.015, 0.045)
+        meshes.box((0.008, 0.11, 0.0016), (196, 74, 66)).transformed((x, 0, FLOOR)) for x in (-0.045, -0.015, 0.015, 0.045)
     ]
     return [
         cloth,
         *stripes,
-        *(geometry.box((0.13, 0.008, 0.0014), (222, 140, 132)).transformed((0, y, FLOOR)) for y in (-0.03, 0, 0.03)),
+        *(meshes.box((0.13, 0.008, 0.0014), (222, 140, 132)).transformed((0, y, FLOOR)) for y in (-0.03, 0, 0.03)),
     ]
 
 

@@ -9,8 +9,9 @@ After RoboTwin 2.0's place_burger_fries.
 
 import numpy as np
 
-from xew.sim_warp import geometry, objects
-from xew.sim_warp.geometry import Color, Mesh
+from xew.sim_warp import objects
+from xew.sim_warp.geometry import meshes
+from xew.sim_warp.geometry.meshes import Color, Mesh
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, upright
@@ -44,7 +45,7 @@ def tray(color: Color) -> Shape:
         objects.moved(objects.block((0.006, depth - 0.012, 0.009), rim), (side * (width / 2 - 0.003), 0, TRAY_FLOOR))
         for side in (-1, 1)
     ]
-    paper = geometry.box((width * 0.86, depth * 0.8, 0.0006), (246, 243, 234)).transformed((0, 0, TRAY_FLOOR))
+    paper = meshes.box((width * 0.86, depth * 0.8, 0.0006), (246, 243, 234)).transformed((0, 0, TRAY_FLOOR))
     return objects.merge(floor, *edges, Shape(paper))
 
 
@@ -64,10 +65,10 @@ def burger(rng: np.random.Generator) -> Shape:
         height += thickness
     crown = [_ring(radius * share, height + rise) for share, rise in ((0.98, 0.0), (1.0, 0.005), (0.8, 0.014), (0.42, 0.019))]
     seeds = [
-        geometry.box((0.0035, 0.002, 0.0016), (246, 226, 178)).transformed(_on_crown(radius, height, angle), (0, 0, angle))
+        meshes.box((0.0035, 0.002, 0.0016), (246, 226, 178)).transformed(_on_crown(radius, height, angle), (0, 0, angle))
         for angle in rng.uniform(0, np.pi / 3, 6) + np.arange(6) * np.pi / 3
     ]
-    mesh = geometry.merge([*layers, geometry.hull(np.concatenate(crown), bun), *seeds])
+    mesh = meshes.merge([*layers, meshes.hull(np.concatenate(crown), bun), *seeds])
     hull = np.concatenate([_ring(radius * 0.96, 0.0), _ring(radius, 0.010), *crown[1:]]).astype(np.float32)
     return Shape(mesh, (hull,))
 
@@ -80,13 +81,13 @@ def _ring(radius: float, z: float) -> np.ndarray:
 
 
 def _layer(radius: float, low: float, high: float, color: Color) -> Mesh:
-    return geometry.hull(np.concatenate([_ring(radius, low), _ring(radius, high)]), color)
+    return meshes.hull(np.concatenate([_ring(radius, low), _ring(radius, high)]), color)
 
 
 def _filling(name: str, radius: float, low: float, thickness: float) -> Mesh:
     if name == "cheese":  # a square slice whose corners hang out a little
         edge = radius * 1.44
-        return geometry.box((edge, edge, thickness), (242, 186, 48)).transformed((0, 0, low + thickness / 2), (0, 0, 0.5))
+        return meshes.box((edge, edge, thickness), (242, 186, 48)).transformed((0, 0, low + thickness / 2), (0, 0, 0.5))
     color = {"lettuce": (106, 172, 66), "patty": (92, 54, 34), "tomato": (206, 60, 44)}[name]
     return _layer(radius * (0.94 if name == "tomato" else 1.0), low, low + thickness, color)
 
@@ -103,20 +104,20 @@ def fries(rng: np.random.Generator) -> Shape:
         rng.integers(3)
     ]
     front = CARTON_BACK + CARTON_LENGTH
-    carton = geometry.box((width, CARTON_LENGTH, height), color).transformed((0, front - CARTON_LENGTH / 2, height / 2))
-    label = geometry.cylinder(0.015, 0.0012, stripe, sections=20).transformed((0, front - 0.028, height))
-    band = geometry.box((width + 0.0012, 0.007, height + 0.0012), stripe).transformed((0, front - 0.006, height / 2))
+    carton = meshes.box((width, CARTON_LENGTH, height), color).transformed((0, front - CARTON_LENGTH / 2, height / 2))
+    label = meshes.cylinder(0.015, 0.0012, stripe, sections=20).transformed((0, front - 0.028, height))
+    band = meshes.box((width + 0.0012, 0.007, height + 0.0012), stripe).transformed((0, front - 0.006, height / 2))
     half = width / 2 - 0.005
     corners = np.array(np.meshgrid([-half, half], [front - 0.004, 0.04], [0.004, height - 0.004])).reshape(3, -1).T
     rows, columns = np.linspace(0.008, height - 0.008, 3), np.linspace(-0.84, 0.84, 5) * half
     sticks = [_stick(rng, x, z, front) for z in rows for x in columns]
-    return Shape(geometry.merge([carton, label, band, *sticks]), (carton.vertices, corners.astype(np.float32)))
+    return Shape(meshes.merge([carton, label, band, *sticks]), (carton.vertices, corners.astype(np.float32)))
 
 
 def _stick(rng: np.random.Generator, x: float, z: float, front: float) -> Mesh:
     length, turn, shade = rng.uniform(0.022, 0.040), rng.uniform(-0.06, 0.06), rng.integers(0, 26)
     color = (250 - int(shade) // 2, 212 - int(shade), 96 - int(shade))
-    return geometry.box((0.0065, length, 0.0065), color).transformed((x, front - 0.006 + length / 2, z), (0, 0, turn))
+    return meshes.box((0.0065, length, 0.0065), color).transformed((x, front - 0.006 + length / 2, z), (0, 0, turn))
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:

@@ -8,8 +8,9 @@ After RoboTwin 2.0's place_container_plate, whose plate is wider by a quarter.
 
 import numpy as np
 
-from xew.sim_warp import containers, objects
-from xew.sim_warp.geometry import Color, Mesh
+from xew.sim_warp import objects
+from xew.sim_warp.assets import containers
+from xew.sim_warp.geometry.meshes import Color, Mesh
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright

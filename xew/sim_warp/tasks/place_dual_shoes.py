@@ -15,8 +15,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp import geometry, objects
-from xew.sim_warp.geometry import Color, Mesh
+from xew.sim_warp import objects
+from xew.sim_warp.geometry import meshes
+from xew.sim_warp.geometry.meshes import Color, Mesh
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool, tool
 from xew.sim_warp.scene import Grasp, Scene, SceneObject, upright
@@ -63,7 +64,7 @@ def shoe(kind: str, length: float, color: Color, trim: Color) -> tuple[Shape, fl
         color,
     )
     seen = [sole, quarter, vamp, *_collar(grip, half, top, trim), *_details(kind, grip, half, top, trim)]
-    return Shape(geometry.merge(seen), (sole.vertices, quarter.vertices, vamp.vertices)), 2 * grip
+    return Shape(meshes.merge(seen), (sole.vertices, quarter.vertices, vamp.vertices)), 2 * grip
 
 
 def _plate(
@@ -71,7 +72,7 @@ def _plate(
 ) -> Mesh:
     """The convex body over a half outline (x, y) [m] and its mirror image, from a height to another [m], functions of y."""
     points = [(side * x, y, z(y)) for x, y in outline for side in (-1, 1) for z in (low, high)]
-    return geometry.hull(np.array(points), color)
+    return meshes.hull(np.array(points), color)
 
 
 def _arches(stations: Sequence[tuple[float, float, float]], grip: float, half: float, top: float, color: Color) -> Mesh:
@@ -83,7 +84,7 @@ def _arches(stations: Sequence[tuple[float, float, float]], grip: float, half: f
         for x, z, low in arch
         for side in (-1, 1)
     ]
-    return geometry.hull(np.array(points), color)
+    return meshes.hull(np.array(points), color)
 
 
 def _collar(grip: float, half: float, top: float, trim: Color) -> list[Mesh]:
@@ -109,18 +110,18 @@ def _details(kind: str, grip: float, half: float, top: float, trim: Color) -> li
         return 0.0, y * half, top * 0.85 - fall * (y - 0.14) * half
 
     if kind == "loafer":
-        strap = geometry.box((grip * 1.35, 0.015, 0.004), trim).transformed(on_vamp(0.34), (lean, 0, 0))
-        buckle = geometry.box((grip * 0.4, 0.008, 0.006), (212, 182, 92)).transformed(on_vamp(0.34), (lean, 0, 0))
-        heel = geometry.box((grip * 1.5, 0.25 * half, SOLE), (30, 24, 20)).transformed((0, -0.86 * half, SOLE / 2))
+        strap = meshes.box((grip * 1.35, 0.015, 0.004), trim).transformed(on_vamp(0.34), (lean, 0, 0))
+        buckle = meshes.box((grip * 0.4, 0.008, 0.006), (212, 182, 92)).transformed(on_vamp(0.34), (lean, 0, 0))
+        heel = meshes.box((grip * 1.5, 0.25 * half, SOLE), (30, 24, 20)).transformed((0, -0.86 * half, SOLE / 2))
         return [strap, buckle, heel]
     laces = [
-        geometry.box((grip * 1.1, 0.0045, 0.0045), (250, 250, 248)).transformed(on_vamp(y), (lean, 0, 0.16 * (-1) ** number))
+        meshes.box((grip * 1.1, 0.0045, 0.0045), (250, 250, 248)).transformed(on_vamp(y), (lean, 0, 0.16 * (-1) ** number))
         for number, y in enumerate((0.20, 0.32, 0.44, 0.56))
     ]
-    tongue = geometry.box((grip * 0.95, 0.004, 0.020), trim).transformed((0, 0.06 * half, 0.92 * top), (0.5, 0, 0))
+    tongue = meshes.box((grip * 0.95, 0.004, 0.020), trim).transformed((0, 0.06 * half, 0.92 * top), (0.5, 0, 0))
     cap = _arches([(0.76, 0.95, 0.535), (0.86, 0.8, 0.49), (0.975, 0.45, 0.40)], grip, half, top, (242, 240, 234))
     stripes = [
-        geometry.box((0.0012, 0.007, 0.030), trim).transformed((side * grip, y * half, 0.031), (-0.5, 0, 0))
+        meshes.box((0.0012, 0.007, 0.030), trim).transformed((side * grip, y * half, 0.031), (-0.5, 0, 0))
         for side in (-1, 1)
         for y in (-0.42, -0.22, -0.02)
     ]
@@ -135,9 +136,9 @@ def shoe_box(color: Color) -> Shape:
     walls += [
         objects.moved(objects.block((WALL, depth - 2 * WALL, RIM), color), (s * (width - WALL) / 2, 0, 0)) for s in (-1, 1)
     ]
-    paper = geometry.box((width - 0.02, depth - 0.02, 0.0008), (246, 244, 240)).transformed((0, 0, FLOOR))
-    label = geometry.box((0.07, 0.0012, 0.018), (246, 244, 240)).transformed((0, -depth / 2, RIM / 2))
-    return objects.merge(floor, *walls, Shape(geometry.merge([paper, label])))
+    paper = meshes.box((width - 0.02, depth - 0.02, 0.0008), (246, 244, 240)).transformed((0, 0, FLOOR))
+    label = meshes.box((0.07, 0.0012, 0.018), (246, 244, 240)).transformed((0, -depth / 2, RIM / 2))
+    return objects.merge(floor, *walls, Shape(meshes.merge([paper, label])))
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:

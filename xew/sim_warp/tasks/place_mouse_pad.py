@@ -10,7 +10,7 @@ After RoboTwin 2.0's place_mouse_pad, whose mouse lies at any yaw and at least .
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp import household
+from xew.sim_warp.assets import household
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP

@@ -10,8 +10,9 @@ After RoboTwin 2.0's place_object_scale, whose scale is free and stands at any y
 
 import numpy as np
 
-from xew.sim_warp import geometry, household
-from xew.sim_warp.household import on_top, slab
+from xew.sim_warp.assets import household
+from xew.sim_warp.assets.household import on_top, slab
+from xew.sim_warp.geometry import meshes
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
@@ -32,16 +33,16 @@ def scale(rng: np.random.Generator) -> tuple[str, Shape]:
     width, depth, height = rng.uniform([0.112, 0.140, 0.034], [0.128, 0.156, 0.044])
     low, half = 0.6 * height, 0.46 * width
     body = slab((width, depth, low), 0.004, household.COLORS[name]).transformed((0, half + 0.004 - depth / 2, 0))
-    neck = geometry.cylinder(0.018, height - low, household.DARK, sections=16).transformed((0, 0, (height + low) / 2 - 0.001))
+    neck = meshes.cylinder(0.018, height - low, household.DARK, sections=16).transformed((0, 0, (height + low) / 2 - 0.001))
     if rng.random() < 0.5:
-        pan = geometry.cylinder(half, PLATE, household.STEEL, sections=20).transformed((0, 0, height - PLATE / 2))
+        pan = meshes.cylinder(half, PLATE, household.STEEL, sections=20).transformed((0, 0, height - PLATE / 2))
     else:
         pan = slab((2 * half, 2 * half, PLATE), 0.002, household.STEEL, height - PLATE)
     front = half + 0.004 - depth + 0.016
     window = on_top((0.040, 0.018), (0, front, low), (60, 66, 62))
     digits = [on_top((0.004, 0.010), (x, front, low + household.SKIN), (190, 230, 150)) for x in (-0.010, 0.001, 0.012)]
     keys = [on_top((0.010, 0.010), (side * 0.034, front, low), (205, 205, 200)) for side in (-1, 1)]
-    seen = geometry.merge([body, neck, pan, window, *digits, *keys])
+    seen = meshes.merge([body, neck, pan, window, *digits, *keys])
     return name, Shape(seen, (body.vertices, pan.vertices))
 
 

@@ -10,9 +10,10 @@ After RoboTwin 2.0's place_object_stand, whose thing lies within 60 degrees and 
 
 import numpy as np
 
-from xew.sim_warp import geometry, household
-from xew.sim_warp.geometry import Color, Mesh
-from xew.sim_warp.household import slab
+from xew.sim_warp.assets import household
+from xew.sim_warp.assets.household import slab
+from xew.sim_warp.geometry import meshes
+from xew.sim_warp.geometry.meshes import Color, Mesh
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
@@ -38,17 +39,17 @@ def stand(rng: np.random.Generator) -> tuple[str, Shape]:
     color, is_round = household.COLORS[name], form == "round"
     foot = _plate(0.78 * width, 0.78 * span, 0.010, color, is_round)
     plate = _plate(width, span, PLATE, color, is_round).transformed((0, 0, height - PLATE))
-    column = geometry.cylinder(0.022, height - 0.012, household.STEEL, sections=12).transformed((0, 0, height / 2))
+    column = meshes.cylinder(0.022, height - 0.012, household.STEEL, sections=12).transformed((0, 0, height / 2))
     # The rim is seen a little lower than it collides: a thing lies on the inlay.
     rim = plate.transformed((0, 0, -INLAY))
     inlay = _plate(width - 0.012, span - 0.012, INLAY, household.CREAM, is_round).transformed((0, 0, height - INLAY))
-    return name, Shape(geometry.merge([foot, column, rim, inlay]), tuple(mesh.vertices for mesh in (foot, column, plate)))
+    return name, Shape(meshes.merge([foot, column, rim, inlay]), tuple(mesh.vertices for mesh in (foot, column, plate)))
 
 
 def _plate(width: float, depth: float, thickness: float, color: Color, is_round: bool) -> Mesh:
     """A plate that lies on z = 0: a slab, or a disc as wide as that."""
     if is_round:
-        return geometry.cylinder(width / 2, thickness, color, sections=20).transformed((0, 0, thickness / 2))
+        return meshes.cylinder(width / 2, thickness, color, sections=20).transformed((0, 0, thickness / 2))
     return slab((width, depth, thickness), min(0.002, thickness / 3), color)
 
 

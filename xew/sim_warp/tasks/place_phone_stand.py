@@ -12,8 +12,10 @@ After RoboTwin 2.0's place_phone_stand, which does not test the lean, and whose 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp import geometry, household, objects
-from xew.sim_warp.geometry import Color, Mesh
+from xew.sim_warp import objects
+from xew.sim_warp.assets import household
+from xew.sim_warp.geometry import meshes
+from xew.sim_warp.geometry.meshes import Color, Mesh
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
@@ -41,18 +43,18 @@ def stand(style: str, color: Color) -> Shape:
     ledge = _leaning((WIDTH, 0.004, LEDGE + 0.010), (0, -0.002, LEDGE / 2 - 0.001), color)
     lip = _leaning((WIDTH, 0.005, 0.003), (0, 0.0005, LEDGE + 0.0025), dark)
     if style == "easel":
-        base = geometry.box((0.07, 0.105, 0.006), dark).transformed((0, 0.0, 0.003))
+        base = meshes.box((0.07, 0.105, 0.006), dark).transformed((0, 0.0, 0.003))
         behind = [(-0.01, 0.045, 0.004), (0.01, 0.045, 0.004), (-0.01, 0.033, 0.004), (0.01, 0.033, 0.004)]
         at = [tuple(_on_rest((x, y, -0.006))) for x in (-0.01, 0.01) for y in (0.055, 0.070)]
-        strut = geometry.hull(np.array([*behind, *at]), dark)
+        strut = meshes.hull(np.array([*behind, *at]), dark)
     else:
-        base = geometry.box((0.058, 0.105, 0.008), dark).transformed((0, 0.0, 0.004))
+        base = meshes.box((0.058, 0.105, 0.008), dark).transformed((0, 0.0, 0.004))
         corners = [(side * 0.017, y, 0.006) for side in (-1, 1) for y in (-0.030, 0.042)]
         at = [tuple(_on_rest((side * 0.017, y, -0.006))) for side in (-1, 1) for y in (0.006, 0.080)]
-        strut = geometry.hull(np.array([*corners, *at]), color)
+        strut = meshes.hull(np.array([*corners, *at]), color)
     pads = [_leaning((0.010, 0.050, 0.0008), (side * 0.018, 0.055, 0.0), (40, 40, 42)) for side in (-1, 1)]
     pieces = [rest, ledge, lip, base, strut]
-    return Shape(geometry.merge([*pieces, *pads]), tuple(piece.vertices for piece in pieces))
+    return Shape(meshes.merge([*pieces, *pads]), tuple(piece.vertices for piece in pieces))
 
 
 def _on_rest(point: tuple[float, float, float]) -> np.ndarray:
@@ -62,7 +64,7 @@ def _on_rest(point: tuple[float, float, float]) -> np.ndarray:
 
 def _leaning(size: tuple[float, float, float], center: tuple[float, float, float], color: Color) -> Mesh:
     """A box that lies on the rest's slope."""
-    return geometry.box(size, color).transformed(tuple(_on_rest(center)), (LEAN, 0, 0))
+    return meshes.box(size, color).transformed(tuple(_on_rest(center)), (LEAN, 0, 0))
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:

@@ -10,8 +10,8 @@ After RoboTwin 2.0's press_stapler, whose stapler has no hinge and whose test as
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp import household
-from xew.sim_warp.household import StaplerParts
+from xew.sim_warp.assets import household
+from xew.sim_warp.assets.household import StaplerParts
 from xew.sim_warp.plan import ASIDE_TIME, Timeline, Tool, tool
 from xew.sim_warp.scene import Hinge, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP

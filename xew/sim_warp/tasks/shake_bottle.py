@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp import containers
+from xew.sim_warp.assets import containers
 from xew.sim_warp.plan import Timeline, Tool, tool
 from xew.sim_warp.scene import Scene, SceneObject, draw
 from xew.sim_warp.tasks.task import Moment, Task, arm_for, grasp_across, outward, pick, radial_yaw

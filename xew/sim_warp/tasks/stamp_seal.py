@@ -11,8 +11,9 @@ After RoboTwin 2.0's stamp_seal.
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp import geometry, objects
-from xew.sim_warp.geometry import Color
+from xew.sim_warp import objects
+from xew.sim_warp.geometry import meshes
+from xew.sim_warp.geometry.meshes import Color
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
@@ -40,7 +41,7 @@ def seal(rng: np.random.Generator, ink: Color) -> Shape:
     outline = [(0.55, 0.034), (1.0, 0.044), (1.0, height - 0.010), (0.72, height)]
     knob = np.concatenate([_ring(share * handle, FACETS, z) for share, z in outline]).astype(np.float32)
     pieces = [(pad, ink), (base, wood), (ring, BRASS), (neck, wood), (knob, wood)]
-    mesh = geometry.merge([geometry.hull(points, color) for points, color in pieces])
+    mesh = meshes.merge([meshes.hull(points, color) for points, color in pieces])
     return Shape(mesh, (np.concatenate([pad, base]), neck, knob))
 
 
@@ -57,9 +58,9 @@ def _ring(radius: float, sides: int, z: float) -> np.ndarray:
 
 def square(color: Color) -> Shape:
     """Where the seal goes: paint on the table, with a paler frame."""
-    paint = geometry.box((TARGET, TARGET, 0.0008), color)
-    frame = geometry.box((TARGET + 0.008, TARGET + 0.008, 0.0004), (250, 250, 250))
-    return Shape(geometry.merge([paint, frame]))
+    paint = meshes.box((TARGET, TARGET, 0.0008), color)
+    frame = meshes.box((TARGET + 0.008, TARGET + 0.008, 0.0004), (250, 250, 250))
+    return Shape(meshes.merge([paint, frame]))
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:

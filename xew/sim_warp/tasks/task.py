@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from xew.sim_warp.geometry.poses import Pose
 from xew.sim_warp.plan import ASIDE, ASIDE_TIME, LEFT, RIGHT, Timeline, Tool, tool
-from xew.sim_warp.poses import Pose
 from xew.sim_warp.scene import Point, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
 

@@ -1,0 +1,123 @@
+"""Means by address, and what they vary over."""
+
+import numpy as np
+import pytest
+
+from tests.analysis.synthetic_study import TASKS, paper_axes, write_study
+from xew.analysis.paper import read_paper
+from xew.analysis.scores import Scores, read_scores
+from xew.analysis.statistics.grades import SEEN, PaperGrades, StudyGrades, better, find_variant, interval, resample, row_keys
+from xew.protocol import PAPER_PARTS, PARTS, ROBOT_NAMES, SEEN_ROBOTS
+
+
+@pytest.fixture(scope="module")
+def scores(tmp_path_factory: pytest.TempPathFactory) -> Scores:
+    return read_scores(write_study(tmp_path_factory.mktemp("grades") / "scores.parquet"))
+
+
+@pytest.fixture(scope="module")
+def grades(scores: Scores) -> StudyGrades:
+    return StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper()))
+
+
+def test_every_row_of_the_paper_is_a_variant_of_the_protocol_and_the_other_way_round() -> None:
+    paper = read_paper()
+    for part, printed in paper.parts.items():
+        keys = {key for variant in PARTS[part] for key in row_keys(part, variant)}
+        assert set(printed.rows) == keys - {"robot_render"} or (part == "ladder" and set(printed.rows) == keys)
+        for key in printed.rows:
+            assert find_variant(part, key) in PARTS[part]
+    assert set(paper.parts) | {"fixed"} == set(PAPER_PARTS)
+    with pytest.raises(KeyError, match="wings"):
+        find_variant("actions", "wings")
+
+
+def test_a_mean_is_over_episodes_and_seen_robots_are_pooled(grades: StudyGrades, scores: Scores) -> None:
+    rows = scores.rows[(scores.rows["variant"] == "fixed-optical_flow-none") & (scores.rows["metric"] == "lpips")]
+    for robots, names in ((SEEN, SEEN_ROBOTS), ("piper", ("piper",))):
+        mean, chosen = grades.mean("fixed", "fixed", robots, "lpips"), rows[rows["robot"].isin(names)]
+        assert mean is not None and mean.value == pytest.approx(chosen["value"].mean())
+        assert mean.count == len(chosen) and mean.scenes == 12
+    fold = grades.mean("loeo", "loeo_piper", SEEN, "lpips")
+    assert fold is not None and fold.count == 4 * 12
+
+
+def test_intervals_are_those_of_resampled_scenes(grades: StudyGrades, scores: Scores) -> None:
+    """Episodes of one scene are alike, so the interval of three pooled robots is far wider than that of as many scenes."""
+    mean = grades.mean("fixed", "fixed", SEEN, "lpips")
+    rows = scores.rows[(scores.rows["variant"] == "fixed-optical_flow-none") & (scores.rows["metric"] == "lpips")]
+    by_scene = rows[rows["robot"].isin(SEEN_ROBOTS)].groupby(["task", "seed"])["value"].mean()
+    assert mean is not None
+    assert mean.values[1:].std() == pytest.approx(by_scene.std(ddof=0) / np.sqrt(12), rel=0.06)
+    low, high = interval(mean.values, 0.95)
+    assert low < mean.value < high
+
+
+@pytest.mark.parametrize(("scenes", "share"), [(6, 0.15), (10, 0.11), (20, 0.08), (100, 0.05)])
+def test_chance_resolves_as_often_as_is_said(scenes: int, share: float) -> None:
+    differences = np.random.default_rng(1).normal(size=(1500, scenes, 1))
+    means = [mean for mean in map(resample, differences) if mean]
+    ends = np.array([interval(mean.values, 0.95) for mean in means])
+    assert np.mean((ends[:, 0] > 0) | (ends[:, 1] < 0)) == pytest.approx(share, abs=0.02)
+
+
+def test_differences_are_paired_by_scene(grades: StudyGrades) -> None:
+    """Scenes differ by 15 %, the two rows by 3 % within a scene: only pairing can tell them apart so well."""
+    after, before = (grades.mean("actions", row, "piper", "lpips") for row in ("optical_flow", "joints"))
+    assert after is not None and before is not None
+    gain = better(after, before, grades.metrics["lpips"])
+    assert gain[0] == pytest.approx((before.value - after.value) / before.value)
+    unpaired = before.values[1:] - np.random.default_rng(0).permutation(after.values[1:])
+    assert np.ptp(interval(gain, 0.95)) * before.value < 0.5 * np.ptp(np.quantile(unpaired, [0.025, 0.975]))
+
+
+def test_the_floor_is_what_the_estimators_miss_on_the_truth(grades: StudyGrades) -> None:
+    assert grades.floor("piper", "mask_iou") == pytest.approx(0.03)
+    assert grades.floor(SEEN, "keypoint_error") == pytest.approx(1.2)
+    assert grades.floor("piper", "psnr") == grades.floor("piper", "lpips") == 0
+
+
+def test_what_was_not_graded_is_none(scores: Scores) -> None:
+    rows = scores.rows[(scores.rows["variant"] != "fixed-mask-none") & (scores.rows["robot"] != "piper")]
+    some = StudyGrades(rows, scores.metrics, paper_axes(read_paper()))
+    assert some.mean("actions", "mask", "franka_panda", "lpips") is None
+    assert some.mean("actions", "joints", "piper", "lpips") is None and not some.has("fixed-mask-none")
+    assert some.floor("piper", "mask_iou") == 0
+
+
+def test_shared_cells_are_those_that_all_rows_of_a_part_have(scores: Scores) -> None:
+    lacks = (scores.rows["variant"] == "fixed-mask-none") & (scores.rows["task"] == TASKS[0])
+    some = StudyGrades(scores.rows[~lacks], scores.metrics, paper_axes(read_paper()))
+    counts = {}
+    for shared in (False, True):
+        means = {row: some.mean("actions", row, "piper", "lpips", shared) for row in ("joints", "mask")}
+        counts[shared] = [mean.count for mean in means.values() if mean]
+    assert counts == {False: [12, 9], True: [9, 9]}
+
+
+def test_an_adapted_model_takes_no_seen_robot_from_the_one_that_it_starts_from(grades: StudyGrades) -> None:
+    """It is graded on UR5 alone of the seen ones; the pool stays whole."""
+    pool, alone = (grades.mean("few_shot", "reference", robots, "lpips", shared=True) for robots in (SEEN, "ur5_wsg"))
+    assert pool is not None and alone is not None and (pool.count, alone.count) == (36, 12)
+
+
+def test_the_papers_means_vary_by_what_prints_the_same() -> None:
+    paper = read_paper()
+    grades = PaperGrades(paper, paper.infos)
+    mean = grades.mean("baselines", "irasim", "piper", "trajectory_error")
+    assert mean is not None and set(np.round(mean.values, 6)) == {18.4, 18.35, 18.45}
+    assert grades.print("baselines", "irasim", "piper", "trajectory_error") == "18.4"
+    assert (
+        grades.print("fixed", "fixed", "piper", "psnr") == "24.245"
+        and grades.print("actions", "joints", "arx_x5", "psnr") == ""
+    )
+    looks, reach = (grades.axis(axis) for axis in ("appearance", "kinematic"))
+    assert looks[0].tolist() == [paper.robots[robot].appearance for robot in ROBOT_NAMES]
+    up = (looks[1:] > looks[0]).ravel(), (reach[1:] > reach[0]).ravel()
+    assert abs(np.corrcoef(*up)[0, 1]) < 0.05  # else half of what prints the same is never tried
+
+
+def test_no_two_variants_of_a_part_fill_one_row() -> None:
+    for part, variants in PARTS.items():
+        keys = [key for variant in variants for key in row_keys(part, variant)]
+        assert len(keys) == len(set(keys)), part

@@ -1,0 +1,104 @@
+"""Means, intervals and verdicts on numbers whose answer is known."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from xew.analysis.scores import MetricInfo
+from xew.analysis.statistics.summary import Interval, RobotTable, Row, finding, mean_interval, progress, verdict
+from xew.analysis.tables.layouts import number
+
+rng = np.random.default_rng(0)
+
+
+def episodes(values: object, robots: tuple[str, ...] = ("piper",)) -> pd.Series:
+    """Scores of scenes and robots, scene by scene."""
+    values = np.atleast_1d(np.asarray(values, float))
+    scenes = [("lift_pot", seed) for seed in range(len(values) // len(robots))]
+    index = pd.MultiIndex.from_tuples([(*s, r) for s in scenes for r in robots], names=["task", "seed", "robot"])
+    return pd.Series(values, index)
+
+
+def info(name: str, unit: str = "", higher: bool = False) -> MetricInfo:
+    return MetricInfo(name, "visual", unit, higher, None, None, "")
+
+
+def test_the_interval_is_close_to_the_normal_one_for_many_values() -> None:
+    values = rng.normal(3, 2, 400)
+    interval = mean_interval(episodes(values))
+    half = 1.96 * values.std() / np.sqrt(len(values))
+    assert interval.mean == pytest.approx(values.mean())
+    assert (interval.low, interval.high) == pytest.approx((values.mean() - half, values.mean() + half), abs=0.1 * half)
+    assert interval == mean_interval(episodes(values))
+
+
+def test_one_value_has_no_interval_and_equal_values_a_point() -> None:
+    assert np.isnan(mean_interval(episodes(2.0)).low)
+    assert mean_interval(episodes([2.0] * 6)) == Interval(2, 2, 2, 6)
+
+
+@pytest.mark.parametrize(("shift", "higher", "expected"), [(1, True, "better"), (1, False, "worse"), (0, True, "unresolved")])
+def test_verdicts_are_paired(shift: float, higher: bool, expected: str) -> None:
+    """Episodes differ by far more than the models do, so that only pairing can tell them apart."""
+    copy = episodes(rng.normal(0, 50, 20))
+    model = copy + shift + np.tile([-0.5, 0.5], 10)
+    assert verdict(model.sample(frac=1, random_state=1), copy, higher) == expected
+
+
+def test_fewer_than_six_scenes_resolve_nothing() -> None:
+    """Of five all differences have one sign by chance in 6 % of cases; a study's tables ask for as many."""
+    high, low, pooled = [9.0, 8.0, 9.5, 8.5, 9.1, 8.9], [1.0, 2.0, 1.5, 1.2, 1.8, 1.1], ("aloha_agilex", "arx_x5", "ur5_wsg")
+    assert verdict(episodes(high), episodes(low), True) == "better"
+    assert verdict(episodes(high[:5]), episodes(low[:5]), True) == "unresolved"
+    assert verdict(episodes(high), episodes(low).iloc[1:], True) == "unresolved"
+    assert verdict(episodes(high, pooled), episodes(low, pooled), True) == "unresolved"  # three robots in two scenes
+    assert np.isnan(mean_interval(episodes(high[:5])).low) and mean_interval(episodes(high)).low < 8.9
+
+
+def test_robots_in_one_scene_are_resampled_together() -> None:
+    """Three robots that score alike in every scene tell no more than one of them."""
+    scenes, pooled = rng.normal(3, 2, 30), ("aloha_agilex", "arx_x5", "ur5_wsg")
+    one, three = mean_interval(episodes(scenes)), mean_interval(episodes(np.repeat(scenes, 3), pooled))
+    assert (three.low, three.high) == pytest.approx((one.low, one.high)) and (one.count, three.count) == (30, 90)
+
+
+def test_a_difference_inside_the_noise_floor_is_not_resolved() -> None:
+    model, copy = episodes(0.53 + 0.001 * np.arange(8)), episodes(0.5 + 0.001 * np.arange(8))
+    assert verdict(model, copy, True, floor=0.02) == "better" and verdict(model, copy, True, floor=0.04) == "unresolved"
+    assert verdict(copy, model, True, floor=0.02) == "worse" and verdict(copy, model, True, floor=0.04) == "unresolved"
+
+
+def table(title: str, model: float, copy: float = 0.4) -> RobotTable:
+    point = lambda value: {"lpips": Interval(value, value, value, 4)}  # noqa: E731
+    rows = (
+        Row("m", "c", point(model), {"lpips": "better" if model < copy else "worse"}),
+        Row("copy_first_frame", "", point(copy), {}),
+        Row("ground_truth", "", point(0.0), {}),
+    )
+    return RobotTable(title, (title,), rows, 4)
+
+
+def test_progress_is_the_share_of_the_way_from_frozen_to_true() -> None:
+    for model, share in ((0.4, 0), (0.1, 0.75), (0, 1), (0.5, -0.25)):
+        made = table("x", model)
+        assert progress(made, made.rows[0], "lpips") == pytest.approx(share)
+
+
+def test_the_finding_says_better_worse_and_how_far() -> None:
+    said = finding([table("Panda", 0.1), table("Piper", 0.5)], [table("Seen", 0.2)], [info("lpips")])
+    assert said == [
+        "Panda (4 episodes): m · c beats a frozen first frame on LPIPS. "
+        "In LPIPS it is at 25% of that frame's distance from the truth (on seen robots 50%).",
+        "Piper (4 episodes): m · c falls behind a frozen first frame on LPIPS. "
+        "In LPIPS it is at 125% of that frame's distance from the truth (on seen robots 50%).",
+    ]
+    assert "--no-baselines" in finding([], [], [info("lpips")])[0]
+    few = Row("m", "c", {"lpips": Interval(0.1, np.nan, np.nan, 4)}, {"lpips": "unresolved"})
+    said = finding([RobotTable("Panda", ("Panda",), (few,), 4)], [], [info("lpips")])
+    assert said == ["Panda (4 episodes): m · c cannot be told from a frozen first frame by fewer than 6 scenes."]
+
+
+def test_numbers_have_the_digits_that_mean_something() -> None:
+    assert number(21.23456, info("psnr", "dB")) == "21.23"
+    assert number(3.14159, info("keypoint_error", "px")) == "3.1"
+    assert number(0.123456, info("lpips")) == "0.123"

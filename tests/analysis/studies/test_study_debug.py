@@ -1,0 +1,140 @@
+"""The debug study from nothing to a report by its real commands, then a part of it killed again and again.
+
+The task is the tests' own of twelve simulated frames, and of the 18 models five are made, something of every part.
+"""
+
+import filecmp
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from tests.sim_warp.small import TASK
+from xew.protocol import PAPER_PARTS, PARTS, VARIANTS
+
+ROOT = Path(__file__).parents[3]
+CONFIG = ROOT / "configs" / "study_debug.yaml"
+MADE = (
+    "fixed-optical_flow-none",
+    "fixed-joints-none",
+    "fixed-optical_flow-nine_views",
+    "loeo_franka_panda-*",
+    "few_shot-piper-1",
+)
+"""Something of each table."""
+ADAPTED = "few_shot-piper-1"
+PART = (ADAPTED, "--parts", "few_shot", "forgetting")
+"""What is killed: a training, an adaptation from it, and all that they need and lead to."""
+KILLS = 4
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the studies of this file lie, and what they share."""
+
+    root: Path
+    environment: dict[str, str]
+
+    @property
+    def study(self) -> Path:
+        return self.root / "study"
+
+    def command(self, *variants: str) -> list[str]:
+        """Of a study of these variants (and of more choices after them)."""
+        files = [str(CONFIG), "--experiment", str(ROOT / "configs" / "debug.yaml")]
+        return [sys.executable, "-m", "xew.analysis.study", *files, "--out", "study", "--tasks", TASK, "--variants", *variants]
+
+    def run(self, *variants: str) -> str:
+        """What the study's command prints; it must end well."""
+        done = subprocess.run(self.command(*variants), cwd=self.root, env=self.environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+    """A folder without data, weights or compiled programs."""
+    root = tmp_path_factory.mktemp("debug")
+    own = {"PYTHONPATH": str(ROOT), "JAX_COMPILATION_CACHE_DIR": str(root / "jax"), "CUDA_VISIBLE_DEVICES": ""}
+    yield Place(root, os.environ | own)
+    shutil.rmtree(root)
+
+
+@pytest.fixture(scope="module")
+def told(place: Place) -> str:
+    """The whole study, from nothing."""
+    return place.run(*MADE)
+
+
+def rows_of(study: Path) -> pd.DataFrame:
+    return pd.read_parquet(study / "scores.parquet")
+
+
+def test_from_nothing_to_a_report(place: Place, told: str) -> None:
+    table = rows_of(place.study)
+    planned = table.attrs["study"]
+    assert set(table["variant"]) == {"", *planned["variants"]}
+    assert len(planned["variants"]) == len(MADE) and planned["incomplete"] == [] and not planned["of_paper"]
+    for part in PAPER_PARTS:
+        assert {variant.name for variant in PARTS[part]} & set(planned["variants"]), f"nothing of {part}"
+    for name, counts in planned["variants"].items():
+        assert counts["found"] == dict.fromkeys(VARIANTS[name].graded_robots, 1)
+    assert set(table.loc[table["variant"] == "", "model"]) == {"copy_first_frame", "ground_truth"}
+    assert table["value"].notna().all()
+    assert (place.study / "report" / "index.html").stat().st_size > 10_000
+    assert f"report: {Path('study', 'report', 'index.html')}" in told
+
+
+def test_done_is_done(place: Place, told: str) -> None:
+    before = {path: path.stat().st_mtime_ns for path in place.study.rglob("*") if path.is_file() and "state" not in path.parts}
+    again = place.run(*MADE)
+    after = {path: path.stat().st_mtime_ns for path in before}
+    changed = {path.name for path in before if before[path] != after[path]}
+    assert changed <= {"study.yaml", "status.txt", ".lock"}
+    assert "[0/" not in again.partition("about")[2], again
+
+
+def test_an_adaptation_started_from_its_variant(place: Place, told: str) -> None:
+    start = json.loads((place.study / "runs" / ADAPTED / "start.json").read_text())
+    assert Path(start["run"]).name == VARIANTS[ADAPTED].start.name  # type: ignore[union-attr]
+
+
+def test_killed_anywhere_it_ends_in_the_same_report(place: Place, told: str) -> None:
+    """A part of the study without a break, then again from nothing but data, killed as it goes: the same bytes at the end."""
+    place.run(*PART)
+    straight = place.root / "straight"
+    place.study.rename(straight)
+    place.study.mkdir()
+    shutil.copytree(straight / "data", place.study / "data")
+    moments = random.Random(int(time.time()))
+    for number in range(KILLS):
+        seconds = moments.uniform(3, 10)
+        print(f"kill {number} after {seconds:.2f} s")
+        process = subprocess.Popen(place.command(*PART), cwd=place.root, env=place.environment, stdout=subprocess.PIPE)
+        try:
+            process.communicate(timeout=seconds)
+            break
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+    place.run(*PART)
+    same_files(straight / "report", place.study / "report")
+    pd.testing.assert_frame_equal(rows_of(straight), rows_of(place.study))
+
+
+def same_files(straight: Path, killed: Path) -> None:
+    """Raises where two folders hold other files, or other bytes."""
+    files = {path.relative_to(straight) for path in straight.rglob("*") if path.is_file()}
+    assert files == {path.relative_to(killed) for path in killed.rglob("*") if path.is_file()}
+    assert files
+    different = [str(file) for file in sorted(files) if not filecmp.cmp(straight / file, killed / file, shallow=False)]
+    assert not different

@@ -1,0 +1,237 @@
+"""The command under way: stopped anywhere it ends in the same bytes, on several devices too, and its memory does not grow."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+import types
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.metrics.small import write_many
+from tests.synthetic import write_synthetic_data
+from xew import files
+from xew.episode import find_accepted, read_video
+from xew.metrics import evaluate
+from xew.metrics.evaluate import Args, main
+from xew.metrics.grading.workers import Bench
+from xew.rollout import write_rollout
+
+ROBOTS = ("franka_panda", "piper")
+SEEDS = tuple(range(1_000_000, 1_000_003))
+METRICS = ("psnr", "mask_iou")
+WRITTEN = ("parquet", "curves.parquet", "summary.md", "summary.csv", "pairs.csv", "bundle.json")
+CELLS = len(SEEDS) * len(ROBOTS) * 3
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six episodes and a model that predicts noise."""
+    root = tmp_path_factory.mktemp("world")
+    write_synthetic_data(root / "data", tasks=("place_empty_cup",), seeds=SEEDS, robots=ROBOTS, frames=4)
+    rng = np.random.default_rng(0)
+    for folder, record in find_accepted(root / "data"):
+        video = read_video(folder / "rgb.mkv")
+        video[1:] //= rng.integers(1, 4, (len(video) - 1, 1, 1, 1), dtype=np.uint8)
+        write_rollout(root / "rollouts", record.task, record.seed, record.robot, video, {"model": "dim"})
+    return root
+
+
+def arguments(world: Path, out: Path) -> Args:
+    return Args((world / "rollouts",), world / "data", out, METRICS, workers=2)
+
+
+def read_all(out: Path) -> dict[str, bytes]:
+    return {ending: out.with_suffix(f".{ending}").read_bytes() for ending in WRITTEN}
+
+
+@pytest.fixture(scope="module")
+def whole(world: Path) -> dict[str, bytes]:
+    """What a run writes that nobody stops."""
+    main(arguments(world, world / "whole" / "scores.parquet"))
+    return read_all(world / "whole" / "scores.parquet")
+
+
+def dying(function: Callable, at: int) -> Callable:
+    """The function, which is stopped as by Ctrl-C at the call of this number."""
+    calls = iter(range(1, 1 << 30))
+
+    def dies(*args: object, **settings: object) -> object:
+        if next(calls) == at:
+            raise KeyboardInterrupt
+        return function(*args, **settings)
+
+    return dies
+
+
+PLACES = [
+    (evaluate, "grade", 1),
+    (evaluate, "grade", 8),
+    (files.os, "replace", 1),  # a cell that is written but does not have its name yet
+    (files.os, "replace", 11),
+    (files.os, "replace", CELLS + 1),  # the curves
+    (files.os, "replace", CELLS + 2),  # the scores, whose curves are there
+    (evaluate, "write_bundle", 1),
+    (evaluate, "summarise", 1),
+]
+
+
+@pytest.mark.parametrize(("module", "name", "at"), PLACES, ids=[f"{name}-{at}" for _, name, at in PLACES])
+def test_stopped_anywhere_it_ends_in_the_same_bytes(
+    module: object, name: str, at: int, world: Path, whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    args = arguments(world, tmp_path / "scores.parquet")
+    with monkeypatch.context() as patch, pytest.raises(SystemExit, match="130"):
+        patch.setattr(module, name, dying(getattr(module, name), at))
+        main(args)
+    main(args)
+    assert read_all(args.out) == whole
+    assert not list(tmp_path.glob(".*.partial"))
+
+
+def test_killed_at_random_on_two_devices_it_ends_in_the_same_bytes(
+    world: Path, whole: dict[str, bytes], tmp_path: Path
+) -> None:
+    out = tmp_path / "scores.parquet"
+    command = [sys.executable, "-m", "xew.metrics.evaluate", world / "rollouts", "--data", world / "data", "--out", out]
+    command += ["--metrics", *METRICS, "--workers", "2"]
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    run = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wanted = random.randrange(1, CELLS - 2)
+    deadline = time.monotonic() + 120
+    while run.poll() is None and len(graded(out)) < wanted and time.monotonic() < deadline:
+        time.sleep(0.01)
+    run.send_signal(signal.SIGKILL)
+    run.wait()
+    assert wanted <= len(graded(out)) and not out.exists()
+    main(arguments(world, out))
+    assert read_all(out) == whole
+
+
+def graded(out: Path) -> list[Path]:
+    return list(out.with_suffix(".cells").glob("*/*/*/[!.]*.json"))
+
+
+def test_workers_are_shared_out_to_the_devices() -> None:
+    """Each thread takes the next device; one that has an estimator of its own keeps it."""
+    first, second = (types.SimpleNamespace(local_hardware_id=number) for number in range(2))
+    bench = Bench(lambda _: object(), lambda _: object(), iter([first, second, first]))  # who opens it takes one too
+    found = []
+    threads = [threading.Thread(target=lambda: found.append((bench.device, bench.masker is bench.masker))) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+        thread.join()
+    assert [kept for _, kept in found] == [True, True] and {device.local_hardware_id for device, _ in found} == {0, 1}
+
+
+SHARING = """
+import threading, time
+from pathlib import Path
+import jax
+from xew.metrics.backends import Backend
+from xew.metrics.grading.workers import opener
+
+opened, busy, overlaps = [], set(), []
+
+def open_network(name, checkpoint):
+    number = len(opened)
+    opened.append(jax.numpy.zeros(1).devices())
+    def call():
+        overlaps.append(number in busy)
+        busy.add(number)
+        time.sleep(0.01)
+        busy.discard(number)
+        return number
+    return call
+
+network = opener("mine", {"mine": Backend(open_network, "weights", "")}, open_network, Path("x"))
+found = []
+
+def work(device):
+    for _ in range(3):
+        found.append((device.id, network(device)()))
+
+threads = [threading.Thread(target=work, args=(device,)) for device in (*jax.devices(), *jax.devices())]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+assert len(opened) == 2 and opened[0] != opened[1] and len(found) == 12 and len(set(found)) == 2, (opened, found)
+assert not any(overlaps)
+"""
+
+
+def test_a_network_is_opened_once_on_each_device_and_used_in_turn() -> None:
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    run = subprocess.run([sys.executable, "-c", SHARING], env=environment, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr
+
+
+def test_a_second_run_grades_nothing_anew_and_metrics_come_beside_those_that_are_there(
+    world: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    asked: list[tuple[str, ...]] = []
+    real = evaluate.grade
+
+    def notes(comparison: object, metrics: tuple[str, ...]) -> object:
+        asked.append(tuple(metrics))
+        return real(comparison, metrics)
+
+    monkeypatch.setattr(evaluate, "grade", notes)
+    out = tmp_path / "scores.parquet"
+    for metrics in (("psnr",), METRICS, METRICS):
+        main(Args((world / "rollouts",), world / "data", out, metrics, workers=1))
+    assert asked == [("psnr",)] * CELLS + [("mask_iou",)] * CELLS
+    assert read_all(out) == whole
+    main(Args((world / "rollouts",), world / "data", out, METRICS, workers=1, overwrite=True))
+    assert len(asked) == 3 * CELLS and read_all(out) == whole
+
+
+def test_other_settings_are_graded_anew(world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "scores.parquet"
+    main(Args((world / "rollouts",), world / "data", out, ("psnr",), baselines=False))
+    before = out.read_bytes()
+    monkeypatch.setattr(evaluate, "grade", lambda *_: pytest.fail("graded anew"))
+    main(Args((world / "rollouts",), world / "data", out, ("psnr",), baselines=False))
+    assert out.read_bytes() == before
+    monkeypatch.setattr(evaluate, "PROTOCOL", evaluate.PROTOCOL + 1)
+    with pytest.raises(pytest.fail.Exception, match="graded anew"):
+        main(Args((world / "rollouts",), world / "data", out, ("psnr",), baselines=False))
+
+
+def test_a_damaged_cell_is_graded_anew(world: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
+    args = arguments(world, tmp_path / "scores.parquet")
+    main(args)
+    first, second, *_ = graded(args.out)
+    first.write_text(first.read_text()[:100])
+    second.write_text("[1, 2]")
+    main(args)
+    assert read_all(args.out) == whole
+
+
+def test_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """300 episodes; what the process holds after 100 of them is what it holds after all, but for a few megabytes."""
+    write_many(tmp_path, 300)
+    held: list[float] = []
+    real = evaluate._grade_group
+
+    def notes(*args: object, **settings: object) -> object:
+        held.append(resident())
+        return real(*args, **settings)
+
+    monkeypatch.setattr(evaluate, "_grade_group", notes)
+    args = Args((tmp_path / "rollouts",), tmp_path / "data", tmp_path / "scores.parquet", ("psnr", "mask_iou"), workers=2)
+    main(args)
+    assert len(held) == 300 and len(graded(args.out)) == 900
+    assert np.median(held[-50:]) - np.median(held[100:150]) < 8, "megabytes"
+    assert resident() - held[-1] < 100, "megabytes, for the tables"
+
+
+def resident() -> float:
+    """Megabytes that this process holds."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6

@@ -1,0 +1,35 @@
+"""The codec's ceiling is what the study's metrics say of its reconstruction."""
+
+import numpy as np
+import pytest
+
+from xew.metrics import psnr
+from xew.model.codecs.ceiling import measure_ceiling, spread
+from xew.model.codecs.codec import PatchCodec
+from xew.model.video.frames import to_camera_size, to_model_size
+
+
+def picture(seed: int) -> np.ndarray:
+    """A smooth picture uint8 [1 240 320 3]."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:240, :320]
+    waves = [np.sin(rng.uniform(-0.1, 0.1) * x + rng.uniform(-0.1, 0.1) * y) for _ in range(3)]
+    return (127 + 100 * np.stack(waves, -1)).astype(np.uint8)[None]
+
+
+def test_ceiling() -> None:
+    videos = [np.repeat(picture(seed), frames, 0) for seed, frames in ((0, 3), (1, 9))]
+    codec = PatchCodec.fit([to_model_size(video[[0] * 5], 48, 64) for video in videos], 8, 16)
+    found = measure_ceiling(codec, iter(videos), 5, 48, 64)
+    decoded = [to_camera_size(codec.decode(codec.encode(to_model_size(video[[0] * 5], 48, 64)))) for video in videos]
+    expected = [np.mean(psnr(made[:n], video[:n])) for made, video, n in zip(decoded, videos, (3, 5), strict=True)]
+    assert found.clips == 2
+    assert found.psnr == pytest.approx(np.mean(expected), abs=1e-3)
+    assert 0 < found.lpips < 1
+    better = PatchCodec.fit([to_model_size(video[[0] * 5], 48, 64) for video in videos], 8, 96)
+    assert measure_ceiling(better, videos, 5, 48, 64).psnr > found.psnr
+
+
+def test_spread_takes_evenly() -> None:
+    assert spread(range(10), 4) == [0, 3, 6, 9]
+    assert spread("abc", 8) == ["a", "b", "c"]

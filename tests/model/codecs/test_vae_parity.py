@@ -1,0 +1,163 @@
+"""The autoencoder beside diffusers' AutoencoderKLWan: the same numbers from the same weights, by both kinds of file."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+
+from xew.config import ConfigError
+from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae
+from xew.model.codecs.vae_layouts import diffusers_layout, load_vae, official_layout
+from xew.model.weights.tensors import checkpoint_shapes, save_weights
+
+torch = pytest.importorskip("torch")
+diffusers = pytest.importorskip("diffusers")
+
+REFERENCE = Path(__file__).parents[1] / "reference"
+SIZE = VaeSize(4, encoder_dim=16, decoder_dim=16, multipliers=(1, 2, 4, 4), halve_time=(False, True, True), blocks=1)
+TOLERANCE = 1e-5
+
+
+@pytest.fixture(scope="module", autouse=True)
+def exact() -> Iterator[None]:
+    with jax.default_matmul_precision("highest"), torch.no_grad():
+        yield
+
+
+@pytest.fixture(scope="module")
+def theirs() -> Any:
+    """AutoencoderKLWan at a tiny size with weights that leave no layer without effect."""
+    model = diffusers.AutoencoderKLWan(
+        base_dim=SIZE.encoder_dim,
+        decoder_base_dim=SIZE.decoder_dim,
+        z_dim=SIZE.channels,
+        dim_mult=list(SIZE.multipliers),
+        num_res_blocks=SIZE.blocks,
+        temperal_downsample=list(SIZE.halve_time),
+        is_residual=True,
+        in_channels=12,
+        out_channels=12,
+        patch_size=2,
+        scale_factor_spatial=16,
+        scale_factor_temporal=4,
+        latents_mean=[0.0] * SIZE.channels,
+        latents_std=[1.0] * SIZE.channels,
+    )
+    generator = torch.Generator().manual_seed(0)
+    for name, parameter in model.named_parameters():
+        noise = torch.randn(parameter.shape, generator=generator)
+        if name.endswith("gamma"):
+            parameter.copy_(torch.rand(parameter.shape, generator=generator) + 0.5)
+        elif name.endswith("bias"):
+            parameter.copy_(0.1 * noise)
+        else:
+            parameter.copy_(noise / parameter[0].numel() ** 0.5)
+    return model.eval()
+
+
+@pytest.fixture(scope="module")
+def ours(theirs: Any, tmp_path_factory: pytest.TempPathFactory) -> VideoVae:
+    """Our module with their weights, by the file that they write."""
+    folder = tmp_path_factory.mktemp("theirs")
+    theirs.save_pretrained(folder)
+    vae = abstract_vae(SIZE)
+    load_vae(vae, folder)
+    return vae
+
+
+def noise(*shape: int) -> np.ndarray:
+    return np.random.default_rng(sum(shape)).uniform(-1, 1, shape).astype(np.float32)
+
+
+jitted_encode = jax.jit(lambda vae, video: vae.moments(video))
+jitted_decode = jax.jit(lambda vae, latents: vae.decode(latents))
+
+
+def to_torch(video: np.ndarray) -> Any:
+    """[b t h w c] -> [b c t h w]."""
+    return torch.from_numpy(np.moveaxis(video, -1, 1).copy())
+
+
+def from_torch(video: Any) -> np.ndarray:
+    return np.moveaxis(video.numpy(), 1, -1)
+
+
+CLIPS = [(1, 32, 48), (5, 48, 16), (9, 32, 32), (13, 16, 48)]
+
+
+@pytest.mark.parametrize(("frames", "height", "width"), CLIPS)
+def test_encoder(ours: VideoVae, theirs: Any, frames: int, height: int, width: int) -> None:
+    video = noise(2, frames, height, width, 3)
+    distribution = theirs.encode(to_torch(video)).latent_dist
+    mean, log_variance = jitted_encode(ours, video)
+    assert np.abs(mean).max() > 0.5
+    np.testing.assert_allclose(mean, from_torch(distribution.mode()), atol=TOLERANCE)
+    np.testing.assert_allclose(log_variance, from_torch(distribution.logvar), atol=TOLERANCE)
+
+
+@pytest.mark.parametrize(("frames", "height", "width"), CLIPS)
+def test_decoder(ours: VideoVae, theirs: Any, frames: int, height: int, width: int) -> None:
+    latents = noise(2, (frames - 1) // 4 + 1, height // 16, width // 16, SIZE.channels)
+    decoded = jitted_decode(ours, latents)
+    assert decoded.shape == (2, frames, height, width, 3)
+    assert np.std(decoded) > 0.1
+    np.testing.assert_allclose(decoded, from_torch(theirs.decode(to_torch(latents)).sample), atol=TOLERANCE)
+
+
+def test_frames_side_by_side_are_a_volume(ours: VideoVae) -> None:
+    """Both ways to convolve three frames are the same function."""
+    other = abstract_vae(SIZE, taps="volume")
+    nnx.update(other, nnx.state(ours))
+    video, latents = noise(1, 9, 32, 32, 3), noise(1, 3, 2, 2, SIZE.channels)
+    results = [(jitted_encode(vae, video), jitted_decode(vae, latents)) for vae in (ours, other)]
+    for mine, others in zip(*map(jax.tree.leaves, results), strict=True):
+        np.testing.assert_allclose(mine, others, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("suffix", ["vae.safetensors", "Wan2.2_VAE.pth"])
+def test_official_file(ours: VideoVae, tmp_path: Path, suffix: str) -> None:
+    """Written under Wan2.2's names, as safetensors and as the .pth that is published, and read back without a change."""
+    path = tmp_path / suffix
+    save_weights(ours, path.with_suffix(".safetensors"), official_layout(ours))
+    if path.suffix == ".pth":
+        from safetensors.torch import load_file
+
+        torch.save(load_file(path.with_suffix(".safetensors")), path)
+    vae = abstract_vae(SIZE)
+    load_vae(vae, path)
+    for mine, read in zip(jax.tree.leaves(nnx.state(ours)), jax.tree.leaves(nnx.state(vae)), strict=True):
+        np.testing.assert_array_equal(mine, read)
+
+
+def test_diffusers_reads_what_is_written(ours: VideoVae, theirs: Any, tmp_path: Path) -> None:
+    theirs.save_config(tmp_path)
+    save_weights(ours, tmp_path / "diffusion_pytorch_model.safetensors", diffusers_layout(ours))
+    read = diffusers.AutoencoderKLWan.from_pretrained(tmp_path)
+    for name, tensor in theirs.state_dict().items():
+        assert torch.equal(read.state_dict()[name], tensor), name
+
+
+@pytest.mark.parametrize(("kind", "layout"), [("official", official_layout), ("diffusers", diffusers_layout)])
+def test_every_key_and_shape_at_full_size(kind: str, layout: Any) -> None:
+    vae = abstract_vae(VAES["wan22"])
+    lines = (REFERENCE / f"keys_vae22_{kind}.tsv").read_text().splitlines()
+    expected = {key: tuple(int(n) for n in shape.strip("[]").split(",")) for key, shape in (line.split("\t") for line in lines)}
+    assert len(expected) == 196
+    assert checkpoint_shapes(vae, layout(vae)) == expected
+    assert sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(nnx.state(vae, nnx.Param))) == 704_688_668
+
+
+def test_a_wrong_file_says_what_differs(ours: VideoVae, tmp_path: Path) -> None:
+    save_weights(ours, tmp_path / "vae.safetensors", diffusers_layout(ours))
+    larger = VaeSize(4, encoder_dim=16, decoder_dim=32, multipliers=(1, 2, 4, 4), halve_time=(False, True, True), blocks=1)
+    with pytest.raises(ConfigError, match=r"decoder\.conv_in\.bias is \[64\], .*decoder\.conv_in\.bias needs \[128\]"):
+        load_vae(abstract_vae(larger), tmp_path / "vae.safetensors")
+    torch.save({"weight": torch.zeros(3)}, tmp_path / "other.pth")
+    with pytest.raises(ConfigError, match=r"no autoencoder of Wan2\.2: it holds weight"):
+        load_vae(abstract_vae(SIZE), tmp_path / "other.pth")
+    with pytest.raises(ConfigError, match="no weights at"):
+        load_vae(abstract_vae(SIZE), tmp_path / "nowhere.pth")

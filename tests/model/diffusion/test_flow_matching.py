@@ -1,0 +1,54 @@
+"""Noise levels and training pairs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from xew.model.diffusion import flow_matching as fm
+
+pytestmark = pytest.mark.usefixtures("strict_types")
+SHAPE = (64, 3, 2, 2, 4)
+
+
+@pytest.fixture(scope="module")
+def latents() -> jax.Array:
+    return jax.random.normal(jax.random.key(0), SHAPE, jnp.float32)
+
+
+def test_grid_is_that_of_diffsynth_and_flowwam() -> None:
+    """50 steps, shift 5: the third of the four grids in circulation."""
+    sigmas = fm.sampling_sigmas(50, 5.0)
+    assert len(sigmas) == 51 and sigmas[-1] == 0
+    np.testing.assert_allclose(sigmas[:3], [1.0, 0.99593, 0.99174], atol=6e-6)
+    np.testing.assert_allclose(sigmas[-3:-1], [0.17241, 0.09259], atol=6e-6)
+
+
+@pytest.mark.parametrize(("shift", "mean", "above"), [(1, 0.50, 0.10), (3, 0.677, 0.25), (5, 0.748, 0.358), (8, 0.804, 0.471)])
+def test_training_levels_are_distributed_as_published(shift: float, mean: float, above: float) -> None:
+    levels = fm.sampling_sigmas(fm.TRAIN_LEVELS, shift)[:-1]
+    assert levels.mean() == pytest.approx(mean, abs=2e-3)
+    assert (levels > 0.9).mean() == pytest.approx(above, abs=2e-3)
+
+
+def test_training_pair_obeys_its_definition(latents: jax.Array) -> None:
+    pair = fm.training_pair(jax.random.key(1), latents, 5.0)
+    sigma = pair.sigma[:, None, None, None, None]
+    noise = pair.velocity + latents
+    np.testing.assert_allclose(pair.noisy[:, 1:], ((1 - sigma) * latents + sigma * noise)[:, 1:], atol=1e-5)
+    np.testing.assert_allclose((pair.noisy - sigma * pair.velocity)[:, 1:], latents[:, 1:], atol=1e-5)
+    assert noise.std() == pytest.approx(1, abs=0.05)
+
+
+def test_reference_is_perturbed_by_at_most_a_tenth(latents: jax.Array) -> None:
+    pair = fm.training_pair(jax.random.key(1), jnp.tile(latents, (1, 1, 8, 8, 1)), 5.0)
+    change = np.asarray(pair.noisy[:, 0] - jnp.tile(latents, (1, 1, 8, 8, 1))[:, 0])
+    strength = change.std(axis=(1, 2, 3))
+    assert 0 < strength.min() < 0.02 and 0.08 < strength.max() < 0.11
+
+
+def test_loss_ignores_the_reference_frame(latents: jax.Array) -> None:
+    pair = fm.training_pair(jax.random.key(1), latents, 5.0)
+    wrong_reference = pair.velocity.at[:, 0].add(100.0)
+    np.testing.assert_array_equal(fm.sample_losses(wrong_reference, pair), np.zeros(len(latents)))
+    np.testing.assert_allclose(fm.sample_losses(pair.velocity + 2, pair), np.full(len(latents), 4.0), rtol=1e-5)

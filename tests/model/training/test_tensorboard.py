@@ -1,0 +1,41 @@
+"""What a run logs: the same numbers in metrics.jsonl and in TensorBoard, each step once, also where steps were lost."""
+
+import json
+from pathlib import Path
+
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from xew.model.training.tensorboard import RunLog
+
+NAME = "train/loss"
+
+
+def log(folder: Path, begin: int, values: dict[int, float]) -> None:
+    """One try of a run that goes on from step `begin`."""
+    written = RunLog(folder, begin)
+    for step, value in values.items():
+        written.scalars(step, {NAME: value})
+    written.close()
+
+
+def curves(folder: Path) -> tuple[list[tuple[int, float]], list[tuple[int, float]]]:
+    """(step, value) of metrics.jsonl and of TensorBoard."""
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    accumulator = EventAccumulator(str(folder))
+    accumulator.Reload()
+    return [(line["step"], line[NAME]) for line in lines], [(e.step, e.value) for e in accumulator.Scalars(NAME)]
+
+
+def test_a_run_that_goes_on_continues_both_curves(tmp_path: Path) -> None:
+    log(tmp_path, 0, {10: 4.0, 20: 3.0})
+    log(tmp_path, 20, {30: 2.0})
+    assert curves(tmp_path) == ([(10, 4.0), (20, 3.0), (30, 2.0)],) * 2
+
+
+def test_steps_that_were_lost_are_taken_back(tmp_path: Path) -> None:
+    """Killed after step 30 with a checkpoint of step 20, in the middle of a line."""
+    log(tmp_path, 0, {10: 4.0, 20: 3.0, 25: 8.0, 30: 9.0})
+    with (tmp_path / "metrics.jsonl").open("a") as lines:
+        lines.write('{"step": 3')
+    log(tmp_path, 20, {25: 2.5, 40: 1.0})
+    assert curves(tmp_path) == ([(10, 4.0), (20, 3.0), (25, 2.5), (40, 1.0)],) * 2

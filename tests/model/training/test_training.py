@@ -1,0 +1,538 @@
+"""The training step and runs at tiny size: parts of a batch, two chunks, what is not finite, memory, adaptation, LoRA."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from tests import synthetic
+from xew.config import ConfigError, save
+from xew.model import latents, train
+from xew.model.devices.sharding import make_mesh, place_batch
+from xew.model.diffusion.flow_matching import sample_losses
+from xew.model.experiment import Experiment, load_experiment
+from xew.model.latents import LatentCache, first_of_each, load_codec, replay_episodes, training_episodes
+from xew.model.network.lora import corrected, init_corrections
+from xew.model.runs import checkpoint
+from xew.model.runs.checkpoint import TrainState
+from xew.model.training import data, memory
+from xew.model.training.data import Batch, ClipSource, fake_batch, make_dataset
+from xew.model.training.memory import estimate_memory
+from xew.model.training.optimizer import learning_rate, with_steps
+from xew.model.training.samples import sample_episodes
+from xew.model.training.step import (
+    abstract_state,
+    cut_rows,
+    estimate,
+    init_train_state,
+    join_rows,
+    make_train_step,
+    sample_pairs,
+)
+from xew.protocol import HELD_OUT_ROBOTS
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+FRAMES = 12
+CONFIG = """
+clip: {frames: 5, height: 64, width: 80}
+codec: {spatial_factor: 8, channels: 4}
+model: {size: tiny, action: joints, embodiment: robot_render}
+train: {steps: 2, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 1, sample_every: 0}
+rollout: {steps: 2, batch: 3}
+"""
+ADAPT = ("--adapt.robots", "piper", "--adapt.episodes", "2")
+
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+WAN5B = CONFIGS / "wan5b" / "fixed.yaml"
+FEWSHOT = [CONFIGS / "wan5b" / "fewshot.yaml", *sorted((CONFIGS / "fewshot").glob("*.yaml"))]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with data of two tasks and two training seeds, config.yaml and a trained run; latents are encoded."""
+    root = tmp_path_factory.mktemp("training")
+    tasks = ("place_empty_cup", "shake_bottle")
+    synthetic.write_synthetic_data(root / "data", tasks, seeds=(0, 1, 1_000_000), frames=FRAMES)
+    (root / "config.yaml").write_text(f"data: {root / 'data'}\nout: {root / 'run'}\n{CONFIG}")
+    latents.main([str(root / "config.yaml")])
+    train.main([str(root / "config.yaml")])
+    return root
+
+
+@pytest.fixture
+def experiment(world: Path) -> Experiment:
+    return load_experiment(world / "config.yaml")
+
+
+def lines(run: Path, name: str) -> list[float]:
+    logged = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return [line[name] for line in logged if name in line]
+
+
+def fails(command: Callable[[list[str]], None], arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """What a command says when it exits with code 2."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        command(arguments)
+    assert stop.value.code == 2
+    return capsys.readouterr().err
+
+
+def network(run: Path) -> tuple[Any, int]:
+    """Parameters of a run, and of which step they are."""
+    experiment = load_experiment(run / "config.yaml")
+    return checkpoint.restore_params(run, train.network_shapes(experiment, make_mesh(experiment.mesh)))
+
+
+def changed(experiment: Experiment, **settings: Any) -> Experiment:
+    return replace(experiment, train=replace(experiment.train, **settings))
+
+
+Step = Callable[[Batch], tuple[TrainState, Any]]
+
+
+def first_step(experiment: Experiment, codec: Any = None) -> Step:
+    """The first step from parameters that are random throughout: at its own start the network predicts zero."""
+    mesh = make_mesh(experiment.mesh)
+    graph, start = init_train_state(experiment, mesh)
+    noise = jax.tree.map(lambda leaf: 0.1 * np.random.default_rng(7).standard_normal(leaf.shape, np.float32), start.params)
+    start = jax.device_get(replace(start, params=jax.tree.map(np.add, start.params, noise)))
+    step = make_train_step(experiment, graph, mesh, codec)
+    return lambda batch: step(jax.device_put(start), place_batch(batch, mesh))
+
+
+# Parts of a batch.
+
+
+def test_parts_of_a_batch_make_the_same_step(experiment: Experiment) -> None:
+    batch = fake_batch(experiment, 4)
+    whole, of_whole = first_step(changed(experiment, batch=4))(batch)
+    cut, of_cut = first_step(changed(experiment, batch=4, accumulate=2))(batch)
+    np.testing.assert_allclose(of_cut.losses, of_whole.losses, atol=1e-5)
+    np.testing.assert_array_equal(of_cut.sigma, of_whole.sigma)
+    np.testing.assert_allclose(of_cut.gradient_norm, of_whole.gradient_norm, rtol=1e-5)
+    for ours, theirs in zip(jax.tree.leaves(cut.optimizer), jax.tree.leaves(whole.optimizer), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+def test_rows_of_parts_come_back_in_order() -> None:
+    rows = jnp.arange(24).reshape(12, 2)
+    np.testing.assert_array_equal(join_rows(cut_rows(rows, 3)), rows)
+    np.testing.assert_array_equal(cut_rows(rows, 3)[1, :, 0] // 2, [1, 4, 7, 10])
+
+
+def test_bfloat16_moment_is_kept_as_such(experiment: Experiment) -> None:
+    _, state = abstract_state(changed(experiment, mu_dtype="bfloat16"))
+    assert {str(leaf.dtype) for leaf in jax.tree.leaves(state.optimizer)} == {"int32", "float32", "bfloat16"}
+    assert {str(leaf.dtype) for leaf in jax.tree.leaves(state.params)} == {"float32"}
+
+
+# Two chunks.
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class LastFrame:
+    """Stands for a codec in which the last latent frame is the last picture; notes what it was given."""
+
+    def next_reference(self, latents: jax.Array) -> jax.Array:
+        jax.debug.callback(lambda value: SEEN.append(np.asarray(value)), latents)
+        return latents[:, -1:]
+
+
+SEEN: list[np.ndarray] = []
+
+
+@pytest.fixture(scope="module")
+def two(world: Path) -> Experiment:
+    return changed(load_experiment(world / "config.yaml"), chunks=2)
+
+
+@pytest.fixture(scope="module")
+def two_chunks(two: Experiment) -> Step:
+    return first_step(two, LastFrame())
+
+
+def test_second_chunk_starts_from_the_prediction_and_not_from_the_truth(two: Experiment, two_chunks: Step) -> None:
+    batch = fake_batch(two, 2)
+    _, result = two_chunks(batch)
+    assert result.losses.shape == result.sigma.shape == (2, 2)
+    np.testing.assert_array_equal(result.weights, 0.5)
+
+    other_truth = batch.following.latents.copy()
+    other_truth[:, 0] += 3
+    _, same = two_chunks(replace(batch, following=replace(batch.following, latents=other_truth)))
+    np.testing.assert_array_equal(same.losses, result.losses)
+
+    told = {name: values + 1 for name, values in batch.conditions.items()}
+    _, other = two_chunks(replace(batch, conditions=told))
+    difference = np.abs(np.asarray(other.losses - result.losses))
+    assert (difference > 1e-4).all(), "the second loss changes too, though only what the first chunk is told has"
+
+
+def test_estimate_is_the_clip_where_the_prediction_is_right() -> None:
+    """x0 = x_t - sigma v with v = noise - x0; frame 0 is the clean reference and not the perturbed one."""
+    latents = jax.random.normal(jax.random.key(0), (3, 4, 2, 2, 5))
+    pair = sample_pairs(jax.random.split(jax.random.key(1), 3), latents, 5.0)
+    np.testing.assert_allclose(estimate(latents, pair, pair.velocity), latents, atol=1e-5)
+    assert np.abs(np.asarray(pair.noisy[:, 0] - latents[:, 0])).max() > 1e-3
+    assert len(np.unique(pair.sigma)) == 3
+
+
+def test_codec_is_given_the_estimate_of_the_first_chunk(two: Experiment, two_chunks: Step) -> None:
+    SEEN.clear()
+    batch = fake_batch(two, 2)
+    two_chunks(batch)
+    jax.effects_barrier()
+    (seen,) = SEEN
+    np.testing.assert_allclose(seen[:, 0], batch.latents[:, 0], atol=1e-6)
+    assert np.abs(seen[:, 1] - batch.latents[:, 1]).max() > 0.1, "a prediction, not the truth"
+
+
+def test_a_missing_second_chunk_counts_for_nothing(two: Experiment, two_chunks: Step, experiment: Experiment) -> None:
+    batch = fake_batch(two, 2)
+    ended = replace(batch, following=replace(batch.following, shown=np.zeros_like(batch.following.shown)))
+    state, result = two_chunks(ended)
+    np.testing.assert_array_equal(result.weights, [[1, 0], [1, 0]])
+    alone, of_alone = first_step(experiment)(replace(batch, following=None))
+    np.testing.assert_allclose(result.losses[:, :1], of_alone.losses, rtol=1e-5)
+    np.testing.assert_allclose(result.gradient_norm, of_alone.gradient_norm, rtol=1e-5)
+    for ours, theirs in zip(jax.tree.leaves(state.optimizer), jax.tree.leaves(alone.optimizer), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-6)
+
+
+def test_frames_past_the_end_are_not_in_the_loss() -> None:
+    pair = sample_pairs(jax.random.split(jax.random.key(1), 2), jnp.ones((2, 3, 1, 1, 4)), 5.0)
+    predicted = jnp.zeros_like(pair.velocity)
+    by_frame = np.square(pair.velocity).mean(axis=(2, 3, 4))
+    found = sample_losses(predicted, pair, jnp.array([[1.0, 1, 1], [1, 1, 0]]))
+    np.testing.assert_allclose(found, [by_frame[0, 1:].mean(), by_frame[1, 1]], rtol=1e-6)
+    np.testing.assert_allclose(sample_losses(predicted, pair), by_frame[:, 1:].mean(axis=1), rtol=1e-6)
+    assert float(sample_losses(predicted, pair, jnp.zeros((2, 3))).sum()) == 0
+
+
+def test_two_chunks_from_latents_to_a_run(world: Path, tmp_path: Path) -> None:
+    config = [str(world / "config.yaml"), "--train.chunks", "2", "--cache", str(tmp_path / "cache")]
+    latents.main(config)
+    train.main([*config, "--out", str(tmp_path / "run")])
+    assert len(lines(tmp_path / "run", "train/loss")) == 2
+    experiment = load_experiment(tmp_path / "run" / "config.yaml")
+    episodes = training_episodes(experiment)
+    source = ClipSource(LatentCache(experiment, load_codec(experiment, episodes)), episodes)
+    batch = next(iter(make_dataset(source, 3, seed=0)))
+    assert jax.tree.map(np.shape, batch) == jax.tree.map(np.shape, fake_batch(experiment, 3))
+
+
+# What is not finite, and memory.
+
+
+def test_a_spoilt_state_is_never_saved(world: Path, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="not finite"):
+        train.main([str(world / "config.yaml"), "--out", str(tmp_path / "run"), "--train.learning-rate", "inf"])
+    steps = [path for path in (tmp_path / "run" / "checkpoints").glob("*") if path.name.isdigit()]
+    assert steps == []
+
+
+def test_too_little_memory_is_told_before_anything_is_made(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(memory, "device_memory", lambda: 1e5)
+    arguments = [str(world / "config.yaml"), "--out", str(tmp_path / "run")]
+    said = fails(train.main, arguments, capsys)
+    assert "memory of each device [GB]: parameters" in said
+    assert "mesh.fsdp" in said and "--model.remat full" in said and "--ignore-memory" in said
+    assert not (tmp_path / "run").exists()
+    train.main([*arguments, "--ignore-memory"])
+    assert len(lines(tmp_path / "run", "train/loss")) == 2
+
+
+def test_log_lines_hold_what_a_run_is_watched_by(world: Path) -> None:
+    run = world / "run"
+    for name in ("train/learning_rate", "time/step_s", "time/data_wait_s", "time/samples_per_s", "train/gradient_norm"):
+        values = lines(run, name)
+        assert len(values) == 2 and all(value >= 0 for value in values), name
+    assert lines(run, "train/learning_rate") == pytest.approx([1e-3, 1e-3])
+
+
+def test_projection_is_that_of_the_arithmetic() -> None:
+    """5.0e9 parameters on 8 devices: 4 bytes each and 8 for the moments, cut in 8; 2 for the copy; 2 + 4 for gradients."""
+    experiment = load_experiment(WAN5B)
+    whole, cut = estimate_memory(experiment, 1, 1).parts, estimate_memory(experiment, 8, 8).parts
+    numbers = whole["parameters"] / 4
+    assert numbers == pytest.approx(5.0e9, rel=0.01)
+    for name, bytes_each in (("parameters", 4), ("optimizer", 8), ("rounded to bfloat16", 2), ("gradients", 6)):
+        assert whole[name] == pytest.approx(bytes_each * numbers, rel=1e-3), name
+        assert cut[name] == pytest.approx(bytes_each * numbers / 8, rel=0.01), name
+    assert whole["activations"] == pytest.approx(8 * cut["activations"])
+    assert whole["layers gathered"] == 0 < cut["layers gathered"] < 1e9
+    assert 2.8e9 < cut["autoencoder"] < 10e9
+    half = estimate_memory(changed(experiment, mu_dtype="bfloat16", chunks=1), 1, 1).parts
+    assert half["optimizer"] == pytest.approx(6 * numbers, rel=1e-3)
+    assert half["gradients"] == pytest.approx(2 * numbers, rel=0.01)
+    assert half["autoencoder"] == 0
+
+
+def test_estimate_is_printed_without_a_device(capsys: pytest.CaptureFixture[str]) -> None:
+    train.main([str(WAN5B), "--estimate", "--devices", "8", "--memory-gb", "80"])
+    said = capsys.readouterr().out
+    assert "8 devices, state in 8 parts, 1 samples at once on each, remat full" in said
+    assert "fits in 80 GB a device" in said
+    train.main([str(WAN5B), "--estimate", "--devices", "1", "--memory-gb", "80"])
+    assert "does not fit in 80 GB" in capsys.readouterr().out
+
+
+# Configs.
+
+
+@pytest.mark.parametrize("path", [WAN5B, *FEWSHOT], ids=lambda path: path.stem)
+def test_shipped_configs_load_and_survive_saving(path: Path, tmp_path: Path) -> None:
+    experiment = load_experiment(path)
+    save(experiment, tmp_path / "saved.yaml")
+    assert load_experiment(tmp_path / "saved.yaml") == experiment
+
+
+@pytest.mark.parametrize("path", FEWSHOT, ids=lambda path: path.stem)
+def test_adaptations_have_the_network_of_the_run_they_start_from(path: Path) -> None:
+    adapted, trained = (
+        load_experiment(path),
+        load_experiment(CONFIGS / ("wan5b" if "wan5b" in str(path) else "") / "fixed.yaml"),
+    )
+    assert adapted.adapt.start_from == trained.out
+    assert (adapted.clip, adapted.codec) == (trained.clip, trained.codec)
+    assert replace(adapted.model, weights=None) == replace(trained.model, weights=None)
+    assert set(adapted.adapt.robots) <= set(HELD_OUT_ROBOTS)
+    assert adapted.train.epochs == 20
+
+
+def test_step_of_the_full_size_is_made_from_shapes() -> None:
+    """The whole program of wan5b, two chunks of 121 frames in three streams, without one of its weights."""
+    experiment = load_experiment(WAN5B, ["--model.attention", "xla"])
+    mesh = make_mesh(experiment.mesh)
+    graph, shapes = abstract_state(experiment)
+    step = make_train_step(experiment, graph, mesh, LastFrame())
+    batch = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, fake_batch(experiment, 8)))
+    state, result = step.lower(train.placed(shapes, mesh), batch).out_info
+    assert result.losses.shape == (8, 2)
+    assert jax.tree.map(lambda leaf: leaf.shape, state) == jax.tree.map(lambda leaf: leaf.shape, shapes)
+
+
+# Length and settings.
+
+
+def test_epochs_are_passes_over_the_new_samples(experiment: Experiment) -> None:
+    passes = changed(experiment, steps=0, epochs=20, batch=8)
+    assert with_steps(passes, 75).train.steps == 188
+    replaying = replace(passes, adapt=replace(passes.adapt, replay=0.25))
+    assert with_steps(replaying, 75).train.steps == 250
+    assert with_steps(experiment, 75) is experiment
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["--train.steps", "0"], "give one of them"),
+        (["--train.epochs", "2"], "give one of them"),
+        (["--train.batch", "3", "--train.accumulate", "2"], "train.batch is 3; it must be a multiple of"),
+        (["--mesh.fsdp", "3"], "mesh is data -1 x fsdp 3, there are 1 devices"),
+        (["--adapt.start-from", "x"], "adapt needs the robots"),
+        (["--rollout.shift", "0"], "rollout.shift is 0; it must be over 0"),
+        (["--train.log-every", "0"], "train.log_every is 0; it must be at least 1"),
+        (["--train.batch", "0"], "train.batch is 0; it must be at least 1"),
+        (["--train.ema-decay", "1"], "train.ema_decay is 1; it must be under 1"),
+        (["--adapt.robots", "piper"], "adapt.start_from not which run to adapt"),
+        (["--adapt.start-from", "x", "--adapt.robots", "piper", "--adapt.replay", "0.9"], "a part that leaves room"),
+        (["--adapt.start-from", "nowhere", "--adapt.robots", "piper"], "nowhere holds no run"),
+    ],
+)
+def test_mistakes_are_told(
+    world: Path, tmp_path: Path, overrides: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert said in fails(train.main, [str(world / "config.yaml"), "--out", str(tmp_path / "run"), *overrides], capsys)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_rate_has_decayed_at_the_last_step(experiment: Experiment) -> None:
+    settings = replace(experiment.train, steps=50, warmup_steps=10, learning_rate=1e-2, decay_to=0.1)
+    rates = [float(learning_rate(settings)(step)) for step in range(51)]
+    assert rates[0] == 0 and np.argmax(rates) == 10
+    np.testing.assert_allclose([rates[10], rates[30], rates[50]], [1e-2, 5.5e-3, 1e-3], rtol=1e-5)
+
+
+def test_arithmetic_that_one_way_streams_save_is_not_counted(experiment: Experiment) -> None:
+    one_way = replace(experiment, model=replace(experiment.model, visibility="one_way"))
+    assert memory.flops_of_step(one_way) < memory.flops_of_step(experiment)
+
+
+def test_episodes_without_videos_are_told_before_training(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Data made with --states-only: a sample begins with a stored picture, and would end a run in its middle."""
+    shutil.copytree(world / "data", tmp_path / "data")
+    shutil.copytree(world / "data-latents", tmp_path / "data-latents")
+    for path in (tmp_path / "data").glob("*/*/*/episode.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"videos": False}))
+    arguments = [str(world / "config.yaml"), "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")]
+    assert "--train.sample-every 0" in fails(train.main, [*arguments, "--train.sample-every", "1"], capsys)
+    assert not (tmp_path / "run").exists()
+    train.main([*arguments, "--train.steps", "1"])
+
+
+# Adaptation.
+
+
+def test_a_robot_to_adapt_to_that_the_data_lack_is_told(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start = ["--adapt.start-from", str(world / "run"), "--adapt.robots", "pipr", "--out", str(tmp_path / "run")]
+    said = fails(train.main, [str(world / "config.yaml"), *start], capsys)
+    assert "has no training episode of pipr; did you mean 'piper'?" in said
+
+
+def test_a_robot_of_ones_own_is_adapted_to(world: Path, tmp_path: Path) -> None:
+    shutil.copytree(world / "data", tmp_path / "data")
+    for folder in (tmp_path / "data").glob("*/*/piper"):
+        header = folder.rename(folder.with_name("my_arm")) / "episode.json"
+        header.write_text(json.dumps(json.loads(header.read_text()) | {"robot": "my_arm"}))
+    start = ["--adapt.start-from", str(world / "run"), "--adapt.robots", "my_arm", "--train.steps", "1"]
+    arguments = [str(world / "config.yaml"), "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run"), *start]
+    latents.main(arguments)
+    train.main(arguments)
+    assert network(tmp_path / "run")[1] == 1
+
+
+def test_the_run_that_an_adaptation_starts_from_is_not_overwritten(world: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    start = ["--adapt.start-from", str(world / "run"), *ADAPT, "--overwrite"]
+    assert "choose another --out" in fails(train.main, [str(world / "config.yaml"), *start], capsys)
+    assert network(world / "run")[1] == 2
+
+
+def adapt(world: Path, out: Path, *options: str) -> list[str]:
+    config = [str(world / "config.yaml"), "--adapt.start-from", str(world / "run"), *ADAPT, *options]
+    latents.main(config)
+    return [*config, "--out", str(out)]
+
+
+def test_adaptation_learns_from_few_episodes_of_the_target(world: Path, experiment: Experiment) -> None:
+    adapted = replace(experiment, adapt=replace(experiment.adapt, start_from=world / "run", robots=("piper",), episodes=1))
+    chosen = {(record.task, record.robot, record.seed) for _, record in training_episodes(adapted)}
+    assert chosen == {("place_empty_cup", "piper", 0), ("shake_bottle", "piper", 0)}
+    assert replay_episodes(adapted) == []
+    with pytest.raises(ConfigError, match=r"adapt.episodes is 3, there are only 2 training episodes of piper"):
+        first_of_each(training_episodes(replace(adapted, adapt=replace(adapted.adapt, episodes=2))), 3)
+
+
+def test_adapted_run_starts_from_the_trained_weights(world: Path, tmp_path: Path) -> None:
+    arguments = adapt(world, tmp_path / "run")
+    train.main([*arguments, "--train.steps", "1", "--resume"])  # of nothing: it begins, and notes where
+    adapted = load_experiment(tmp_path / "run" / "config.yaml")
+    start, base = train.start_params(adapted, make_mesh(adapted.mesh)), network(world / "run")[0]
+    jax.tree.map(np.testing.assert_array_equal, start, base)
+    after = network(tmp_path / "run")[0]
+    moved = [float(np.abs(np.asarray(a - b)).max()) for a, b in zip(*map(jax.tree.leaves, (after, start)), strict=True)]
+    assert 0 < max(moved) <= 1.1e-3, "one step of AdamW moves a weight by the learning rate"
+
+
+def test_samples_of_an_adapted_run_are_named_by_role(experiment: Experiment) -> None:
+    adapted = replace(experiment, adapt=replace(experiment.adapt, start_from=Path("runs/x"), robots=("piper",)))
+    names = sample_episodes(adapted)
+    seen = {"seen/aloha_agilex", "seen/arx_x5", "seen/ur5_wsg"}
+    assert set(names) == seen | {"target/piper", "unseen/franka_panda"}
+
+
+def test_adapting_another_network_is_told(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    start = ["--adapt.start-from", str(world / "run"), *ADAPT, "--out", str(tmp_path / "run")]
+    said = fails(train.main, [str(world / "config.yaml"), *start, "--model.action", "none"], capsys)
+    assert "model.action is 'joints' there, 'none' here" in said
+
+
+def test_replay_is_a_part_of_every_batch(world: Path, experiment: Experiment) -> None:
+    settings = replace(experiment.adapt, start_from=world / "run", robots=("piper",), episodes=2, replay=0.25)
+    adapted = replace(experiment, adapt=settings)
+    old, new = replay_episodes(adapted), training_episodes(adapted)
+    assert {record.robot for _, record in old} == {"aloha_agilex", "arx_x5", "ur5_wsg"}
+
+    class Names(ClipSource):
+        def __getitem__(self, index: int) -> Batch:
+            return Batch(np.array(self.samples[index][0].robot == "piper"), {}, np.array(index))
+
+    source = Names(LatentCache(adapted, load_codec(adapted, new)), new, old)
+    batches = iter(make_dataset(source, 8, seed=0, replay=0.25))
+    drawn = [next(batches) for _ in range(6)]
+    assert all(batch.latents.sum() == 6 for batch in drawn)
+    assert len({int(index) for batch in drawn for index in batch.text[6:]}) == 12, "replay goes on through its episodes"
+
+
+def test_corrections_change_nothing_at_first_and_only_they_are_learned(experiment: Experiment) -> None:
+    low_rank = replace(experiment, adapt=replace(experiment.adapt, lora_rank=2))
+    mesh = make_mesh(experiment.mesh)
+    _, full = init_train_state(experiment, mesh)
+    start = jax.tree.map(lambda leaf: leaf + 0.1, full.params)  # the head's own start is zero and gives no gradient
+    base = jax.device_get(start)
+    graph, state = init_train_state(low_rank, mesh, start)
+    jax.tree.map(np.testing.assert_array_equal, corrected(state.base, state.params), base)
+    assert len(state.params["blocks"]) == 10, "q, k, v, o of both attentions and both layers of the feed-forward"
+    moments = sum(leaf.size for leaf in jax.tree.leaves(state.optimizer))
+    assert moments < 2.1 * sum(leaf.size for leaf in jax.tree.leaves(state.params))
+    step = make_train_step(low_rank, graph, mesh)
+    for _ in range(2):
+        state, _ = step(state, place_batch(fake_batch(low_rank, 2), mesh))
+    jax.tree.map(np.testing.assert_array_equal, state.base, base)
+    assert all(np.abs(np.asarray(leaf["b"])).max() > 0 for leaf in state.params["blocks"].values())
+
+
+def test_corrections_have_the_gradient_of_the_whole_matrix(experiment: Experiment) -> None:
+    """W + A B: with dL/dW known, dL/dB is A transposed times it."""
+    params = {"blocks": {"ffn": {"first": {"kernel": jax.random.normal(jax.random.key(0), (2, 3, 4))}}}}
+    learned = init_corrections(params, 2, jax.random.key(1))
+    weight = jax.random.normal(jax.random.key(2), (2, 3, 4))
+    gradient = jax.grad(lambda c: (corrected(params, c)["blocks"]["ffn"]["first"]["kernel"] * weight).sum())(learned)
+    a = learned["blocks"]["ffn.first.kernel"]["a"]
+    np.testing.assert_allclose(gradient["blocks"]["ffn.first.kernel"]["b"], a.swapaxes(1, 2) @ weight, rtol=1e-5)
+
+
+def test_run_with_corrections_resumes_and_is_read(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    base = tmp_path / "base"
+    shutil.copytree(world / "run", base)
+    arguments = adapt(world, tmp_path / "run", "--adapt.lora-rank", "2", "--adapt.start-from", str(base))
+    train.main([*arguments, "--train.steps", "1"])
+    train.main([*arguments, "--train.steps", "3", "--resume"])
+    straight = adapt(world, tmp_path / "straight", "--adapt.lora-rank", "2", "--adapt.start-from", str(base))
+    train.main([*straight, "--train.steps", "3"])
+    assert lines(tmp_path / "run", "train/loss") == lines(tmp_path / "straight", "train/loss")
+
+    after, step = network(tmp_path / "run")
+    before, _ = network(base)
+    assert step == 3
+    moved = [
+        ".".join(path)
+        for (path, ours), (_, theirs) in zip(nnx.to_flat_state(after), nnx.to_flat_state(before), strict=True)
+        if not np.array_equal(ours.get_value(), theirs.get_value())
+    ]
+    assert len(moved) == 10 and all(path.startswith("blocks.") and path.endswith(".kernel") for path in moved)
+    elsewhere = (tmp_path / "run").rename(tmp_path / "elsewhere")
+    jax.tree.map(np.testing.assert_array_equal, network(elsewhere)[0], after)
+    shutil.rmtree(base / "checkpoints" / "2")
+    with pytest.raises(ConfigError, match="not there any more or was trained anew"):
+        network(elsewhere)
+    (elsewhere / "start.json").unlink()
+    with pytest.raises(ConfigError, match="does not tell from which checkpoint"):
+        network(elsewhere)
+
+
+def test_checkpoint_of_a_step_that_is_not_there_is_told(world: Path) -> None:
+    with pytest.raises(ConfigError, match=r"has no checkpoint of step 9; it has 1, 2\."):
+        checkpoint.restore_params(world / "run", network(world / "run")[0], 9)
+
+
+def test_fake_batches_have_a_second_chunk_only_where_asked(experiment: Experiment) -> None:
+    assert data.fake_batch(experiment, 1).following is None
+    assert data.fake_batch(changed(experiment, chunks=2), 1).following.latents.shape == (1, *experiment.latent_shape)

@@ -1,0 +1,224 @@
+"""Every task of the registry: unsolved at first, solved in physics by its expert at last; and the page that tells of them."""
+
+from dataclasses import replace
+from itertools import cycle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.sim_warp.small import SLOW, TASK
+from xew.config import ConfigError
+from xew.episode import FAILURES, EpisodeError, Record
+from xew.sim_warp.plan import LEFT, RIGHT
+from xew.sim_warp.production.produce import Cell, Job, moment, plan_cells, simulate_cells
+from xew.sim_warp.robots import ROBOTS
+from xew.sim_warp.scene import Scene, scene_rng
+from xew.sim_warp.tasks import TASKS, get_task
+from xew.sim_warp.tasks.task import Moment
+from xew.sim_warp.yields import PARTS, Args, attempt_batch, attempts, described, description, markdown, page
+
+PAGE = Path(__file__).parents[3] / "docs" / "tasks.md"
+SOLVERS = dict(zip(sorted(TASKS), cycle(ROBOTS), strict=False))
+"""One robot a task, all five among them."""
+SEED = 2
+
+
+@pytest.fixture(scope="module")
+def solved() -> dict[str, Cell]:
+    """A whole episode of every task, in physics."""
+    assert set(SOLVERS.values()) == set(ROBOTS)
+    cells = simulate_cells(plan_cells([Job(task, SEED, (robot,)) for task, robot in SOLVERS.items()]), "cpu")
+    return {seed[0].task_name: seed[0] for seed in cells}
+
+
+def at(cell: Cell, frame: int) -> Moment:
+    return moment(cell.commands.action, cell.moved, cell.tool_pose, frame)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_an_expert_turns_failure_into_success(name: str, solved: dict[str, Cell]) -> None:
+    cell = solved[name]
+    assert cell.failure is None
+    assert not cell.task.success(cell.scene, at(cell, 0))
+    assert cell.task.success(cell.scene, at(cell, -1))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_hands_hold_what_the_plan_says_they_hold(name: str, solved: dict[str, Cell]) -> None:
+    cell = solved[name]
+    assert cell.path.holds
+    for hold in cell.path.holds:
+        end = int(hold.end * cell.path.frame_rate)
+        touched = cell.moved.contact[end - 8 : end, hold.arm, cell.scene.index(hold.name)]
+        assert touched.any(), f"the {('left', 'right')[hold.arm]} hand does not touch the {hold.name}"
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_an_expert_that_closes_no_hand_is_told_so(name: str, solved: dict[str, Cell]) -> None:
+    """Success is not for free: with nothing moved it fails, and the reason is one of the contract's."""
+    cell = solved[name]
+    still = {
+        field: np.repeat(getattr(cell.moved, field)[:1], cell.path.frame_count, 0) for field in ("object_pose", "object_joint")
+    }
+    idle = replace(cell, motion=replace(cell.moved, **still, contact=np.zeros_like(cell.moved.contact)))
+    reason, words = idle.failure or ("", "")
+    assert reason == "grasp" and reason in FAILURES and "never touched" in words
+
+
+def test_what_is_lost_on_the_way_is_a_slip(solved: dict[str, Cell]) -> None:
+    cell = solved["place_empty_cup"]
+    hold = cell.path.holds[0]
+    contact = cell.moved.contact.copy()
+    contact[int(hold.end * cell.path.frame_rate) - 12 :] = False
+    pose = np.repeat(cell.moved.object_pose[:1], cell.path.frame_count, 0)
+    lost = replace(cell, motion=replace(cell.moved, contact=contact, object_pose=pose))
+    assert lost.failure == ("slip", f"the {('left', 'right')[hold.arm]} hand lost the cup")
+
+
+def test_an_overflow_and_an_early_success_are_told(solved: dict[str, Cell]) -> None:
+    cell = solved["grab_roller"]
+    assert (replace(cell, motion=replace(cell.moved, overflow=True)).failure or ("",))[0] == "overflow"
+    early = replace(cell, task=replace(cell.task, success=lambda scene, now: True))
+    assert early.failure == ("plan", "the scene is solved before it begins")
+    late = replace(cell, task=replace(cell.task, success=lambda scene, now: False))
+    assert (late.failure or ("",))[0] == "timeout"
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_no_scene_of_many_is_solved_as_it_stands(name: str) -> None:
+    task = TASKS[name]
+    for seed in range(100):
+        scene = task.sample(scene_rng(name, seed), seed)
+        assert not task.success(scene, beginning(scene)), f"seed {seed}"
+
+
+def beginning(scene: Scene) -> Moment:
+    """Open hands far from everything, objects where the scene puts them."""
+    joint = np.array([thing.hinge.start if thing.hinge else 0.0 for thing in scene.objects])
+    pose = np.array([thing.pose for thing in scene.objects])
+    tools = np.tile([0.0, -0.5, 1.2, 0, 0, 0, 1], (2, 1))
+    return Moment(pose, joint, tools, np.ones(2), np.zeros((2, len(scene.objects)), bool))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_instruction_names_what_the_scene_shows(name: str) -> None:
+    task = TASKS[name]
+    said = {task.instruction.format(**task.sample(scene_rng(name, seed), seed).words) for seed in range(30)}
+    assert all("{" not in text for text in said)
+    assert ("{" in task.instruction) == (len(said) > 1)
+
+
+def test_both_arms_get_work() -> None:
+    for name in ("beat_block_hammer", "open_laptop", "place_empty_cup"):
+        arms = {task_arm(name, seed) for seed in range(12)}
+        assert arms == {LEFT, RIGHT}, name
+
+
+def task_arm(name: str, seed: int) -> int:
+    return TASKS[name].plan(TASKS[name].sample(scene_rng(name, seed), seed)).holds[0].arm
+
+
+def test_success_wants_what_the_docstrings_say(solved: dict[str, Cell]) -> None:
+    """Each condition alone undoes success."""
+    undone = {
+        "beat_block_hammer": [("object_pose", (0, 0), 0.021), ("object_pose", (0, 2), 0.012)],
+        "blocks_ranking_rgb": [("object_pose", (2, 0), 0.14), ("object_pose", (1, 1), 0.06)],
+        "grab_roller": [("object_pose", (0, 2), -0.2)],
+        "move_stapler_pad": [("object_pose", (0, 0), 0.025), ("object_pose", (0, 1), 0.025), ("object_pose", (0, 2), 0.012)],
+        "open_laptop": [("object_joint", (0,), -0.5)],
+        "place_a2b_left": [("object_pose", (0, 0), 0.27), ("object_pose", (0, 1), 0.06), ("object_pose", (0, 0), -0.13)],
+        "place_a2b_right": [("object_pose", (0, 0), -0.27), ("object_pose", (0, 1), 0.06), ("object_pose", (0, 0), 0.13)],
+        "place_empty_cup": [("object_pose", (0, 1), 0.07), ("object_pose", (0, 2), 0.016)],
+        "place_mouse_pad": [("object_pose", (0, 0), 0.02), ("object_pose", (0, 1), 0.017)],
+        "place_object_scale": [("object_pose", (0, 1), 0.05), ("object_pose", (0, 2), -0.013)],
+        "place_object_stand": [("object_pose", (0, 1), 0.04), ("object_pose", (0, 2), 0.015)],
+        "press_stapler": [("object_joint", (0,), -0.06), ("tool_pose", (slice(None), 2), 0.05)],
+        "stack_bowls_two": [("object_pose", (1, 0), 0.09), ("object_pose", (1, 2), 0.05), ("object_pose", (1, 2), -0.02)],
+    }
+    for name, changes in undone.items():
+        cell = solved[name]
+        last = at(cell, -1)
+        for field, index, change in changes:
+            values = getattr(last, field).copy()
+            values[index] += change
+            assert not cell.task.success(cell.scene, replace(last, **{field: values})), (name, field, index)
+    let_go = ("blocks_ranking_rgb", "move_stapler_pad", "place_a2b_left", "place_a2b_right", "place_empty_cup")
+    for name in (*let_go, "place_mouse_pad", "place_object_scale", "place_object_stand", "press_stapler", "stack_bowls_two"):
+        last = at(solved[name], -1)
+        assert not TASKS[name].success(solved[name].scene, replace(last, gripper=np.array([1.0, 0.7])))
+    roller = at(solved["grab_roller"], -1)
+    assert not TASKS["grab_roller"].success(solved["grab_roller"].scene, replace(roller, gripper=np.array([0.0, 0.5])))
+    laptop = at(solved["open_laptop"], -1)
+    away = laptop.tool_pose + np.float32([0, -0.3, 0.3, 0, 0, 0, 0])
+    assert not TASKS["open_laptop"].success(solved["open_laptop"].scene, replace(laptop, tool_pose=away))
+
+
+def test_unknown_tasks_are_told_with_the_nearest_name() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'grab_roller'"):
+        get_task("grab_rollers")
+    with pytest.raises(ConfigError, match="expected module:NAME"):
+        get_task("nowhere.to.be:FOUND")
+    with pytest.raises(ConfigError, match="is a str; expected a Task"):
+        get_task("tests.sim_warp.small:TASK")
+
+
+# --- The page and the table of yields.
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_page_tells_what_the_docstrings_tell(name: str) -> None:
+    assert all(described(TASKS[name]).get(part) for part in PARTS)
+    assert description(TASKS[name]) in PAGE.read_text(), (
+        "write docs/tasks.md anew: python -m xew.sim_warp.yields --seeds 50 --page docs/tasks.md"
+    )
+
+
+def test_the_page_shows_at_least_80_percent_everywhere() -> None:
+    rows = [line.split("|")[2:-2] for line in PAGE.read_text().splitlines() if line.startswith("| `") and "/50 (" in line]
+    counts = [int(cell.split("/")[0]) for row in rows for cell in row]
+    assert len(counts) == len(TASKS) * len(ROBOTS) and min(counts) >= 40
+
+
+def test_the_table_of_yields_counts_right() -> None:
+    def record(seed: int, robot: str, failure: str | None = None) -> Record:
+        return Record("grab_roller", seed, robot, failure is None, failure, "because" if failure else "")
+
+    records = [
+        record(0, "piper"),
+        record(1, "piper", "slip"),
+        record(0, "arx_x5"),
+        record(1, "arx_x5"),
+        record(2, "arx_x5", "plan"),
+    ]
+    lines = markdown(records).splitlines()
+    assert lines[0] == "| task | `arx_x5` | `piper` | all robots on the same seed |"
+    assert lines[2] == "| `grab_roller` | 2/3 (67 %) | 1/2 (50 %) | 1/3 (33 %) |"
+    assert lines[-1] == "- `grab_roller`, `piper`, seed 1: slip (because)"
+
+
+def test_yields_try_every_robot_and_write_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    jobs = [Job(TASK, seed, ("ur5_wsg", SLOW)) for seed in (0, 1)]
+    records = [record for seed in attempt_batch(jobs, "cpu", 1) for record in seed]
+    assert [(record.robot, record.success) for record in records] == [
+        ("ur5_wsg", True), (SLOW, True), ("ur5_wsg", True), (SLOW, False),
+    ]  # fmt: skip
+    text = page(records, Args(tasks=(TASK,), robots=("ur5_wsg", SLOW), seeds=2))
+    assert (
+        f"| `{TASK}` | 2/2 (100 %) | 1/2 (50 %) | 1/2 (50 %) |" in text
+        and "2 seeds from 0 of each task, in physics, on CPU:" in text
+        and "python -m xew.sim_warp.yields --seeds 2 --page docs/tasks.md`" in text
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_yields_of_nothing_or_of_the_unknown_are_refused() -> None:
+    with pytest.raises(EpisodeError, match="nothing to try"):
+        next(attempts(Args(seeds=0)))
+    with pytest.raises(ConfigError, match="unknown robot 'ur5'"):
+        next(attempts(Args(robots=("ur5",))))
+    with pytest.raises(EpisodeError, match="1 robots and 20 seeds from -1; name"):
+        next(attempts(Args(robots=("piper",), first_seed=-1)))
+    with pytest.raises(ConfigError, match="--device cuda:99: not on this machine, which has cpu"):
+        next(attempts(Args(device="cuda:99")))

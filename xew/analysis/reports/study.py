@@ -1,0 +1,330 @@
+"""Stage 11 of 11: the report of a study, from a score table with the column `variant`; `report` reads and writes files.
+
+What came out stands first, then the claims with their verdicts, then a section for each question of the paper: chart, the
+main table, what it looks like, and all metrics folded away.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from xew.analysis.paper import AXES, read_paper
+from xew.analysis.reports import page, pictures
+from xew.analysis.reports.charts import Chart, chart_files
+from xew.analysis.reports.study_charts import study_charts
+from xew.analysis.reports.study_strips import Strip, study_strips
+from xew.analysis.scores import Scores, describe_cells, missing_cells
+from xew.analysis.statistics.grades import SEEN, Grades, PaperGrades, StudyGrades, better, interval
+from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.analysis.tables import formats
+from xew.analysis.tables.distances import (
+    Distances,
+    certainty_table,
+    correlate,
+    correlation_table,
+    distance_tables,
+    own_correlation_tables,
+    printed_distances,
+    read_distances,
+    signed,
+)
+from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask, findings_frame
+from xew.analysis.tables.layouts import ACTIONS, LADDER, MARKS, SHORT_ROBOTS, Builder, Table, build_tables, count_table
+from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
+
+TITLE = "Can the model render a robot that it has never seen?"
+PART_TITLES = {
+    "fixed": "Seen and unseen robots",
+    "actions": "How it is told to move",
+    "ladder": "What it is told of the robot's looks",
+    "few_shot": "Adaptation, and what it costs",
+    "loeo": "Does distance predict difficulty?",
+    "baselines": "Other world models",
+}
+SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]] = {
+    "fixed": ((), ("gap",), ()),
+    "actions": (("gains_actions",), ("actions",), ("actions_full",)),
+    "ladder": (("gains_ladder",), ("ladder",), ("ladder_full",)),
+    "few_shot": (("forgetting", "gains_few_shot"), ("few_shot",), ("few_shot_full", "forgetting_full")),
+    "loeo": (
+        ("distance",),
+        ("correlations", "correlations_own", "loeo_full"),
+        ("certainty", "distances", "features", "matrices"),
+    ),
+    "baselines": ((), ("baselines",), ()),
+}
+"""By part: charts, tables that stand open, and tables that are folded away."""
+FRAME_CHARTS = {"actions": "frames_actions", "ladder": "frames_ladder"}
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that is written, by path relative to the report's folder."""
+
+    html: str
+    markdown: str
+    summary: pd.DataFrame
+    files: Mapping[str, bytes]
+
+
+@dataclass(frozen=True)
+class Content:
+    """What the formats show."""
+
+    sentences: Sequence[str]
+    findings: Sequence[Finding]
+    printed: Sequence[Finding]
+    """The same claims asked of the paper's own figures."""
+    tables: Mapping[str, Table]
+    charts: Mapping[str, Chart]
+    strips: Mapping[str, Strip]
+    lacks: Sequence[str]
+    """Notes on what is not there."""
+    missing: pd.DataFrame
+    """Every cell that other models have."""
+
+
+def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances: Path | None, footer: str) -> Report:
+    """Everything that a report holds.
+
+    Args:
+        scores: with the column `variant`.
+        data: the data set, for pictures.
+        rollouts: trees of rollouts named after their variants, or folders that hold such trees; for pictures.
+        distances: folder of the command of distances; the paper's printed ones where None.
+        footer: HTML, versions.
+
+    Raises:
+        ConfigError: a file that was named cannot be read.
+    """
+    paper = read_paper()
+    known = read_distances(distances) if distances else printed_distances(paper)
+    strips = study_strips(scores, data, rollouts) if data and rollouts else {}
+    grades = StudyGrades(scores.rows, scores.metrics, {axis: known.of(axis) for axis in AXES}, known.measured)
+    printed = PaperGrades(paper, scores.metrics)
+    planned = scores.attributes.get("study", {}).get("variants", {})
+    builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
+    tables = [*build_tables(builder), count_table(builder), *distance_tables(known)]
+    if builder.present("loeo"):
+        tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
+        tables.append(certainty_table(grades, known, paper))
+    findings = ask(grades)
+    missing = missing_cells(scores.rows)
+    content = Content(
+        _sentences(grades, known, findings),
+        findings,
+        ask(printed),
+        {table.name: table for table in tables},
+        study_charts(builder, known, scores.curves),
+        strips,
+        [*_lacks(builder, scores), *missing_note(missing)],
+        missing,
+    )
+    html = _html(content, scores, footer)
+    return Report(html, _markdown(content), formats.tables_frame(tables), dict(_files(content)))
+
+
+def _sentences(grades: Grades, distances: Distances, findings: Sequence[Finding]) -> list[str]:
+    """What came out, in as many sentences as there are questions that were asked."""
+    asked = [
+        *_gap_sentence(grades),
+        *_best_sentences(grades),
+        *_adaptation_sentences(grades),
+        *_distance_sentence(grades, distances),
+    ]
+    return [_verdict_sentence(findings), *asked]
+
+
+def _verdict_sentence(findings: Sequence[Finding]) -> str:
+    claims = [finding for finding in findings if finding.claim.where != "ours"]
+    counts = {word: sum(finding.verdict == word for finding in claims) for word in (HOLDS, FAILS, UNRESOLVED, UNMEASURED)}
+    measured = len(claims) - counts[UNMEASURED]
+    if not measured:
+        return f"None of {len(claims)} claims of the paper could be asked of what was graded here."
+    asked = "all" if measured == len(claims) else str(measured)
+    verbs = {HOLDS: ("holds", "hold"), FAILS: ("fails", "fail"), UNRESOLVED: ("is unresolved", "are unresolved")}
+    parts = [f"{counts[word] or 'none'} {verbs[word][counts[word] > 1]}" for word in verbs]
+    text = f"Of {len(claims)} claims of the paper {asked} could be asked here: {', '.join(parts)}."
+    failed = [finding.claim.says.strip("… ").rstrip(".") for finding in claims if finding.verdict == FAILS]
+    return text + (f" What fails: {'; '.join(failed)}." if failed else "")
+
+
+def _gap_sentence(grades: Grades) -> Iterator[str]:
+    seen = grades.mean("fixed", "fixed", SEEN, "lpips") if "lpips" in grades.metrics else None
+    parts = []
+    for robot in HELD_OUT_ROBOTS:
+        mean = grades.mean("fixed", "fixed", robot, "lpips") if seen else None
+        if mean and seen:
+            worse = -better(mean, seen, grades.metrics["lpips"])
+            low, high = interval(worse, grades.level)
+            parts.append(f"{_change(worse[0])} on {ROBOT_TITLES[robot]} ({_change(low)} to {_change(high)})")
+    if parts and seen:
+        yield f"Told optical flow only, LPIPS is {seen.value:.3f} on robots seen in training; {' and '.join(parts)}."
+
+
+def _best_sentences(grades: Grades) -> Iterator[str]:
+    """What helps most, of ways to be told actions and of ways to be told looks."""
+    for part, base, labels in (("actions", "joints", ACTIONS), ("ladder", "none", LADDER)):
+        found = []
+        for robot in HELD_OUT_ROBOTS:
+            gains = {row: _gain(grades, part, row, base, robot) for row in labels if row != base}
+            known = {row: gain for row, gain in gains.items() if gain is not None}
+            if known:
+                best = max(known, key=lambda row: known[row])
+                found.append(f"{labels[best].removeprefix('+ ').lower()} on {SHORT_ROBOTS[robot]} ({_change(known[best])})")
+        if found:
+            yield f"Against {labels[base].lower()}, LPIPS improves most with {' and '.join(found)}."
+
+
+def _adaptation_sentences(grades: Grades) -> Iterator[str]:
+    for robot in HELD_OUT_ROBOTS:
+        gain = _gain(grades, "few_shot", f"{robot}-1", f"{robot}-0", robot)
+        loss = _gain(grades, "forgetting", f"{robot}-1", "none", FORGETTING_ROBOT)
+        if gain is not None and loss is not None:
+            yield (
+                f"One demonstration of each task changes LPIPS by {_change(-gain)} on {ROBOT_TITLES[robot]}, and by "
+                f"{_change(-loss)} on {ROBOT_TITLES[FORGETTING_ROBOT]}, which the model had been trained on."
+            )
+
+
+def _distance_sentence(grades: Grades, distances: Distances) -> Iterator[str]:
+    found = correlate(grades, distances)
+    parts = [
+        f"r = {signed(found['lpips', axis].r)} with {axis} distance (p = {found['lpips', axis].p_value:.3f}, "
+        f"{'stable' if found['lpips', axis].stable else 'unstable'} sign)"
+        for axis in AXES
+        if ("lpips", axis) in found
+    ]
+    if parts:
+        yield f"Over the five robots, each held out in turn, LPIPS goes with distance: {'; '.join(parts)}."
+
+
+def _change(share: float) -> str:
+    return f"{100 * share:+z.0f}\u00a0%".replace("-", "−")
+
+
+def _gain(grades: Grades, part: str, row: str, base: str, robot: str) -> float | None:
+    if "lpips" not in grades.metrics:
+        return None
+    after, before = (grades.mean(part, key, robot, "lpips", shared=True) for key in (row, base))
+    return float(better(after, before, grades.metrics["lpips"])[0]) if after and before else None
+
+
+def _lacks(builder: Builder, scores: Scores) -> Iterator[str]:
+    absent = [part.replace("_", " ") for part in PAPER_PARTS if not builder.present(part)]
+    if absent:
+        yield f"Not run in this study: {', '.join(absent)}."
+    unknown = set(scores.rows["variant"]) - {variant.name for variants in PARTS.values() for variant in variants} - {""}
+    if unknown:
+        yield f"Graded, but in no table of the protocol: {', '.join(sorted(unknown))}."
+
+
+def missing_note(missing: pd.DataFrame) -> list[str]:
+    """What to say of scores that other models have; none where there is nothing to say."""
+    if missing.empty:
+        return []
+    return [
+        f"{len(missing)} scores are missing that other models have; comparisons leave these cells out for all. They are in "
+        f"missing.csv: {describe_cells(missing, 3)}."
+    ]
+
+
+def _html(content: Content, scores: Scores, footer: str) -> str:
+    """The page."""
+    sections = {"Claims": _claims_section(content)}
+    sections |= {PART_TITLES[part]: text for part in SECTIONS if (text := _part_section(content, part))}
+    sections["How it was measured"] = _method_section(content, scores)
+    head = page.contents(list(sections)) + "".join(map(page.note, content.lacks))
+    return page.page(TITLE, content.sentences, [head, *sections.values()], footer)
+
+
+def _claims_section(content: Content) -> str:
+    text = (
+        "Each claim of the paper as an inequality, asked of this study and of the paper's own printed figures. It holds where "
+        "every number lies on its side with its whole 95 % interval over scenes (for the paper: with all that prints the "
+        "same), and fails where one lies on the other side; anything else is unresolved. The last ones, “ours”, ask more "
+        "than the paper claims."
+    )
+    return page.section("Claims", page.paragraph(text), page.claims(content.findings, content.printed))
+
+
+def _part_section(content: Content, part: str) -> str:
+    charts, shown, folded = SECTIONS[part]
+    if not any(name in content.tables for name in shown):
+        return ""
+    parts = [page.chart(content.charts[name]) for name in charts if name in content.charts]
+    parts += [page.table(content.tables[name]) for name in shown if name in content.tables]
+    if part in content.strips:
+        strip = content.strips[part]
+        source = pictures.data_uri(strip.image)
+        parts.append(page.labelled_picture(source, page.escape(strip.caption), strip.columns, strip.rows))
+    if FRAME_CHARTS.get(part) in content.charts:
+        parts.append(page.chart(content.charts[FRAME_CHARTS[part]]))
+    hidden = [content.tables[name] for name in folded if name in content.tables]
+    if hidden:
+        parts.append(page.folded("; ".join(table.title for table in hidden), *map(page.table, hidden)))
+    return page.section(PART_TITLES[part], *parts)
+
+
+def _method_section(content: Content, scores: Scores) -> str:
+    made = {"scenes graded": str(len(scores.rows[["task", "seed"]].drop_duplicates())), **scores.measured_by}
+    definitions = {METRIC_TITLES.get(metric.name, metric.name): metric.reference for metric in scores.metrics}
+    return page.section(
+        "How it was measured",
+        page.paragraph(
+            "Means over episodes with 95 % bootstrap intervals; scenes (task and seed) are resampled, the same ones for every "
+            "model and robot, so that all comparisons are paired. Behind a value, against the row that the caption names: "
+            f"{MARKS}. “True video, graded” is the truth in the model's place: what it lacks is the estimators' own error, "
+            "the noise floor. The paper's values are of its own renders and a model of five billion weights; they stand "
+            "beside ours where its protocol is the same."
+        ),
+        page.table(content.tables["counts"]),
+        page.definitions(definitions),
+        page.definitions(made),
+    )
+
+
+def _markdown(content: Content) -> str:
+    lines = [
+        f"# {TITLE}",
+        "",
+        *(f"- {sentence}" for sentence in content.sentences),
+        "",
+        *(f"> {note}\n" for note in content.lacks),
+    ]
+    lines += ["## Claims", "", formats.findings_markdown(content.findings, content.printed)]
+    for part, (charts, shown, folded) in SECTIONS.items():
+        if not any(name in content.tables for name in shown):
+            continue
+        lines += ["", f"## {PART_TITLES[part]}"]
+        for name in (*charts, *([FRAME_CHARTS[part]] if part in FRAME_CHARTS else [])):
+            if name in content.charts:
+                lines += ["", f"![{content.charts[name].caption}](figures/{name}.png)"]
+        if part in content.strips:
+            lines += ["", f"![{content.strips[part].caption}](figures/strip_{part}.png)"]
+        for name in (*shown, *folded):
+            if name in content.tables:
+                table = content.tables[name]
+                lines += ["", f"### {table.title}", "", table.caption, "", formats.markdown(table)]
+    counts = content.tables["counts"]
+    lines += ["", "## How it was measured", "", f"{MARKS[0].upper()}{MARKS[1:]}.", "", formats.markdown(counts)]
+    return "\n".join(lines) + "\n"
+
+
+def _files(content: Content) -> Iterator[tuple[str, bytes]]:
+    """Tables as LaTeX and CSV, charts as PNG, PDF and CSV, strips as PNG, findings as CSV and LaTeX."""
+    for name, table in content.tables.items():
+        yield f"tables/{name}.tex", formats.latex(table).encode()
+        yield f"tables/{name}.csv", formats.frame(table).to_csv(index=False).encode()
+    for chart in content.charts.values():
+        for name, data in chart_files(chart).items():
+            yield f"figures/{name}", data
+    for part, strip in content.strips.items():
+        yield f"figures/strip_{part}.png", strip.image
+    both = pd.concat([findings_frame(content.findings, "here"), findings_frame(content.printed, "paper")])
+    if len(content.missing):
+        yield "missing.csv", content.missing.to_csv(index=False).encode()
+    yield "findings.csv", both.to_csv(index=False).encode()
+    yield "tables/findings.tex", formats.findings_latex(content.findings, content.printed).encode()

@@ -1,0 +1,263 @@
+"""Stage 11 of 11: the charts of a study: bars of gains, adaptation against forgetting, distances, error by frame."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from xew.analysis.reports import charts
+from xew.analysis.reports.charts import SERIES, SOFT, Chart, Panel, Series
+from xew.analysis.scores import COPY, TRUTH, VARIANT, MetricInfo
+from xew.analysis.statistics.grades import MIN_SCENES, Grades, Mean, PaperGrades, better, find_variant, interval
+from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.analysis.tables.distances import AXIS_TITLES, Distances
+from xew.analysis.tables.layouts import ACTIONS, LADDER, REMEDIES, SHORT_ROBOTS, Builder, metric_title
+from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS
+
+BAR_METRICS = ("lpips", "region_lpips", "mask_iou", "pck")
+CURVE_METRIC = "lpips"
+BASELINE_STYLES = {COPY: "frozen first frame", TRUTH: "ground truth"}
+ROBOT_COLOURS = dict(zip(HELD_OUT_ROBOTS, SERIES, strict=False))
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Rows of a part against the row that they start from."""
+
+    part: str
+    title: str
+    base: Callable[[str], str]
+    """Of a robot."""
+    rows: Callable[[str], Mapping[str, str]]
+    """Row and label, of a robot."""
+
+
+STEPS = (
+    Steps("actions", "against joint pose", lambda _: "joints", lambda _: {k: v for k, v in ACTIONS.items() if k != "joints"}),
+    Steps("ladder", "against flow only", lambda _: "none", lambda _: {k: v for k, v in LADDER.items() if k != "none"}),
+    Steps("few_shot", "against M = 0", lambda r: f"{r}-0", lambda r: {f"{r}-{shots}": f"M = {shots}" for shots in SHOTS}),
+)
+
+
+def study_charts(builder: Builder, distances: Distances, curves: pd.DataFrame) -> dict[str, Chart]:
+    """All charts for which something was measured, by name."""
+    made = {f"gains_{steps.part}": gain_chart(builder, steps) for steps in STEPS if builder.present(steps.part)}
+    if builder.present("forgetting"):
+        made["forgetting"] = forgetting_chart(builder)
+    scatter = distance_chart(builder.ours, distances)
+    if scatter:
+        made["distance"] = scatter
+    for part, labels in (("actions", ACTIONS), ("ladder", LADDER)):
+        if builder.present(part) and len(curves):
+            made[f"frames_{part}"] = frame_chart(curves, part, labels)
+    return made
+
+
+def gain_chart(builder: Builder, steps: Steps) -> Chart:
+    """Relative improvement of each row over the base, a panel for each metric, a bar for each held-out robot."""
+    metrics = [metric for metric in BAR_METRICS if metric in builder.ours.metrics]
+    data = pd.DataFrame(
+        {"metric": metric, "robot": robot, "row": label} | _gain(builder, steps, row, robot, metric)
+        for metric in metrics
+        for robot in HELD_OUT_ROBOTS
+        for row, label in steps.rows(robot).items()
+    )
+
+    def draw(axes: Axes, metric: str) -> None:
+        labels = list(steps.rows(HELD_OUT_ROBOTS[0]).values())
+        groups = []
+        for robot in HELD_OUT_ROBOTS:
+            chosen = data[(data["metric"] == metric) & (data["robot"] == robot)]
+            groups.append((ROBOT_COLOURS[robot], chosen[["gain", "low", "high"]].to_numpy(), chosen["paper"].to_numpy()))
+        charts.bars(axes, labels, groups, f"better by [%], {steps.title}")
+
+    height = 1.0 + 0.42 * len(steps.rows(HELD_OUT_ROBOTS[0]))
+    panels = [Panel(METRIC_TITLES[metric], partial(draw, metric=metric), height) for metric in metrics]
+    legend = [Series(ROBOT_TITLES[robot], ROBOT_COLOURS[robot]) for robot in HELD_OUT_ROBOTS]
+    caption = f"Relative improvement {steps.title}; to the right is better. Lines: 95 % intervals, paired by scene."
+    if builder.paper:
+        legend.append(Series("the paper", charts.INK, "o"))
+    return Chart(f"gains_{steps.part}", caption, panels, data, legend)
+
+
+def forgetting_chart(builder: Builder) -> Chart:
+    """LPIPS on the target and on UR5 by the number of demonstrations, a panel for each target."""
+    data = pd.DataFrame(_adaptation_rows(builder))
+
+    def draw(axes: Axes, target: str) -> None:
+        lines = []
+        for style, (kind, source) in _adaptation_styles().items():
+            chosen = data[(data["target"] == target) & (data["line"] == kind) & (data["of"] == source)].dropna(subset="value")
+            if len(chosen):
+                band = chosen[["low", "high"]].to_numpy() if source == "here" and chosen["low"].notna().all() else None
+                lines.append((style, chosen["shots"].to_numpy(), chosen["value"].to_numpy(), band))
+        charts.lines(axes, lines, "demonstrations of each task, M", "LPIPS ↓")
+        axes.set_xticks((0, *SHOTS))
+        axes.set_ylim(bottom=0)
+
+    panels = [Panel(f"Adapted to {ROBOT_TITLES[robot]}", partial(draw, target=robot)) for robot in HELD_OUT_ROBOTS]
+    used = set(zip(data["line"], data["of"], strict=True))
+    legend = [style for style, place in _adaptation_styles().items() if place in used]
+    caption = "What adaptation gains on the target, and what it costs on a robot seen before. Bands: 95 % intervals."
+    return Chart("forgetting", caption, panels, data, legend)
+
+
+def _adaptation_styles() -> dict[Series, tuple[str, str]]:
+    """How each line is drawn: what it shows, and of whom."""
+    lost = SHORT_ROBOTS[FORGETTING_ROBOT]
+    return {
+        Series("target", SERIES[0]): ("target", "here"),
+        Series(lost, SERIES[1]): ("forgetting", "here"),
+        **{Series(f"{lost}, {REMEDIES[r]}", SERIES[2 + i]): (r, "here") for i, r in enumerate(REMEDIES)},
+        Series("target, the paper", SERIES[0], "--"): ("target", "paper"),
+        Series(f"{lost}, the paper", SERIES[1], "--"): ("forgetting", "paper"),
+    }
+
+
+def _adaptation_rows(builder: Builder) -> Iterator[dict[str, object]]:
+    sources: list[tuple[str, Grades]] = [("here", builder.ours)]
+    if builder.paper:
+        sources.append(("paper", builder.paper))
+    for target in HELD_OUT_ROBOTS:
+        for shots in (0, *SHOTS):
+            after = f"{target}-{shots}"
+            places = {
+                "target": ("few_shot", after, target),
+                "forgetting": ("forgetting", after if shots else "none", FORGETTING_ROBOT),
+            }
+            if builder.present("remedies"):
+                places |= {r: ("forgetting", f"{after}-{r}" if shots else "none", FORGETTING_ROBOT) for r in REMEDIES}
+            for line, (part, row, robot) in places.items():
+                for source, grades in sources:
+                    if source == "paper" and line in REMEDIES:
+                        continue
+                    mean = grades.mean(part, row, robot, "lpips")
+                    value, low, high = _numbers(mean, grades.level)
+                    yield {
+                        "target": target,
+                        "shots": shots,
+                        "line": line,
+                        "of": source,
+                        "value": value,
+                        "low": low,
+                        "high": high,
+                    }
+
+
+def distance_chart(grades: Grades, distances: Distances, metric: str = "lpips") -> Chart | None:
+    """A metric by distance, a panel for each axis; None where a fold is missing."""
+    means = [grades.mean("loeo", f"loeo_{robot}", robot, metric) if metric in grades.metrics else None for robot in ROBOT_NAMES]
+    scores = np.array([mean.value for mean in means if mean is not None])
+    if len(scores) < len(ROBOT_NAMES):
+        return None
+    robots = [ROBOT_TITLES[robot] for robot in ROBOT_NAMES]
+    title = metric_title(grades.metrics[metric])
+    panels = [
+        Panel(
+            AXIS_TITLES[axis],
+            partial(_scatter, distance=distances.of(axis), score=scores, robots=robots, axis=axis, title=title),
+        )
+        for axis in distances.axes
+    ]
+    data = pd.DataFrame({"robot": ROBOT_NAMES, metric: scores} | {axis: distances.of(axis) for axis in distances.axes})
+    caption = (
+        "Each robot held out in turn. Thick: the line through all five. Thin: the lines without one robot, which show how far "
+        "one point carries."
+    )
+    return Chart("distance", caption, panels, data)
+
+
+def _scatter(axes: Axes, distance: np.ndarray, score: np.ndarray, robots: Sequence[str], axis: str, title: str) -> None:
+    charts.scatter(axes, distance, score, robots, "mean distance to the other four", title)
+
+
+def frame_chart(curves: pd.DataFrame, part: str, labels: Mapping[str, str]) -> Chart:
+    """Mean LPIPS by frame on each held-out robot, a line for each row of a part; bands hold the middle half of the episodes."""
+    names = {find_variant(part, row).name: label for row, label in labels.items()}
+    chosen = curves[(curves["metric"] == CURVE_METRIC) & curves["robot"].isin(HELD_OUT_ROBOTS)]
+    own = chosen[chosen[VARIANT].isin(names)].assign(row=lambda rows: rows[VARIANT].map(names))
+    still = chosen[chosen["model"] == COPY].assign(row="frozen first frame")
+    grouped = pd.concat([own, still]).groupby(["robot", "row", "frame"], sort=False)["value"]
+    data = pd.DataFrame({"mean": grouped.mean(), "low": grouped.quantile(0.25), "high": grouped.quantile(0.75)}).reset_index()
+    colours = charts.colour_of(list(names.values()))
+    styles = [Series(label, colours[label]) for label in names.values() if label in set(own["row"])]
+    styles += [Series("frozen first frame", SOFT, "--")] if len(still) else []
+
+    def draw(axes: Axes, robot: str) -> None:
+        lines = []
+        for style in styles:
+            line = data[(data["robot"] == robot) & (data["row"] == style.label)].sort_values("frame")
+            if len(line):
+                lines.append((style, line["frame"].to_numpy(), line["mean"].to_numpy(), line[["low", "high"]].to_numpy()))
+        charts.lines(axes, lines, "frame", "LPIPS ↓")
+
+    panels = [
+        Panel(ROBOT_TITLES[robot], partial(draw, robot=robot)) for robot in HELD_OUT_ROBOTS if robot in set(data["robot"])
+    ]
+    caption = "LPIPS by frame, mean over episodes; bands hold the middle half of them."
+    return Chart(f"frames_{part}", caption, panels, data, styles)
+
+
+def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Sequence[str]) -> Chart:
+    """Of one ordinary run: mean over episodes by frame, a panel for each metric and robot; bands hold the middle half."""
+    robots = [robot for robot in robots if (curves["robot"] == robot).any()]
+    shown = curves[curves["robot"].isin(robots) & curves["metric"].isin([metric.name for metric in metrics])]
+    # The truth's PSNR is a cap, not a measurement, and would squeeze everything else flat.
+    shown = shown[~((shown["model"] == TRUTH) & (shown["metric"] == "psnr"))]
+    shown = shown.assign(row=[_run_label(*key) for key in zip(shown["model"], shown["condition"], strict=True)])
+    grouped = shown.groupby(["metric", "robot", "row", "frame"], sort=False)["value"]
+    data = pd.DataFrame({"mean": grouped.mean(), "low": grouped.quantile(0.25), "high": grouped.quantile(0.75)}).reset_index()
+    own = [row for row in dict.fromkeys(shown["row"]) if row not in BASELINE_STYLES.values()]
+    styles = [Series(label, colour) for label, colour in charts.colour_of(own).items()]
+    dashes: Mapping[str, Literal["--", ":"]] = {COPY: "--", TRUTH: ":"}
+    styles += [Series(BASELINE_STYLES[m], SOFT, dash) for m, dash in dashes.items() if BASELINE_STYLES[m] in set(data["row"])]
+
+    def draw(axes: Axes, metric: MetricInfo, robot: str) -> None:
+        lines = []
+        for style in styles:
+            line = data[(data["metric"] == metric.name) & (data["robot"] == robot) & (data["row"] == style.label)]
+            line = line.sort_values("frame")  # the first episode may lack early frames
+            if len(line):
+                band = line[["low", "high"]].to_numpy() if style.colour != SOFT else None
+                lines.append((style, line["frame"].to_numpy(), line["mean"].to_numpy(), band))
+        charts.lines(axes, lines, "frame", metric_title(metric))
+
+    panels = [
+        Panel(ROBOT_TITLES.get(robot, robot), partial(draw, metric=metric, robot=robot))
+        for metric in metrics
+        for robot in robots
+    ]
+    caption = "Mean over episodes frame by frame; bands hold the middle half of the episodes."
+    return Chart("curves", caption, panels, data, styles, columns=len(robots))
+
+
+def _run_label(model: str, condition: str) -> str:
+    return BASELINE_STYLES.get(model) or " · ".join(filter(None, (model, condition)))
+
+
+def _gain(builder: Builder, steps: Steps, row: str, robot: str, metric: str) -> dict[str, float]:
+    base = steps.base(robot)
+    values = _relative(builder.ours, steps.part, row, base, robot, metric)
+    printed = _relative(builder.paper, steps.part, row, base, robot, metric) if builder.paper else values * np.nan
+    return {"gain": values[0], "low": values[1], "high": values[2], "paper": printed[0]}
+
+
+def _relative(grades: Grades | PaperGrades, part: str, row: str, base: str, robot: str, metric: str) -> np.ndarray:
+    """Gain over the base and its interval's ends [3] in percent; NaN where one of the two is missing."""
+    after, before = (grades.mean(part, key, robot, metric, shared=True) for key in (row, base))
+    if after is None or before is None:
+        return np.full(3, np.nan)
+    values = better(after, before, grades.metrics[metric])
+    ends = interval(values, grades.level) if min(after.scenes, before.scenes) >= MIN_SCENES else (np.nan, np.nan)
+    return 100 * np.array([values[0], *ends])
+
+
+def _numbers(mean: Mean | None, level: float) -> tuple[float, float, float]:
+    if mean is None:
+        return np.nan, np.nan, np.nan
+    ends = interval(mean.values, level) if mean.scenes >= MIN_SCENES else (np.nan, np.nan)
+    return mean.value, *ends

@@ -1,0 +1,111 @@
+"""Stage 11 of 11: what the variants of a study look like, one scene and moment, robots down and conditions across."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from xew.analysis.reports import pictures
+from xew.analysis.scores import VARIANT, Scores
+from xew.analysis.statistics.grades import find_variant
+from xew.analysis.tables.layouts import ACTIONS, LADDER, SHORT_ROBOTS
+from xew.config import ConfigError
+from xew.episode import episode_folder, read_video
+from xew.protocol import HELD_OUT_ROBOTS, SHOTS, VARIANTS
+from xew.rollout import Rollout, find_rollouts, read_rollout_video
+
+RANKED_BY = "lpips"
+Videos = dict[tuple[str, str, int, str], Rollout]
+"""By variant, task, seed and robot."""
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A sheet of frames."""
+
+    image: bytes
+    """PNG."""
+    caption: str
+    columns: Sequence[str]
+    rows: Sequence[str]
+
+
+def study_strips(scores: Scores, data: Path, rollouts: Sequence[Path]) -> dict[str, Strip]:
+    """A strip for each comparison of which at least two variants can be shown.
+
+    Args:
+        scores: the study's; the scene whose mean LPIPS over what is shown is the median is taken.
+        data: the data set.
+        rollouts: trees named after their variants, or folders of such trees.
+
+    Raises:
+        ConfigError: none of the folders holds a variant's rollouts.
+    """
+    videos = find_videos(rollouts)
+    adapted = {f"M = {shots}": {robot: f"{robot}-{shots}" for robot in HELD_OUT_ROBOTS} for shots in (0, *SHOTS)}
+    wanted = {
+        "actions": {label: dict.fromkeys(HELD_OUT_ROBOTS, row) for row, label in ACTIONS.items()},
+        "ladder": {label: dict.fromkeys(HELD_OUT_ROBOTS, row) for row, label in LADDER.items()},
+        "few_shot": adapted,
+    }
+    made = {part: _strip(part, columns, scores, data, videos) for part, columns in wanted.items()}
+    return {part: strip for part, strip in made.items() if strip is not None}
+
+
+def find_videos(folders: Sequence[Path]) -> Videos:
+    """All rollouts of variants under some folders."""
+    trees = {tree.name: tree for folder in folders for tree in (folder, *_children(folder)) if tree.name in VARIANTS}
+    if not trees:
+        raise ConfigError(
+            f"no folder {', '.join(map(str, folders))} is named after a variant or holds one that is, such as "
+            f"{next(iter(VARIANTS))}; name the folder of the study's rollouts."
+        )
+    return {
+        (name, rollout.task, rollout.seed, rollout.robot): rollout
+        for name, tree in trees.items()
+        for rollout in find_rollouts(tree)
+    }
+
+
+def _children(folder: Path) -> list[Path]:
+    return sorted(child for child in folder.iterdir() if child.is_dir()) if folder.is_dir() else []
+
+
+def _strip(part: str, columns: Mapping[str, Mapping[str, str]], scores: Scores, data: Path, videos: Videos) -> Strip | None:
+    """Observed frame and all variants of a part, for each held-out robot; None where fewer than two can be shown."""
+    names = {
+        label: {robot: find_variant(part, row).name for robot, row in by_robot.items()} for label, by_robot in columns.items()
+    }
+    scene = _median_scene(names, scores.rows, videos)
+    if scene is None:
+        return None
+    task, seed, robots = scene
+    labels = [label for label, by_robot in names.items() if all((by_robot[r], task, seed, r) in videos for r in robots)]
+    shown = []
+    for robot in robots:
+        truth = read_video(episode_folder(data, task, seed, robot) / "rgb.mkv")
+        predicted = [read_rollout_video(videos[names[label][robot], task, seed, robot]) for label in labels]
+        shown.append([truth, *(pictures.as_graded(video, truth, scores.frame_zero) for video in predicted)])
+    moment = min(len(video) for row in shown for video in row) - 1
+    caption = f"{task.replace('_', ' ')}, seed {seed}, frame {moment}: the scene whose LPIPS is the median of those shown."
+    image = pictures.png(pictures.sheet([[video[moment] for video in row] for row in shown]))
+    return Strip(image, caption, ["observed", *labels], [SHORT_ROBOTS[robot] for robot in robots])
+
+
+def _median_scene(
+    names: Mapping[str, Mapping[str, str]], rows: pd.DataFrame, videos: Videos
+) -> tuple[str, int, list[str]] | None:
+    """Task, seed and robots: of the scenes that most variants show on most robots, the one in the middle by LPIPS."""
+    shown = {name for by_robot in names.values() for name in by_robot.values()}
+    chosen = rows[(rows["metric"] == RANKED_BY) & rows[VARIANT].isin(shown) & rows["robot"].isin(HELD_OUT_ROBOTS)]
+    keys = zip(chosen[VARIANT], chosen["task"], chosen["seed"], chosen["robot"], strict=True)
+    chosen = chosen[np.array([key in videos for key in keys], bool)]
+    if chosen[VARIANT].nunique() < 2:
+        return None
+    scenes = chosen.groupby(["task", "seed"])["value"].agg(["size", "mean"]).reset_index()
+    full = scenes[scenes["size"] == scenes["size"].max()].sort_values(["mean", "task", "seed"])
+    middle = full.iloc[len(full) // 2]
+    there = chosen[(chosen["task"] == middle["task"]) & (chosen["seed"] == middle["seed"])]
+    return str(middle["task"]), int(middle["seed"]), [robot for robot in HELD_OUT_ROBOTS if robot in set(there["robot"])]

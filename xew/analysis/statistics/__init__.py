@@ -1,0 +1,3 @@
+"""Means, intervals and verdicts of score tables."""
+
+__all__ = ["grades", "summary"]

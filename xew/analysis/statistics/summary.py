@@ -1,0 +1,231 @@
+"""Stage 11 of 11: scores to means, intervals and verdicts, robot by robot."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores
+from xew.analysis.statistics.grades import LEVEL, MIN_SCENES, interval, resample
+
+ROBOT_TITLES = {
+    "aloha_agilex": "Aloha-AgileX",
+    "arx_x5": "ARX-X5",
+    "ur5_wsg": "UR5 with WSG-50",
+    "franka_panda": "Franka Panda",
+    "piper": "Piper",
+}
+METRIC_TITLES = {
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "mask_iou": "Mask IoU",
+    "boundary_f1": "Boundary F1",
+    "region_lpips": "Region LPIPS",
+    "pck": "PCK",
+    "pck_05": "PCK at 0.05",
+    "keypoint_error": "Keypoint error",
+    "ndtw": "nDTW",
+    "coverage": "Keypoints found",
+    "trajectory_error": "Object error",
+    "object_coverage": "Objects found",
+}
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean over episodes and its bootstrap interval; the ends are NaN where there are fewer than MIN_SCENES scenes."""
+
+    mean: float
+    low: float
+    high: float
+    count: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a robot's table."""
+
+    model: str
+    condition: str
+    scores: dict[str, Interval]
+    """By metric."""
+    verdicts: dict[str, str]
+    """By metric, against the frozen first frame, paired by episode: better, worse or unresolved; empty for baselines."""
+
+    @property
+    def title(self) -> str:
+        baseline = {COPY: "frozen first frame", TRUTH: "ground truth (ceiling)"}.get(self.model)
+        return baseline or (f"{self.model} · {self.condition}" if self.condition else self.model)
+
+
+@dataclass(frozen=True)
+class RobotTable:
+    """The scores of one robot, or of several that are pooled on purpose."""
+
+    title: str
+    robots: tuple[str, ...]
+    rows: tuple[Row, ...]
+    expected: int | None
+    """Episodes that the protocol's data hold for a model; None where the data set was not given."""
+
+    @property
+    def counts(self) -> list[int]:
+        """Episodes of each model. Metrics that are not defined for some, as of objects where there is none, lack these."""
+        return [max(score.count for score in row.scores.values()) for row in self.rows if row.scores]
+
+    @property
+    def count(self) -> int:
+        """Episodes of the model that has fewest."""
+        return min(self.counts, default=0)
+
+    @property
+    def complete(self) -> bool:
+        return self.expected is None or all(count == self.expected for count in self.counts)
+
+
+def robot_title(robot: str) -> str:
+    """Its name in print; robots of one's own are called by their key."""
+    return ROBOT_TITLES.get(robot, robot)
+
+
+def mean_interval(scores: pd.Series) -> Interval:
+    """Mean of episodes' scores and its percentile bootstrap interval; the same at every call.
+
+    Args:
+        scores: indexed by task, seed and robot; scenes (task, seed) are resampled, with all robots that they have.
+    """
+    mean = resample(scores.unstack("robot").to_numpy(np.float64))
+    assert mean is not None, "no episode"
+    if mean.scenes < MIN_SCENES:
+        return Interval(mean.value, np.nan, np.nan, mean.count)
+    if np.ptp(scores) == 0:
+        return Interval(mean.value, mean.value, mean.value, mean.count)
+    return Interval(mean.value, *interval(mean.values, LEVEL), mean.count)
+
+
+def verdict(model: pd.Series, copy: pd.Series, higher_is_better: bool, floor: float = 0) -> str:
+    """Is a model better than the frozen first frame on the episodes that both have? Series are indexed as above.
+
+    'unresolved' where the interval of the mean paired difference holds 0, where the difference is inside the estimators' noise
+    floor, or where there are fewer than MIN_SCENES scenes.
+    """
+    difference = (model - copy).dropna() * (1 if higher_is_better else -1)
+    if len(difference.unstack("robot")) < MIN_SCENES:
+        return "unresolved"
+    found = mean_interval(difference)
+    if found.low > 0 and found.mean > floor:
+        return "better"
+    return "worse" if found.high < 0 and -found.mean > floor else "unresolved"
+
+
+def robot_table(scores: Scores, title: str, robots: Sequence[str], expected: int | None) -> RobotTable:
+    """Rows for all models, then the frozen first frame, then the truth."""
+    rows = scores.rows[scores.rows["robot"].isin(robots)]
+    groups = rows.groupby(["model", "condition"], sort=False)
+    by_model = {(str(model), str(condition)): group for (model, condition), group in groups}
+    ends = [key for name in (COPY, TRUTH) for key in by_model if key[0] == name]
+    order = [key for key in by_model if key[0] not in (COPY, TRUTH)] + ends
+    copy, truth = (next((by_model[key] for key in ends if key[0] == name), None) for name in (COPY, TRUTH))
+    built = tuple(_row(key, by_model[key], copy, truth, scores.metrics) for key in order)
+    return RobotTable(title, tuple(robots), built, expected)
+
+
+def _row(
+    key: tuple[str, str],
+    group: pd.DataFrame,
+    copy: pd.DataFrame | None,
+    truth: pd.DataFrame | None,
+    metrics: Sequence[MetricInfo],
+) -> Row:
+    values = {metric.name: _by_episode(group, metric.name) for metric in metrics}
+    verdicts = {}
+    if copy is not None and key[0] not in (COPY, TRUTH):
+        for metric in metrics:
+            floor = _noise_floor(truth, metric)
+            still = _by_episode(copy, metric.name)
+            verdicts[metric.name] = verdict(values[metric.name], still, metric.higher_is_better, floor)
+    intervals = {name: mean_interval(series) for name, series in values.items() if len(series)}
+    return Row(*key, intervals, verdicts)
+
+
+def _noise_floor(truth: pd.DataFrame | None, metric: MetricInfo) -> float:
+    """How far from perfect the true video is graded."""
+    perfect = metric.high if metric.higher_is_better else metric.low
+    graded = _by_episode(truth, metric.name) if truth is not None else pd.Series()
+    return abs(float(graded.mean()) - perfect) if len(graded) and perfect is not None and np.isfinite(perfect) else 0.0
+
+
+def _by_episode(rows: pd.DataFrame, metric: str) -> pd.Series:
+    return rows[rows["metric"] == metric].set_index(["task", "seed", "robot"])["value"]
+
+
+def finding(held_out: Sequence[RobotTable], seen: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> list[str]:
+    """The result in sentences, one for each held-out robot and model: against a frozen frame, and how far from the truth."""
+    compared = [(table, row) for table in held_out for row in table.rows if row.verdicts]
+    sentences = []
+    for table, row in compared:
+        twins = [(other, twin) for other in seen for twin in other.rows if _same_model(twin, row)]
+        episodes = f"{table.count} episode{'s' if table.count != 1 else ''}"
+        sentences.append(
+            f"{table.title} ({episodes}): {row.title} {_compare(row, metrics)}.{_distance_left((table, row), twins)}"
+        )
+    return sentences or ["No model has been compared with the frozen first frame yet: grade without --no-baselines."]
+
+
+def _same_model(a: Row, b: Row) -> bool:
+    return (a.model, a.condition) == (b.model, b.condition)
+
+
+def _distance_left(own: tuple[RobotTable, Row], seen: Sequence[tuple[RobotTable, Row]], metric: str = "lpips") -> str:
+    shares = [progress(table, row, metric) for table, row in (own, *seen)]
+    if shares[0] is None:
+        return ""
+    beside = f" (on seen robots {1 - shares[1]:.0%})" if len(shares) > 1 and shares[1] is not None else ""
+    return f" In {METRIC_TITLES[metric]} it is at {1 - shares[0]:.0%} of that frame's distance from the truth{beside}."
+
+
+def progress(table: RobotTable, row: Row, metric: str) -> float | None:
+    """0 where the model's mean is the frozen first frame's, 1 where it is the truth's; None where these are not graded."""
+    ends = [other.scores.get(metric) for name in (COPY, TRUTH) for other in table.rows if other.model == name]
+    own = row.scores.get(metric)
+    if own is None or len(ends) < 2 or ends[0] is None or ends[1] is None or ends[0].mean == ends[1].mean:
+        return None
+    return (own.mean - ends[0].mean) / (ends[1].mean - ends[0].mean)
+
+
+def _compare(row: Row, metrics: Sequence[MetricInfo]) -> str:
+    if all(np.isnan(score.low) for score in row.scores.values()):
+        return f"cannot be told from a frozen first frame by fewer than {MIN_SCENES} scenes"
+    parts = []
+    for word, phrase in (("better", "beats"), ("worse", "falls behind"), ("unresolved", "cannot be told from")):
+        names = [METRIC_TITLES.get(m.name, m.name) for m in metrics if row.verdicts.get(m.name) == word]
+        if names:
+            parts.append(f"{phrase} a frozen first frame on {_join(names)}")
+    return "; it ".join(parts)
+
+
+def _join(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def flat_summary(tables: Sequence[RobotTable]) -> pd.DataFrame:
+    """All tables as one tidy frame: robots model condition metric mean low high episodes expected versus_frozen."""
+    return pd.DataFrame(
+        {
+            "robots": " ".join(table.robots),
+            "model": row.model,
+            "condition": row.condition,
+            "metric": name,
+            "mean": score.mean,
+            "low": score.low,
+            "high": score.high,
+            "episodes": score.count,
+            "expected": table.expected,
+            "versus_frozen": row.verdicts.get(name, ""),
+        }
+        for table in tables
+        for row in table.rows
+        for name, score in row.scores.items()
+    )

@@ -1,0 +1,176 @@
+"""Where the cells of a study run: on the GPUs (or cores) of this machine, or on a Ray cluster.
+
+Both start the same commands as processes of their own, with their output in the same logs. A cluster's machines must see the
+study's folder at the same path.
+"""
+
+import logging
+import multiprocessing.connection
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any, Protocol
+
+from xew.analysis.studies.cell import start_cell
+from xew.analysis.studies.config import Study
+from xew.analysis.studies.plan import Cell
+from xew.config import ConfigError
+
+PATIENCE_S = 120.0
+"""How long cells may take to end after they were asked to; training saves in that time."""
+
+
+class Machines(Protocol):
+    """What the study's loop asks for."""
+
+    slots: int
+    """Cells of one GPU (or core) at once; 0 where it is not known."""
+
+    def room_for(self, cell: Cell) -> bool: ...
+
+    def start(self, cell: Cell, command: tuple[str, ...], log: Path) -> None: ...
+
+    def wait(self) -> list[tuple[str, int]]:
+        """Names and exit codes of cells that have ended, at least one."""
+        ...
+
+    def stop(self) -> None:
+        """Ask all cells to end and wait for them."""
+        ...
+
+
+def open_machines(study: Study) -> Machines:
+    """Those that the config names. Raises ConfigError if they are not there or too small."""
+    if study.machine.ray:
+        return RayCluster(study.machine.ray, study.environment)
+    gpus = gpus_of(study)
+    needed = study.machine.gpus_per_training
+    if gpus and needed > len(gpus):
+        raise ConfigError(f"machine.gpus_per_training is {needed}, there are {len(gpus)} GPUs ({', '.join(gpus)}); lower it.")
+    return ThisMachine(gpus, study.machine.workers, study.environment)
+
+
+def gpus_of(study: Study) -> tuple[str, ...]:
+    """The GPUs of this machine that a study may use, as CUDA_VISIBLE_DEVICES names them."""
+    return visible_gpus() if study.machine.gpus is None else tuple(map(str, study.machine.gpus))
+
+
+def visible_gpus() -> tuple[str, ...]:
+    """NVIDIA's GPUs that this process may use."""
+    try:
+        told = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return ()
+    count = len([line for line in told.splitlines() if line.startswith("GPU ")])
+    limited = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return tuple(map(str, range(count))) if limited is None else tuple(part for part in limited.split(",") if part)
+
+
+@dataclass(frozen=True)
+class _Running:
+    process: BaseProcess
+    slots: tuple[str, ...]
+
+
+class ThisMachine:
+    """GPU by GPU; without one, as many cells at once as there are workers."""
+
+    def __init__(self, gpus: tuple[str, ...], workers: int, environment: Mapping[str, str]) -> None:
+        self.gpus, self.environment = gpus, dict(environment)
+        self.slots = len(gpus) or workers
+        self._free = list(gpus or map(str, range(workers)))
+        self._running: dict[str, _Running] = {}
+        os.environ.update(environment)  # the fork server imports JAX, which reads some of it then
+
+    def room_for(self, cell: Cell) -> bool:
+        return self._needed(cell) <= len(self._free)
+
+    def _needed(self, cell: Cell) -> int:
+        """Slots; without GPUs every cell takes one."""
+        return max(1, cell.gpus) if self.gpus else 1
+
+    def start(self, cell: Cell, command: tuple[str, ...], log: Path) -> None:
+        slots = tuple(self._free.pop(0) for _ in range(self._needed(cell)))
+        own = {"CUDA_VISIBLE_DEVICES": ",".join(slots)} if self.gpus else {}
+        process = start_cell(command, log, self.environment | own, launcher=cell.launcher)
+        self._running[cell.name] = _Running(process, slots)
+
+    def wait(self) -> list[tuple[str, int]]:
+        multiprocessing.connection.wait([running.process.sentinel for running in self._running.values()])
+        ended = [name for name, running in self._running.items() if running.process.exitcode is not None]
+        return [(name, self._settle(name)) for name in ended]
+
+    def _settle(self, name: str) -> int:
+        running = self._running.pop(name)
+        running.process.join()
+        self._free = sorted([*self._free, *running.slots])
+        return running.process.exitcode or 0
+
+    def stop(self) -> None:
+        for running in self._running.values():
+            running.process.terminate()
+        until = time.monotonic() + PATIENCE_S
+        for name, running in list(self._running.items()):
+            running.process.join(max(0.0, until - time.monotonic()))
+            running.process.kill()
+            self._settle(name)
+
+
+class RayCluster:
+    """Every cell a task on an existing cluster; more machines may join it while the study runs."""
+
+    def __init__(self, address: str, environment: Mapping[str, str]) -> None:
+        try:
+            import ray
+        except ImportError as error:
+            raise ConfigError(f"machine.ray is {address!r}, but Ray is not installed: pip install 'xew[ray]'") from error
+        try:
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise ConfigError(f"no Ray cluster answers at {address!r} ({error}); start one: ray start --head") from error
+        self._ray, self.environment = ray, dict(environment)
+        self._gpus = int(ray.cluster_resources().get("GPU", 0))
+        self.slots = self._gpus or int(ray.cluster_resources().get("CPU", 1))
+        self._running: dict[Any, str] = {}
+
+    def room_for(self, cell: Cell) -> bool:
+        """Ray itself lets tasks wait for room."""
+        return True
+
+    def start(self, cell: Cell, command: tuple[str, ...], log: Path) -> None:
+        # A machine that is lost is made up for elsewhere: the same command goes on from what is on disk.
+        options: dict[str, Any] = {"num_cpus": 1, "num_gpus": cell.gpus if self._gpus else 0, "max_retries": 2}
+        task = self._ray.remote(_run_on_ray).options(**options)
+        reference = task.remote(command, str(log.absolute()), self.environment, cell.launcher, str(Path.cwd()))
+        self._running[reference] = cell.name
+
+    def wait(self) -> list[tuple[str, int]]:
+        ready, _ = self._ray.wait(list(self._running), num_returns=1)
+        ended = []
+        for reference in ready:
+            name = self._running.pop(reference)
+            try:
+                ended.append((name, self._ray.get(reference)))
+            except self._ray.exceptions.RayError as error:
+                print(f"{name}: {error}", file=sys.stderr)
+                ended.append((name, -1))
+        return ended
+
+    def stop(self) -> None:
+        """Its tasks' processes notice that their parents have gone, and save."""
+        self._ray.shutdown()
+
+
+def _run_on_ray(command: tuple[str, ...], log: str, environment: dict[str, str], launcher: tuple[str, ...], folder: str) -> int:
+    """In a Ray worker: the command in a process of its own, from the study's working folder."""
+    os.chdir(folder)
+    os.environ.update(environment)
+    process = start_cell(command, Path(log), environment, method="spawn", launcher=launcher)
+    process.join()
+    return process.exitcode if process.exitcode is not None else -signal.SIGKILL

@@ -1,0 +1,6 @@
+"""The study's tables in the paper's layouts, the paper's claims as inequalities, and both as text.
+
+A `Table` is plain data; `formats` writes Markdown, LaTeX and CSV, the page of a report writes HTML.
+"""
+
+__all__ = ["distances", "findings", "formats", "layouts", "paper"]

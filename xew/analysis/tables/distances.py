@@ -1,0 +1,310 @@
+"""Stage 11 of 11: tables of distance between robots, and of how it goes with scores, in the paper's layouts.
+
+Distances are those that `python -m xew.analysis.distance` wrote; without them the paper's printed ones stand in, and say so.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from xew.analysis.correlation import Correlation, dof_correlation, loeo_correlation
+from xew.analysis.paper import AXES, Paper
+from xew.analysis.statistics.grades import Grades
+from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.analysis.tables.layouts import PAPER_METRICS, SHORT_ROBOTS, Block, Cell, Column, Row, Table
+from xew.config import ConfigError
+from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES
+
+AXIS_TITLES = {
+    "kinematic": "Kinematic distance [m]",
+    "appearance": "Appearance distance",
+    "arm_base": "From the arm's base [m] (ours)",
+    "arm_alone": "Arm alone, from there [m] (ours)",
+    "perceptual": "LPIPS of the renders (ours)",
+}
+FEATURE_TITLES = {"dof": "Joints", "links": "Links", "reach": "Reach [m]", "volume": "Volume [m³]"}
+COMMAND = "python -m xew.analysis.distance --out {folder}"
+
+
+@dataclass(frozen=True)
+class Distances:
+    """What is known of the robots."""
+
+    pairs: pd.DataFrame
+    """Columns axis robot other value spread published."""
+    robots: pd.DataFrame
+    """Columns robot feature value spread published; features are those above and the mean distances by axis."""
+    measured: bool
+    """By ourselves, or the paper's figures in their place."""
+
+    @property
+    def axes(self) -> list[str]:
+        return [axis for axis in AXIS_TITLES if axis in set(self.robots["feature"])]
+
+    def of(self, feature: str) -> np.ndarray:
+        """A feature of all robots in the order of ROBOT_NAMES [5]."""
+        column = self.robots[self.robots["feature"] == feature].set_index("robot")["value"]
+        return column.reindex(list(ROBOT_NAMES)).to_numpy(np.float64)
+
+
+def read_distances(folder: Path) -> Distances:
+    """Read what the command of distances wrote.
+
+    Raises:
+        ConfigError: a file is missing, or lacks a column, a robot or one of the paper's two axes.
+    """
+    frames = []
+    for name, columns in (("distances", ["axis", "robot", "other"]), ("robots", ["robot", "feature"])):
+        path = folder / f"{name}.csv"
+        try:
+            frames.append(pd.read_csv(path))
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"cannot read {path} ({error}); make it: {COMMAND.format(folder=folder)}") from error
+        missing = [column for column in (*columns, "value", "spread", "published") if column not in frames[-1]]
+        if missing:
+            raise ConfigError(f"{path} has no column {', '.join(missing)}; make it anew: {COMMAND.format(folder=folder)}")
+    found = Distances(frames[0], frames[1], measured=True)
+    for feature in (*AXES, *FEATURE_TITLES):
+        lacking = [robot for robot, value in zip(ROBOT_NAMES, found.of(feature), strict=True) if np.isnan(value)]
+        if lacking:
+            raise ConfigError(
+                f"{folder / 'robots.csv'} has no {feature} of {', '.join(lacking)}; make it anew with all five robots: "
+                f"{COMMAND.format(folder=folder)}"
+            )
+    return found
+
+
+def printed_distances(paper: Paper) -> Distances:
+    """The paper's figures as if they were measured."""
+    features = (*FEATURE_TITLES, *AXES)
+    robots = [(robot, name, getattr(paper.robots[robot], name)) for name in features for robot in ROBOT_NAMES]
+    names = list(paper.robots)
+    pairs = [
+        (axis, names[a], names[b], paper.distances[axis][a][b]) for axis in AXES for a in range(5) for b in range(a + 1, 5)
+    ]
+    blank = {"spread": 0.0, "published": np.nan}
+    return Distances(
+        pd.DataFrame(pairs, columns=["axis", "robot", "other", "value"]).assign(**blank),
+        pd.DataFrame(robots, columns=["robot", "feature", "value"]).assign(**blank),
+        measured=False,
+    )
+
+
+def correlate(grades: Grades, distances: Distances) -> dict[tuple[str, str], Correlation]:
+    """By metric and axis; metrics that some fold lacks are left out."""
+    found = {}
+    for name in PAPER_METRICS:
+        scores = _loeo_scores(grades, name)
+        if scores is not None:
+            for axis in distances.axes:
+                better_up = grades.metrics[name].higher_is_better
+                found[name, axis] = loeo_correlation(distances.of(axis).tolist(), scores, better_up)
+    return found
+
+
+def distance_tables(distances: Distances) -> list[Table]:
+    """Mean distances, features and both matrices."""
+    origin = "" if distances.measured else " These are the paper's figures: none of our own were given (--distances)."
+    drawn = (distances.robots["spread"] > 0).any()
+    spread = " ±: deviation of one draw of configurations; of looks, the jackknife over views." if drawn else ""
+    return [
+        _robot_table(
+            distances,
+            "distances",
+            "Distance of each robot to the other four",
+            f"{spread}{origin}".strip(),
+            {axis: AXIS_TITLES[axis] for axis in distances.axes},
+        ),
+        _robot_table(
+            distances,
+            "features",
+            "Kinematic features",
+            f"Reach and volume of the hull are of all links over all configurations.{origin}",
+            FEATURE_TITLES,
+        ),
+        _matrix_table(distances, origin),
+    ]
+
+
+def correlation_table(grades: Grades, distances: Distances, paper: Paper) -> Table:
+    """The paper's layout: r and leave-one-out range for each of its axes, then r with the number of joints."""
+    found = correlate(grades, distances)
+
+    def row(metric: str) -> Row:
+        cells = []
+        for axis in AXES:
+            result, printed = found.get((metric, axis)), getattr(paper.metrics[metric], axis)
+            cells += [
+                _signed_cell([result.r] if result else [], [printed.r]),
+                _signed_cell([result.low, result.high] if result else [], [printed.low, printed.high]),
+            ]
+        scores = _loeo_scores(grades, metric)
+        dof = [dof_correlation(distances.of("dof").tolist(), scores, grades.metrics[metric].higher_is_better)] if scores else []
+        cells.append(_signed_cell(dof, [paper.metrics[metric].dof_r]))
+        return Row((METRIC_TITLES[metric],), tuple(cells))
+
+    columns = [Column(title, AXIS_TITLES[axis]) for axis in AXES for title in ("Pearson r", "leave one out")]
+    shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
+    return Table(
+        "correlations",
+        "Correlation of distance with scores",
+        "r of each robot's mean distance with its score when it was held out, and its range when one robot is left out. "
+        f"Positive: farther is worse. LPIPS is the paper's primary outcome, all else exploratory.{_standing_in(distances)}",
+        ("metric",),
+        (*columns, Column("DoF r")),
+        (Block("", tuple(row(metric) for metric in shown), _missing_folds(grades, shown)),),
+    )
+
+
+def own_correlation_tables(grades: Grades, distances: Distances) -> list[Table]:
+    """The same of distances that the paper does not have; none where none were measured."""
+    found = correlate(grades, distances)
+    own = [axis for axis in distances.axes if axis not in AXES]
+    shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
+
+    def row(metric: str) -> Row:
+        cells: list[Cell] = []
+        for axis in own:
+            result = found.get((metric, axis))
+            p = Cell(f"{result.p_value:.3f}", value=result.p_value) if result else Cell()
+            cells += [
+                _signed_cell([result.r] if result else [], []),
+                _signed_cell([result.low, result.high] if result else [], []),
+                p,
+            ]
+        return Row((METRIC_TITLES[metric],), tuple(cells))
+
+    table = Table(
+        "correlations_own",
+        "Correlation of our own distances with scores",
+        "r, its range when one robot is left out, and the exact two-sided p over all 120 pairings. Positive: farther is worse.",
+        ("metric",),
+        tuple(Column(title, AXIS_TITLES[axis]) for axis in own for title in ("Pearson r", "leave one out", "p")),
+        (Block("", tuple(row(metric) for metric in shown), _missing_folds(grades, shown)),),
+    )
+    return [table] if own else []
+
+
+def certainty_table(grades: Grades, distances: Distances, paper: Paper) -> Table:
+    """What five points can say: exact p, Spearman, bootstrap over robots, stability of the sign."""
+    found = correlate(grades, distances)
+
+    def row(metric: str) -> Row:
+        cells: list[Cell] = []
+        for axis in AXES:
+            result, printed = found.get((metric, axis)), getattr(paper.metrics[metric], axis).p_value
+            p = Cell(published=f"{printed:.3f}" if printed else "", printed=printed or np.nan)
+            if result is None:
+                cells += [p, Cell(), Cell(), Cell()]
+                continue
+            spread = f"{signed(result.bootstrap_low)} to {signed(result.bootstrap_high)}"
+            cells += [
+                Cell(f"{result.p_value:.3f}", published=p.published, printed=p.printed, value=result.p_value),
+                Cell(signed(result.spearman), value=result.spearman),
+                Cell(spread, value=result.r, low=result.bootstrap_low, high=result.bootstrap_high),
+                Cell("stable" if result.stable else "unstable", value=float(result.stable)),
+            ]
+        return Row((METRIC_TITLES[metric],), tuple(cells))
+
+    shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
+    heads = ("exact p", "Spearman ρ", "bootstrap of r", "sign")
+    return Table(
+        "certainty",
+        "How certain that is",
+        "p is two-sided over all 120 pairings; ρ and the 95 % bootstrap over robots are ours; the sign is stable where it "
+        f"survives leaving out any one robot.{_standing_in(distances)}",
+        ("metric",),
+        tuple(Column(head, AXIS_TITLES[axis]) for axis in AXES for head in heads),
+        (Block("", tuple(row(metric) for metric in shown), _missing_folds(grades, shown)),),
+    )
+
+
+def signed(value: float) -> str:
+    return f"{value:+z.3f}".replace("-", "−")
+
+
+def _loeo_scores(grades: Grades, metric: str) -> list[float] | None:
+    means = [grades.mean("loeo", f"loeo_{robot}", robot, metric) if metric in grades.metrics else None for robot in ROBOT_NAMES]
+    values = [mean.value for mean in means if mean is not None]
+    varies = all(np.ptp(np.delete(values, i)) > 0 for i in range(len(values))) if len(values) > 2 else False
+    return values if len(values) == len(ROBOT_NAMES) and varies else None
+
+
+def _missing_folds(grades: Grades, metrics: Sequence[str]) -> str:
+    missing = [
+        ROBOT_TITLES[robot]
+        for robot in ROBOT_NAMES
+        if not any(grades.mean("loeo", f"loeo_{robot}", robot, metric) for metric in metrics)
+    ]
+    return f"Incomplete: all five folds are needed, not run: {', '.join(missing)}." if missing else ""
+
+
+def _standing_in(distances: Distances) -> str:
+    return "" if distances.measured else " Distances are the paper's printed ones."
+
+
+def _signed_cell(ours: Sequence[float], printed: Sequence[float]) -> Cell:
+    """One figure, or the two ends of a range."""
+    return Cell(
+        " to ".join(map(signed, ours)) or "–",
+        published=" to ".join(map(signed, printed)),
+        value=ours[0] if len(ours) == 1 else np.nan,
+        low=ours[0] if len(ours) == 2 else np.nan,
+        high=ours[-1] if len(ours) == 2 else np.nan,
+        printed=printed[0] if len(printed) == 1 else np.nan,
+    )
+
+
+def _robot_table(distances: Distances, name: str, title: str, caption: str, features: Mapping[str, str]) -> Table:
+    records = {(row["robot"], row["feature"]): row for row in distances.robots.to_dict("records")}
+
+    def row(robot: str) -> Row:
+        return Row((ROBOT_TITLES[robot],), tuple(_cell(records.get((robot, feature)), feature) for feature in features))
+
+    seen = tuple(row(robot) for robot in ROBOT_NAMES if robot not in HELD_OUT_ROBOTS)
+    held_out = tuple(row(robot) for robot in HELD_OUT_ROBOTS)
+    columns = tuple(Column(head) for head in features.values())
+    return Table(name, title, caption, ("robot",), columns, (Block("Seen", seen), Block("Held out", held_out)))
+
+
+def _matrix_table(distances: Distances, origin: str) -> Table:
+    def block(axis: str) -> Block:
+        chosen = distances.pairs[distances.pairs["axis"] == axis]
+        records = {frozenset((row["robot"], row["other"])): row for row in chosen.to_dict("records")}
+        rows = tuple(
+            Row(
+                (SHORT_ROBOTS[a],),
+                tuple(Cell("0", value=0.0) if a == b else _cell(records.get(frozenset((a, b)))) for b in ROBOT_NAMES),
+            )
+            for a in ROBOT_NAMES
+        )
+        return Block(AXIS_TITLES[axis], rows)
+
+    axes = [axis for axis in AXIS_TITLES if axis in set(distances.pairs["axis"])]
+    return Table(
+        "matrices",
+        "Distance of every two robots",
+        f"Symmetric.{origin}",
+        ("",),
+        tuple(Column(SHORT_ROBOTS[robot]) for robot in ROBOT_NAMES),
+        tuple(block(axis) for axis in axes),
+    )
+
+
+def _cell(record: Mapping[object, float] | None, feature: str = "") -> Cell:
+    if record is None:
+        return Cell()
+    digits = 0 if feature in ("dof", "links") else 3
+    value, spread, printed = (float(record[name]) for name in ("value", "spread", "published"))
+    return Cell(
+        f"{value:.{digits}f}",
+        f"± {spread:.{digits}f}" if spread > 0 else "",
+        "" if np.isnan(printed) else f"{printed:.{digits}f}",
+        value=value,
+        low=value - spread if spread > 0 else np.nan,
+        high=value + spread if spread > 0 else np.nan,
+        printed=printed,
+    )

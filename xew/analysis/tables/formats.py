@@ -1,0 +1,188 @@
+"""Stage 11 of 11: a `Table` as Markdown, LaTeX (booktabs) and CSV. HTML is in `page`."""
+
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+
+import pandas as pd
+
+from xew.analysis.tables.findings import Finding
+from xew.analysis.tables.layouts import Cell, Row, Table
+
+MARK = {"better": "▲", "worse": "▼", "unresolved": "≈", "": ""}
+AGREES = {None: "", True: "✓", False: "✗"}
+LATEX_MARK = {"better": r"$^{\blacktriangle}$", "worse": r"$^{\blacktriangledown}$", "unresolved": r"$^{\approx}$", "": ""}
+LATEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "−": "$-$", "–": "--",
+    "³": "$^3$", "ρ": r"$\rho$", "≈": r"$\approx$", "▲": r"$\blacktriangle$", "▼": r"$\blacktriangledown$", "…": r"\dots{}",
+    "·": r"$\cdot$", "×": r"$\times$", "±": r"$\pm$", "✓": r"$\checkmark$", "✗": r"$\times$", "\u00a0": "~",
+    "<": "$<$", ">": "$>$",
+}  # fmt: skip
+"""What stands for characters that LaTeX reads otherwise, or does not have."""
+
+
+def heads(table: Table) -> list[str]:
+    """Heads of all columns in one line each: 'Visual quality: PSNR [dB] ↑'."""
+    return [*table.stubs, *(": ".join(filter(None, (column.group, column.title))) for column in table.columns)]
+
+
+def markdown(table: Table) -> str:
+    """Ours [interval] mark (paper ...); what is missing stands in the table."""
+    width = len(table.stubs) + len(table.columns)
+    lines = [_markdown_line(heads(table)), f"|{'---|' * len(table.stubs)}{'---:|' * len(table.columns)}"]
+    for block in table.blocks:
+        above = [f"**{block.title}**"] * bool(block.title) + [f"*{block.note}*"] * bool(block.note)
+        lines += [_markdown_line([text, *[""] * (width - 1)]) for text in above]
+        lines += [_markdown_line([*row.labels, *map(_markdown_cell, row.cells)]) for row in block.rows]
+    return "\n".join(lines)
+
+
+def _markdown_line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def _markdown_cell(cell: Cell) -> str:
+    text = f"**{cell.text}**" if cell.best else cell.text
+    interval = f"[{cell.interval}]" if cell.interval else ""
+    paper = f"(paper {cell.published})" if cell.published else ""
+    return " ".join(filter(None, (text, interval, MARK[cell.verdict], paper, AGREES[cell.agrees])))
+
+
+def latex(table: Table) -> str:
+    """A table for the packages booktabs, amssymb and adjustbox; small under each number stand its interval and the paper's.
+
+    It is scaled down where it is wider than the page.
+    """
+    stubs, width = len(table.stubs), len(table.stubs) + len(table.columns)
+    lines = [
+        r"% \usepackage{booktabs,amssymb,adjustbox}",
+        r"\begin{table*}[t]",
+        r"\centering\footnotesize\setlength{\tabcolsep}{4pt}",
+        r"\begin{adjustbox}{max width=\textwidth}",
+        rf"\begin{{tabular}}{{@{{}}{'l' * stubs}{'c' * len(table.columns)}@{{}}}}",
+        r"\toprule",
+        *_latex_groups(table),
+        _latex_line([*map(_escape, table.stubs), *(_escape(column.title) for column in table.columns)]),
+        r"\midrule",
+    ]
+    for i, block in enumerate(table.blocks):
+        lines += [r"\addlinespace"] if i else []
+        if block.title:
+            lines.append(rf"\multicolumn{{{width}}}{{@{{}}l}}{{\textit{{{_escape(block.title)}}}}} \\")
+        for row, above in zip(block.rows, (None, *block.rows), strict=False):
+            lines += _latex_rows(row, above)
+    # Notes are too long for a row: they would stretch the table.
+    notes = [": ".join(filter(None, (block.title, block.note))) for block in table.blocks if block.note]
+    caption = rf"\textbf{{{_escape(table.title)}.}} {_escape(' '.join([table.caption, *notes]))}"
+    lines += [r"\bottomrule", r"\end{tabular}", r"\end{adjustbox}"]
+    lines += [rf"\caption{{{caption}}}", rf"\label{{tab:{table.name}}}", r"\end{table*}", ""]
+    return "\n".join(lines)
+
+
+def _latex_groups(table: Table) -> Iterator[str]:
+    if not any(column.group for column in table.columns):
+        return
+    cells, rules, at = [""] * len(table.stubs), [], len(table.stubs) + 1
+    for title, members in groupby(table.columns, key=lambda column: column.group):
+        count = len(list(members))
+        cells.append(rf"\multicolumn{{{count}}}{{c}}{{{_escape(title)}}}")
+        rules += [rf"\cmidrule(lr){{{at}-{at + count - 1}}}"] if title else []
+        at += count
+    yield _latex_line(cells)
+    yield "".join(rules)
+
+
+def _latex_rows(row: Row, above: Row | None) -> Iterator[str]:
+    """A label that the row above has too stands there only, but for the last one."""
+    same = [bool(above and above.labels[i] == label and label != row.labels[-1]) for i, label in enumerate(row.labels)]
+    labels = ["" if repeated else _escape(label) for label, repeated in zip(row.labels, same, strict=True)]
+    yield _latex_line([*labels, *map(_latex_cell, row.cells)])
+    intervals = [f"[{cell.interval}]" if cell.interval else "" for cell in row.cells]
+    papers = [f"({cell.published}){AGREES[cell.agrees]}" if cell.published else "" for cell in row.cells]
+    for below in filter(any, (intervals, papers)):
+        small = (rf"{{\tiny {_escape(text)}}}" if text else "" for text in below)
+        yield _latex_line([*[""] * len(row.labels), *small])
+
+
+def _latex_cell(cell: Cell) -> str:
+    text = _escape(cell.text)
+    return (rf"\textbf{{{text}}}" if cell.best else text) + LATEX_MARK[cell.verdict]
+
+
+def _latex_line(cells: Sequence[str]) -> str:
+    return " & ".join(cells) + r" \\"
+
+
+def _escape(text: str) -> str:
+    """Also two hyphens, of a command's option, which LaTeX would draw as a dash."""
+    return "-{}-".join("".join(LATEX.get(character, character) for character in part) for part in text.split("--"))
+
+
+def frame(table: Table) -> pd.DataFrame:
+    """A tidy frame, one row a cell: table block note row column text value low high verdict paper episodes.
+
+    `note` says what the block lacks.
+    """
+    columns = heads(table)[len(table.stubs) :]
+    return pd.DataFrame(
+        {
+            "table": table.name,
+            "block": block.title,
+            "note": block.note,
+            "row": ", ".join(row.labels),
+            "column": column,
+            "text": cell.text,
+            "value": cell.value,
+            "low": cell.low,
+            "high": cell.high,
+            "verdict": cell.verdict,
+            "paper": cell.printed,
+            "episodes": cell.episodes,
+        }
+        for block in table.blocks
+        for row in block.rows
+        for column, cell in zip(columns, row.cells, strict=True)
+    )
+
+
+def tables_frame(tables: Sequence[Table]) -> pd.DataFrame:
+    """All tables, one below the other."""
+    return pd.concat([frame(table) for table in tables], ignore_index=True)
+
+
+def findings_markdown(findings: Sequence[Finding], papers: Sequence[Finding] = ()) -> str:
+    """Claim, test, verdict with numbers, and where given the verdict on the paper's own figures."""
+    beside = [["the paper's own figures"], *([paper.verdict] for paper in papers)] if papers else [[]] * (len(findings) + 1)
+    lines = [_markdown_line(["claim", "test", "verdict", "numbers", *beside[0]]), "|---" * (4 + bool(papers)) + "|"]
+    for finding, last in zip(findings, beside[1:], strict=True):
+        numbers = "; ".join(answer.text for answer in finding.answers) or f"missing: {finding.missing}"
+        claim = finding.claim
+        lines.append(_markdown_line([f"{claim.says} ({claim.where})", claim.test, f"**{finding.verdict}**", numbers, *last]))
+    return "\n".join(lines)
+
+
+def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = ()) -> str:
+    """The verdicts alone: claim, test, here, and where given the paper's own figures."""
+    beside = [["paper"], *([paper.verdict] for paper in papers)] if papers else [[]] * (len(findings) + 1)
+    rows = [
+        _latex_line([_escape(text) for text in (finding.claim.says, finding.claim.test, finding.verdict, *last)])
+        for finding, last in zip(findings, beside[1:], strict=True)
+    ]
+    return "\n".join(
+        [
+            r"% \usepackage{booktabs,amssymb}",
+            r"\begin{table*}[t]",
+            r"\centering\footnotesize",
+            rf"\begin{{tabular}}{{@{{}}p{{0.36\textwidth}}p{{0.36\textwidth}}l{'l' * bool(papers)}@{{}}}}",
+            r"\toprule",
+            _latex_line(["claim", "test", "verdict", *beside[0]]),
+            r"\midrule",
+            *rows,
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\caption{\textbf{Findings.} Each claim as an inequality.}",
+            r"\label{tab:findings}",
+            r"\end{table*}",
+            "",
+        ]
+    )

@@ -1,0 +1,279 @@
+"""Stage 11 of 11: tables of what follows from the paper's figures, for `paper_report`."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from xew.analysis.correlation import Correlation, loeo_correlation
+from xew.analysis.distance import Frame, chamfer_floor, mean_distances, measure
+from xew.analysis.paper import AXES, Cell, Paper, PublishedChange, RecomputedChange
+from xew.analysis.statistics.grades import PaperGrades
+from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.analysis.tables import layouts as tables
+from xew.analysis.tables.distances import signed
+from xew.analysis.tables.findings import Finding
+from xew.analysis.tables.layouts import ACTIONS, LADDER, SYSTEMS, Block, Builder, Column, Row, Table
+from xew.protocol import ROBOT_NAMES
+from xew.sim_warp.robots import ROBOTS
+
+AXIS_TITLES = {"appearance": "Appearance distance", "kinematic": "Kinematic distance"}
+SEEDS = range(20)
+"""Draws of the clouds that kinematic distances of our own are means of."""
+SECTIONS = {
+    "sec:exp-actrep": "Action representation",
+    "sec:exp-cond": "Robot descriptions",
+    "sec:exp-fewshot": "Few-shot adaptation",
+    "sec:exp-baseline": "World models",
+}
+"""Titles of the paper's sections that print percentages."""
+
+CORRELATION_TEXT = (
+    "Pearson's r of each robot's distance to the other four with its score when it was held out, and its range when one "
+    "robot is left out. Positive means: farther is worse. Ours is computed from the printed scores and distances; the "
+    "printed value is below it. ✓ says that inputs which print like these exist for which the value prints like the "
+    "paper's; ✗ says that none was found. DoF r is a diagnostic: one robot alone has seven joints."
+)
+CERTAINTY_TEXT = (
+    "What five points can say. p is exact and two-sided, over all 120 pairings; the paper prints it for LPIPS only. Spearman's "
+    "ρ and the 95 % bootstrap interval of r (all resamples of three or more different robots) are ours. The sign is stable "
+    "where it survives leaving out any one robot."
+)
+FRAME_TEXT = (
+    "The paper's text has the origins of every link in the arm's base frame. Its figures are those of each URDF's root frame, "
+    "as clouds of our own URDFs show: in it all ten distances come out, in the arm's frame three of Aloha's four do not. "
+    "Aloha's root lies on the floor, the others' is the arm's base. Here its scores meet our own clouds: in its frame; as its "
+    "text says; and of the arm alone, so that no body counts. The arm alone goes with the joints' column, for Franka, the one "
+    "robot of seven joints, is then the farthest; five robots cannot tell the two apart."
+)
+FRAME_TITLES: dict[Frame, str] = {
+    "root": "Root frame (ours)",
+    "arm_base": "Arm's base frame, as the text says (ours)",
+    "arm_alone": "Arm alone, in that frame (ours)",
+}
+CHANGE_TEXT = (
+    "What the text says (small), and what the tables give for it: from the printed scores, and below from all scores that "
+    "print the same. Shares of a gap are of the way from zero-shot to the seen robots."
+)
+ROBOT_TEXT = "Means of the rows of the printed matrices, the printed means below them; features as printed."
+
+
+class PrintedBuilder(Builder):
+    """Tables of the paper alone: its means with all the digits that it prints."""
+
+    def cell(self, part: str, row: str, robots: str, metric: str, base: str = "") -> tables.Cell:
+        assert isinstance(self.ours, PaperGrades)
+        cell = super().cell(part, row, robots, metric, base)
+        return replace(cell, text=self.ours.print(part, row, robots, metric) or cell.text)
+
+
+@cache
+def frame_distances() -> dict[Frame, np.ndarray]:
+    """Mean kinematic distances of our five robots to the other four by frame, a row for each seed [s 5], metres."""
+    robots = {name: ROBOTS[name] for name in ROBOT_NAMES}
+    return {frame: mean_distances(measure(robots, SEEDS, frame).kinematic) for frame in FRAME_TITLES}
+
+
+@cache
+def _floor() -> np.ndarray:
+    return chamfer_floor({name: ROBOTS[name] for name in ROBOT_NAMES}, SEEDS[:5]).mean(axis=0)
+
+
+def frame_results(paper: Paper, distances: np.ndarray) -> dict[str, Correlation]:
+    """Correlation of the paper's scores with mean distances [s 5], by metric."""
+    axis = distances.mean(axis=0).tolist()
+    return {
+        name: loeo_correlation(axis, paper.scores(name).tolist(), metric.higher_is_better)
+        for name, metric in paper.metrics.items()
+    }
+
+
+def claims_table(claims: Sequence[Finding]) -> Table:
+    rows = []
+    for one in claims:
+        numbers = "; ".join(answer.text for answer in one.answers) or f"not printed: {one.missing}"
+        cells = (tables.Cell(one.verdict), tables.Cell(numbers))
+        rows.append(Row((f"{one.claim.says} ({one.claim.where})", one.claim.test), cells))
+    columns = (Column("verdict"), Column("numbers"))
+    return Table(
+        "claims", "Claims, asked of the paper's own figures", "", ("claim", "test"), columns, (Block("", tuple(rows)),)
+    )
+
+
+def correlation_table(paper: Paper, cells: Sequence[Cell]) -> Table:
+    """The paper's layout: r and leave-one-out range for each axis, then r with the number of joints."""
+    found = {(cell.metric, cell.axis, cell.quantity): cell for cell in cells}
+    layout = [(axis, names) for axis in AXES for names in (("r",), ("low", "high"))] + [("dof", ("r",))]
+    rows = [
+        Row((METRIC_TITLES[metric],), tuple(_compared([found[metric, axis, q] for q in names]) for axis, names in layout))
+        for metric in paper.metrics
+    ]
+    columns = [Column(title, AXIS_TITLES[axis]) for axis in AXES for title in ("Pearson r", "leave one out")]
+    return _table(
+        "correlations", "The correlation table", CORRELATION_TEXT, "metric", [*columns, Column("DoF r", "Joints")], rows
+    )
+
+
+def _compared(cells: Sequence[Cell]) -> tables.Cell:
+    """One figure, or the two ends of a range."""
+    ours = " to ".join(signed(cell.ours) for cell in cells)
+    published = " to ".join(signed(cell.published) for cell in cells)
+    value, printed = (cells[0].ours, cells[0].published) if len(cells) == 1 else (np.nan, np.nan)
+    agrees = all(cell.agrees for cell in cells)
+    return tables.Cell(ours, published=published, agrees=agrees, value=value, printed=printed)
+
+
+def certainty_table(paper: Paper, cells: Sequence[Cell], results: Mapping[tuple[str, str], Correlation]) -> Table:
+    printed = {(cell.metric, cell.axis): cell for cell in cells if cell.quantity == "p_value"}
+
+    def row(metric: str) -> Row:
+        columns = []
+        for axis in AXES:
+            result, p = results[metric, axis], printed.get((metric, axis))
+            text = f"{result.p_value:.3f}"
+            compared = tables.Cell(text, value=result.p_value)
+            if p:
+                compared = replace(compared, published=f"{p.published:.3f}", agrees=p.agrees, printed=p.published)
+            columns += [compared, *_own_certainty(result)]
+        return Row((METRIC_TITLES[metric],), tuple(columns))
+
+    heads = ("p", "Spearman ρ", "bootstrap of r", "sign")
+    columns = [Column(head, AXIS_TITLES[axis]) for axis in AXES for head in heads]
+    return _table(
+        "certainty", "How certain it is", CERTAINTY_TEXT, "metric", columns, [row(metric) for metric in paper.metrics]
+    )
+
+
+def _own_certainty(result: Correlation) -> list[tables.Cell]:
+    ends = (result.bootstrap_low, result.bootstrap_high)
+    return [
+        tables.Cell(signed(result.spearman), value=result.spearman),
+        tables.Cell(" to ".join(map(signed, ends)), low=ends[0], high=ends[1]),
+        _stability(result),
+    ]
+
+
+def _stability(result: Correlation) -> tables.Cell:
+    return tables.Cell("stable" if result.stable else "unstable", value=float(result.stable))
+
+
+def frame_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
+    """The paper's kinematic correlation beside what our own clouds give for it, in each frame."""
+    by_frame = {frame: frame_results(paper, distances) for frame, distances in frames.items()}
+
+    def row(metric: str) -> Row:
+        printed = paper.metrics[metric].kinematic
+        cells = [_signed(printed.r), _range(printed.low, printed.high)]
+        for frame, results in by_frame.items():
+            result = results[metric]
+            p = tables.Cell(f"{result.p_value:.3f}", value=result.p_value)
+            cells += [_signed(result.r), *((_range(result.low, result.high), p) if frame != "root" else ())]
+        return Row((METRIC_TITLES[metric],), tuple(cells))
+
+    columns = [Column(head, "As printed") for head in ("r", "leave one out")]
+    columns += [
+        Column(head, FRAME_TITLES[frame])
+        for frame in frames
+        for head in (("r",) if frame == "root" else ("r", "leave one out", "p"))
+    ]
+    rows = [row(metric) for metric in paper.metrics]
+    return _table("frames", "Kinematic distance with the paper's scores", FRAME_TEXT, "metric", columns, rows)
+
+
+def base_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
+    """The distances that this rests on."""
+    rows, floor = [], _floor()
+    for i, name in enumerate(paper.robots):
+        cells = [tables.Cell(f"{paper.robots[name].kinematic:.3f}", value=paper.robots[name].kinematic)]
+        for distances in frames.values():
+            mean, spread = float(distances[:, i].mean()), float(distances[:, i].std(ddof=1))
+            cells.append(tables.Cell(f"{mean:.3f}", f"± {spread:.3f}", value=mean, low=mean - spread, high=mean + spread))
+        cells.append(tables.Cell(f"{floor[i]:.3f}", value=float(floor[i])))
+        rows.append(Row((ROBOT_TITLES[name],), tuple(cells)))
+    caption = (
+        f"Metres. ± is the standard deviation of one draw of configurations, over {len(SEEDS)} draws. Right: how far a robot "
+        "is from itself by another draw in the root frame, which is what 4,000 points make of no distance at all."
+    )
+    columns = [Column(head) for head in ("As printed", *FRAME_TITLES.values(), "The same robot twice (ours)")]
+    return _table("frame_distances", "Mean kinematic distance to the other four", caption, "robot", columns, rows)
+
+
+def change_table(changes: Sequence[RecomputedChange]) -> Table:
+    blocks = []
+    for source, title in SECTIONS.items():
+        found = [one for one in changes if one.change.source == source]
+        rows = (Row((compared_places(one.change),), (_change_cell(one),)) for one in found)
+        blocks.append(Block(title, tuple(rows)))
+    caption, columns = CHANGE_TEXT, (Column("change"),)
+    return Table("changes", "What the tables give for them", caption, ("what is compared",), columns, tuple(blocks))
+
+
+def _change_cell(found: RecomputedChange) -> tables.Cell:
+    printed = percent(found.change.percent, 0)
+    if found.change.word != "rounded":
+        printed = f"{found.change.word} {printed.lstrip('+−') if found.change.word == 'less than' else printed}"
+    return tables.Cell(
+        percent(found.ours),
+        f"{percent(found.least)} to {percent(found.most)}",
+        printed,
+        agrees=found.agrees,
+        value=found.ours,
+        low=found.least,
+        high=found.most,
+        printed=found.change.percent,
+    )
+
+
+def compared_places(change: PublishedChange) -> str:
+    """Such as 'LPIPS, Piper: joint pose to optical flow'."""
+    (part, before, start), (_, after, end) = (place.split("/") for place in (change.before, change.after))
+    if start == end:
+        subject, first, second = ROBOT_TITLES[end], _row_title(part, before, end), _row_title(part, after, end)
+    else:
+        subject, first, second = SYSTEMS[after], *(ROBOT_TITLES.get(robot, "seen robots") for robot in (start, end))
+    gap = ", share of the gap to seen robots" if change.toward else ""
+    return f"{METRIC_TITLES[change.metric]}, {subject}: {first} to {second}{gap}"
+
+
+def _row_title(part: str, key: str, robot: str) -> str:
+    target, _, shots = key.rpartition("-")
+    if target:
+        return f"M = {shots}" if target == robot else f"{ROBOT_TITLES[target]}, M = {shots}"
+    return {"actions": ACTIONS, "ladder": LADDER, "forgetting": {"none": "no adaptation"}}[part][key].lower()
+
+
+def percent(value: float, digits: int = 1) -> str:
+    return f"{value:+z.{digits}f} %".replace("-", "−")
+
+
+def robot_table(paper: Paper, means: Sequence[Cell]) -> Table:
+    found = {(cell.metric, cell.axis): cell for cell in means}
+
+    def row(name: str) -> Row:
+        robot = paper.robots[name]
+        cells = [_mean(found[name, axis]) for axis in AXES]
+        cells += [tables.Cell(str(count), value=count) for count in (robot.dof, robot.links)]
+        cells += [tables.Cell(f"{size:.3f}", value=size) for size in (robot.reach, robot.volume)]
+        return Row((ROBOT_TITLES[name],), tuple(cells))
+
+    columns = [Column(head, "Mean distance to the other four") for head in ("appearance", "kinematic [m]")]
+    columns += [Column(head, "Features") for head in ("joints", "links", "reach [m]", "hull [m³]")]
+    return _table("robots", "Distances and features", ROBOT_TEXT, "robot", columns, [row(name) for name in paper.robots])
+
+
+def _mean(cell: Cell) -> tables.Cell:
+    printed = f"{cell.published:.3f}"
+    return tables.Cell(f"{cell.ours:.3f}", published=printed, agrees=cell.agrees, value=cell.ours, printed=cell.published)
+
+
+def _signed(value: float) -> tables.Cell:
+    return tables.Cell(signed(value), value=value)
+
+
+def _range(low: float, high: float) -> tables.Cell:
+    return tables.Cell(f"{signed(low)} to {signed(high)}", low=low, high=high)
+
+
+def _table(name: str, title: str, caption: str, stub: str, columns: Sequence[Column], rows: Sequence[Row]) -> Table:
+    return Table(name, title, caption, (stub,), tuple(columns), (Block("", tuple(rows)),))

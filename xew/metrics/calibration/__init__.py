@@ -1,0 +1,3 @@
+"""Videos that are wrong in a known way, to measure estimators and metrics by."""
+
+__all__ = ["wrong"]

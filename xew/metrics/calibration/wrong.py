@@ -1,0 +1,114 @@
+"""Metrics, calibration: renderings that are wrong in a known way, with their true masks, keypoints and object places.
+
+Reads  an episode's recorded states
+Writes `WrongVideo`s: the same scene with robot and objects moved otherwise, as a model that errs would show it
+
+An estimator sees the pixels only; what it says of them can be held against the truth that the renderer knows. The
+simulation is asked to render when a case is made, so that the metrics load without it. Frame 0 is every model's given
+frame and stays as it was.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from xew.episode import States, demand_known, read_record, read_states
+from xew.protocol import ARMS
+
+
+@dataclass(frozen=True)
+class WrongVideo:
+    """What a wrong motion looks like, and where everything truly is in it."""
+
+    rgb: np.ndarray
+    """[t h w 3] uint8."""
+    mask: np.ndarray
+    """[t h w] bool, the robot."""
+    keypoints: np.ndarray
+    """[t k 2] float32 [pixels], those of `States.keypoints`."""
+    objects: np.ndarray
+    """[t o 2] float32 [pixels], projected origins of the objects' poses."""
+
+
+def late(states: States, frames: int) -> States:
+    """Everything happens some frames too late."""
+    shown = np.maximum(np.arange(states.frame_count) - frames, 0)
+    return _moved(states, states.joint_pos[shown], states.object_pose[shown], states.object_joint[shown])
+
+
+def frozen(states: States) -> States:
+    """Nothing ever moves."""
+    return late(states, states.frame_count)
+
+
+def biased(states: States, angle: float) -> States:
+    """Every joint of both arms is off by an angle [rad] after frame 0; the objects are where they belong."""
+    joints = states.joint_pos.copy()
+    for arm, _ in ARMS:
+        used = np.any(states.joint_pos[:, arm] != 0, axis=0)  # arms of six joints leave their seventh at zero
+        joints[1:, arm] += np.float32(angle) * used
+    return _moved(states, joints, states.object_pose, states.object_joint)
+
+
+def half(states: States) -> States:
+    """Robot and objects move half as far from where they began."""
+    joints, hinges = (0.5 * (values[:1] + values) for values in (states.joint_pos, states.object_joint))
+    poses = states.object_pose.copy()
+    poses[..., :3] = 0.5 * (poses[:1, :, :3] + poses[..., :3])
+    for index in range(poses.shape[1]):
+        first, turned = (Rotation.from_quat(states.object_pose[rows, index, 3:]) for rows in (0, slice(None)))
+        poses[:, index, 3:] = (Rotation.from_rotvec(0.5 * (turned * first.inv()).as_rotvec()) * first).as_quat()
+    return _moved(states, joints, poses, hinges)
+
+
+MOTIONS: dict[str, Callable[[States], States]] = {
+    "as recorded": lambda states: states,
+    "3 frames late": lambda states: late(states, 3),
+    "8 frames late": lambda states: late(states, 8),
+    "joints off by 0.05 rad": lambda states: biased(states, 0.05),
+    "joints off by 0.12 rad": lambda states: biased(states, 0.12),
+    "half the motion": half,
+    "frozen": frozen,
+}
+"""How each case moves what it shows."""
+
+
+def wrong_videos(folder: Path) -> Iterator[tuple[str, WrongVideo]]:
+    """Every case of MOTIONS on one episode, rendered as soon as it is asked for.
+
+    Raises:
+        EpisodeError: the episode was imported and lacks the states to render from.
+    """
+    demand_known(folder, "joint_pos", "object_pose", "object_joint")
+    states = read_states(folder)
+    for name, motion in MOTIONS.items():
+        yield name, render(folder, motion(states))
+
+
+def render(folder: Path, states: States) -> WrongVideo:
+    """The scene of an episode with its robot and objects where other states have them."""
+    # Only here: the metrics load without Warp.
+    from xew.sim_warp.devices.workers import quiet_warp
+    from xew.sim_warp.geometry.camera import HEAD_CAMERA, project
+    from xew.sim_warp.production.produce import recording
+    from xew.sim_warp.rendering.observe import observe
+    from xew.sim_warp.rendering.streams import default_renderer
+    from xew.sim_warp.robots import get_robot, use_robots_of
+    from xew.sim_warp.scene import scene_rng
+    from xew.sim_warp.tasks import get_task
+
+    quiet_warp()
+    use_robots_of(folder.absolute().parents[2])
+    record = read_record(folder)
+    scene = get_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
+    seen = recording(get_robot(record.robot), scene, states.joint_pos, states.object_pose, states.object_joint)
+    view = observe(default_renderer(), [seen])[0]
+    objects, _ = project(HEAD_CAMERA, states.object_pose[..., :3].astype(np.float64))
+    return WrongVideo(view.rgb, view.robot_mask, view.keypoints, objects.astype(np.float32))
+
+
+def _moved(states: States, joints: np.ndarray, poses: np.ndarray, hinges: np.ndarray) -> States:
+    return replace(states, joint_pos=joints, object_pose=poses, object_joint=hinges)

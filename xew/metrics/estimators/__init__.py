@@ -1,0 +1,6 @@
+"""Who finds the robot, its points and its motion in a video that has no ground truth.
+
+Two estimators need no weights; the others open local checkpoints of other projects.
+"""
+
+__all__ = ["adapters", "alike", "contact", "cotracker", "flow", "masks", "sam2", "tapir", "tracks"]

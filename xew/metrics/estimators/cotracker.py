@@ -1,0 +1,83 @@
+"""CoTracker3 as a tracker, as in the paper: the offline network, run forwards and backwards over a predicted video.
+
+Neither its code nor its weights are here: both are CC-BY-NC 4.0, not for commercial use. Whoever may use them installs the
+package `cotracker` and brings the checkpoint.
+
+The true points start the tracks, so a point is right by definition in its query frame. All points are tracked together and
+influence each other, as the network was made to.
+"""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from xew.config import ConfigError
+from xew.metrics.estimators.adapters import (
+    check_tracks,
+    import_package,
+    import_torch,
+    lost,
+    query_frames,
+    read_state_dict,
+    torch_device,
+)
+
+LICENCE = "CoTracker3, code and weights, is CC-BY-NC 4.0: scores that use it are not for commercial use"
+INSTALL = "install it from the sources of github.com/facebookresearch/co-tracker, January 2025 or later (it is not on PyPI)"
+SHORTEST_OFFLINE = 17
+"""Frames of time embedding: the online network has 16, the offline one 60."""
+
+
+def open_cotracker(checkpoint: Path) -> "CoTracker":
+    """CoTracker3 offline from a local `scaled_offline.pth`, on the thread's GPU or else the CPU; says its licence on stderr.
+
+    Raises:
+        ConfigError: PyTorch or the package `cotracker` is absent, or the file is damaged or of another network.
+    """
+    window = _window(checkpoint)
+    package = import_package("cotracker.predictor", "CoTracker3", INSTALL)
+    try:
+        predictor = package.CoTrackerPredictor(checkpoint=str(checkpoint), offline=True, v2=False, window_len=window)
+    except RuntimeError as error:
+        raise ConfigError(f"{checkpoint} is no checkpoint of CoTracker3 offline: {str(error)[:300]}") from error
+    print(f"note: {LICENCE}", file=sys.stderr)
+    return CoTracker(predictor.to(torch_device()))
+
+
+class CoTracker:
+    """The tracker: see `xew.metrics.backends.Tracker`. Lost is where the network's visibility is 0.9 or less."""
+
+    def __init__(self, predictor: Callable[..., Any]) -> None:
+        self._predictor = predictor
+        self._torch = import_torch("CoTracker3")
+
+    def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        check_tracks(prediction, points, visible)
+        tracks = lost(visible.shape)
+        frames = query_frames(visible)
+        asked = np.flatnonzero(frames >= 0)
+        if len(asked) == 0:
+            return tracks
+        queries = np.column_stack([frames[asked], points[frames[asked], asked]]).astype(np.float32)
+        device = torch_device()
+        video = self._torch.from_numpy(np.ascontiguousarray(prediction.transpose(0, 3, 1, 2))).to(device).float()
+        with self._torch.inference_mode():
+            found, seen = self._predictor(
+                video[None], queries=self._torch.from_numpy(queries)[None].to(device), backward_tracking=True
+            )
+        tracks[:, asked] = np.where(seen[0].cpu().numpy()[..., None], found[0].cpu().numpy(), np.nan)
+        return tracks
+
+
+def _window(checkpoint: Path) -> int:
+    """Length of the network's time embedding; raises ConfigError unless the file is of CoTracker3 offline."""
+    state = read_state_dict(checkpoint, "CoTracker3")
+    embedding = state.get("time_emb")
+    if embedding is None or embedding.ndim != 3 or not any(key.startswith("corr_mlp.") for key in state):
+        raise ConfigError(f"{checkpoint} is no checkpoint of CoTracker3; expected scaled_offline.pth.")
+    if embedding.shape[1] < SHORTEST_OFFLINE:
+        raise ConfigError(f"{checkpoint} is CoTracker3 online, which sees no whole video; expected scaled_offline.pth.")
+    return int(embedding.shape[1])

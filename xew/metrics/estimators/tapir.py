@@ -1,0 +1,126 @@
+"""TAPIR and BootsTAPIR as trackers: the offline networks of DeepMind's `tapnet`, in JAX.
+
+Code and weights are Apache-2.0; neither is here. Whoever uses them installs the package `tapnet` and brings a checkpoint. The
+true points start the tracks, at the frame where most are visible; the network finds them forwards and backwards at once.
+"""
+
+import functools
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import jax
+import numpy as np
+from PIL import Image
+
+from xew.config import ConfigError
+from xew.metrics.estimators.adapters import check_tracks, import_package, lost, query_frames
+
+SIDE = 256
+"""Of the square for which the networks were trained [pixels]."""
+CHUNK = 64
+"""Points at once."""
+INSTALL = "install it from the sources of github.com/google-deepmind/tapnet, with all that they ask for (it is not on PyPI)"
+TAPIR = {"bilinear_interp_with_depthwise_conv": False, "pyramid_level": 0}
+BOOTSTAPIR = {
+    "bilinear_interp_with_depthwise_conv": False, "pyramid_level": 1, "extra_convs": True, "softmax_temperature": 10.0
+}  # fmt: skip
+"""How the authors build each network; a BootsTAPIR is told by its extra convolutions."""
+ADMITTED = {
+    *((f"numpy.{core}.multiarray", name) for core in ("core", "_core") for name in ("_reconstruct", "scalar")),
+    ("numpy", "ndarray"),
+    ("numpy", "dtype"),
+    ("collections", "OrderedDict"),
+}
+"""The only names that a checkpoint may call: what arrays and dictionaries are made of."""
+
+
+def open_tapir(checkpoint: Path) -> "Tapir":
+    """TAPIR or BootsTAPIR from a local .npy of the authors, on JAX's default device.
+
+    Raises:
+        ConfigError: the package `tapnet` is absent, or the file is damaged, of another network, or holds more than arrays.
+    """
+    content = read_checkpoint(checkpoint)
+    model = import_package("tapnet.models.tapir_model", "TAPIR", INSTALL)
+    options = BOOTSTAPIR if any("extra_convs" in name for name in content["params"]) else TAPIR
+    return Tapir(model.ParameterizedTAPIR, content["params"], content["state"], options)
+
+
+class Tapir:
+    """The tracker: see `xew.metrics.backends.Tracker`. Lost is where the network finds it likelier than not that the point is
+    hidden or that it is off by more than it was trained to tolerate."""
+
+    def __init__(self, network: Any, params: Any, state: Any, options: Mapping[str, Any]) -> None:
+        self._weights = jax.device_put((params, state))
+        self._run = jax.jit(functools.partial(_run, network, dict(options)))
+
+    def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        check_tracks(prediction, points, visible)
+        tracks = lost(visible.shape)
+        frames = query_frames(visible)
+        asked = np.flatnonzero(frames >= 0)
+        if len(asked) == 0:
+            return tracks
+        scale = SIDE / np.array(prediction.shape[2:0:-1], np.float32)  # of x and y
+        # Its pixels' centres are at halves, ours at whole numbers.
+        x, y = ((points[frames[asked], asked] + 0.5) * scale).T
+        queries = np.column_stack([frames[asked], y, x]).astype(np.float32)
+        found, seen = (np.asarray(array) for array in self._run(self._weights, _resize(prediction), queries))
+        tracks[:, asked] = np.where(seen[..., None], found / scale - 0.5, np.nan).swapaxes(0, 1)
+        return tracks
+
+
+def _run(
+    network: Any, options: dict[str, Any], weights: tuple[Any, Any], video: jax.Array, queries: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Tracks [k t 2] (x, y in the network's pixels) and where they hold [k t], of a video uint8 [t h w 3] and [k 3] t, y, x."""
+    signed = video.astype("float32") / 127.5 - 1
+    output = network(*weights, options)(
+        video=signed[None], is_training=False, query_points=queries[None], query_chunk_size=CHUNK
+    )
+    shown, near = (jax.nn.sigmoid(-output[name][0]) for name in ("occlusion", "expected_dist"))
+    return output["tracks"][0], shown * near > 0.5
+
+
+def _resize(video: np.ndarray) -> np.ndarray:
+    return np.stack([np.asarray(Image.fromarray(frame).resize((SIDE, SIDE))) for frame in video])
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """The trees `params` and `state` of a checkpoint, which is a dictionary in a NumPy file, so a pickle.
+
+    Raises:
+        ConfigError: the file is something else, or asks for anything but arrays.
+    """
+    expected = "expected tapir_checkpoint_panning.npy or bootstapir_checkpoint_v2.npy"
+    if "causal" in path.name:
+        raise ConfigError(f"{path} is a causal network, which sees no whole video; {expected}.")
+    try:
+        with path.open("rb") as file:
+            content = _read_object(file)
+    except (OSError, EOFError, ValueError, pickle.UnpicklingError, AttributeError, IndexError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path} is no checkpoint of TAPIR ({error}); {expected}.") from error
+    if not isinstance(content, dict) or not all(isinstance(content.get(part), Mapping) for part in ("params", "state")):
+        raise ConfigError(f"{path} lacks the parameters of TAPIR (`params`, `state`); {expected}.")
+    return content
+
+
+class _ArrayUnpickler(pickle.Unpickler):
+    """A pickle can run any code; this one can build arrays and dictionaries and nothing else."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in ADMITTED:
+            raise pickle.UnpicklingError(f"the file asks for {module}.{name}, which no file of arrays needs; it was not run")
+        return super().find_class(module.replace("numpy.core", "numpy._core"), name)
+
+
+def _read_object(file: IO[bytes]) -> Any:
+    """The one object of a .npy file."""
+    if np.lib.format.read_magic(file) != (1, 0):
+        raise ValueError("it is of another version of .npy")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    if shape != () or not dtype.hasobject:
+        raise ValueError(f"it holds {dtype} {shape}, not one dictionary")
+    return _ArrayUnpickler(file).load().item()

@@ -1,0 +1,149 @@
+"""A bundle: one JSON file by which others can check a score table without trusting whoever made it.
+
+It holds the protocol, versions and estimators, the digest of the score table, every graded video with the digests of
+the prediction and of the truth and its values, the means over them, and a digest of all this. Checking it needs the bundle
+alone (is it whole, are the means those of its values, is it of the table beside it?), or also the videos and the data
+(was it made from them?).
+"""
+
+import hashlib
+import json
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from xew.config import ConfigError
+from xew.metrics.grading.scores import KEY, Cell, file_digest, write_whole
+
+FORMAT = 1
+DIGESTS = ("prediction", "rgb", "states")
+CHOICES = ("protocol", "estimators", "frame_zero", "allowed")
+SHOWN = 5
+"""So many differences are named."""
+AGREEMENT = 1e-3
+"""Relative (of numbers below 1: absolute), by which scores graded anew on another machine may differ."""
+
+Bundle = dict[str, Any]
+
+
+def write_bundle(path: Path, table: Path, rows: pd.DataFrame, cells: Sequence[Cell]) -> None:
+    """Write the bundle of a score table. Raises ConfigError if the disk does not take it.
+
+    Args:
+        path: of the bundle.
+        table: the score table, of which the digest is taken.
+        rows: what is in it.
+        cells: what was graded; those without a row had no value.
+    """
+    values: dict[tuple[Any, ...], dict[str, float]] = defaultdict(dict)
+    exact: dict[tuple[Any, ...], int] = {}
+    for *key, metric, value, exact_frames in rows[[*KEY, "metric", "value", "exact_frames"]].itertuples(index=False, name=None):
+        values[tuple(key)][metric] = value
+        exact[tuple(key)] = exact_frames
+    samples = [
+        dict(zip(KEY, cell.key, strict=True))
+        | {"frames": cell.frames, "exact_frames": exact[cell.key]}
+        | {name: getattr(cell, name) for name in DIGESTS}
+        | {"values": values[cell.key]}
+        for cell in sorted(cells, key=lambda cell: cell.key)
+        if cell.key in values
+    ]
+    bundle: Bundle = {"format": FORMAT, "table": table.name, "table_sha256": file_digest([table])}
+    bundle |= {str(name): value for name, value in rows.attrs.items()} | {"samples": samples, "means": means(samples)}
+    write_whole(path, (json.dumps(bundle | {"digest": digest(bundle)}, indent=1) + "\n").encode())
+
+
+def read_bundle(path: Path) -> Bundle:
+    """A bundle that is whole and consistent in itself and with the table beside it, where there is one.
+
+    Raises:
+        ConfigError: it is not; the message says what does not hold.
+    """
+    try:
+        bundle = json.loads(path.read_text())
+        given, samples = bundle.pop("digest"), bundle["samples"]
+        wrong = []
+        if bundle["format"] != FORMAT:
+            wrong.append(f"its format is {bundle['format']}, this xew reads {FORMAT}")
+        elif given != digest(bundle):
+            wrong.append("its content does not have the digest that it names: it was changed after it was written")
+        elif bundle["means"] != means(samples):
+            wrong.append("its means are not those of its values")
+        elif len({_key(sample) for sample in samples}) != len(samples):
+            wrong.append("it holds a video twice")
+        table = path.parent / bundle["table"]
+        if not wrong and table.exists() and file_digest([table]) != bundle["table_sha256"]:
+            wrong.append(f"{table} is another table than it was made from")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{path} is no bundle of xew, or is damaged ({type(error).__name__}: {error}).") from error
+    if wrong:
+        raise ConfigError(f"{path} does not hold: {'; '.join(wrong)}.")
+    return bundle
+
+
+def differences(bundle: Bundle, choices: dict[str, Any], cells: Iterable[Cell]) -> list[str]:
+    """What keeps a bundle from being that of these videos and data, one line each; nothing where it is theirs.
+
+    Args:
+        bundle: as read.
+        choices: protocol, estimators, frame_zero and allowed, as they are now.
+        cells: the videos and truths as they are now.
+    """
+    found = [f"{name} is {bundle[name]!r}, here {choices[name]!r}" for name in CHOICES if bundle[name] != choices[name]]
+    here = {cell.key: cell for cell in cells}
+    there = {_key(sample): sample for sample in bundle["samples"]}
+    found += [f"{_text(key)} is in the bundle and not here" for key in there.keys() - here.keys()]
+    found += [f"{_text(key)} is here and not in the bundle" for key in here.keys() - there.keys()]
+    for key in sorted(there.keys() & here.keys()):
+        changed = [name for name in (*DIGESTS, "frames") if there[key][name] != getattr(here[key], name)]
+        found += [f"{_text(key)} has another {', '.join(changed)}"] if changed else []
+    return found
+
+
+def disagreements(bundle: Bundle, key: tuple[Any, ...], values: dict[str, float]) -> list[str]:
+    """Where values of a video that were graded anew are not those of the bundle, one line each."""
+    sample = next(sample for sample in bundle["samples"] if _key(sample) == key)
+    found = []
+    for metric in bundle["metrics"]:
+        then, now = (some.get(metric, math.nan) for some in (sample["values"], values))
+        if not np.isclose(now, then, rtol=AGREEMENT, atol=AGREEMENT, equal_nan=True):
+            found.append(f"{_text(key)}: {metric} is {now:.6g}, the bundle says {then:.6g}")
+    return found
+
+
+def demand_none(path: Path, found: Sequence[str]) -> None:
+    """Raise ConfigError that names the first few differences, if there are any."""
+    if found:
+        more = f"\n  and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+        raise ConfigError(f"{path} does not hold here:\n  " + "\n  ".join(found[:SHOWN]) + more)
+
+
+def means(samples: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Mean values over samples, one for each robot, model, condition and metric; independent of the samples' order."""
+    groups: dict[tuple[str, ...], list[float]] = defaultdict(list)
+    for sample in samples:
+        for metric, value in sample["values"].items():
+            groups[sample["robot"], sample["model"], sample["condition"], metric].append(value)
+    names = ("robot", "model", "condition", "metric")
+    return [
+        dict(zip(names, group, strict=True)) | {"mean": math.fsum(values) / len(values), "episodes": len(values)}
+        for group, values in sorted(groups.items())
+    ]
+
+
+def digest(bundle: Bundle) -> str:
+    """SHA-256 of a bundle's content, its own digest left out."""
+    return hashlib.sha256(json.dumps(bundle, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _key(sample: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(sample[name] for name in KEY)
+
+
+def _text(key: tuple[Any, ...]) -> str:
+    return " ".join(str(part) for part in key if part != "")

@@ -1,0 +1,84 @@
+"""Metrics, many videos at once: worker threads, what each has for itself, and how far they run ahead.
+
+Threads and not processes: decoding, OpenCV and XLA let go of Python's lock, and compiled programs are shared.
+"""
+
+import os
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from xew.config import ConfigError, pick
+from xew.files import cache_folder
+from xew.metrics.backends import Masker, Tracker
+from xew.metrics.estimators.adapters import use_torch_device
+
+MOST_WORKERS = 32
+"""A worker holds an episode and a prediction, a quarter of a gigabyte at full length."""
+
+
+def worker_count(asked: int) -> int:
+    """How many threads to use; 0 asks for one for each processor core. Raises ConfigError for a negative number."""
+    if asked < 0:
+        raise ConfigError(f"--workers is {asked}, expected a positive number, or 0 for one for each core.")
+    return asked or max(len(jax.local_devices()), min(os.cpu_count() or 1, MOST_WORKERS))
+
+
+class Bench(threading.local):
+    """What each worker thread has for itself: a device, and who finds robots and points there."""
+
+    def __init__(
+        self,
+        masker: Callable[[jax.Device], Masker],
+        tracker: Callable[[jax.Device], Tracker],
+        devices: Iterator[jax.Device],
+    ) -> None:
+        self.device = next(devices)
+        use_torch_device(self.device.local_hardware_id or 0)
+        self.masker, self.tracker = masker(self.device), tracker(self.device)
+
+
+def not_needed(_: jax.Device) -> Any:
+    """In place of an estimator that no metric asks."""
+
+
+E = TypeVar("E", bound=Callable[..., np.ndarray])
+
+
+def opener(
+    name: str, registry: Any, open_: Callable[[str, Path | None], E], checkpoint: Path | None
+) -> Callable[[jax.Device], E]:
+    """How a thread on a device comes by an estimator: its own, or, of one with weights, the device's, used in turn."""
+    if pick(registry, name, "estimator").needs is None:
+        return lambda _: open_(name, checkpoint)
+    opened: dict[jax.Device, E] = {}
+    opening = threading.Lock()
+
+    def of_device(device: jax.Device) -> E:
+        with opening, jax.default_device(device):
+            if device not in opened:
+                opened[device] = in_turn(open_(name, checkpoint))
+            return opened[device]
+
+    return of_device
+
+
+def in_turn(estimator: E) -> E:
+    """The same estimator for one thread at a time; estimators keep notes of the episode at hand."""
+    turn = threading.Lock()
+
+    def call(*arrays: np.ndarray) -> np.ndarray:
+        with turn:
+            return estimator(*arrays)
+
+    return call  # type: ignore[return-value]
+
+
+def compile_cache() -> None:
+    """Keep compiled programs between runs in the user's cache folder, unless JAX was told otherwise."""
+    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder("jax")))

@@ -1,0 +1,3 @@
+"""What LPIPS computes with: AlexNet's published weights, and convolutions of images in float32."""
+
+__all__ = ["alexnet", "convolution"]

@@ -1,0 +1,6 @@
+"""Video codecs: frames to latents and back, the names of published weights, and the ceiling that a codec sets.
+
+Every codec is causal in time: the first frame alone, then groups of four.
+"""
+
+__all__ = ["ceiling", "codec", "vae", "vae_layouts"]

@@ -1,0 +1,59 @@
+"""The ceiling: what is left of true video after the codec, and so what no rollout at this size can exceed.
+
+Reads  videos, codec
+Writes `Ceiling`
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from xew.model.codecs.codec import Codec
+from xew.model.video.frames import to_camera_size, to_model_size
+
+T = TypeVar("T")
+
+LPIPS_EVERY = 3
+"""Frames between those on which LPIPS is taken: not 4, so that each place in a group of four gets its turn."""
+
+
+@dataclass(frozen=True)
+class Ceiling:
+    """Reconstruction of true video at the camera's size, mean over clips."""
+
+    psnr: float
+    """Decibels, as `xew.metrics.psnr`."""
+    lpips: float
+    """As `xew.metrics.lpips`, on every third frame."""
+    clips: int
+
+    def __str__(self) -> str:
+        return f"PSNR {self.psnr:.2f} dB, LPIPS {self.lpips:.4f} at camera size over {self.clips} clips"
+
+
+def measure_ceiling(codec: Codec, videos: Iterable[np.ndarray], frames: int, height: int, width: int) -> Ceiling:
+    """Encode and decode the first `frames` frames of each video.
+
+    Args:
+        videos: true video, uint8 [t 240 320 3] each; a shorter one is continued by its last frame, which is not graded.
+        frames, height, width: of the model's clip.
+    """
+    from xew.metrics import lpips, psnr  # only here: the model room does without metrics
+
+    scores = []
+    for video in videos:
+        truth = video[:frames]
+        clip = truth[np.minimum(np.arange(frames), len(truth) - 1)]
+        decoded = to_camera_size(codec.decode(codec.encode(to_model_size(clip, height, width))))[: len(truth)]
+        pair = jnp.asarray(decoded), jnp.asarray(truth)
+        scores.append((np.mean(psnr(*pair)), np.mean(lpips(*(video[::LPIPS_EVERY] for video in pair)))))
+    means = np.mean(scores, axis=0)
+    return Ceiling(float(means[0]), float(means[1]), len(scores))
+
+
+def spread(items: Sequence[T], count: int) -> list[T]:
+    """At most `count` of them, evenly chosen."""
+    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(len(items), count)).astype(int))]

@@ -1,0 +1,404 @@
+"""Video codecs: frames to latents and back. Every codec is causal: the first frame alone, then groups of four.
+
+Reads  uint8 [t h w 3], or on the device float [b t h w 3] in [-1, 1]; t = 4 k + 1
+Writes float32 latents [k + 1, h / factor, w / factor, channels] of about unit size
+To add a codec: a class with the methods of `Codec` (most come with `BatchCodec`), and one line in CODECS.
+
+A codec is a JAX pytree of its arrays, so that it is passed to compiled functions and is no constant in them.
+"""
+
+import functools
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Protocol, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jax import Array, lax
+
+from xew.config import ConfigError, parse, pick
+from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae
+from xew.model.codecs.vae_layouts import load_vae, save_vae
+
+TEMPORAL_FACTOR = 4
+
+
+@dataclass(frozen=True)
+class CodecSettings:
+    """The `codec` section of a config."""
+
+    name: str = "patch_pca"
+    """One of CODECS."""
+    spatial_factor: int = 8
+    channels: int = 48
+    fit_clips: int = 64
+    """patch_pca: clips of training episodes from which the components are computed."""
+    vae: str = "wan22"
+    """wan_vae: one of VAES."""
+    weights: Path | None = None
+    """wan_vae: Wan2.2_VAE.pth, the vae folder of the diffusers layout, or what `train_vae` wrote."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """wan_vae: of the activations."""
+    chunk: int = 8
+    """wan_vae: latent frames that go through the network at once; more is faster and takes more memory, 0 takes all."""
+
+
+class Codec(Protocol):
+    """What the rest of the room asks of a codec."""
+
+    fitted: ClassVar[bool]
+    """Whether it comes from the training episodes themselves, and not from weights."""
+
+    @property
+    def spatial_factor(self) -> int:
+        """Pixels a side of what one latent covers."""
+
+    @property
+    def channels(self) -> int:
+        """Of the latents."""
+
+    @property
+    def hash(self) -> str:
+        """Changes whenever latents would."""
+
+    def encode(self, video: np.ndarray) -> np.ndarray:
+        """uint8 [t h w 3] -> float32 [t' h' w' c]. Later frames never change earlier latents."""
+
+    def decode(self, latents: np.ndarray) -> np.ndarray:
+        """float32 [t' h' w' c] -> uint8 [t h w 3]."""
+
+    def encode_batch(self, frames: Array) -> Array:
+        """Float [b t h w 3] in [-1, 1] -> float32 [b t' h' w' c]; may be traced."""
+
+    def decode_batch(self, latents: Array) -> Array:
+        """Float [b t' h' w' c] -> float32 [b t h w 3], about in [-1, 1]; may be traced."""
+
+    def next_reference(self, latents: Array) -> Array:
+        """[b t' h' w' c] -> [b 1 h' w' c]: the last frame of a decoded clip, encoded alone; may be traced.
+
+        It is rounded as if it had been a picture in between, so it is what a rollout begins its next chunk with.
+        """
+
+    def save(self, folder: Path) -> None:
+        """Write all that `load` needs into a folder, under names of its own."""
+
+    @classmethod
+    def load(cls, folder: Path) -> Self: ...
+
+    @classmethod
+    def check(cls, settings: CodecSettings) -> None:
+        """Raise ConfigError where settings contradict one another; reads no weights."""
+
+    @classmethod
+    def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> Self:
+        """The codec of a config; `clips` gives uint8 [t h w 3] of training episodes to one that is fitted to them."""
+
+
+class BatchCodec:
+    """A codec's functions on pictures and on single clips, from its `encode_batch` and `decode_batch`."""
+
+    spatial_factor: int
+    encode_batch: Callable[[Array], Array]
+    decode_batch: Callable[[Array], Array]
+
+    def encode(self, video: np.ndarray) -> np.ndarray:
+        """uint8 [t h w 3] -> float32 [t' h' w' c]; t must be 4 k + 1 and the sides multiples of the factor."""
+        check_clip_shape(video.shape, self.spatial_factor)
+        return np.asarray(encode_pictures(self, video[None]))[0]
+
+    def decode(self, latents: np.ndarray) -> np.ndarray:
+        """float32 [t' h' w' c] -> uint8 [t h w 3]."""
+        return np.asarray(decode_to_pictures(self, latents[None]))[0]
+
+    def next_reference(self, latents: Array) -> Array:
+        """[b t' h' w' c] -> [b 1 h' w' c]: the last decoded frame as a picture, encoded alone."""
+        return self.encode_batch(to_signed(to_pictures(self.decode_batch(latents)[:, -1:])))
+
+
+@jax.jit
+def encode_pictures(codec: Any, videos: Array) -> Array:
+    """uint8 [b t h w 3] -> float32 latents [b t' h' w' c]."""
+    return codec.encode_batch(to_signed(videos))
+
+
+@jax.jit
+def decode_to_pictures(codec: Any, latents: Array) -> Array:
+    """Latents [b t' h' w' c] -> uint8 [b t h w 3]."""
+    return to_pictures(codec.decode_batch(latents))
+
+
+def to_signed(pictures: Array) -> Array:
+    """uint8 -> float32 in [-1, 1]."""
+    return pictures.astype(jnp.float32) / 127.5 - 1
+
+
+def to_pictures(frames: Array) -> Array:
+    """Float, about in [-1, 1] -> uint8."""
+    return jnp.clip(jnp.rint((frames + 1) * 127.5), 0, 255).astype(jnp.uint8)
+
+
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("mean", "directions", "scale"), meta_fields=())
+@dataclass(frozen=True)
+class Basis:
+    """An affine map between patches [p] and latent channels [c]."""
+
+    mean: Any
+    """[p] float32."""
+    directions: Any
+    """[p c] float32, orthonormal columns."""
+    scale: Any
+    """[c] float32, divides the coordinates along the directions."""
+
+    def encode(self, patches: Array) -> Array:
+        """[... p] -> [... c]. At the highest precision: TF32, the default of some GPUs, costs the codec decibels."""
+        centred = patches - over_last(self.mean, patches.ndim)
+        return jnp.matmul(centred, self.directions, precision=lax.Precision.HIGHEST) / over_last(self.scale, patches.ndim)
+
+    def decode(self, latents: Array) -> Array:
+        """[... c] -> [... p]."""
+        scaled = latents * over_last(self.scale, latents.ndim)
+        patches = jnp.matmul(scaled, self.directions.T, precision=lax.Precision.HIGHEST)
+        return patches + over_last(self.mean, latents.ndim)
+
+
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("first", "later"), meta_fields=("spatial_factor",))
+@dataclass(frozen=True)
+class PatchCodec(BatchCodec):
+    """A linear codec without pretrained weights: principal components of square patches.
+
+    Frame 0 is coded as it is; a group of four later frames as its difference from frame 0, as video codecs code frames
+    between key frames. What stays still is zero, so copying the reference asks nothing of the model.
+    """
+
+    fitted: ClassVar[bool] = True
+
+    spatial_factor: int
+    first: Basis
+    """Of patches [factor factor 3] of the first frame."""
+    later: Basis
+    """Of patches [4 factor factor 3] of differences from the first frame; its mean is zero."""
+
+    @property
+    def channels(self) -> int:
+        return len(self.first.scale)
+
+    @property
+    def hash(self) -> str:
+        digest = hashlib.sha256(f"patch_pca {self.spatial_factor}".encode())
+        for basis in (self.first, self.later):
+            for field in fields(Basis):
+                digest.update(np.ascontiguousarray(getattr(basis, field.name)).tobytes())
+        return digest.hexdigest()
+
+    def encode_batch(self, frames: Array) -> Array:
+        """Float [b t h w 3] in [-1, 1] -> float32 [b t' h' w' c]."""
+        first, later = cut_patches(frames, self.spatial_factor)
+        return jnp.concatenate([self.first.encode(first), self.later.encode(later)], axis=1)
+
+    def decode_batch(self, latents: Array) -> Array:
+        """Float32 [b t' h' w' c] -> float32 [b t h w 3], about in [-1, 1]."""
+        return join_patches(self.first.decode(latents[:, :1]), self.later.decode(latents[:, 1:]), self.spatial_factor)
+
+    def save(self, folder: Path) -> None:
+        """Write codec.npz."""
+        arrays = {
+            f"{name}_{f.name}": getattr(getattr(self, name), f.name) for name in ("first", "later") for f in fields(Basis)
+        }
+        np.savez(folder / "codec.npz", spatial_factor=self.spatial_factor, **arrays)
+
+    @classmethod
+    def load(cls, folder: Path) -> "PatchCodec":
+        with np.load(folder / "codec.npz") as stored:
+            first, later = (Basis(*(stored[f"{name}_{f.name}"] for f in fields(Basis))) for name in ("first", "later"))
+            return cls(int(stored["spatial_factor"]), first, later)
+
+    @classmethod
+    def check(cls, settings: CodecSettings) -> None:
+        directions = 3 * settings.spatial_factor**2
+        if not 0 < settings.channels <= directions:
+            raise ConfigError(
+                f"codec.channels is {settings.channels}; square patches of codec.spatial_factor {settings.spatial_factor}"
+                f" have {directions} directions, so give 1 to {directions}."
+            )
+        if settings.fit_clips < 2:
+            raise ConfigError(f"codec.fit_clips is {settings.fit_clips}; it must be at least 2, a scene's and a robot's.")
+
+    @classmethod
+    def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> "PatchCodec":
+        return cls.fit(clips(), settings.spatial_factor, settings.channels)
+
+    @classmethod
+    def fit(cls, clips: list[np.ndarray], spatial_factor: int, channels: int, whitening: float = 0.5) -> "PatchCodec":
+        """Fit on uint8 clips [t h w 3]; deterministic.
+
+        Args:
+            whitening: 1 gives every channel unit variance, 0 keeps the patches' own proportions; the scale is such that
+                the mean variance over channels is 1 either way.
+        """
+        cut = [cut_patches(clip[None].astype(np.float32) / 127.5 - 1, spatial_factor) for clip in clips]
+        first = np.concatenate([np.reshape(part, (-1, part.shape[-1])) for part, _ in cut])
+        later = np.concatenate([np.reshape(part, (-1, part.shape[-1])) for _, part in cut])
+        return cls(spatial_factor, _fit(first, channels, whitening, True), _fit(later, channels, whitening, False))
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass, data_fields=("params",), meta_fields=("graph", "size", "dtype", "chunk", "hash")
+)
+@dataclass(frozen=True)
+class WanVaeCodec(BatchCodec):
+    """Wan2.2's autoencoder, or a smaller one of its kind, with trained weights; see `xew.model.codecs.vae`."""
+
+    fitted: ClassVar[bool] = False
+
+    params: Any
+    """State of a `VideoVae`, with the statistics of its latents."""
+    graph: nnx.GraphDef
+    size: VaeSize
+    dtype: str
+    chunk: int
+    hash: str
+
+    @property
+    def spatial_factor(self) -> int:  # type: ignore[override]
+        return self.size.spatial_factor
+
+    @property
+    def channels(self) -> int:
+        return self.size.channels
+
+    @property
+    def vae(self) -> VideoVae:
+        return nnx.merge(self.graph, self.params)
+
+    def encode_batch(self, frames: Array) -> Array:
+        """Float [b t h w 3] in [-1, 1] -> float32 [b t' h' w' c]: normalised means, as Wan's diffusion takes them."""
+        return self.vae.encode(frames, self.chunk)
+
+    def decode_batch(self, latents: Array) -> Array:
+        """Float [b t' h' w' c] -> float32 [b t h w 3] in [-1, 1]."""
+        return self.vae.decode(latents, self.chunk)
+
+    def next_reference(self, latents: Array) -> Array:
+        """[b t' h' w' c] -> [b 1 h' w' c]; decodes two latents at a time, so that it fits beside a network in training."""
+        last = self.vae.decode(latents, chunk=2, last_only=True)
+        return self.vae.encode(to_signed(to_pictures(last)))
+
+    def save(self, folder: Path) -> None:
+        """Write vae.safetensors and vae.json; weights that are there already are not written again."""
+        description = {"size": asdict(self.size), "dtype": self.dtype, "chunk": self.chunk, "hash": self.hash}
+        file = folder / "vae.json"
+        if not file.exists() or json.loads(file.read_text())["hash"] != self.hash:
+            save_vae(self.vae, folder / "vae.safetensors")
+        file.write_text(json.dumps(description, indent=1) + "\n")
+
+    @classmethod
+    def load(cls, folder: Path) -> "WanVaeCodec":
+        stored = json.loads((folder / "vae.json").read_text())
+        size = parse(VaeSize, stored["size"], str(folder / "vae.json"))
+        return cls.read(folder / "vae.safetensors", size, stored["dtype"], stored["chunk"])
+
+    @classmethod
+    def check(cls, settings: CodecSettings) -> None:
+        size = pick(VAES, settings.vae, "autoencoder")
+        if (settings.spatial_factor, settings.channels) != (size.spatial_factor, size.channels):
+            raise ConfigError(
+                f"codec.spatial_factor is {settings.spatial_factor} and codec.channels {settings.channels}; the autoencoder"
+                f" {settings.vae} has {size.spatial_factor} and {size.channels}: write those."
+            )
+        if settings.chunk < 0:
+            raise ConfigError(f"codec.chunk is {settings.chunk}; expected latent frames at once, or 0 for all.")
+
+    @classmethod
+    def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> "WanVaeCodec":
+        """Read the weights of a config.
+
+        Raises:
+            ConfigError: none are named, or they are missing, broken or of another size.
+        """
+        if settings.weights is None:
+            raise ConfigError(
+                "the codec wan_vae needs codec.weights: Wan2.2_VAE.pth, the vae folder of Wan2.2-TI2V-5B-Diffusers, or the"
+                " folder of an autoencoder trained by `python -m xew.model.train_vae CONFIG`."
+            )
+        return cls.read(settings.weights, pick(VAES, settings.vae, "autoencoder"), settings.dtype, settings.chunk)
+
+    @classmethod
+    def read(cls, weights: Path, size: VaeSize, dtype: str = "float32", chunk: int = 8) -> "WanVaeCodec":
+        """A codec from a file of weights of any known kind."""
+        vae = abstract_vae(size, jnp.dtype(dtype))
+        load_vae(vae, weights)
+        return cls.of(vae, chunk)
+
+    @classmethod
+    def of(cls, vae: VideoVae, chunk: int = 8) -> "WanVaeCodec":
+        """The codec of an autoencoder."""
+        graph, params = nnx.split(vae)
+        dtype = jnp.dtype(vae.dtype).name
+        digest = hashlib.sha256(f"wan_vae {vae.size} {dtype}".encode())
+        for path, leaf in sorted(nnx.to_flat_state(params), key=lambda item: str(item[0])):
+            digest.update(f"{path}".encode())
+            digest.update(np.asarray(jax.device_get(leaf.get_value())).tobytes())
+        return cls(params, graph, vae.size, dtype, chunk, digest.hexdigest())
+
+
+CODECS: dict[str, type[Codec]] = {"patch_pca": PatchCodec, "wan_vae": WanVaeCodec}
+
+
+def codec_of(settings: CodecSettings) -> type[Codec]:
+    """The kind of codec that a config names. Raises ConfigError if there is none of that name."""
+    return pick(CODECS, settings.name, "codec")
+
+
+def over_last(vector: Array, ndim: int) -> Array:
+    """[c] -> [1 ... 1 c]: to be broadcast over the last of `ndim` axes."""
+    return jnp.reshape(vector, (1,) * (ndim - 1) + (-1,))
+
+
+def check_clip_shape(shape: tuple[int, ...], spatial_factor: int) -> None:
+    """Raise ValueError unless a clip [t h w 3] can be encoded."""
+    t, h, w, _ = shape
+    if t % TEMPORAL_FACTOR != 1 or h % spatial_factor or w % spatial_factor:
+        raise ValueError(f"a clip of {t} frames {w}x{h} cannot be encoded: it needs 4 k + 1 frames, sides in {spatial_factor}s")
+
+
+def latent_frames(frames: int) -> int:
+    """How many latent frames `frames` = 4 k + 1 pixels frames become."""
+    return (frames - 1) // TEMPORAL_FACTOR + 1
+
+
+def cut_patches(frames: Any, factor: int) -> tuple[Any, Any]:
+    """Frames [b t h w 3] -> first frame's patches [b 1 h' w' p] and later groups' difference patches [b k h' w' 4p]."""
+    b, t, h, w, _ = frames.shape
+    rows, columns, patch = h // factor, w // factor, factor * factor * 3
+    cut = frames.reshape(b, t, rows, factor, columns, factor, 3).transpose(0, 1, 2, 4, 3, 5, 6)
+    groups = (cut[:, 1:] - cut[:, :1]).reshape(b, (t - 1) // TEMPORAL_FACTOR, TEMPORAL_FACTOR, *cut.shape[2:])
+    later = groups.transpose(0, 1, 3, 4, 2, 5, 6, 7)
+    return cut[:, :1].reshape(b, 1, rows, columns, patch), later.reshape(*later.shape[:4], TEMPORAL_FACTOR * patch)
+
+
+def join_patches(first: Array, later: Array, factor: int) -> Array:
+    """The inverse of `cut_patches`."""
+    b, k, h, w, _ = later.shape
+    groups = later.reshape(b, k, h, w, TEMPORAL_FACTOR, factor, factor, 3).transpose(0, 1, 4, 2, 3, 5, 6, 7)
+    cut = first.reshape(b, 1, h, w, factor, factor, 3)
+    frames = jnp.concatenate([cut, cut + groups.reshape(b, k * TEMPORAL_FACTOR, *cut.shape[2:])], axis=1)
+    return frames.transpose(0, 1, 2, 4, 3, 5, 6).reshape(b, -1, h * factor, w * factor, 3)
+
+
+def _fit(patches: np.ndarray, channels: int, whitening: float, centred: bool) -> Basis:
+    """Leading principal directions of patches [m p], by the eigenvectors of their second moments."""
+    mean = patches.mean(0) if centred else np.zeros(patches.shape[1], np.float32)
+    centred_patches = patches - mean
+    moments = centred_patches.T.astype(np.float64) @ centred_patches.astype(np.float64) / len(patches)
+    values, vectors = np.linalg.eigh(moments)
+    variance = np.maximum(values[::-1][:channels], 1e-8)
+    directions = vectors[:, ::-1][:, :channels]
+    directions = directions * np.sign(directions[np.abs(directions).argmax(0), np.arange(channels)])
+    scale = variance ** (whitening / 2)
+    scale *= np.sqrt((variance / scale**2).mean())
+    return Basis(mean.astype(np.float32), directions.astype(np.float32), scale.astype(np.float32))

@@ -1,0 +1,121 @@
+"""What the leaves of `VideoVae` are called in the files of others: Wan2.2's own, diffusers', and ours.
+
+Ours is diffusers' and the two statistics of the latents, which theirs keeps in its config and Wan2.2's in its code.
+"""
+
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from flax import nnx
+
+from xew.config import ConfigError
+from xew.model.codecs.vae import VideoVae
+from xew.model.weights.tensors import Layout, Source, Tensors, fill, read_tensors, save_weights
+
+STATISTICS = ("latents_mean", "latents_std")
+
+DIFFUSERS = {
+    r"^(post_)?quant\.": r"\g<1>quant_conv.",
+    r"^encoder\.stages\.(\d+)\.": r"encoder.down_blocks.\1.",
+    r"^decoder\.stages\.(\d+)\.": r"decoder.up_blocks.\1.",
+    r"\.blocks\.": ".resnets.",
+    r"\.shortcut\.": ".conv_shortcut.",
+    r"^encoder(.*)\.resample\.": r"encoder\1.downsampler.",
+    r"^decoder(.*)\.resample\.": r"decoder\1.upsampler.",
+    r"sampler\.conv\.": "sampler.resample.1.",
+    r"sampler\.time\.": "sampler.time_conv.",
+    r"\.middle\.first\.": ".mid_block.resnets.0.",
+    r"\.middle\.last\.": ".mid_block.resnets.1.",
+    r"\.middle\.attention\.": ".mid_block.attentions.0.",
+}
+"""Patterns of our names and what diffusers writes instead, applied in order."""
+
+OFFICIAL = {
+    r"^encoder\.stages\.(\d+)\.": r"encoder.downsamples.\1.downsamples.",
+    r"^decoder\.stages\.(\d+)\.": r"decoder.upsamples.\1.upsamples.",
+    r"\.blocks\.": ".",
+    r"\.norm1\.": ".residual.0.",
+    r"\.conv1\.": ".residual.2.",
+    r"\.norm2\.": ".residual.3.",
+    r"\.conv2\.": ".residual.6.",
+    r"\.conv\.": ".resample.1.",
+    r"\.time\.": ".time_conv.",
+    r"\.middle\.first\.": ".middle.0.",
+    r"\.middle\.attention\.": ".middle.1.",
+    r"\.middle\.last\.": ".middle.2.",
+    r"\.conv_in\.": ".conv1.",
+    r"\.norm_out\.": ".head.0.",
+    r"\.conv_out\.": ".head.2.",
+    r"^quant\.": "conv1.",
+    r"^post_quant\.": "conv2.",
+}
+"""The same for Wan2.2; what resamples a stage is numbered on after its blocks."""
+
+
+def diffusers_layout(vae: VideoVae) -> Layout:
+    """Names of diffusers' AutoencoderKLWan; the module may be abstract."""
+    return _layout(vae, lambda path: _renamed(path, DIFFUSERS))
+
+
+def official_layout(vae: VideoVae) -> Layout:
+    """Names of `Wan2.2_VAE.pth`; the module may be abstract."""
+
+    def name(path: str) -> str:
+        blocks = vae.size.blocks + (1 if path.startswith("decoder") else 0)
+        return _renamed(path.replace(".resample.", f".{blocks}."), OFFICIAL)
+
+    return _layout(vae, name)
+
+
+def own_layout(vae: VideoVae) -> Layout:
+    """Names of the files that the project writes."""
+    return {**diffusers_layout(vae), **{name: Source((name,)) for name in STATISTICS}}
+
+
+def load_vae(vae: VideoVae, path: Path) -> None:
+    """Fill an autoencoder from a file of any of the three kinds; what a file lacks of the statistics keeps its value.
+
+    Raises:
+        ConfigError: the file is none of the three, or of another size.
+    """
+    tensors = read_tensors(path)
+    fill(vae, tensors, _layout_of(vae, tensors), optional=STATISTICS)
+
+
+def save_vae(vae: VideoVae, path: Path) -> None:
+    """Write an autoencoder with its statistics as one .safetensors. Raises ConfigError if it cannot be written."""
+    save_weights(vae, path, own_layout(vae))
+
+
+def _layout_of(vae: VideoVae, tensors: Tensors) -> Layout:
+    """The layout whose first layer the file holds."""
+    known = {"encoder.conv_in.weight": own_layout, "encoder.conv1.weight": official_layout}
+    for key, layout in known.items():
+        if key in tensors:
+            return layout(vae)
+    found = ", ".join(list(tensors)[:3]) or "nothing"
+    raise ConfigError(
+        f"{tensors.source} is no autoencoder of Wan2.2: it holds {found} …, expected {' or '.join(known)} among its tensors."
+    )
+
+
+def _layout(vae: VideoVae, name: Callable[[str], str]) -> Layout:
+    """A source for every trained leaf."""
+    paths = [".".join(map(str, path)) for path, _ in nnx.to_flat_state(nnx.state(vae, nnx.Param))]
+    return {path: _source(path, name(path)) for path in paths}
+
+
+def _source(path: str, name: str) -> Source:
+    """PyTorch writes kernels as [out in *kernel], and the scales of norms with ones for every axis beside the channels."""
+    if path.endswith(".kernel"):
+        return Source((name.removesuffix("kernel") + "weight",), "conv")
+    if path.endswith(".gamma"):
+        return Source((name,), "ones", (1, 1) if ".attention." in path else (1, 1, 1))
+    return Source((name,))
+
+
+def _renamed(path: str, patterns: Mapping[str, str]) -> str:
+    for pattern, replacement in patterns.items():
+        path = re.sub(pattern, replacement, path)
+    return path

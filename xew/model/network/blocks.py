@@ -1,0 +1,334 @@
+"""One block of the network, and what it is made of: attention, norms, feed-forward, and how they are computed on a device.
+
+Reads  tokens [b s d] of all streams, modulations [b r 6 d], rotations, context [b l d]
+Writes tokens [b s d]
+
+Shape letters: as in dit.py. Names of modules and parameters are those of Wan's checkpoints where Wan has the thing.
+
+Precision: matrix products and attention in `dtype`; norms, modulation and residual sums in float32 and written so that they
+fuse: no [b s 6 d] is formed, and what enters several products is rounded once.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jax import Array
+from jax.ad_checkpoint import checkpoint_name
+
+from xew.config import ConfigError
+from xew.model.devices.sharding import cut_over_batch
+from xew.model.network.mechanisms import FramedContext
+from xew.model.network.tokens import WAVELENGTH_BASE
+
+EPSILON = 1e-6
+
+Activation = Callable[[Array], Array]
+Rotary = tuple[Array, Array]
+"""Cosine and sine [s head_dim/2] of every token's rotation angles."""
+AttentionName = Literal["auto", "xla", "cudnn"]
+RematName = Literal["none", "attention", "dots", "full"]
+
+
+class ConditionCache(NamedTuple):
+    """What every layer's RGB tokens read of the condition tokens, when these do not look back (`one_way`)."""
+
+    keys: Array
+    """[layers b s n head_dim], rotated."""
+    values: Array
+    """[layers b s n head_dim]."""
+
+
+@dataclass(frozen=True)
+class ModelSize:
+    """Everything that distinguishes one size of the network from another."""
+
+    dim: int
+    depth: int
+    heads: int
+    ffn_dim: int
+    text_dim: int
+    text_tokens: int
+    rotary_base: float = WAVELENGTH_BASE
+    """Ratio of the slowest to the fastest rotation of positions; Wan's serves clips of hundreds of positions a side, and
+    a model of few positions tells them apart sooner with less."""
+
+    @property
+    def head_dim(self) -> int:
+        return self.dim // self.heads
+
+
+class Block(nnx.Module):
+    """Self-attention over all streams, cross-attention to the text, feed-forward; modulated by the noise level."""
+
+    def __init__(self, size: ModelSize, dtype: jnp.dtype, attention: AttentionName, rngs: nnx.Rngs) -> None:
+        self.dtype = dtype
+        self.modulation = nnx.Param(scaled_normal(rngs.params(), (1, 6, size.dim)))
+        self.self_attn = Attention(size, dtype, attention, rngs)
+        self.cross_attn = Attention(size, dtype, attention, rngs)
+        self.norm3 = nnx.LayerNorm(size.dim, epsilon=EPSILON, use_fast_variance=False, dtype=jnp.float32, rngs=rngs)
+        self.ffn = TwoLayer(size.dim, size.ffn_dim, size.dim, gelu, dtype, nnx.initializers.xavier_uniform(), rngs)
+
+    def __call__(
+        self,
+        tokens: Array,
+        modulation: Array,
+        rows: np.ndarray,
+        rotary: Rotary,
+        text: Array | FramedContext,
+        alone: int | None = None,
+        cache: ConditionCache | None = None,
+    ) -> Array:
+        """tokens [b s d]; modulation [b r 6 d], of which token i takes row rows[i]; text [b l d].
+
+        Tokens from `alone` on see none before them; those before see all, and the keys and values of `cache` too.
+        """
+        shift_sa, scale_sa, gate_sa, shift_ffn, scale_ffn, gate_ffn = self._chunks(modulation, rows)
+        attended = self.self_attn(modulate(tokens, shift_sa, scale_sa, self.dtype), rotary=rotary, alone=alone, cache=cache)
+        tokens = add(tokens, attended, gate_sa)
+        asked = self.norm3(tokens).astype(self.dtype)
+        read = self.cross_attn.by_frame(asked, text) if isinstance(text, FramedContext) else self.cross_attn(asked, text)
+        tokens = add(tokens, read)
+        return add(tokens, self.ffn(modulate(tokens, shift_ffn, scale_ffn, self.dtype)), gate_ffn)
+
+    def keys_values(self, tokens: Array, modulation: Array, rows: np.ndarray, rotary: Rotary) -> tuple[Array, Array]:
+        """What others' self-attention reads of these tokens: keys and values [b s n head_dim]."""
+        shift, scale = self._chunks(modulation, rows)[:2]
+        return self.self_attn.keys_values(modulate(tokens, shift, scale, self.dtype), rotary)
+
+    def _chunks(self, modulation: Array, rows: np.ndarray) -> list[Array]:
+        """Six [b s d]: shift, scale and gate of self-attention, then of the feed-forward; never formed at once."""
+        chunks = self.modulation[...][None] + modulation
+        return [take_rows(chunks[:, :, i], rows) for i in range(6)]
+
+
+class Attention(nnx.Module):
+    """Multi-head attention; queries and keys are normalised over the full width, before they are split into heads."""
+
+    def __init__(self, size: ModelSize, dtype: jnp.dtype, implementation: AttentionName, rngs: nnx.Rngs) -> None:
+        self.heads, self.dtype, self.implementation = size.heads, dtype, implementation
+        self.q, self.k, self.v, self.o = (linear(size.dim, size.dim, dtype, rngs) for _ in range(4))
+        self.norm_q, self.norm_k = (nnx.RMSNorm(size.dim, epsilon=EPSILON, dtype=jnp.float32, rngs=rngs) for _ in range(2))
+
+    def __call__(
+        self,
+        tokens: Array,
+        context: Array | None = None,
+        rotary: Rotary | None = None,
+        alone: int | None = None,
+        cache: ConditionCache | None = None,
+    ) -> Array:
+        """tokens [b s d] attend to context [b l d], or to each other under rotary positions.
+
+        Tokens from `alone` on see none before them: two calls of attention instead of a mask [s s]. The keys and values
+        of `cache` (one layer's) are seen beside the tokens' own.
+        """
+        q = self._heads(self.norm_q(self.q(tokens)), rotary)
+        k, v = self.keys_values(tokens if context is None else context, rotary)
+        if cache is not None:
+            k, v = jnp.concatenate([k, cache.keys], axis=1), jnp.concatenate([v, cache.values], axis=1)
+        if alone is None:
+            attended = self._attend(q, k, v)
+        else:
+            parts = self._attend(q[:, :alone], k, v), self._attend(q[:, alone:], k[:, alone:], v[:, alone:])
+            attended = jnp.concatenate(parts, axis=1)
+        return self.o(attended.reshape(tokens.shape))
+
+    def by_frame(self, tokens: Array, context: FramedContext) -> Array:
+        """tokens [b s d] attend to the shared context; those of the first frames to their own frame's beside it."""
+        batch, frames, own, width = context.framed.shape
+        shared = self.keys_values(context.shared, None)
+        k, v = (
+            jnp.concatenate([jnp.repeat(all_see[:, None], frames, axis=1), one.reshape(batch, frames, own, *one.shape[2:])], 2)
+            for all_see, one in zip(
+                shared, self.keys_values(context.framed.reshape(batch, frames * own, width), None), strict=True
+            )
+        )
+        q, cut = self._heads(self.norm_q(self.q(tokens)), None), frames * context.tokens
+        by_frame = q[:, :cut].reshape(batch * frames, context.tokens, *q.shape[2:])
+        attended = self._attend(by_frame, *(x.reshape(batch * frames, *x.shape[2:]) for x in (k, v)))
+        attended = attended.reshape(batch, cut, *q.shape[2:])
+        if cut < tokens.shape[1]:
+            attended = jnp.concatenate([attended, self._attend(q[:, cut:], *shared)], axis=1)
+        return self.o(attended.reshape(tokens.shape))
+
+    def keys_values(self, context: Array, rotary: Rotary | None) -> tuple[Array, Array]:
+        """Keys (rotated where there are positions) and values [b l n head_dim] of context [b l d]."""
+        return self._heads(self.norm_k(self.k(context)), rotary), self._heads(self.v(context), None)
+
+    def _heads(self, values: Array, rotary: Rotary | None) -> Array:
+        values = values.reshape(*values.shape[:2], self.heads, -1)
+        return cut_over_batch((values if rotary is None else rotate(values, rotary)).astype(self.dtype))
+
+    def _attend(self, q: Array, k: Array, v: Array) -> Array:
+        chosen = choose_attention(self.implementation, q.shape[-1], self.dtype)
+        attended = jax.nn.dot_product_attention(q, k, v, implementation=chosen)
+        return attended if chosen == "cudnn" else checkpoint_name(attended, "attention")
+
+
+class Head(nnx.Module):
+    """Norm modulated by the time embedding itself (not by its projection), then one linear layer, zero at the start."""
+
+    def __init__(self, dim: int, features: int, rngs: nnx.Rngs) -> None:
+        self.modulation = nnx.Param(scaled_normal(rngs.params(), (1, 2, dim)))
+        self.head = nnx.Linear(dim, features, dtype=jnp.float32, kernel_init=nnx.initializers.zeros_init(), rngs=rngs)
+
+    def __call__(self, tokens: Array, time: Array, rows: np.ndarray) -> Array:
+        """Features [b s pt*ph*pw*c] of tokens [b s d]; time [b r d]."""
+        chunks = self.modulation[...][None] + time[:, :, None]
+        return self.head(modulate(tokens, take_rows(chunks[:, :, 0], rows), take_rows(chunks[:, :, 1], rows)))
+
+
+class TwoLayer(nnx.Module):
+    """Linear, activation, linear."""
+
+    def __init__(
+        self,
+        features: int,
+        hidden: int,
+        out: int,
+        activation: Activation,
+        dtype: jnp.dtype,
+        init: nnx.Initializer,
+        rngs: nnx.Rngs,
+    ) -> None:
+        self.activation = activation
+        self.first = nnx.Linear(features, hidden, dtype=dtype, kernel_init=init, rngs=rngs)
+        self.second = nnx.Linear(hidden, out, dtype=dtype, kernel_init=init, rngs=rngs)
+
+    def __call__(self, values: Array) -> Array:
+        return self.second(self.activation(self.first(values)))
+
+
+def modulate(tokens: Array, shift: Array, scale: Array, dtype: jnp.dtype = jnp.float32) -> Array:
+    """LayerNorm without parameters in float32, then scale and shift [b s d], rounded once for all who read it."""
+    tokens = tokens.astype(jnp.float32)
+    centred = tokens - tokens.mean(-1, keepdims=True)
+    normed = centred * jax.lax.rsqrt(jnp.square(centred).mean(-1, keepdims=True) + EPSILON)
+    return (normed * (1 + scale) + shift).astype(dtype)
+
+
+def add(tokens: Array, change: Array, gate: Array | None = None) -> Array:
+    """tokens + change * gate [b s d] in float32, in the type of the tokens."""
+    change = change.astype(jnp.float32)
+    return (tokens.astype(jnp.float32) + (change if gate is None else change * gate)).astype(tokens.dtype)
+
+
+def take_rows(values: Array, rows: np.ndarray) -> Array:
+    """values[:, rows] [b s d] of [b r d] float32, in forms whose gradient is no scatter (slow on every device).
+
+    Two rows are a choice, which fuses into what uses it and whose gradient is a masked sum. More (a row for each latent
+    frame) are a gather whose gradient is a product with the matrix of ones that says which token has which row.
+    """
+    count = values.shape[1]
+    if count <= 2:
+        return jnp.where((rows == 0)[None, :, None], values[:, :1], values[:, count - 1 :])
+    return _gather_rows(values, tuple(rows.tolist()))
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
+def _gather_rows(values: Array, rows: tuple[int, ...]) -> Array:
+    return values[:, np.asarray(rows)]
+
+
+def _gather_rows_forward(values: Array, rows: tuple[int, ...]) -> tuple[Array, int]:
+    return _gather_rows(values, rows), values.shape[1]
+
+
+def _gather_rows_backward(rows: tuple[int, ...], count: int, gradient: Array) -> tuple[Array]:
+    has_row = jnp.asarray(np.equal(rows, np.arange(count)[:, None]), gradient.dtype)
+    return (jnp.einsum("rs,bsd->brd", has_row, gradient, precision=jax.lax.Precision.HIGHEST),)
+
+
+_gather_rows.defvjp(_gather_rows_forward, _gather_rows_backward)
+
+
+def rotate(values: Array, rotary: Rotary) -> Array:
+    """Turn neighbouring pairs of features of [b s n k] by each token's angles, in float32."""
+    cos, sin = (table[None, :, None, :, None] for table in rotary)
+    pairs = values.reshape(*values.shape[:-1], -1, 2)
+    return (pairs * cos + pairs[..., ::-1] * jnp.concatenate([-sin, sin], axis=-1)).reshape(values.shape)
+
+
+def _is_attention(primitive: Any, *_: Any, **__: Any) -> bool:
+    """Results of cuDNN's attention (output and logarithms of its sums), which has no other name to be kept by."""
+    return str(primitive.name).startswith("dot_product_attention_fwd")
+
+
+_POLICIES = jax.checkpoint_policies
+_KEEP_ATTENTION = _POLICIES.save_from_both_policies(_POLICIES.save_only_these_names("attention"), _is_attention)
+REMAT: dict[str, Callable[..., bool] | None] = {
+    "attention": _KEEP_ATTENTION,
+    "dots": _POLICIES.save_from_both_policies(_POLICIES.dots_with_no_batch_dims_saveable, _KEEP_ATTENTION),
+    "full": None,
+}
+"""What the backward pass finds kept beside each block's input, by name.
+
+full       nothing: the forward pass is computed twice (4/3 of the work), the least memory
+attention  results of attention, so that all but its quadratic part is computed twice; two widths more a token and block
+dots       results of all matrix products and of attention, so that only norms and activations are computed twice
+none       everything that the backward pass reads
+"""
+
+
+def choose_attention(asked: AttentionName, head_dim: int, dtype: jnp.dtype) -> Literal["xla", "cudnn"]:
+    """The implementation of `jax.nn.dot_product_attention` on this machine.
+
+    "auto" is cuDNN's on a CUDA GPU of compute capability 8.0 and up, in bfloat16 or float16, where the width of a head is
+    a multiple of 8 and at most 256 (128 before Hopper, 9.0); else XLA's, which forms [n s s]. cuDNN takes any number of
+    tokens, so nothing is padded. (The limits are those that jax itself checks.)
+
+    Raises:
+        ConfigError: cuDNN was asked for and cannot do it.
+    """
+    if asked == "xla":
+        return "xla"
+    reason = _cudnn_lacks(head_dim, jnp.dtype(dtype))
+    if reason and asked == "cudnn":
+        raise ConfigError(f"attention: cudnn cannot be used: {reason}; set model.attention to auto or xla.")
+    return "xla" if reason else "cudnn"
+
+
+def _cudnn_lacks(head_dim: int, dtype: np.dtype) -> str:
+    """Why cuDNN's attention cannot be used here; empty if it can."""
+    device = jax.devices()[0]
+    if device.platform != "gpu" or "cuda" not in device.client.platform_version:
+        return f"it needs a CUDA GPU and JAX runs on {device.platform}"
+    capability = tuple(int(part) for part in str(device.compute_capability).split("."))
+    widest = 256 if capability >= (9, 0) else 128
+    if capability < (8, 0):
+        return f"it needs compute capability 8.0 and {device.device_kind} has {device.compute_capability}"
+    if dtype not in (jnp.bfloat16, jnp.float16):
+        return f"it needs model.dtype bfloat16 and the model has {dtype.name}"
+    if head_dim % 8 or head_dim > widest:
+        return f"it needs heads of a multiple of 8 and at most {widest} features and the model's have {head_dim}"
+    return ""
+
+
+def gelu(values: Array) -> Array:
+    return nnx.gelu(values, approximate=True)
+
+
+def linear(features: int, out: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> nnx.Linear:
+    return nnx.Linear(features, out, dtype=dtype, kernel_init=nnx.initializers.xavier_uniform(), rngs=rngs)
+
+
+def scaled_normal(key: Array, shape: tuple[int, ...]) -> Array:
+    """Wan's start for modulations: normal over the root of the width."""
+    return jax.random.normal(key, shape, jnp.float32) / np.sqrt(shape[-1]).astype(np.float32)
+
+
+def stacked_blocks(size: ModelSize, dtype: jnp.dtype, attention: AttentionName, rngs: nnx.Rngs) -> Block:
+    """`depth` blocks as one whose parameters have a leading layer axis."""
+
+    @nnx.split_rngs(splits=size.depth)
+    @nnx.vmap(in_axes=0, out_axes=0)
+    def create(layer_rngs: nnx.Rngs) -> Block:
+        return Block(size, dtype, attention, layer_rngs)
+
+    return create(rngs)

@@ -1,0 +1,236 @@
+"""Ways into the network beside token streams: how other systems tell a video model what the robot does.
+
+Reads  numbers of the commands [b f n], or latents [b t h w c], of each way that a model has
+Writes what the network adds or attends to: vectors, context tokens, features of patches
+To add a way: a module and one line in MECHANISMS; what feeds it is said in `conditions.ACTIONS`.
+
+Each mechanism enters the network in one of four places, and a system is a combination of them:
+    time     a vector for each latent frame, added to the time embedding of that frame's RGB tokens (IRASim, BWM)
+    frame    tokens that only the tokens of their own latent frame attend to (Ctrl-World)
+    context  tokens that all tokens attend to, beside the text or instead of it (EnerVerse-AC, BWM)
+    channels pictures joined to RGB's latents before they are embedded (EnerVerse-AC)
+
+Shape letters: b batch, t h w c latent video, f latent frames (earlier ones first), n numbers, d width, k context tokens.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jax import Array
+
+from xew.episode import HEIGHT, WIDTH
+from xew.model.video.frames import padding_to
+
+GROUP = 4
+"""Frames of video in a latent frame; latent frame 0 holds one, which counts as four equal ones."""
+TOOLS = 14
+"""Position, roll-pitch-yaw and gripper of two tools."""
+CAMERA = 16
+"""fx fy cx cy [pixels of the camera], rotation of world to camera [9], position [3, m]."""
+RAY_PATCH = 6 * 4
+"""Numbers of a patch of a ray map: direction and origin of 2x2 latent pixels."""
+HIDDEN = 4
+"""Width of the hidden layer of per-frame vectors, in widths of the network (IRASim and BWM alike)."""
+POOLED_TOKENS, POOLING_LAYERS = 16, 2
+"""EnerVerse-AC's resampler has 16 queries and four layers of its own width; ours has the network's width and two."""
+
+Activation = Callable[[Array], Array]
+
+
+class FrameVector(nnx.Module):
+    """Two layers from the four actions of a latent frame to a vector of the time embedding's width.
+
+    The second layer starts at zero, so that a pretrained network starts as it is. With `null`, latent frame 0 gets a
+    learned vector instead: no action led to it.
+    """
+
+    def __init__(self, dim: int, numbers: int, activation: Activation, null: bool, rngs: nnx.Rngs) -> None:
+        self.activation = activation
+        self.first = _linear(numbers, HIDDEN * dim, jnp.float32, rngs)
+        self.second = nnx.Linear(HIDDEN * dim, dim, kernel_init=nnx.initializers.zeros_init(), rngs=rngs)
+        self.null = nnx.Param(0.02 * jax.random.normal(rngs.params(), (dim,), jnp.float32)) if null else None
+
+    def __call__(self, numbers: Array) -> Array:
+        """[b t 4*n] -> float32 [b t d]."""
+        vectors = self.second(self.activation(self.first(numbers)))
+        if self.null is None:
+            return vectors
+        null = jnp.broadcast_to(self.null[...], (len(vectors), 1, vectors.shape[-1]))
+        return jnp.concatenate([null, vectors[:, 1:]], axis=1)
+
+
+class FrameTokens(nnx.Module):
+    """Three layers from the tool poses of a latent frame to one context token of that frame (Ctrl-World)."""
+
+    def __init__(self, dim: int, numbers: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
+        self.layers = nnx.List([_linear(width, dim, dtype, rngs) for width in (numbers, dim, dim)])
+
+    def __call__(self, numbers: Array) -> Array:
+        """[b f n] -> [b f 1 d]."""
+        first, second, third = self.layers
+        return third(nnx.silu(second(nnx.silu(first(numbers)))))[:, :, None]
+
+
+class ClipTokens(nnx.Module):
+    """Two layers from the tool pose of each frame of video to a context token of all (BWM)."""
+
+    def __init__(self, dim: int, numbers: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
+        self.first, self.second = _linear(numbers // GROUP, dim, dtype, rngs), _linear(dim, dim, dtype, rngs)
+
+    def __call__(self, numbers: Array) -> Array:
+        """[b t 4*n] -> [b k d], k the frames of video."""
+        return self.second(nnx.gelu(self.first(frames_of_groups(numbers)), approximate=False))
+
+
+class PooledTokens(nnx.Module):
+    """A fixed number of learned queries that attend to the actions of all frames of video (EnerVerse-AC's resampler)."""
+
+    def __init__(self, dim: int, heads: int, numbers: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
+        self.first = _linear(numbers // GROUP, dim, dtype, rngs)
+        self.queries = nnx.Param(0.02 * jax.random.normal(rngs.params(), (POOLED_TOKENS, dim), jnp.float32))
+        self.layers = nnx.List([PoolingLayer(dim, heads, dtype, rngs) for _ in range(POOLING_LAYERS)])
+
+    def __call__(self, numbers: Array) -> Array:
+        """[b t 4*n] -> [b 16 d]."""
+        actions = self.first(frames_of_groups(numbers)).astype(jnp.float32)
+        actions = actions + jnp.asarray(positions(*actions.shape[1:]))[None]
+        tokens = jnp.broadcast_to(self.queries[...], (len(actions), *self.queries.shape))
+        for layer in self.layers:
+            tokens = layer(tokens, actions)
+        return tokens
+
+
+class PoolingLayer(nnx.Module):
+    """Queries attend to the actions and to themselves, then a feed-forward layer; both on top of what came in."""
+
+    def __init__(self, dim: int, heads: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
+        self.norm_tokens, self.norm_actions, self.norm = (nnx.LayerNorm(dim, dtype=jnp.float32, rngs=rngs) for _ in range(3))
+        self.attention = nnx.MultiHeadAttention(heads, dim, dtype=dtype, decode=False, rngs=rngs)
+        self.first, self.second = _linear(dim, HIDDEN * dim, dtype, rngs), _linear(HIDDEN * dim, dim, dtype, rngs)
+
+    def __call__(self, tokens: Array, actions: Array) -> Array:
+        """tokens [b 16 d], actions [b k d] -> [b 16 d], all float32."""
+        asked = self.norm_tokens(tokens)
+        seen = jnp.concatenate([self.norm_actions(actions), asked], axis=1)
+        tokens = tokens + self.attention(asked, seen).astype(jnp.float32)
+        return tokens + self.second(nnx.gelu(self.first(self.norm(tokens)))).astype(jnp.float32)
+
+
+class Channels(nnx.Module):
+    """More channels of RGB's patches: new columns of its patch embedding, at zero to begin with, kept apart from it."""
+
+    def __init__(self, dim: int, features: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
+        self.columns = nnx.Linear(
+            features, dim, use_bias=False, dtype=dtype, kernel_init=nnx.initializers.zeros_init(), rngs=rngs
+        )
+
+    def __call__(self, patches: Array) -> Array:
+        """Patches [b s features] -> [b s d] to be added to RGB's tokens."""
+        return self.columns(patches)
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """One way into the network."""
+
+    enters: Literal["time", "frame", "context", "channels"]
+    source: Literal["numbers", "camera", "latents"]
+    """`width` numbers for each latent frame, the camera's 16 (drawn as a map of rays), or encoded pictures."""
+    build: Callable[[Any, int, jnp.dtype, nnx.Rngs], nnx.Module]
+    """(`dit.ModelSize`, features of a patch of the source, dtype of products, rngs) -> the module."""
+    width: int = 0
+    replaces_text: bool = False
+    """Its context stands alone; the text is not attended to."""
+
+
+def _frame_vector(activation: Activation, null: bool) -> Callable[[Any, int, jnp.dtype, nnx.Rngs], nnx.Module]:
+    return lambda size, _, dtype, rngs: FrameVector(size.dim, GROUP * TOOLS, activation, null, rngs)
+
+
+MECHANISMS = {
+    "relative_time": Mechanism("time", "numbers", _frame_vector(nnx.gelu, null=True), width=GROUP * TOOLS),
+    "pose_time": Mechanism("time", "numbers", _frame_vector(nnx.silu, null=False), width=GROUP * TOOLS),
+    "pose_frame": Mechanism(
+        "frame", "numbers", lambda size, _, dtype, rngs: FrameTokens(size.dim, TOOLS, dtype, rngs), width=TOOLS
+    ),
+    "pose_context": Mechanism(
+        "context",
+        "numbers",
+        lambda size, _, dtype, rngs: ClipTokens(size.dim, GROUP * TOOLS, dtype, rngs),
+        width=GROUP * TOOLS,
+        replaces_text=True,
+    ),
+    "pooled_context": Mechanism(
+        "context",
+        "numbers",
+        lambda size, _, dtype, rngs: PooledTokens(size.dim, size.heads, GROUP * TOOLS, dtype, rngs),
+        width=GROUP * TOOLS,
+    ),
+    "map_channels": Mechanism(
+        "channels", "latents", lambda size, features, dtype, rngs: Channels(size.dim, features, dtype, rngs)
+    ),
+    "ray_channels": Mechanism(
+        "channels", "camera", lambda size, features, dtype, rngs: Channels(size.dim, features, dtype, rngs), width=CAMERA
+    ),
+}
+
+
+class FramedContext(NamedTuple):
+    """What cross-attention reads where frames have a context of their own."""
+
+    shared: Array
+    """[b k d], for every token: the text's embeddings, or what stands in their place."""
+    framed: Array
+    """[b f k d], beside it for the tokens of one frame each: the first f * `tokens` tokens, frame by frame."""
+    tokens: int
+    """Tokens of a frame."""
+
+
+def create_mechanism(name: str, size: Any, features: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> nnx.Module:
+    """The module of a mechanism for a network of this size, whose RGB patches have so many `features`."""
+    mechanism = MECHANISMS[name]
+    return mechanism.build(size, RAY_PATCH if mechanism.source == "camera" else features, dtype, rngs)
+
+
+def frames_of_groups(numbers: Array) -> Array:
+    """[b t 4*n] of latent frames -> [b 4*(t-1)+1 n] of frames of video: the first group is one frame, four times."""
+    frames = numbers.reshape(len(numbers), GROUP * numbers.shape[1], -1)
+    return frames[:, GROUP - 1 :]
+
+
+def ray_maps(camera: Array, shape: Sequence[int]) -> Array:
+    """Where each latent pixel looks: unit direction and origin of its ray in the world (EnerVerse-AC's ray maps).
+
+    Args:
+        camera: [b t 16], see `CAMERA`.
+        shape: of the latents [b t h w c], whose frames are the camera's after `frames.to_model_size`.
+
+    Returns:
+        [b t h w 6].
+    """
+    height, width = shape[2:4]
+    top, bottom, left, right = padding_to(height, width)
+    rows = (np.arange(height) + 0.5) / height * (HEIGHT + top + bottom) - 0.5 - top
+    columns = (np.arange(width) + 0.5) / width * (WIDTH + left + right) - 0.5 - left
+    x, y = (jnp.asarray(grid, jnp.float32)[None, None] for grid in np.meshgrid(columns, rows))
+    fx, fy, cx, cy = (camera[:, :, index, None, None] for index in range(4))
+    rotation = camera[:, :, 4:13].reshape(*camera.shape[:2], 3, 3)
+    seen = jnp.stack([(x - cx) / fx, (y - cy) / fy, jnp.ones_like((x - cx) / fx)], axis=-1)
+    world = jnp.einsum("bthwi,btij->bthwj", seen, rotation)
+    direction = world / jnp.linalg.norm(world, axis=-1, keepdims=True)
+    return jnp.concatenate([direction, jnp.broadcast_to(camera[:, :, None, None, 13:], direction.shape)], axis=-1)
+
+
+def positions(count: int, dim: int) -> np.ndarray:
+    """Sines and cosines [count dim] float32 that tell the order of frames."""
+    angles = np.arange(count)[:, None] * 10_000.0 ** (-np.arange(0, dim, 2) / dim)
+    return np.concatenate([np.sin(angles), np.cos(angles)], axis=-1)[:, :dim].astype(np.float32)
+
+
+def _linear(features: int, out: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> nnx.Linear:
+    return nnx.Linear(features, out, dtype=dtype, kernel_init=nnx.initializers.xavier_uniform(), rngs=rngs)

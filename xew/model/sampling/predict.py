@@ -1,0 +1,232 @@
+"""Predicting: a trained network continues episodes from their first frame and their commands.
+
+Reads  episodes (first frame, instruction, commands)
+Writes uint8 video at the model's size
+
+Long episodes are predicted in chunks; the last predicted frame of one is the reference of the next. A batch of episodes is cut
+over the devices of the mesh that the parameters lie on, and every chunk runs on them from frames to frames.
+"""
+
+import functools
+import math
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jax import Array
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from xew.config import pick
+from xew.model.cache.scales import Scale, apply_scales
+from xew.model.codecs.codec import Codec, encode_pictures, to_pictures, to_signed
+from xew.model.conditions import Condition, clip_numbers
+from xew.model.devices.sharding import batch_sharding, replicated
+from xew.model.diffusion.samplers import GRIDS, SAMPLERS, Grid
+from xew.model.experiment import Experiment
+from xew.model.latents import Episode, stream_videos
+from xew.model.network.dit import WorldModel, compute_params
+
+Streams = dict[str, np.ndarray]
+"""Of one whole episode, by stream: uint8 [t h w 3] or float32 [t n]."""
+
+
+class ChunkInputs(NamedTuple):
+    """What the network is given for one chunk of each episode of a batch."""
+
+    reference: Array
+    """[b 1 h w 3] uint8, the frame that the chunk continues."""
+    conditions: Mapping[str, Array]
+    """Stream or mechanism -> [b t' h' w' c] latents or [b t' n] numbers, scaled."""
+    text: Array
+    """[b l e] or [b l]."""
+    negative: Array | None
+    """The same of the negative prompt, where there is guidance."""
+    keys: Array
+    """[b 2] uint32, data of random keys, of the episode and the chunk."""
+
+
+class Sampling(NamedTuple):
+    """How a chunk is sampled; hashable, static in the compiled function."""
+
+    sampler: str
+    grid: Grid
+    guidance: float
+    latent_shape: tuple[int, ...]
+
+
+class Prediction(NamedTuple):
+    """A prediction that the devices may still be working on."""
+
+    chunks: list[Array]
+    """Of frames [b t h w 3] uint8; each begins with the last frame of the one before."""
+    episodes: int
+    frame_count: int
+
+    def fetch(self) -> np.ndarray:
+        """Wait for all frames: uint8 [episodes frame_count h w 3]."""
+        frames = [np.asarray(chunk)[: self.episodes, min(number, 1) :] for number, chunk in enumerate(self.chunks)]
+        return np.concatenate(frames, axis=1)[:, : self.frame_count]
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """A trained model that continues videos."""
+
+    experiment: Experiment
+    codec: Codec
+    graph: nnx.GraphDef
+    params: Any
+    """On one device, or on the devices of a mesh (`xew.model.devices.sharding`), over which batches are then cut."""
+    scales: Mapping[str, Scale] = field(default_factory=dict)
+    """Of the numbers that the network is told, as in training."""
+
+    def predict(self, episodes: Sequence[Episode], frame_count: int) -> np.ndarray:
+        """The first `frame_count` frames of each episode, predicted from its first: uint8 [b t h w 3] at the model's size.
+
+        Frame 0 is the codec's view of the given one. The noise depends on the episode and the chunk, not on the batch.
+        """
+        return self.begin(episodes, frame_count).fetch()
+
+    def begin(self, episodes: Sequence[Episode], frame_count: int, batch: int = 1) -> Prediction:
+        """Read what `predict` needs and set the devices to work, without waiting for them.
+
+        Fewer episodes than `batch` are filled up by repeating the last, so that nothing is compiled for a smaller batch; so
+        are those that do not cover the devices evenly.
+        """
+        filled = max(len(episodes), batch)
+        filled += -filled % self._devices
+        whole = [*episodes, *[episodes[-1]] * (filled - len(episodes))]
+        streams = [self._read(episode) for episode in episodes]
+        streams += streams[-1:] * (filled - len(episodes))
+        text, negative = self._text(whole)
+        given = self._place(np.stack([stream["rgb"][:1] for stream in streams]))
+        standing = self._standing(streams)
+        chunks: list[Array] = []
+        for number, start in enumerate(range(0, max(frame_count - 1, 1), self.experiment.clip.frames - 1)):
+            conditions = self._conditions(streams, start) | standing | self._history(given, chunks, start)
+            keys = self._place(np.stack([self._key(episode, number) for episode in whole]))
+            reference = chunks[-1][:, -1:] if chunks else given
+            inputs = ChunkInputs(reference, conditions, text, negative, keys)
+            with jax.set_mesh(self._mesh) if self._mesh is not None else nullcontext():
+                chunks.append(predict_chunk(self.graph, self.params, self.codec, inputs, self._sampling))
+        return Prediction(chunks, len(episodes), frame_count)
+
+    @property
+    def _sampling(self) -> Sampling:
+        settings = self.experiment.rollout
+        grid = pick(GRIDS, settings.grid, "grid of noise levels")(settings.steps, settings.shift or self.experiment.train.shift)
+        return Sampling(settings.sampler, grid, settings.guidance, self.experiment.latent_shape)
+
+    def _read(self, episode: Episode) -> Streams:
+        conditions = {name: condition for name, condition in self.experiment.conditions.items() if condition.make is not None}
+        return stream_videos(self.experiment, *episode, ("rgb", *conditions))
+
+    def _text(self, episodes: Sequence[Episode]) -> tuple[Any, Any]:
+        """The instructions and, where there is guidance, as many negative prompts."""
+        settings = self.experiment.rollout
+        spoken = [record.instruction for _, record in episodes]
+        encoded = self.experiment.encode_instructions(spoken)
+        text = self._place(np.stack([encoded[instruction] for instruction in spoken]))
+        if settings.guidance == 1:
+            return text, None
+        negative = self.experiment.encode_instructions([settings.negative_prompt])[settings.negative_prompt]
+        return text, self._place(np.stack([negative] * len(episodes)))
+
+    def _standing(self, streams: Sequence[Streams]) -> dict[str, Array]:
+        """Pictures that say the same of every chunk."""
+        return {
+            name: encode_pictures(self.codec, self._place(np.stack([stream[name] for stream in streams])))
+            for name, condition in self.experiment.conditions.items()
+            if _is_picture(condition, streams[0].get(name)) and not condition.aligned
+        }
+
+    def _conditions(self, streams: Sequence[Streams], start: int) -> dict[str, Array]:
+        """What conditions say of the chunk that begins at frame `start`; past the end the last frame stays."""
+        frames, history = self.experiment.clip.frames, self.experiment.model.history
+        pictures, numbers = {}, {}
+        for name, condition in self.experiment.conditions.items():
+            if _is_picture(condition, streams[0].get(name)) and condition.aligned:
+                clips = [
+                    stream[name][np.minimum(np.arange(start, start + frames), len(stream[name]) - 1)] for stream in streams
+                ]
+                pictures[name] = encode_pictures(self.codec, self._place(np.stack(clips)))
+            elif name in streams[0] and streams[0][name].ndim == 2:
+                numbers[name] = np.stack([clip_numbers(condition, s[name], start, frames, history) for s in streams])
+        scaled = apply_scales(self.scales, self.experiment.conditions, numbers)
+        return pictures | {name: self._place(array) for name, array in scaled.items()}
+
+    def _history(self, given: Array, chunks: Sequence[Array], start: int) -> dict[str, Array]:
+        """Earlier frames, each encoded alone: what the model has made itself, for the recorded ones would show the future."""
+        names = [name for name, condition in self.experiment.conditions.items() if condition.make is None]
+        if not names:
+            return {}
+        past = jnp.concatenate([given, *(chunk[:, 1:] for chunk in chunks)], axis=1)
+        earlier = np.maximum(start + np.asarray(self.experiment.model.history), 0)
+        encoded = [encode_pictures(self.codec, past[:, frame : frame + 1]) for frame in earlier]
+        return dict.fromkeys(names, jnp.concatenate(encoded, axis=1))
+
+    def _key(self, episode: Episode, chunk: int) -> np.ndarray:
+        _, record = episode
+        name = zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode())
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.experiment.rollout.seed), name), chunk)
+        return np.asarray(jax.random.key_data(key))
+
+    @property
+    def _mesh(self) -> Mesh | None:
+        sharding = jax.tree.leaves(self.params)[0].sharding
+        mesh = sharding.mesh if isinstance(sharding, NamedSharding) else None
+        return mesh if isinstance(mesh, Mesh) else None
+
+    @property
+    def _devices(self) -> int:
+        """Over how many devices a batch is cut. Of several processes each has it whole, so that each gets all frames."""
+        return math.prod(self._mesh.devices.shape) if self._mesh is not None and jax.process_count() == 1 else 1
+
+    def _place(self, array: Any) -> Any:
+        """An array [b ...] over the devices."""
+        if self._mesh is None:
+            return jnp.asarray(array)
+        return jax.device_put(array, batch_sharding(self._mesh) if self._devices > 1 else replicated(self._mesh))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 4))
+def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInputs, sampling: Sampling) -> Array:
+    """One chunk of every episode of a batch, from its reference on: uint8 [b t h w 3]."""
+    model = nnx.merge(graph, compute_params(graph, params))
+    reference = codec.encode_batch(to_signed(inputs.reference))
+    keys = jax.random.wrap_key_data(inputs.keys)
+    noise = jax.vmap(lambda key: jax.random.normal(key, sampling.latent_shape, jnp.float32))(keys)
+    velocity, sampler = guided_velocity(model, inputs, sampling.guidance), pick(SAMPLERS, sampling.sampler, "sampler")
+    frames = to_pictures(codec.decode_batch(sampler(velocity, reference, noise, sampling.grid)))
+    return jax.lax.with_sharding_constraint(frames, PartitionSpec()) if jax.process_count() > 1 else frames
+
+
+def guided_velocity(model: WorldModel, inputs: ChunkInputs, guidance: float) -> Callable[[Array, Array], Array]:
+    """The network's velocity as a function of latents and level; with guidance away from the negative prompt's."""
+    wanted = _velocity(model, inputs.conditions, inputs.text)
+    if inputs.negative is None:
+        return wanted
+    unwanted = _velocity(model, inputs.conditions, inputs.negative)
+
+    def velocity(latents: Array, level: Array) -> Array:
+        away = unwanted(latents, level)
+        return away + guidance * (wanted(latents, level) - away)
+
+    return velocity
+
+
+def _velocity(model: WorldModel, conditions: Mapping[str, Array], text: Array) -> Callable[[Array, Array], Array]:
+    """Condition tokens that do not see RGB's are computed here, once a chunk."""
+    once = model.visibility == "one_way" and model.condition_streams
+    cache = model.condition_cache(conditions, text) if once else None
+    return lambda latents, level: model(latents, conditions, level, text, cache)
+
+
+def _is_picture(condition: Condition, video: np.ndarray | None) -> bool:
+    return condition.make is not None and video is not None and video.ndim == 4

@@ -1,0 +1,6 @@
+"""Training: batches in an exact order, one compiled step, memory told beforehand, curves and samples.
+
+The same numbers on one device and on many, interrupted or not.
+"""
+
+__all__ = ["data", "memory", "optimizer", "samples", "step", "tensorboard", "vae_data"]

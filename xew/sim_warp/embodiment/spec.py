@@ -1,0 +1,53 @@
+"""What the simulator must know of a robot beside its URDF."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from xew.sim_warp.geometry.poses import Pose
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One arm of a bimanual robot: which joints of the URDF it is and how its tool sits."""
+
+    root_pose: Pose
+    """Pose of the URDF's root link in the world. A robot of one URDF with both arms has the same in both."""
+    joints: tuple[str, ...]
+    """Six or seven revolute joints of the URDF, from the base outwards."""
+    home: tuple[float, ...]
+    """Joint positions at rest [rad], as many as `joints`."""
+    tool_link: str
+    """The link that carries the tool frame."""
+    tool_pose: Pose
+    """Tool frame in `tool_link`: x approach (out of the hand), y along which the fingers open, origin between
+    the finger pads where an object is held (the tool centre point, TCP)."""
+    fingers: tuple[str, str]
+    """The two prismatic joints of the gripper."""
+    finger_closed: tuple[float, float]
+    """Finger joint positions at gripper 0 [m]."""
+    finger_open: tuple[float, float]
+    """Finger joint positions at gripper 1 [m]."""
+
+
+@dataclass(frozen=True)
+class RobotSpec:
+    """A bimanual robot: a URDF, used once with both arms in it or twice with one."""
+
+    key: str
+    title: str
+    urdf: Path
+    arms: tuple[Arm, Arm]
+    """Left (at -x) and right (at +x); the robot stands at -y and looks to +y."""
+    joint_lower: tuple[float, ...]
+    """Lower position limits of an arm that experts keep [rad]: the real robot's, inside the URDF's."""
+    joint_upper: tuple[float, ...]
+    joint_velocity: tuple[float, ...]
+    """Speed limits that experts keep [rad/s]."""
+
+    @property
+    def one_urdf_holds_both_arms(self) -> bool:
+        return self.arms[0].joints != self.arms[1].joints
+
+    @property
+    def arm_joint_count(self) -> int:
+        return len(self.arms[0].joints)

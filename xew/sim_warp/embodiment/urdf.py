@@ -1,0 +1,332 @@
+"""Reading URDFs: `load_urdf(path)` gives links, joints, coloured meshes and convex collision shapes.
+
+yourdfpy parses the XML, trimesh the mesh files; what comes out is a small tree of our own, so that the rest of the
+room knows neither. Units are metres, kilograms and radians; every shape is in the frame of its link.
+"""
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import numpy as np
+import trimesh
+import yourdfpy
+
+from xew.config import ConfigError
+from xew.sim_warp.embodiment.mesh_files import MeshError, MeshFile, Part, read_mesh
+from xew.sim_warp.geometry.meshes import Color, Mesh, from_trimesh, merge
+
+DEFAULT_COLOR: Color = (190, 190, 190)
+"""Of a visual that names no material."""
+HULL_POINTS = 64
+"""Corners of a collision hull; of finer ones those are kept that lie farthest out in as many directions."""
+LARGEST_LINK = 10.0
+"""Extent of a link [m] beyond which its mesh must be in millimetres."""
+
+
+class UrdfError(ConfigError):
+    """A URDF, or a mesh that it names, cannot be used; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """Mass properties of a link."""
+
+    mass: float
+    """kg."""
+    center: np.ndarray
+    """[3] centre of mass in the link frame, m."""
+    inertia: np.ndarray
+    """[3 3] about the centre of mass, along the axes of the link frame, kg m2."""
+
+
+@dataclass(frozen=True)
+class Collision:
+    """A convex shape that a link collides with."""
+
+    name: str
+    """As in the URDF; "pad" is the gripping face of a finger. Empty where the URDF names none."""
+    points: np.ndarray
+    """[k 3] float32, corners of its convex hull in the link frame, m."""
+
+
+@dataclass(frozen=True)
+class Link:
+    name: str
+    visual: Mesh | None
+    """All visuals of the link as one mesh."""
+    collisions: tuple[Collision, ...]
+    inertial: Inertial | None
+
+
+@dataclass(frozen=True)
+class Joint:
+    name: str
+    kind: str
+    """fixed, revolute, continuous or prismatic."""
+    parent: str
+    child: str
+    origin: np.ndarray
+    """[4 4] child frame in the parent frame at joint position 0."""
+    axis: np.ndarray
+    """[3] unit vector in the child frame."""
+    lower: float
+    """Position limit [rad or m], -inf where there is none."""
+    upper: float
+    velocity: float
+    """Speed limit [rad/s or m/s], inf where there is none."""
+    effort: float
+    """Effort limit [N m or N], inf where there is none."""
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """A robot description: a tree of links and the joints between them, both in file order."""
+
+    name: str
+    path: Path
+    root: str
+    links: dict[str, Link]
+    joints: dict[str, Joint]
+    meshes: dict[str, Path]
+    """Where each mesh is that the URDF names."""
+    files: tuple[Path, ...]
+    """All that was read: the URDF, meshes, their materials and textures."""
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        """The joints that move, in file order: what a `joint_pos [n j]` lists. Mimic tags are not followed."""
+        return tuple(name for name, joint in self.joints.items() if joint.kind != "fixed")
+
+    @cached_property
+    def tree(self) -> tuple[Joint, ...]:
+        """All joints, parents before children."""
+        below: dict[str, list[Joint]] = {}
+        for joint in self.joints.values():
+            below.setdefault(joint.parent, []).append(joint)
+        ordered, links = [], [self.root]
+        while links:
+            found = below.get(links.pop(), [])
+            ordered += found
+            links += [joint.child for joint in found]
+        return tuple(ordered)
+
+    def chain(self, link: str) -> tuple[Joint, ...]:
+        """The joints from the root to a link, fixed ones included."""
+        above = {joint.child: joint for joint in self.joints.values()}
+        path = []
+        while link in above:
+            path.append(above[link])
+            link = above[link].parent
+        return tuple(reversed(path))
+
+
+def load_urdf(path: Path | str) -> Urdf:
+    """Read a URDF with its meshes; a file that has not changed is read once.
+
+    Args:
+        path: the file. Mesh names may be relative to it, absolute or `package://`, which is looked for in the folders above.
+
+    Raises:
+        UrdfError: the file or a mesh is missing or cannot be understood, or it is not one tree; says which and what to do.
+    """
+    path = Path(path).resolve()
+    if not path.is_file():
+        raise UrdfError(f"{path} does not exist; expected a URDF file.")
+    return _load(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=32)
+def _load(path: Path, modified: int) -> Urdf:
+    try:
+        ElementTree.parse(path)  # yourdfpy reads on where a file ends too early
+        robot = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+    except Exception as error:  # lxml and yourdfpy each have their own
+        raise UrdfError(f"{path} is not a URDF that can be read ({error}); mend its XML.") from error
+    for kind, entries in (("link", robot.links), ("joint", robot.joints)):
+        _check_names(path, kind, [entry.name for entry in entries])
+    source = _Source(path, {material.name: material for material in robot.materials}, {})
+    links = {link.name: _link(link, source) for link in robot.links}
+    joints = {joint.name: _joint(joint, path) for joint in robot.joints}
+    children = {joint.child for joint in joints.values()}
+    root = next((name for name in links if name not in children), "")
+    if not root:
+        raise UrdfError(f"{path}: there is no link without a parent; links must form one tree.")
+    meshes = {name: file.files[0] for name, file in source.meshes.items()}
+    files = dict.fromkeys([path, *(read for file in source.meshes.values() for read in file.files)])
+    urdf = Urdf(robot.name, path, root, links, joints, meshes, tuple(files))
+    _check_tree(urdf)
+    return urdf
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A URDF while it is read."""
+
+    path: Path
+    materials: dict[str, yourdfpy.Material]
+    meshes: dict[str, MeshFile]
+    """Mesh files read so far, by the name that the URDF gives them."""
+
+
+def _check_names(path: Path, kind: str, names: list[str]) -> None:
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise UrdfError(f"{path}: more than one {kind} is called {', '.join(twice)}; names must be unique.")
+
+
+def _finite(values: object, path: Path, what: str) -> np.ndarray:
+    """The values as float64. Raises UrdfError if one is not a finite number."""
+    array = np.asarray(values, float)
+    if not np.isfinite(array).all():
+        raise UrdfError(f"{path}: {what} has a number that is not finite; mend it.")
+    return array
+
+
+def _check_tree(urdf: Urdf) -> None:
+    """All links hang together from one root, each by one joint."""
+    path, links, joints = urdf.path, set(urdf.links), urdf.joints.values()
+    if unknown := sorted({name for joint in joints for name in (joint.parent, joint.child)} - links):
+        raise UrdfError(f"{path}: joints name links that do not exist: {', '.join(unknown)}; add or rename them.")
+    children = [joint.child for joint in joints]
+    if twice := sorted({name for name in children if children.count(name) > 1}):
+        raise UrdfError(f"{path}: links must form one tree; more than one joint leads to {', '.join(twice)}.")
+    if loose := sorted(links - {urdf.root, *(joint.child for joint in urdf.tree)}):
+        raise UrdfError(f"{path}: links must form one tree; no way leads from {urdf.root} to {', '.join(loose)}.")
+
+
+def _joint(joint: yourdfpy.Joint, path: Path) -> Joint:
+    if joint.type not in ("fixed", "revolute", "continuous", "prismatic"):
+        raise UrdfError(f"{path}: joint {joint.name} is {joint.type}; expected fixed, revolute, continuous or prismatic.")
+    axis = np.array([1.0, 0.0, 0.0]) if joint.axis is None else _finite(joint.axis, path, f"the axis of joint {joint.name}")
+    if not np.any(axis):
+        raise UrdfError(f"{path}: joint {joint.name} has the axis 0 0 0; give it a direction.")
+    limit = joint.limit
+    bounded = joint.type in ("revolute", "prismatic") and limit is not None
+    return Joint(
+        joint.name,
+        joint.type,
+        joint.parent,
+        joint.child,
+        _origin(joint.origin, path, f"the origin of joint {joint.name}"),
+        axis / np.linalg.norm(axis),
+        _number(limit.lower, 0.0, path, joint.name) if bounded else -math.inf,
+        _number(limit.upper, 0.0, path, joint.name) if bounded else math.inf,
+        _number(limit and limit.velocity, math.inf, path, joint.name),
+        _number(limit and limit.effort, math.inf, path, joint.name),
+    )
+
+
+def _number(value: float | None, default: float, path: Path, joint: str) -> float:
+    return default if value is None else float(_finite(value, path, f"the limit of joint {joint}"))
+
+
+def _origin(origin: np.ndarray | None, path: Path, what: str) -> np.ndarray:
+    return np.eye(4) if origin is None else _finite(origin, path, what)
+
+
+def _link(link: yourdfpy.Link, source: _Source) -> Link:
+    visuals = [mesh for visual in link.visuals for mesh in _visual(visual, link.name, source)]
+    visual = merge(visuals) if visuals else None
+    if visual is not None and np.ptp(visual.vertices, axis=0).max() > LARGEST_LINK:
+        size = np.ptp(visual.vertices, axis=0).max()
+        raise UrdfError(
+            f"{source.path}: link {link.name} is {size:.0f} m large; is its mesh in millimetres? Then give it "
+            f'scale="0.001 0.001 0.001".'
+        )
+    collisions = tuple(_collision(collision, link.name, source) for collision in link.collisions)
+    return Link(link.name, visual, collisions, _inertial(link, source.path))
+
+
+def _inertial(link: yourdfpy.Link, path: Path) -> Inertial | None:
+    inertial = link.inertial
+    if inertial is None or not inertial.mass:
+        return None
+    what = f"the inertial of link {link.name}"
+    mass = float(_finite(inertial.mass, path, what))
+    if mass < 0:
+        raise UrdfError(f"{path}: {what} has a mass of {mass:g} kg; expected more than 0.")
+    origin = _origin(inertial.origin, path, what)
+    inertia = np.zeros((3, 3)) if inertial.inertia is None else _finite(inertial.inertia, path, what)
+    return Inertial(mass, origin[:3, 3], origin[:3, :3] @ inertia @ origin[:3, :3].T)
+
+
+def _visual(visual: yourdfpy.Visual, link: str, source: _Source) -> Iterable[Mesh]:
+    """A mesh a part, coloured by the visual's material or else by the mesh file."""
+    origin = _origin(visual.origin, source.path, f"a visual of link {link}")
+    color = _material_color(visual, source)
+    for part in _shape(visual.geometry, link, source):
+        shape = part.shape
+        if visual.origin is not None:
+            shape.apply_transform(origin)
+        mesh = from_trimesh(shape, color or DEFAULT_COLOR)
+        yield mesh if color or part.colors is None else replace(mesh, colors=part.colors)
+
+
+def _material_color(visual: yourdfpy.Visual, source: _Source) -> Color | None:
+    """The visual's own colour, or that of the material it names; None where the mesh file decides."""
+    material = visual.material
+    known = material and source.materials.get(material.name)
+    color = material and (material.color or (known and known.color))
+    if not color:
+        return None
+    red, green, blue = (round(255 * min(max(float(value), 0.0), 1.0)) for value in color.rgba[:3])
+    return red, green, blue
+
+
+def _collision(collision: yourdfpy.Collision, link: str, source: _Source) -> Collision:
+    parts = [part.shape for part in _shape(collision.geometry, link, source)]
+    shape = parts[0] if len(parts) == 1 else trimesh.util.concatenate(parts)
+    if collision.origin is not None:
+        shape.apply_transform(_origin(collision.origin, source.path, f"a collision of link {link}"))
+    try:
+        corners = np.asarray(shape.convex_hull.vertices, np.float32)
+    except Exception as error:  # qhull's own: all points in a plane
+        raise UrdfError(f"{source.path}: link {link} has a collision without volume; give it a box.") from error
+    return Collision(collision.name or "", outermost(corners, HULL_POINTS))
+
+
+def outermost(points: np.ndarray, most: int) -> np.ndarray:
+    """Of points [k 3] those that lie farthest out in `most` evenly spread directions; all if there are no more."""
+    if len(points) <= most:
+        return points
+    step = np.arange(most) + 0.5
+    polar, azimuth = np.arccos(1 - 2 * step / most), np.pi * (1 + 5**0.5) * step
+    directions = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], -1)
+    return points[np.unique(np.argmax(directions @ points.T, axis=1))]
+
+
+def _shape(geometry: yourdfpy.Geometry, link: str, source: _Source) -> list[Part]:
+    """The triangles of one geometry element, before its origin is applied; the caller may move them."""
+    if geometry.box is not None:
+        return [Part(trimesh.creation.box(geometry.box.size), None)]
+    if geometry.cylinder is not None:
+        return [Part(trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length, sections=24), None)]
+    if geometry.sphere is not None:
+        return [Part(trimesh.creation.icosphere(2, geometry.sphere.radius), None)]
+    if geometry.mesh is not None:
+        return _mesh_parts(geometry.mesh, link, source)
+    raise UrdfError(f"{source.path}: link {link} has an empty geometry; expected box, cylinder, sphere or mesh.")
+
+
+def _mesh_parts(mesh: yourdfpy.Mesh, link: str, source: _Source) -> list[Part]:
+    if mesh.filename not in source.meshes:
+        source.meshes[mesh.filename] = _mesh_file(mesh.filename, link, source.path)
+    scale = np.broadcast_to(np.asarray(1.0 if mesh.scale is None else mesh.scale, float), 3)
+    parts = [Part(part.shape.copy(), part.colors) for part in source.meshes[mesh.filename].parts]
+    for part in parts:
+        part.shape.apply_scale(_finite(scale, source.path, f"the scale of a mesh of link {link}"))
+    return parts
+
+
+def _mesh_file(name: str, link: str, path: Path) -> MeshFile:
+    """A mesh file by the name that the URDF gives it: relative to the URDF, absolute or `package://`."""
+    found = Path(yourdfpy.urdf.filename_handler_magic(name, dir=str(path.parent)))
+    if not found.is_file():
+        raise UrdfError(f"{path}: link {link} names the mesh {name}, which does not exist; put it there or mend the name.")
+    try:
+        return read_mesh(found)
+    except MeshError as error:
+        raise UrdfError(f"{path}: link {link}: {found} {error}.") from error

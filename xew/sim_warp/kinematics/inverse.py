@@ -1,0 +1,260 @@
+"""Tool poses to joint positions: batched Levenberg-Marquardt of newton.ik, on the CPU or a GPU.
+
+Every arm is posed as seven joints (six-joint arms get a last one that moves nothing), so that one set of kernels
+serves all robots. Both arms of a robot are alike and share a solver; only their bases differ.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import newton
+import newton.ik
+import numpy as np
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from xew.config import ConfigError
+from xew.sim_warp.devices.waiting import wait_for
+from xew.sim_warp.embodiment.spec import Arm, RobotSpec
+from xew.sim_warp.embodiment.urdf import load_urdf
+from xew.sim_warp.geometry.poses import matrix_from_pose, pose_from_matrix
+from xew.sim_warp.kinematics.forward import tool_matrix
+
+JOINT_COUNT = 7
+POSITION_WEIGHT = 4.0
+"""A residual of 1 m counts as much as one of 4 rad: near a pose both then converge at the same pace."""
+LIMIT_WEIGHT = 2.0
+POSTURE_WEIGHT = 0.01
+"""Pull of a seven-joint arm towards the mean of its two homes, so that its elbow does not drift."""
+POLISH_STEPS = 4
+"""Last steps, without that pull, so that it does not move the tool."""
+ANCHOR_STRIDE = 8
+"""Frames of a path between two that are solved one after the other; those between are then solved all at once."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Joint positions that bring tools where they should be, and how far from it they end."""
+
+    joint_pos: np.ndarray
+    """[... d] float64, rad, inside the robot's limits."""
+    position_error: np.ndarray
+    """[...] m, distance between the wanted and the reached tool frame."""
+    rotation_error: np.ndarray
+    """[...] rad, angle between them."""
+
+
+class ArmSolver:
+    """Inverse kinematics of one robot's arms; made once, called for every frame or path."""
+
+    def __init__(self, robot: RobotSpec, device: str | None = None, iterations: int = 24) -> None:
+        """Prepare a solver.
+
+        Args:
+            robot: whose arms.
+            device: Warp's name of the device; its default if left out.
+            iterations: Levenberg-Marquardt steps a call.
+
+        Raises:
+            ConfigError: the arms are not alike.
+        """
+        self.robot = robot
+        self.iterations = iterations
+        self.base = np.stack([_base(robot, arm) for arm in robot.arms])
+        self.model, self.tool = _arm_model(robot, device)
+        self.lower, self.upper = np.array(robot.joint_lower), np.array(robot.joint_upper)
+        self._problems: dict[int, _Problems] = {}
+
+    def solve(self, arm: int | np.ndarray, tool_pose: np.ndarray, seed: np.ndarray) -> Solution:
+        """Joint positions for tool poses, near a seed.
+
+        Args:
+            arm: 0 (left) or 1 (right), one for all or [n].
+            tool_pose: [n 7], wanted pose of the tool frame in the world.
+            seed: [n d], where the search starts [rad].
+
+        Returns:
+            Solution of [n ...]. A pose out of reach gives the nearest found, with the errors that it has.
+        """
+        arm = np.broadcast_to(arm, len(tool_pose))
+        joint_pos = self._nearest(self._in_base(arm, tool_pose), seed)
+        return Solution(joint_pos, *self._errors(arm, tool_pose, joint_pos))
+
+    def solve_path(self, arm: int | np.ndarray, tool_pose: np.ndarray, start: np.ndarray) -> Solution:
+        """Joint positions along paths of the tool, each frame near the one before it.
+
+        Args:
+            arm: 0 (left) or 1 (right), one for all or [n].
+            tool_pose: [t n 7], wanted poses.
+            start: [n d], joint positions before the first frame.
+
+        Returns:
+            Solution of [t n ...].
+        """
+        frames, count = tool_pose.shape[:2]
+        arms = np.tile(np.broadcast_to(arm, count), frames)
+        poses = tool_pose.reshape(-1, 7)
+        targets = self._in_base(arms, poses)
+        anchors = np.unique(np.append(np.arange(0, frames, ANCHOR_STRIDE), frames - 1))
+        at_anchor = np.empty((len(anchors), *start.shape))
+        for index, frame in enumerate(anchors):
+            start = at_anchor[index] = self._nearest(targets[frame * count : (frame + 1) * count], start)
+        seed = _interpolated(np.arange(frames), anchors, at_anchor)
+        joint_pos = self._nearest(targets, seed.reshape(frames * count, -1))
+        position, rotation = self._errors(arms, poses, joint_pos)
+        return Solution(joint_pos.reshape(seed.shape), position.reshape(frames, count), rotation.reshape(frames, count))
+
+    def _in_base(self, arm: np.ndarray, tool_pose: np.ndarray) -> np.ndarray:
+        """Tool poses [n 7] seen from the bases of their arms [n]."""
+        return pose_from_matrix(np.linalg.inv(self.base)[arm] @ matrix_from_pose(tool_pose))
+
+    def _nearest(self, target: np.ndarray, seed: np.ndarray) -> np.ndarray:
+        """[n d] joint positions for poses [n 7] in the arms' bases, found from seeds [n d]."""
+        size = 1 << max(0, len(target) - 1).bit_length()
+        if size not in self._problems:
+            self._problems[size] = _Problems(self.robot, self.model, self.tool, size, self.iterations)
+        return np.clip(self._problems[size].solve(target, seed), self.lower, self.upper)
+
+    def _errors(self, arm: np.ndarray, tool_pose: np.ndarray, joint_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        reached = np.empty((len(arm), 4, 4))
+        for side in np.unique(arm):
+            reached[arm == side] = tool_matrix(self.robot, side, joint_pos[arm == side])
+        position = np.linalg.norm(reached[:, :3, 3] - tool_pose[:, :3], axis=-1)
+        rotation = (Rotation.from_matrix(reached[:, :3, :3]).inv() * Rotation.from_quat(tool_pose[:, 3:])).magnitude()
+        return position, rotation
+
+
+def inverse_kinematics(
+    robot: RobotSpec, arm: int | np.ndarray, tool_pose: np.ndarray, seed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Joint positions for tool poses: `ArmSolver.solve` with a solver that is kept.
+
+    Args:
+        robot: whose arms.
+        arm: 0 (left) or 1 (right), one for all or [n].
+        tool_pose: [n 7], world.
+        seed: [n d], rad.
+
+    Returns:
+        joint_pos [n d] rad, position_error [n] m, rotation_error [n] rad.
+    """
+    solution = arm_solver(robot).solve(arm, tool_pose, seed)
+    return solution.joint_pos, solution.position_error, solution.rotation_error
+
+
+@lru_cache(maxsize=16)
+def arm_solver(robot: RobotSpec) -> ArmSolver:
+    """The process's solver of a robot, made at first use."""
+    return ArmSolver(robot)
+
+
+def _interpolated(frames: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values [a n d] at anchor frames [a], linearly between them at frames [t]: [t n d]."""
+    after = np.clip(np.searchsorted(anchors, frames), 1, max(1, len(anchors) - 1))
+    if len(anchors) == 1:
+        return np.repeat(values, len(frames), 0)
+    share = (frames - anchors[after - 1]) / (anchors[after] - anchors[after - 1])
+    return values[after - 1] + share[:, None, None] * (values[after] - values[after - 1])
+
+
+def _segments(robot: RobotSpec, arm: Arm) -> list[np.ndarray]:
+    """Transforms [4 4] from the root to the first joint, between joints, and from the last joint to the tool."""
+    segments, frame = [], np.eye(4)
+    for joint in load_urdf(robot.urdf).chain(arm.tool_link):
+        frame = frame @ joint.origin
+        if joint.name in arm.joints:
+            segments.append(frame)
+            frame = np.eye(4)
+    return [*segments, frame @ matrix_from_pose(arm.tool_pose)]
+
+
+def _base(robot: RobotSpec, arm: Arm) -> np.ndarray:
+    """[4 4] world pose of the frame in which the arm's first joint turns."""
+    return matrix_from_pose(arm.root_pose) @ _segments(robot, arm)[0]
+
+
+def _arm_model(robot: RobotSpec, device: str | None) -> tuple[newton.Model, np.ndarray]:
+    """The arm from its first joint on as a Newton model of seven joints, and its tool frame [7] in the last real link."""
+    left, right = (_segments(robot, arm) for arm in robot.arms)
+    if not np.allclose(left[1:], right[1:], atol=1e-6):
+        raise ConfigError(f"{robot.urdf}: the arms of {robot.key} differ beyond their bases; expected two alike.")
+    joints = [load_urdf(robot.urdf).joints[name] for name in robot.arms[0].joints]
+    builder = newton.ModelBuilder()
+    handles = []
+    for index in range(JOINT_COUNT):
+        real = index < len(joints)
+        segment = left[index] if 0 < index < len(joints) else np.eye(4)
+        handles.append(
+            builder.add_joint_revolute(
+                parent=index - 1,
+                child=builder.add_link(mass=1.0, inertia=wp.mat33(*np.eye(3).ravel())),
+                parent_xform=wp.transform(*pose_from_matrix(segment)),
+                axis=wp.vec3(*(joints[index].axis if real else (0.0, 0.0, 1.0))),
+                limit_lower=robot.joint_lower[index] if real else 0.0,
+                limit_upper=robot.joint_upper[index] if real else 0.0,
+            )
+        )
+    builder.add_articulation(handles)
+    return builder.finalize(device=device), pose_from_matrix(left[-1])
+
+
+class _Problems:
+    """A fixed number of problems of one arm model, with their buffers and, on a GPU, their captured graph."""
+
+    def __init__(self, robot: RobotSpec, model: newton.Model, tool: np.ndarray, size: int, iterations: int) -> None:
+        device = model.device
+        link = robot.arm_joint_count - 1
+        home = np.mean([arm.home for arm in robot.arms], 0).tolist() + [0.0] * (JOINT_COUNT - robot.arm_joint_count)
+        posture = wp.array(home, dtype=wp.float32, device=device)
+        self.positions = wp.zeros(size, dtype=wp.vec3, device=device)
+        self.rotations = wp.zeros(size, dtype=wp.vec4, device=device)
+        self.joint_pos = wp.zeros((size, JOINT_COUNT), dtype=wp.float32, device=device)
+        self.iterations = iterations
+        self.posture = newton.ik.IKObjectiveJointLimit(posture, posture)
+        self.posture_weight = POSTURE_WEIGHT if robot.arm_joint_count == JOINT_COUNT else 0.0
+        objectives = [
+            newton.ik.IKObjectivePosition(link, wp.vec3(*tool[:3]), self.positions, weight=POSITION_WEIGHT),
+            newton.ik.IKObjectiveRotation(link, wp.quat(*tool[3:]), self.rotations),
+            newton.ik.IKObjectiveJointLimit(model.joint_limit_lower, model.joint_limit_upper, weight=LIMIT_WEIGHT),
+            self.posture,
+        ]
+        self.solver = newton.ik.IKSolver(
+            model, size, objectives, jacobian_mode=newton.ik.IKJacobianType.ANALYTIC, lambda_initial=1e-3
+        )
+        self.has_run = False
+        self.graph: wp.Graph | None = None
+        self.device = device
+
+    def solve(self, target: np.ndarray, seed: np.ndarray) -> np.ndarray:
+        """Joint positions [n d] for tool poses [n 7] in the arm's base frame; n may be less than the size."""
+        count, joints = seed.shape
+        self.positions.assign(_padded(target[:, :3], self.positions.shape[0]))
+        self.rotations.assign(_padded(target[:, 3:], self.positions.shape[0]))
+        start = np.zeros((self.positions.shape[0], JOINT_COUNT), np.float32)
+        start[:count, :joints] = seed
+        self.joint_pos.assign(start)
+        self._run()
+        wait_for(self.device)
+        return self.joint_pos.numpy()[:count, :joints].astype(float)
+
+    def _run(self) -> None:
+        """All steps; on a GPU the first run loads the kernels, the second records them, later ones replay."""
+        if not self.device.is_cuda or not self.has_run:
+            self._step()
+            self.has_run = True
+            return
+        if self.graph is None:
+            with wp.ScopedCapture(self.device) as capture:
+                self._step()
+            self.graph = capture.graph
+        wp.capture_launch(self.graph)
+
+    def _step(self) -> None:
+        for weight, iterations in ((self.posture_weight, self.iterations - POLISH_STEPS), (0.0, POLISH_STEPS)):
+            self.posture.weight = weight
+            self.solver.step(self.joint_pos, self.joint_pos, iterations=iterations)
+
+
+def _padded(rows: np.ndarray, size: int) -> np.ndarray:
+    """Rows [n ...] float32, the last one repeated up to `size` rows."""
+    return np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), 0)]).astype(np.float32)

@@ -1,0 +1,67 @@
+"""Physics on a CPU: MuJoCo's C engine, one world at a time, the same bits every time."""
+
+import mujoco
+import numpy as np
+
+from xew.sim_warp.physics.worlds import (
+    FIRST_OBJECT,
+    LEFT_ARM_LINKS,
+    LEFT_FINGERS,
+    RIGHT_ARM_LINKS,
+    RIGHT_FINGERS,
+    TABLE,
+    Motion,
+    World,
+    build_solver,
+    control_targets,
+    initial_joints,
+    motion,
+    shape_owners,
+)
+
+# Warnings are counted in `data.warning` and told as overflow; MuJoCo would write them to a file where the user stands, too.
+mujoco.set_mju_user_warning(lambda message: None)
+
+_ARMS = ((LEFT_FINGERS, LEFT_ARM_LINKS), (RIGHT_FINGERS, RIGHT_ARM_LINKS))
+
+
+def simulate_one(world: World) -> Motion:
+    """Step one world through its commands."""
+    solver = build_solver([world], "cpu", use_mujoco_cpu=True)
+    model, data = solver.mj_model, solver.mj_data
+    labels = solver.model.shape_label
+    owners = shape_owners([labels[shape] for shape in solver.mjc_geom_to_newton_shape.numpy()[0]])
+    data.qpos[:] = initial_joints(world)
+    mujoco.mj_forward(model, data)
+    count = len(world.scene.objects)
+    frames = [_frame(data, owners, count)]
+    for targets in control_targets(world.robot, world.action):
+        for target in targets:
+            data.ctrl[:] = target
+            mujoco.mj_step(model, data)
+        frames.append(_frame(data, owners, count))
+    qpos, qvel, contact, penetration, overlap = (np.stack(parts) for parts in zip(*frames, strict=True))
+    overflow = any(warning.number for warning in data.warning)
+    return motion(world, qpos, qvel, contact, penetration, overlap.max(0), overflow)
+
+
+Frame = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Joint coordinates and velocities, which fingers touch which objects [2 o], how deep each object [o] is in
+something else, and an arm in the table and in the other arm [2] [m]."""
+
+
+def _frame(data: mujoco.MjData, owners: np.ndarray, objects: int) -> Frame:
+    distance = np.array(data.contact.dist) if data.ncon else np.zeros(0)
+    pairs = np.sort(owners[data.contact.geom], axis=-1) if data.ncon else np.zeros((0, 2), int)
+    touching = pairs[distance < 0]
+    contact = np.zeros((2, objects), bool)
+    held = touching[np.isin(touching[:, 0], (LEFT_FINGERS, RIGHT_FINGERS)) & (touching[:, 1] >= FIRST_OBJECT)]
+    contact[held[:, 0], held[:, 1] - FIRST_OBJECT] = True
+    penetration = np.zeros(objects)
+    for column in (0, 1):
+        deep = (pairs[:, column] >= FIRST_OBJECT) & (pairs[:, 0] != pairs[:, 1])
+        np.maximum.at(penetration, pairs[deep, column] - FIRST_OBJECT, -distance[deep])
+    left, right = (np.isin(pairs, arm) for arm in _ARMS)
+    wrong = ((left | right).any(1) & (pairs == TABLE).any(1), left.any(1) & right.any(1))
+    overlap = np.array([-distance[those].min(initial=0.0) for those in wrong])
+    return data.qpos.copy(), data.qvel.copy(), contact, penetration, overlap

@@ -1,0 +1,386 @@
+"""The common template: one Newton world that any robot, task and seed fits, so that all are rows of one batch.
+
+Reads  RobotSpec (through its URDF) and Scene
+Writes a world of a newton.ModelBuilder: two arms of seven revolute joints and two finger slides each, `FREE_SLOTS` free
+       bodies, one hinged lid, and whatever is fixed to the table
+
+MuJoCo Warp wants the same bodies and joints in every world; what their frames, axes, limits, masses and convex hulls are
+may differ. So arms of six joints get a seventh that is pinned, and slots that a scene does not need float, massless in
+gravity and without a shape, below the table.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import newton
+import numpy as np
+import trimesh
+import warp as wp
+from newton import JointTargetMode
+from scipy.spatial.transform import Rotation
+
+from xew.config import ConfigError
+from xew.sim_warp.embodiment.spec import Arm
+from xew.sim_warp.embodiment.urdf import Joint, Urdf
+from xew.sim_warp.geometry.poses import matrix_from_pose
+from xew.sim_warp.robots import RobotSpec, load_urdf
+from xew.sim_warp.scene import Scene, SceneObject
+from xew.sim_warp.stage import TABLE_SIZE, TABLE_TOP
+
+ARM_JOINTS = 7
+FREE_SLOTS = 3
+PARKED = tuple((0.3 * slot, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0) for slot in range(FREE_SLOTS))
+"""Where free bodies float that a scene has no object for: under the table, out of sight."""
+SIDES = ("left", "right")
+
+ARM_STIFFNESS, ARM_DAMPING, ARM_ARMATURE = 4000.0, 120.0, 1.0
+"""Position gain [N m/rad], velocity gain [N m s/rad] and reflected rotor inertia [kg m2] of every arm joint: with the
+commanded velocity fed forward a joint follows its command within a few milliradians, whatever arm hangs on it.
+MuJoCo solves contacts as if the velocity gain acted explicitly and then integrates it implicitly: where time step times
+gain is not small beside the inertia, what a hand holds is thrown ahead of it (9 mm in a lift with 400 and 0.3)."""
+CONTACT_TIME = 0.012
+"""Time constant in which soft contacts push back [s], three time steps: held things sink 1 mm into a pad."""
+PIN_STIFFNESS, PIN_DAMPING, PIN_ARMATURE = 20000.0, 500.0, 1.0
+"""Of the seventh joint of an arm that has six."""
+FINGER_STIFFNESS, FINGER_DAMPING, FINGER_ARMATURE = 10000.0, 200.0, 0.5
+"""N/m, N s/m, kg: stiff enough that a wall of 5 mm is held with the full force."""
+FINGER_FORCE = 16.0
+"""Largest force of a finger [N], gentle beside the Panda hand's 70 N: our objects are light."""
+PAD_FRICTION = 1.2
+"""Rubber pads on plastic or wood."""
+LINK_FRICTION = 0.5
+HINGE_ARMATURE = 0.02
+"""kg m2: gives a light lid a share in the solver's cost beside the arms, without which its friction is not solved for."""
+HINGE_SOLIMP = (0.99, 0.99, 0.001, 0.5, 2.0)
+"""Impedance of a hinge's dry friction: with MuJoCo's default a light lid creeps shut at 4 degrees a second."""
+FARTHEST_MASS = 0.3
+"""A radius of gyration [m] beyond which a link's inertia is taken for a placeholder (RoboTwin's UR5 gripper states
+1 kg m2 for fingers of 100 g) and that of its collision shapes is used. The same where an inertia is not positive."""
+
+ROBOT_GROUP = {"left": -1, "right": -2}
+OBJECT_GROUP = 1
+"""Newton's collision groups: a negative group meets every other group but itself."""
+
+
+@dataclass(frozen=True)
+class RigidGroup:
+    """Links that move as one: what a moving joint carries up to the next one."""
+
+    parent_to_joint: np.ndarray
+    """[4 4] joint frame in the frame of the group before it."""
+    joint: Joint
+    mass: float
+    center: np.ndarray
+    """[3] m."""
+    inertia: np.ndarray
+    """[3 3] about the centre of mass, kg m2."""
+    hulls: tuple[tuple[str, np.ndarray], ...]
+    """(name, points [k 3])."""
+
+
+@lru_cache(maxsize=64)
+def arm_groups(path: Path, arm: Arm) -> tuple[list[RigidGroup], list[RigidGroup]]:
+    """The rigid groups of an arm's revolute joints, base outwards, and those of its two fingers."""
+    urdf, moving = load_urdf(path), [*arm.joints, *arm.fingers]
+    groups = {name: _rigid_group(urdf, urdf.joints[name], moving) for name in moving}
+    return [groups[name] for name in arm.joints], [groups[name] for name in arm.fingers]
+
+
+def _rigid_group(urdf: Urdf, joint: Joint, moving: list[str]) -> RigidGroup:
+    """Mass and shapes of a joint's child and of all that is fixed to it, in the child's frame."""
+    parts = [(joint.child, np.eye(4))]
+    for link, pose in parts:  # grows while it is walked
+        parts += [(j.child, pose @ j.origin) for j in urdf.joints.values() if j.parent == link and j.name not in moving]
+    hulls = tuple(
+        (collision.name, collision.points @ pose[:3, :3].T + pose[:3, 3])
+        for link, pose in parts
+        for collision in urdf.links[link].collisions
+    )
+    return RigidGroup(_from_last_moving(urdf, joint, moving), joint, *_mass_properties(urdf, parts, hulls), hulls)
+
+
+def _from_last_moving(urdf: Urdf, joint: Joint, moving: list[str]) -> np.ndarray:
+    """[4 4] the joint's frame seen from the child of the moving joint before it, or from the root."""
+    pose = np.eye(4)
+    for above in urdf.chain(joint.child):
+        pose = pose @ above.origin
+        if above.name in moving and above.name != joint.name:
+            pose = np.eye(4)
+    return pose
+
+
+def _mass_properties(
+    urdf: Urdf, parts: list[tuple[str, np.ndarray]], hulls: tuple[tuple[str, np.ndarray], ...]
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass, centre and inertia of links together (parallel axes)."""
+    known = [(inertial, pose) for link, pose in parts if (inertial := urdf.links[link].inertial) is not None]
+    mass = sum((inertial.mass for inertial, _ in known), 0.0)
+    if mass <= 0:
+        return 0.05, np.zeros(3), np.eye(3) * 5e-5
+    centers = [pose[:3, :3] @ inertial.center + pose[:3, 3] for inertial, pose in known]
+    center = sum(inertial.mass * c for (inertial, _), c in zip(known, centers, strict=True)) / mass
+    inertia = np.zeros((3, 3))
+    for (inertial, pose), c in zip(known, centers, strict=True):
+        arm = c - center
+        inertia += pose[:3, :3] @ inertial.inertia @ pose[:3, :3].T + inertial.mass * (
+            arm @ arm * np.eye(3) - np.outer(arm, arm)
+        )
+    is_placeholder = np.sqrt(np.trace(inertia) / mass) > FARTHEST_MASS or np.linalg.eigvalsh(inertia).min() <= 0
+    if is_placeholder and hulls:
+        return solid(mass, [points for _, points in hulls])
+    return mass, center, inertia
+
+
+def solid(mass: float, hulls: Sequence[np.ndarray]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass [kg], centre of mass [3] and inertia about it [3 3] of convex pieces of one density."""
+    return _solid(mass, tuple(np.asarray(points, np.float32).tobytes() for points in hulls))
+
+
+@lru_cache(maxsize=1024)
+def _solid(mass: float, hulls: tuple[bytes, ...]) -> tuple[float, np.ndarray, np.ndarray]:
+    """`solid` of float32 points: all robots of a seed meet the same objects."""
+    pieces = [_convex(points) for points in hulls]
+    volume = sum(piece.volume for piece in pieces)
+    center = sum(piece.volume * piece.center_mass for piece in pieces) / volume
+    inertia = np.zeros((3, 3))
+    for piece in pieces:
+        arm = piece.center_mass - center
+        inertia += piece.moment_inertia + piece.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return mass, center, inertia * mass / volume
+
+
+def new_builder() -> newton.ModelBuilder:
+    """A builder with the attributes that the template sets on MuJoCo's side."""
+    builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, -9.81))
+    newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+    return builder
+
+
+def add_world(builder: newton.ModelBuilder, robot: RobotSpec, scene: Scene) -> None:
+    """Append one world of the template: `robot` before `scene`. Raises ConfigError if the scene has more than it holds."""
+    builder.begin_world(label=f"{scene.task}/{scene.seed}/{robot.key}")
+    for side, arm in zip(SIDES, robot.arms, strict=True):
+        _add_arm(builder, side, arm, robot.urdf)
+    _add_objects(builder, scene)
+    builder.end_world()
+
+
+def _add_arm(builder: newton.ModelBuilder, side: str, arm: Arm, path: Path) -> None:
+    links, fingers = arm_groups(path, arm)
+    root = wp.transform(*arm.root_pose)
+    joints: list[int] = []
+    parent = -1
+    for number, group in enumerate(links, 1):
+        is_last_of_six = number == len(links) == ARM_JOINTS - 1
+        frame = root * _transform(group.parent_to_joint) if parent < 0 else _transform(group.parent_to_joint)
+        parent = _add_body(builder, side, f"link{number}", None if is_last_of_six else group)
+        joints.append(_add_arm_joint(builder, f"{side}_joint{number}", joints, parent, frame, group.joint))
+        if is_last_of_six:
+            before, parent = parent, _add_body(builder, side, "link7", group)
+            joints.append(_add_pin(builder, f"{side}_joint7", before, parent))
+    for number, group in enumerate(fingers, 1):
+        body = _add_body(builder, side, f"finger{number}", group)
+        closed, opened = arm.finger_closed[number - 1], arm.finger_open[number - 1]
+        joints.append(_add_finger_joint(builder, f"{side}_finger{number}", parent, body, group, closed, opened))
+    builder.add_articulation(joints, label=f"{side}_arm")
+    builder.set_joint_mimic(joints[-1], joints[-2])
+
+
+def _add_body(builder: newton.ModelBuilder, side: str, name: str, group: RigidGroup | None) -> int:
+    """A body with a group's mass and shapes; without a group a speck that only carries the pinned joint."""
+    mass, center, inertia = (group.mass, group.center, group.inertia) if group else (0.1, np.zeros(3), np.eye(3) * 1e-4)
+    body = builder.add_link(
+        mass=mass,
+        com=wp.vec3(*center),
+        inertia=wp.mat33(*inertia.flatten()),
+        lock_inertia=True,
+        label=f"{side}_{name}",
+        custom_attributes={"mujoco:gravcomp": 1.0},
+    )
+    has_pad = group is not None and "pad" in dict(group.hulls)  # a finger of a user's URDF may name none: then all of it grips
+    for label, points in group.hulls if group else ():
+        friction = PAD_FRICTION if label == "pad" or (name.startswith("finger") and not has_pad) else LINK_FRICTION
+        _add_hull(builder, body, points, friction, ROBOT_GROUP[side], f"{side}_{name}")
+    return body
+
+
+def _add_arm_joint(
+    builder: newton.ModelBuilder, label: str, before: list[int], child: int, frame: wp.transform, joint: Joint
+) -> int:
+    return builder.add_joint_revolute(
+        child - 1 if before else -1,
+        child,
+        parent_xform=frame,
+        axis=wp.vec3(*joint.axis),
+        limit_lower=max(joint.lower, -20.0),
+        limit_upper=min(joint.upper, 20.0),
+        target_ke=ARM_STIFFNESS,
+        target_kd=ARM_DAMPING,
+        armature=ARM_ARMATURE,
+        effort_limit=max(joint.effort, 50.0),
+        actuator_mode=JointTargetMode.POSITION_VELOCITY,
+        label=label,
+    )
+
+
+def _add_pin(builder: newton.ModelBuilder, label: str, parent: int, child: int) -> int:
+    return builder.add_joint_revolute(
+        parent,
+        child,
+        axis=wp.vec3(0, 0, 1),
+        limit_lower=-0.01,
+        limit_upper=0.01,
+        target_ke=PIN_STIFFNESS,
+        target_kd=PIN_DAMPING,
+        armature=PIN_ARMATURE,
+        actuator_mode=JointTargetMode.POSITION_VELOCITY,
+        label=label,
+    )
+
+
+def _add_finger_joint(
+    builder: newton.ModelBuilder, label: str, parent: int, child: int, group: RigidGroup, closed: float, opened: float
+) -> int:
+    """A slide whose position is the finger's way from closed, so that both fingers of all robots count alike."""
+    frame = group.parent_to_joint.copy()
+    frame[:3, 3] += frame[:3, :3] @ group.joint.axis * closed
+    return builder.add_joint_prismatic(
+        parent,
+        child,
+        parent_xform=_transform(frame),
+        axis=wp.vec3(*(group.joint.axis * np.sign(opened - closed))),
+        limit_lower=0.0,
+        limit_upper=abs(opened - closed) + 0.001,
+        target_ke=FINGER_STIFFNESS,
+        target_kd=FINGER_DAMPING,
+        armature=FINGER_ARMATURE,
+        effort_limit=FINGER_FORCE,
+        actuator_mode=JointTargetMode.POSITION_VELOCITY,
+        label=label,
+    )
+
+
+def _add_objects(builder: newton.ModelBuilder, scene: Scene) -> None:
+    table = trimesh.creation.box((TABLE_SIZE[0], TABLE_SIZE[1], TABLE_SIZE[2]))
+    _add_hull(builder, -1, table.vertices + [0, 0, TABLE_TOP - TABLE_SIZE[2] / 2], LINK_FRICTION, OBJECT_GROUP, "table")
+    free = [thing for thing in scene.objects if not thing.is_fixed]
+    hinged = [thing for thing in scene.objects if thing.hinge]
+    if len(free) > FREE_SLOTS or len(hinged) > 1 or any(not thing.is_fixed for thing in hinged):
+        raise ConfigError(
+            f"the scene of {scene.task} has {len(free)} free and {len(hinged)} hinged objects; the template holds "
+            f"{FREE_SLOTS} free ones and one hinge on a fixed object: raise its slots in {__name__}."
+        )
+    for slot in range(FREE_SLOTS):
+        _add_free_slot(builder, slot, free[slot] if slot < len(free) else None, scene)
+    _add_hinge_slot(builder, hinged[0] if hinged else None, scene)
+    for thing in scene.objects:
+        if thing.is_fixed:
+            pose = matrix_from_pose(thing.pose)
+            for points in thing.shape.hulls:
+                points = points @ pose[:3, :3].T + pose[:3, 3]
+                _add_hull(builder, -1, points, thing.friction, OBJECT_GROUP, object_label(scene, thing))
+
+
+def object_label(scene: Scene, thing: SceneObject) -> str:
+    """The label of all collision shapes of an object, its lid included."""
+    return f"object{scene.index(thing.name)}"
+
+
+def _add_free_slot(builder: newton.ModelBuilder, slot: int, thing: SceneObject | None, scene: Scene) -> None:
+    label = f"free{slot}"
+    if thing is None:
+        body = builder.add_link(
+            mass=0.1,
+            inertia=wp.mat33(*(np.eye(3) * 1e-4).flatten()),
+            xform=wp.transform(*PARKED[slot]),
+            lock_inertia=True,
+            label=label,
+            custom_attributes={"mujoco:gravcomp": 1.0},
+        )
+    else:
+        mass, center, inertia = solid(thing.mass, list(thing.shape.hulls))
+        body = builder.add_link(
+            mass=mass,
+            com=wp.vec3(*center),
+            inertia=wp.mat33(*inertia.flatten()),
+            xform=wp.transform(*thing.pose),
+            lock_inertia=True,
+            label=label,
+        )
+        for points in thing.shape.hulls:
+            _add_hull(builder, body, points, thing.friction, OBJECT_GROUP, object_label(scene, thing))
+    builder.add_articulation([builder.add_joint_free(child=body, label=f"{label}_free")], label=label)
+
+
+def _add_hinge_slot(builder: newton.ModelBuilder, thing: SceneObject | None, scene: Scene) -> None:
+    """A lid on a hinge in the world; where no object has one, a pinned speck below the table."""
+    if thing is None or thing.hinge is None:
+        parts = (0.1, np.zeros(3), np.eye(3) * 1e-4)
+        frame, axis = wp.transform((0, 0.3, 0.3), wp.quat_identity()), (0.0, 0.0, 1.0)
+        settings = {"limit_lower": -1.0, "limit_upper": 1.0, "friction": 1.0, "damping": 1.0}
+    else:
+        hinge = thing.hinge
+        mass, center, inertia = solid(hinge.mass, list(hinge.lid.hulls))
+        parts = (mass, center - hinge.anchor, inertia)
+        frame = wp.transform(*thing.pose) * wp.transform(hinge.anchor, wp.quat_identity())
+        axis = hinge.axis
+        settings = {
+            "limit_lower": hinge.lower,
+            "limit_upper": hinge.upper,
+            "friction": hinge.friction,
+            "damping": hinge.damping,
+            "stiffness": hinge.stiffness,
+            "rest_q": hinge.rest,
+        }
+    body = builder.add_link(
+        mass=parts[0],
+        com=wp.vec3(*parts[1]),
+        inertia=wp.mat33(*parts[2].flatten()),
+        lock_inertia=True,
+        label="lid",
+        custom_attributes={} if thing else {"mujoco:gravcomp": 1.0},
+    )
+    if thing is not None and thing.hinge is not None:
+        for points in thing.hinge.lid.hulls:
+            _add_hull(builder, body, points - thing.hinge.anchor, thing.friction, OBJECT_GROUP, object_label(scene, thing))
+    joint = builder.add_joint_revolute(
+        -1,
+        body,
+        parent_xform=frame,
+        axis=wp.vec3(*axis),
+        armature=HINGE_ARMATURE,
+        label="lid_hinge",
+        custom_attributes={"mujoco:solimpfriction": [HINGE_SOLIMP]},
+        **settings,
+    )
+    builder.add_articulation([joint], label="lid")
+
+
+def _add_hull(builder: newton.ModelBuilder, body: int, points: np.ndarray, friction: float, group: int, label: str) -> None:
+    builder.add_shape_convex_hull(
+        body,
+        mesh=_hull(np.asarray(points, np.float32).tobytes()),
+        cfg=newton.ModelBuilder.ShapeConfig(
+            mu=friction, density=0.0, gap=0.0, ke=CONTACT_TIME**-2, kd=2 / CONTACT_TIME, collision_group=group
+        ),
+        label=label,
+        custom_attributes={"mujoco:condim": 4},
+    )
+
+
+@lru_cache(maxsize=4096)
+def _hull(points: bytes) -> newton.Mesh:
+    """The convex hull of float32 points [k 3]; a batch holds the same links hundreds of times."""
+    hull = _convex(points)
+    return newton.Mesh(hull.vertices.astype(np.float32), hull.faces.flatten().astype(np.int32), compute_inertia=False)
+
+
+def _convex(points: bytes) -> trimesh.Trimesh:
+    """The convex hull of float32 points [k 3]."""
+    return trimesh.convex.convex_hull(np.frombuffer(points, np.float32).reshape(-1, 3).astype(float))
+
+
+def _transform(matrix: np.ndarray) -> wp.transform:
+    return wp.transform(tuple(matrix[:3, 3]), wp.quat(*Rotation.from_matrix(matrix[:3, :3]).as_quat()))

@@ -1,0 +1,78 @@
+"""Stage 2b: a plan's tool path to joint commands, by inverse kinematics, for any robot.
+
+Reads  ToolPath, RobotSpec
+Writes `Commands`: canonical joint targets at every stored frame, or the finding that this robot cannot follow
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from xew.protocol import ACTION_DIM, ARMS, FRAME_RATE
+from xew.sim_warp.kinematics.inverse import arm_solver
+from xew.sim_warp.plan import LEFT, RIGHT, ToolPath
+from xew.sim_warp.robots import RobotSpec
+
+POSITION_TOLERANCE = 0.003
+"""Largest distance between commanded and planned tool [m]."""
+ROTATION_TOLERANCE = 0.03
+"""Largest angle between them [rad]."""
+
+
+@dataclass(frozen=True)
+class Commands:
+    """What a robot is told to do."""
+
+    action: np.ndarray
+    """[t 16] float32, canonical."""
+    problem: str | None
+    """Why this robot cannot follow the plan, in words; None if it can."""
+
+
+def joint_commands(robot: RobotSpec, paths: list[ToolPath]) -> list[Commands]:
+    """Joint commands of one robot for many plans, solved together: each frame near the one before it, from home on."""
+    longest = max(path.frame_count for path in paths)
+    targets = np.stack([_lengthened(path.pose, longest) for path in paths], 1).reshape(longest, -1, 7)
+    arms = np.tile([LEFT, RIGHT], len(paths))
+    solution = arm_solver(robot).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
+    commands = []
+    for index, path in enumerate(paths):
+        columns, frames = slice(2 * index, 2 * index + 2), slice(path.frame_count)
+        action = _action(solution.joint_pos[frames, columns], path.gripper)
+        problem = _out_of_reach(solution.position_error[frames, columns], solution.rotation_error[frames, columns])
+        commands.append(Commands(action.astype(np.float32), problem or _too_fast(robot, action)))
+    return commands
+
+
+def _lengthened(pose: np.ndarray, frames: int) -> np.ndarray:
+    """A path [t 2 7] that stands at its last pose until it has `frames` frames."""
+    return np.concatenate([pose, np.repeat(pose[-1:], frames - len(pose), 0)])
+
+
+def _action(joint_pos: np.ndarray, gripper: np.ndarray) -> np.ndarray:
+    """[t 2 d] joints and [t 2] grippers -> [t 16] canonical."""
+    action = np.zeros((len(gripper), ACTION_DIM))
+    for arm, (joints, column) in enumerate(ARMS):
+        action[:, joints.start : joints.start + joint_pos.shape[-1]] = joint_pos[:, arm]
+        action[:, column] = gripper[:, arm]
+    return action
+
+
+def _out_of_reach(position: np.ndarray, rotation: np.ndarray) -> str | None:
+    """Words for tool errors [t 2] m and rad beyond the tolerance."""
+    for arm, side in enumerate(("left", "right")):
+        far, turned = position[:, arm].max(), rotation[:, arm].max()
+        if far > POSITION_TOLERANCE or turned > ROTATION_TOLERANCE:
+            return f"{side} arm cannot reach: off by {1000 * far:.0f} mm, {np.degrees(turned):.0f} deg"
+    return None
+
+
+def _too_fast(robot: RobotSpec, action: np.ndarray) -> str | None:
+    speed = np.abs(np.diff(action, axis=0)) * FRAME_RATE
+    limit = np.array(robot.joint_velocity)
+    for side, (joints, _) in zip(("left", "right"), ARMS, strict=True):
+        fastest = speed[:, joints.start : joints.start + len(limit)].max(0, initial=0)
+        if (fastest > limit).any():
+            joint = int(np.argmax(fastest / limit))
+            return f"{side} joint {joint + 1} would turn at {fastest[joint]:.1f} rad/s, its limit is {limit[joint]:.1f}"
+    return None

@@ -1,0 +1,68 @@
+"""A robot as the renderer sees it: one body per link that has a shape, posed by canonical joint positions.
+
+Reads a RobotSpec and its URDF; both arms come in one list, the left copy of the URDF first where there are two.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+
+from xew.sim_warp.embodiment.spec import RobotSpec
+from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
+from xew.sim_warp.kinematics.forward import link_poses
+from xew.sim_warp.rendering.packing import Body
+
+SIDES = ("left", "right")
+
+
+def robot_bodies(spec: RobotSpec) -> list[Body]:
+    """The robot's visible links, as many and in the order of `robot_pose`. The meshes are shared between calls."""
+    links = load_urdf(spec.urdf).links
+    meshes = [links[name].visual for _, name in _shown_links(spec)]
+    return [Body(mesh, is_robot=True) for mesh in meshes if mesh is not None]
+
+
+def robot_pose(spec: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
+    """World poses of the visible links.
+
+    Args:
+        joint_pos: [t 16] canonical joint positions [rad] and grippers [0 closed, 1 open], measured or commanded.
+
+    Returns:
+        [t b 7] float32, xyz [m] and quaternion xyzw.
+    """
+    poses = link_poses(spec, joint_pos)
+    return np.stack([poses[copy][link] for copy, link in _shown_links(spec)], 1).astype(np.float32)
+
+
+def keypoint_links(spec: RobotSpec) -> list[tuple[int, str, str]]:
+    """The links whose origins are keypoints: (copy of the URDF, name of the link, name of the keypoint).
+
+    They are the links that the joints of each arm and its fingers move, from the base outwards; the names of their
+    keypoints, such as left/link3, say whose they are.
+    """
+    urdf = load_urdf(spec.urdf)
+    found = []
+    for index, (side, arm) in enumerate(zip(SIDES, spec.arms, strict=True)):
+        copy = 0 if spec.one_urdf_holds_both_arms else index
+        links = [urdf.joints[joint].child for joint in (*arm.joints, *arm.fingers)]
+        found += [(copy, link, f"{side}/{link}") for link in links]
+    return found
+
+
+def body_names(spec: RobotSpec) -> list[tuple[int, str]]:
+    """(copy of the URDF, link) of each body of `robot_bodies`."""
+    return list(_shown_links(spec))
+
+
+@lru_cache(maxsize=32)
+def _shown_links(spec: RobotSpec) -> tuple[tuple[int, str], ...]:
+    urdf = load_urdf(spec.urdf)
+    copies = 1 if spec.one_urdf_holds_both_arms else 2
+    return tuple((copy, name) for copy in range(copies) for name, link in urdf.links.items() if link.visual is not None)
+
+
+def nearby_links(urdf: Urdf, link: str) -> set[str]:
+    """A link and those that one joint joins to it."""
+    joined = {joint.parent for joint in urdf.joints.values() if joint.child == link}
+    return joined | {joint.child for joint in urdf.joints.values() if joint.parent == link} | {link}

@@ -1,0 +1,141 @@
+"""Stage 4a: recorded states to what the head camera sees. Everything here is a view of states.
+
+Reads  `Recording`s: a robot, its measured joints, and things with their measured poses
+Writes `Observation`s: RGB, robot mask, keypoints and their visibility, as `xew.episode.States` keeps them
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from xew.sim_warp.embodiment.spec import RobotSpec
+from xew.sim_warp.embodiment.urdf import load_urdf
+from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera, project
+from xew.sim_warp.geometry.poses import matrix_from_pose, pose_from_matrix
+from xew.sim_warp.kinematics.forward import link_poses
+from xew.sim_warp.rendering.bodies import body_names, keypoint_links, nearby_links, robot_bodies, robot_pose
+from xew.sim_warp.rendering.render import Body, Frames, Renderer, World
+from xew.sim_warp.scene import Hinge, Scene
+
+VISIBILITY_MARGIN = 0.02
+"""How far in front of a link's origin something else may be before it hides the link [m]."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One episode to look at: a robot and things, posed as measured."""
+
+    robot: RobotSpec
+    joint_pos: np.ndarray
+    """[t 16] measured canonical joint positions [rad] and grippers."""
+    things: Sequence[Body] = ()
+    """All bodies that are not the robot; keep the `Mesh` objects of equal things, they are stored once."""
+    thing_pose: np.ndarray | None = None
+    """[t o 7] their measured poses, world frame; None if there are none."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the camera sees of one episode; the fields are those of `xew.episode.States`."""
+
+    rgb: np.ndarray
+    """[t h w 3] uint8."""
+    robot_mask: np.ndarray
+    """[t h w] bool."""
+    keypoints: np.ndarray
+    """[t k 2] float32 [pixels]."""
+    keypoint_visible: np.ndarray
+    """[t k] bool."""
+
+
+def observe(renderer: Renderer, recordings: Sequence[Recording], camera: Camera = HEAD_CAMERA) -> list[Observation]:
+    """Look at many episodes at once; the result of each does not depend on the others."""
+    points = [keypoint_positions(recording.robot, recording.joint_pos) for recording in recordings]
+    worlds = [_world(recording, at) for recording, at in zip(recordings, points, strict=True)]
+    frames = renderer.render_batch(worlds, camera)
+    return [_observation(*seen, camera) for seen in zip(recordings, points, frames, strict=True)]
+
+
+def scene_things(scene: Scene, object_pose: np.ndarray, object_joint: np.ndarray) -> tuple[list[Body], np.ndarray]:
+    """The objects of a scene as bodies with poses, lids as bodies of their own.
+
+    Args:
+        object_pose: [t o 7] recorded poses of the objects, world frame.
+        object_joint: [t o] recorded hinge angles [rad].
+
+    Returns:
+        The bodies, and their poses [t b 7].
+    """
+    bodies = [Body(thing.shape.mesh, is_robot=False) for thing in scene.objects]
+    poses = [object_pose]
+    for index, thing in enumerate(scene.objects):
+        if thing.hinge is not None:
+            bodies.append(Body(thing.hinge.lid.mesh, is_robot=False))
+            swing = _swing(thing.hinge, object_joint[:, index])
+            poses.append(pose_from_matrix(matrix_from_pose(object_pose[:, index]) @ swing)[:, None])
+    return bodies, np.concatenate(poses, 1)
+
+
+def _swing(hinge: Hinge, angle: np.ndarray) -> np.ndarray:
+    """[t 4 4] motion of a lid in its object's frame at angles [t]."""
+    motion = np.tile(np.eye(4), (len(angle), 1, 1))
+    axis = np.array(hinge.axis) / np.linalg.norm(hinge.axis)
+    motion[:, :3, :3] = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
+    motion[:, :3, 3] = np.array(hinge.anchor) - motion[:, :3, :3] @ np.array(hinge.anchor)
+    return motion
+
+
+def keypoint_names(robot: RobotSpec) -> tuple[str, ...]:
+    """Names of the keypoints, such as left/link3: the moving links of the left arm, its fingers, then the right's."""
+    return tuple(name for _, _, name in keypoint_links(robot))
+
+
+def keypoint_positions(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
+    """Origins [t k 3] of the moving links at canonical joint positions [t 16], world frame [m]."""
+    poses = link_poses(robot, joint_pos)
+    return np.stack([poses[copy][link][:, :3] for copy, link, _ in keypoint_links(robot)], 1)
+
+
+def keypoint_visibility(robot: RobotSpec, points: np.ndarray, frames: Frames, camera: Camera) -> np.ndarray:
+    """Which keypoints the camera sees, bool [t k].
+
+    A link's origin lies inside the link, so it counts as seen where the pixel that holds it shows the link itself or
+    one that a joint joins to it, or where what the pixel shows is no more than `VISIBILITY_MARGIN` in front of it.
+
+    Args:
+        points: [t k 3] keypoints in the world, as given to the renderer with the frames.
+    """
+    _, depth = project(camera, points)
+    shown = frames.point_body
+    own = _own_table(robot)
+    own_body = np.where((shown >= 0) & (shown < own.shape[1] - 1), shown, -1)
+    seen_depth = np.where(frames.point_depth > 0, frames.point_depth, np.inf)
+    near = seen_depth >= depth - VISIBILITY_MARGIN
+    return (shown != -2) & (depth > 0) & (near | own[np.arange(points.shape[1]), own_body])
+
+
+def _own_table(robot: RobotSpec) -> np.ndarray:
+    """[k b+1] bool: is a body the link of a keypoint, or next to it? The last column, body -1, is False."""
+    urdf = load_urdf(robot.urdf)
+    bodies = body_names(robot)
+    table = np.zeros((len(keypoint_links(robot)), len(bodies) + 1), bool)
+    for row, (copy, link, _) in enumerate(keypoint_links(robot)):
+        near = nearby_links(urdf, link)
+        table[row, :-1] = [body_copy == copy and name in near for body_copy, name in bodies]
+    return table
+
+
+def _world(recording: Recording, points: np.ndarray) -> World:
+    bodies = [*robot_bodies(recording.robot), *recording.things]
+    pose = robot_pose(recording.robot, recording.joint_pos)
+    if recording.thing_pose is not None:
+        pose = np.concatenate([pose, recording.thing_pose], 1)
+    return World(bodies, pose, points)
+
+
+def _observation(recording: Recording, points: np.ndarray, frames: Frames, camera: Camera) -> Observation:
+    pixels, _ = project(camera, points)
+    visible = keypoint_visibility(recording.robot, points, frames, camera)
+    return Observation(frames.rgb, frames.robot_mask, pixels.astype(np.float32), visible)

@@ -1,0 +1,450 @@
+"""Warp kernels, second half: from what each sample shows (raster_kernels.py) to colours, masks, depth and optical flow.
+
+A pixel's colour is made once per triangle that it shows, at the mean of that triangle's samples, in linear light. The
+light on what never moves is kept per camera and source; a frame only multiplies it with its shadows.
+"""
+
+# Warp does not know any().
+# ruff: noqa: SIM110
+
+# Annotations of kernels are types of Warp, which mypy does not know.
+# mypy: ignore-errors
+
+import warp as wp
+
+from xew.sim_warp.rendering.raster_kernels import (
+    CENTER,
+    NEAR,
+    OFFSET_X,
+    OFFSET_Y,
+    SAMPLES,
+    TILE,
+    Geometry,
+    Light,
+    View,
+    bits,
+    in_view,
+    on_screen,
+    vec5,
+)
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})  # why: see raster_kernels.py
+
+SHADOW_BIAS = wp.constant(0.0015)
+"""How far behind a surface a point is still lit [m]."""
+COLORS = wp.constant(8192)
+"""Entries of the table from linear light to sRGB."""
+
+
+@wp.struct
+class Shading:
+    """How surfaces answer light; see stage.py."""
+
+    ambient: float
+    sky_share: float
+    exposure: float
+    specular: float
+    knee: float
+    ceiling: float
+
+
+@wp.struct
+class Stage:
+    """What never moves, seen by one camera: keys of its samples and, per pixel, its light without shadows."""
+
+    key: wp.array3d(dtype=wp.uint64)
+    ambient: wp.array2d(dtype=wp.vec3)
+    direct: wp.array3d(dtype=wp.vec3)
+    shadow_texel: wp.array3d(dtype=wp.vec3)
+
+
+# ---- shadows
+
+
+@wp.func
+def shadow_reach(texel: wp.vec3, parallel: int) -> float:
+    """Nearness beyond which something on the map shades the point at `texel`."""
+    if parallel == 1:
+        return texel[2] + SHADOW_BIAS
+    return texel[2] + SHADOW_BIAS * texel[2] * texel[2]
+
+
+@wp.func
+def lit_share(
+    texel: wp.vec3,
+    reach: float,
+    frame: int,
+    light: int,
+    map_in: wp.array4d(dtype=wp.uint32),
+    tile_in: wp.array4d(dtype=wp.uint32),
+) -> float:
+    """Share of the light that arrives: nine texels round the point, each with bilinear weights (16 comparisons)."""
+    size = float(map_in.shape[2])
+    if texel[0] < 2.0 or texel[1] < 2.0 or texel[0] > size - 4.0 or texel[1] > size - 4.0:
+        return 1.0
+    threshold = bits(reach)
+    x = int(texel[0])
+    y = int(texel[1])
+    if tile_in[frame, light, y / TILE, x / TILE] <= threshold:
+        return 1.0
+    fx = texel[0] - float(x)
+    fy = texel[1] - float(y)
+    shaded = 0.0
+    texels = map_in[frame, light]
+    for j in range(4):
+        row = texels[y + j - 1]
+        in_row = wp.where(row[x - 1] > threshold, 1.0 - fx, 0.0) + wp.where(row[x] > threshold, 1.0, 0.0)
+        in_row += wp.where(row[x + 1] > threshold, 1.0, 0.0) + wp.where(row[x + 2] > threshold, fx, 0.0)
+        shaded += in_row * wp.where(j == 0, 1.0 - fy, wp.where(j == 3, fy, 1.0))
+    return 1.0 - shaded / 9.0
+
+
+# ---- light on surfaces
+
+
+@wp.struct
+class Surface:
+    """A point of a triangle that a pixel sees."""
+
+    point: wp.vec3
+    normal: wp.vec3
+    to_eye: wp.vec3
+    albedo: wp.vec3
+
+
+@wp.func
+def corner_weights(a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3) -> wp.vec3:
+    """Barycentric coordinates of a point of the triangle's plane, clipped to the triangle."""
+    plane = wp.cross(b - a, c - a)
+    scale = 1.0 / wp.max(wp.dot(plane, plane), 1.0e-30)
+    v = wp.clamp(wp.dot(plane, wp.cross(c - a, a - p)) * scale, 0.0, 1.0)
+    w = wp.clamp(wp.dot(plane, wp.cross(a - b, a - p)) * scale, 0.0, 1.0)
+    return wp.vec3(wp.max(1.0 - v - w, 0.0), v, w)
+
+
+@wp.func
+def pixel_ray(camera: View, x: float, y: float) -> wp.vec3:
+    return wp.vec3((x - camera.center[0]) / camera.focal[0], (y - camera.center[1]) / camera.focal[1], 1.0)
+
+
+@wp.func
+def surface_at(
+    geometry: Geometry,
+    packed: int,
+    body_pose: wp.transform,
+    camera: View,
+    seen: wp.vec3,
+    frame: int,
+    vertex_in: wp.array2d(dtype=wp.vec3),
+) -> Surface:
+    """The point `seen` (camera's frame) of a triangle: point and shading normal in the world, colour."""
+    corner = geometry.triangle[packed]
+    weight = corner_weights(vertex_in[frame, corner[0]], vertex_in[frame, corner[1]], vertex_in[frame, corner[2]], seen)
+    normal = (
+        geometry.normal[packed, 0] * weight[0] + geometry.normal[packed, 1] * weight[1] + geometry.normal[packed, 2] * weight[2]
+    )
+    surface = Surface()
+    surface.point = wp.transpose(camera.rotation) * (seen - camera.translation)
+    surface.normal = wp.normalize(wp.transform_vector(body_pose, normal))
+    surface.to_eye = wp.transpose(camera.rotation) * (-wp.normalize(seen))
+    surface.albedo = geometry.albedo[packed]
+    return surface
+
+
+@wp.func
+def ambient_light(surface: Surface, shading: Shading) -> wp.vec3:
+    strength = shading.ambient * (1.0 - shading.sky_share * 0.5 * (1.0 - surface.normal[2]))
+    return surface.albedo * (strength * shading.exposure)
+
+
+@wp.func
+def direct_light(surface: Surface, light: Light, shading: Shading) -> wp.vec3:
+    """Lambert's diffuse and Blinn-Phong's highlight (to the power of 32) of one light, without shadow."""
+    to_light = light.to_light
+    intensity = light.intensity
+    if light.view.parallel == 0:
+        offset = light.position - surface.point
+        squared = wp.length_sq(offset)
+        to_light = offset / wp.sqrt(squared)
+        intensity = light.intensity / squared
+    facing = wp.dot(surface.normal, to_light)
+    if facing <= 0.0:
+        return wp.vec3(0.0, 0.0, 0.0)
+    shine = wp.max(wp.dot(surface.normal, wp.normalize(to_light + surface.to_eye)), 0.0)
+    shine = shine * shine
+    shine = shine * shine
+    shine = shine * shine
+    shine = shine * shine
+    gloss = shading.specular * shine * shine
+    return (surface.albedo * facing + wp.vec3(gloss, gloss, gloss)) * (intensity * shading.exposure)
+
+
+@wp.func
+def toned(light: float, shading: Shading) -> float:
+    """Bright light bends towards a ceiling below white, so that a lit white robot keeps its shape on a white ground."""
+    above = light - shading.knee
+    if above <= 0.0:
+        return light
+    room = shading.ceiling - shading.knee
+    return shading.knee + room * (above / (above + room))
+
+
+@wp.func
+def toned_color(light: wp.vec3, shading: Shading) -> wp.vec3:
+    return wp.vec3(toned(light[0], shading), toned(light[1], shading), toned(light[2], shading))
+
+
+@wp.func
+def nearness_of(key: wp.uint64) -> float:
+    return wp.cast(wp.uint32(key >> wp.uint64(32)), float)
+
+
+@wp.func
+def depth_of(key: wp.uint64) -> float:
+    """Depth along the optical axis [m], 0 where nothing is seen."""
+    if key == wp.uint64(0):
+        return 0.0
+    return 1.0 / nearness_of(key)
+
+
+@wp.func
+def owner(key: wp.uint64, stage_key: wp.uint64) -> int:
+    """The triangle that a sample shows, -1 if it shows the stage."""
+    if key <= stage_key:
+        return -1
+    return int(key & wp.uint64(0xFFFFFFFF)) - 1
+
+
+@wp.kernel
+def light_stage(
+    geometry: Geometry,
+    camera: View,
+    lights: wp.array(dtype=Light),
+    shading: Shading,
+    vertex_in: wp.array2d(dtype=wp.vec3),
+    key_in: wp.array4d(dtype=wp.uint64),
+    sky: wp.vec3,
+    ambient_out: wp.array2d(dtype=wp.vec3),
+    direct_out: wp.array3d(dtype=wp.vec3),
+    shadow_texel_out: wp.array3d(dtype=wp.vec3),
+):
+    """Light on the stage, once per camera: by source, so that a frame only has to multiply with its shadows."""
+    row, column = wp.tid()
+    ambient = wp.vec3(0.0, 0.0, 0.0)
+    for sample in range(SAMPLES):
+        triangle = owner(key_in[0, sample, row, column], wp.uint64(0))
+        if triangle < 0:
+            if sample != CENTER:
+                ambient += sky * 0.25
+        else:
+            ray = pixel_ray(camera, float(column) + OFFSET_X[sample], float(row) + OFFSET_Y[sample])
+            seen = ray / nearness_of(key_in[0, sample, row, column])
+            surface = surface_at(geometry, triangle, wp.transform_identity(), camera, seen, 0, vertex_in)
+            if sample != CENTER:
+                ambient += ambient_light(surface, shading) * 0.25
+            for i in range(direct_out.shape[0]):
+                if sample == CENTER:
+                    shadow_texel_out[i, row, column] = on_screen(lights[i].view, in_view(lights[i].view, surface.point))
+                else:
+                    direct_out[i, row, column] += direct_light(surface, lights[i], shading) * 0.25
+    ambient_out[row, column] = ambient
+
+
+# ---- from visibility to images
+
+
+@wp.func
+def encoded(light: float, srgb: wp.array(dtype=wp.uint8)) -> wp.uint8:
+    return srgb[int(wp.clamp(light, 0.0, 1.0) * float(COLORS - 1) + 0.5)]
+
+
+@wp.func
+def stage_light(
+    stage: Stage,
+    lights: wp.array(dtype=Light),
+    shading: Shading,
+    frame: int,
+    row: int,
+    column: int,
+    map_in: wp.array4d(dtype=wp.uint32),
+    tile_in: wp.array4d(dtype=wp.uint32),
+) -> wp.vec3:
+    total = stage.ambient[row, column]
+    if stage.direct.shape[0] == 0:
+        return total
+    for i in range(stage.direct.shape[0]):
+        share = 1.0
+        if map_in.shape[1] > 0:
+            texel = stage.shadow_texel[i, row, column]
+            share = lit_share(texel, shadow_reach(texel, lights[i].view.parallel), frame, i, map_in, tile_in)
+        total += stage.direct[i, row, column] * share
+    return toned_color(total, shading)
+
+
+@wp.func
+def surface_light(
+    surface: Surface,
+    lights: wp.array(dtype=Light),
+    shading: Shading,
+    frame: int,
+    map_in: wp.array4d(dtype=wp.uint32),
+    tile_in: wp.array4d(dtype=wp.uint32),
+) -> wp.vec3:
+    total = ambient_light(surface, shading)
+    for i in range(lights.shape[0]):
+        light = lights[i]
+        arriving = direct_light(surface, light, shading)
+        if map_in.shape[1] > 0 and arriving[0] + arriving[1] + arriving[2] > 0.0:
+            texel = on_screen(light.view, in_view(light.view, surface.point))
+            arriving = arriving * lit_share(texel, shadow_reach(texel, light.view.parallel), frame, i, map_in, tile_in)
+        total += arriving
+    return toned_color(total, shading)
+
+
+@wp.func
+def shown_before(shown: wp.vec4i, sample: int) -> bool:
+    """Did an earlier sample show the same triangle?"""
+    for earlier in range(sample):
+        if shown[earlier] == shown[sample]:
+            return True
+    return False
+
+
+@wp.kernel
+def shade_pixels(
+    geometry: Geometry,
+    frame_world: wp.array(dtype=int),
+    frame_pose: wp.array(dtype=int),
+    pose: wp.array(dtype=wp.transform),
+    camera: View,
+    lights: wp.array(dtype=Light),
+    shading: Shading,
+    stage: Stage,
+    srgb: wp.array(dtype=wp.uint8),
+    vertex_in: wp.array2d(dtype=wp.vec3),
+    key_in: wp.array4d(dtype=wp.uint64),
+    map_in: wp.array4d(dtype=wp.uint32),
+    tile_in: wp.array4d(dtype=wp.uint32),
+    rgb_out: wp.array4d(dtype=wp.uint8),
+):
+    """Colour: each triangle among a pixel's four samples is lit once, at the mean of its samples."""
+    frame, row, column = wp.tid()
+    drawn = key_in[frame, 0, row, column] | key_in[frame, 1, row, column]
+    drawn = drawn | key_in[frame, 2, row, column] | key_in[frame, 3, row, column]
+    if drawn == wp.uint64(0):
+        plain = stage_light(stage, lights, shading, frame, row, column, map_in, tile_in)
+        for channel in range(3):
+            rgb_out[frame, row, column, channel] = encoded(plain[channel], srgb)
+        return
+    first_triangle = geometry.triangle_range[frame_world[frame]][0]
+    shown = wp.vec4i(-1, -1, -1, -1)
+    for s in range(4):
+        shown[s] = owner(key_in[frame, s, row, column], stage.key[s, row, column])
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for s in range(4):
+        triangle = shown[s]
+        if not shown_before(shown, s):
+            place = vec5(0.0, 0.0, 0.0, 0.0, 0.0)
+            for other in range(s, 4):
+                if shown[other] == triangle:
+                    nearness = nearness_of(key_in[frame, other, row, column])
+                    place += vec5(1.0, OFFSET_X[other], OFFSET_Y[other], nearness, 0.0)
+            count = place[0]
+            if triangle < 0:
+                total += stage_light(stage, lights, shading, frame, row, column, map_in, tile_in) * (0.25 * count)
+            else:
+                packed = first_triangle + triangle
+                # nearness is affine over the screen: its mean belongs to the mean of the samples
+                ray = pixel_ray(camera, float(column) + place[1] / count, float(row) + place[2] / count)
+                body_pose = pose[frame_pose[frame] + geometry.triangle_body[packed]]
+                surface = surface_at(geometry, packed, body_pose, camera, ray * (count / place[3]), frame, vertex_in)
+                total += surface_light(surface, lights, shading, frame, map_in, tile_in) * (0.25 * count)
+    for channel in range(3):
+        rgb_out[frame, row, column, channel] = encoded(total[channel], srgb)
+
+
+@wp.func
+def moved(from_pose: wp.transform, to_pose: wp.transform, point: wp.vec3) -> wp.vec3:
+    """Where a point of a body goes when the body goes from one pose to another; all in the world."""
+    return wp.transform_point(to_pose, wp.transform_point(wp.transform_inverse(from_pose), point))
+
+
+@wp.func
+def motion_on_screen(camera: View, seen: wp.vec3, after: wp.vec3, limit: float) -> wp.vec2:
+    """Motion in pixels between two points of the camera's frame, no longer than `limit`."""
+    now = on_screen(camera, seen)
+    later = on_screen(camera, wp.vec3(after[0], after[1], wp.max(after[2], NEAR)))
+    motion = wp.vec2(later[0] - now[0], later[1] - now[1])
+    length = wp.length(motion)
+    if length > limit:
+        motion = motion * (limit / length)
+    return motion
+
+
+@wp.kernel
+def measure_pixels(
+    geometry: Geometry,
+    frame_world: wp.array(dtype=int),
+    frame_pose: wp.array(dtype=int),
+    frame_next_pose: wp.array(dtype=int),
+    pose: wp.array(dtype=wp.transform),
+    camera: View,
+    stage: Stage,
+    flow_limit: float,
+    key_in: wp.array4d(dtype=wp.uint64),
+    mask_out: wp.array3d(dtype=wp.bool),
+    body_out: wp.array3d(dtype=wp.int16),
+    depth_out: wp.array3d(dtype=float),
+    flow_out: wp.array3d(dtype=wp.vec2),
+):
+    """Geometry at the pixel's centre; outputs of shape zero are left out."""
+    frame, row, column = wp.tid()
+    world = frame_world[frame]
+    body = -1
+    robot = 0
+    flow = wp.vec2(0.0, 0.0)
+    stage_key = stage.key[CENTER, row, column]
+    key = wp.max(key_in[frame, CENTER, row, column], stage_key)
+    triangle = owner(key, stage_key)
+    if triangle >= 0:
+        body = geometry.triangle_body[geometry.triangle_range[world][0] + triangle]
+        robot = geometry.body_is_robot[geometry.body_first[world] + body]
+        if flow_out.shape[0] > 0 and robot == 1 and frame_next_pose[frame] != frame_pose[frame]:
+            seen = pixel_ray(camera, float(column), float(row)) / nearness_of(key)
+            point = wp.transpose(camera.rotation) * (seen - camera.translation)
+            after = moved(pose[frame_pose[frame] + body], pose[frame_next_pose[frame] + body], point)
+            flow = motion_on_screen(camera, seen, in_view(camera, after), flow_limit)
+    mask_out[frame, row, column] = robot == 1
+    if body_out.shape[0] > 0:
+        body_out[frame, row, column] = wp.int16(body)
+    if depth_out.shape[0] > 0:
+        depth_out[frame, row, column] = depth_of(key)
+    if flow_out.shape[0] > 0:
+        flow_out[frame, row, column] = flow
+
+
+@wp.kernel
+def probe_pixels(
+    geometry: Geometry,
+    frame_world: wp.array(dtype=int),
+    stage: Stage,
+    pixel: wp.array2d(dtype=wp.vec2i),
+    key_in: wp.array4d(dtype=wp.uint64),
+    body_out: wp.array2d(dtype=int),
+    depth_out: wp.array2d(dtype=float),
+):
+    """Body (-1 none, -2 outside the image) and depth at the centres of a few pixels (x, y) of every frame."""
+    frame, k = wp.tid()
+    column = pixel[frame, k][0]
+    row = pixel[frame, k][1]
+    if column < 0 or row < 0 or row >= key_in.shape[2] or column >= key_in.shape[3]:
+        body_out[frame, k] = -2
+        depth_out[frame, k] = 0.0
+        return
+    stage_key = stage.key[CENTER, row, column]
+    key = wp.max(key_in[frame, CENTER, row, column], stage_key)
+    triangle = owner(key, stage_key)
+    body_out[frame, k] = -1
+    depth_out[frame, k] = depth_of(key)
+    if triangle >= 0:
+        body_out[frame, k] = geometry.triangle_body[geometry.triangle_range[frame_world[frame]][0] + triangle]

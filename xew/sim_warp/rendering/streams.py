@@ -1,0 +1,251 @@
+"""Stage 4b: what a model may know in advance: images that follow from a robot and its commands alone.
+
+Reads  a robot's key and canonical commands [t 16]; never a recorded state, so that no condition sees the future
+Writes the robot-only render with mask and exact optical flow, ray map, and task-independent views of the robot
+To add one, write a pure function of (robot_key, action, camera) here.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+
+from xew.protocol import ARMS
+from xew.sim_warp.embodiment.spec import RobotSpec
+from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera, look_at, project
+from xew.sim_warp.geometry.meshes import Color
+from xew.sim_warp.geometry.poses import matrix_from_pose
+from xew.sim_warp.kinematics.forward import tool_pose
+from xew.sim_warp.rendering.bodies import robot_bodies, robot_pose
+from xew.sim_warp.rendering.render import FLOW_LIMIT, Body, Renderer, World
+from xew.sim_warp.robots import get_robot
+
+VIEW_COUNT = 9
+CLIP_FRAMES = 17
+"""Views and frames of the paper's specifications of a robot."""
+VIEW_ELEVATION = 25.0
+"""Height of the cameras of reference views over the horizon [deg]."""
+FIT_MARGIN = 1.05
+"""Room round the robot in reference views, as a factor of the distance."""
+SWEEP = 0.6
+"""How far the articulation clip moves a joint from home to either side, where its limits allow [rad]."""
+STILL = 0.5
+"""Shorter optical flow is drawn as none [pixels]."""
+AXIS_LENGTH = 0.1
+"""Of the tool's axes in the ray map [m]."""
+MARKER_RADIUS, AXIS_WIDTH = 50 / 512, 8 / 512
+"""Of the base marker and of the axes' lines, as shares of the image's width."""
+RAY_MAP_GROUND: Color = (128, 128, 128)
+AXIS_COLORS: tuple[Color, ...] = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
+GRIPPER_COLORS: tuple[tuple[Color, Color], ...] = (((229, 245, 224), (0, 68, 27)), ((254, 224, 210), (103, 0, 13)))
+"""Base marker of the left and the right tool with the gripper closed and open: greens and reds, as in EnerVerse-AC."""
+
+
+@dataclass(frozen=True)
+class CommandStreams:
+    """The robot alone, posed by its commands, on white."""
+
+    render: np.ndarray
+    """[t h w 3] uint8, sRGB."""
+    mask: np.ndarray
+    """[t h w] bool."""
+    optical_flow: np.ndarray
+    """[t h w 2] float32, motion from this frame to the next [pixels], see `Frames.optical_flow`."""
+
+
+@cache
+def default_renderer() -> Renderer:
+    """The process's renderer on Warp's default device, made at first use: its kernels and lit stages are shared."""
+    return Renderer()
+
+
+def command_streams(robot_key: str, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> CommandStreams:
+    """Render, mask and exact optical flow of commands [t 16].
+
+    Raises:
+        ConfigError: there is no such robot.
+        ValueError: the action does not have 16 columns.
+    """
+    return command_streams_batch([(robot_key, action)], camera)[0]
+
+
+def command_streams_batch(
+    commands: Sequence[tuple[str, np.ndarray]], camera: Camera = HEAD_CAMERA, renderer: Renderer | None = None
+) -> list[CommandStreams]:
+    """`command_streams` of many (robot_key, action [t 16]) at once; each does not depend on the others."""
+    batch = (renderer or default_renderer()).render_batch(_worlds(commands), camera, ground=False, optical_flow=True)
+    return [CommandStreams(frames.rgb, frames.robot_mask, frames.optical_flow) for frames in batch]
+
+
+def command_renders(
+    commands: Sequence[tuple[str, np.ndarray]], camera: Camera = HEAD_CAMERA, renderer: Renderer | None = None
+) -> list[np.ndarray]:
+    """Only the renders [t h w 3] uint8 of `command_streams_batch`, of which an episode keeps a video."""
+    batch = (renderer or default_renderer()).render_batch(_worlds(commands), camera, ground=False)
+    return [frames.rgb for frames in batch]
+
+
+def _worlds(commands: Sequence[tuple[str, np.ndarray]]) -> list[World]:
+    robots = [get_robot(robot_key) for robot_key, _ in commands]
+    return [
+        World(robot_bodies(robot), robot_pose(robot, _checked(action)))
+        for robot, (_, action) in zip(robots, commands, strict=True)
+    ]
+
+
+def flow_to_rgb(flow: np.ndarray, clip: float = FLOW_LIMIT) -> np.ndarray:
+    """Optical flow as a video that an image codec can take: direction is hue, length is saturation, rest is white.
+
+    The colour wheel is FlowWAM's. Frame 0 is white and frame k holds the motion from k - 1 to k, so that the video has
+    as many frames as the RGB beside it.
+
+    Args:
+        flow: [t h w 2] motion from each frame to the next [pixels].
+        clip: length of full saturation [pixels]; the paper's 25, FlowWAM's WorldArena script has 20.
+
+    Returns:
+        [t h w 3] uint8.
+    """
+    wheel = color_wheel()
+    video = np.full((*flow.shape[:3], 3), 255, np.uint8)
+    x, y = flow[:-1, ..., 0], flow[:-1, ..., 1]
+    moving = x * x + y * y >= STILL * STILL  # little of a picture moves
+    x, y = x[moving], y[moving]
+    hue = (np.arctan2(y, x) + np.pi) / (2 * np.pi) * 179
+    saturation = np.minimum(np.sqrt(x * x + y * y) / clip, 1) * 255
+    video[1:][moving] = wheel[hue.astype(np.uint8), saturation.astype(np.uint8)]
+    return video
+
+
+@cache
+def color_wheel() -> np.ndarray:
+    """RGB of each hue and saturation at full value, as OpenCV has them: uint8 [180 256 3]."""
+    hue, saturation = np.mgrid[:180, :256].astype(np.uint8)
+    return cv2.cvtColor(np.stack([hue, saturation, np.full_like(hue, 255)], -1), cv2.COLOR_HSV2RGB)
+
+
+def ray_map(robot_key: str, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> np.ndarray:
+    """The commanded tool frames drawn into the image: [t h w 3] uint8.
+
+    On grey, each tool has a base marker, a disc at the origin of its frame whose colour goes with the gripper, and over it
+    its x (approach), y (along which the fingers open) and z axes in red, green and blue, 0.1 m long, in the proportions of
+    EnerVerse-AC's trajectory maps. A tool that is nearer covers one that is farther; a tool that is not in front of the
+    camera is left out.
+    """
+    robot = get_robot(robot_key)
+    action = _checked(action)
+    canvas = np.full((len(action), camera.height, camera.width, 3), RAY_MAP_GROUND, np.uint8)
+    tools = [_tool_points(robot, arm, action) for arm in range(len(ARMS))]
+    projected = [project(camera, points) for points in tools]
+    for frame in range(len(action)):
+        for arm in sorted(range(len(ARMS)), key=lambda arm: -projected[arm][1][frame, 0]):
+            pixels, depth = projected[arm]
+            if (depth[frame] > 0.05).all():
+                _draw_tool(canvas[frame], pixels[frame], arm, float(action[frame, ARMS[arm][1]]))
+    return canvas
+
+
+def _tool_points(robot: RobotSpec, arm: int, action: np.ndarray) -> np.ndarray:
+    """[t 4 3] origin and ends of the axes of a tool, world frame [m]."""
+    joints = action[:, ARMS[arm][0]][:, : len(robot.arms[arm].joints)]
+    frame = matrix_from_pose(tool_pose(robot, arm, joints))
+    ends = frame[:, :3, 3:] + AXIS_LENGTH * frame[:, :3, :3]
+    return np.concatenate([frame[:, :3, 3:], ends], -1).transpose(0, 2, 1)
+
+
+def _draw_tool(image: np.ndarray, pixels: np.ndarray, arm: int, gripper: float) -> None:
+    """Base marker and axes from the four projected points [4 2] into an image [h w 3]."""
+    closed, opened = (np.array(color) for color in GRIPPER_COLORS[arm])
+    color = closed + np.clip(gripper, 0, 1) * (opened - closed)
+    fixed_point = np.clip(np.round(pixels * 16), -(1 << 20), 1 << 20).astype(int)
+    origin, *ends = (tuple(int(v) for v in point) for point in fixed_point)
+    width = image.shape[1]
+    cv2.circle(image, origin, round(width * MARKER_RADIUS) * 16, color.round().tolist(), -1, cv2.LINE_AA, 4)
+    for end, axis_color in zip(ends, AXIS_COLORS, strict=True):
+        cv2.line(image, origin, end, axis_color, round(width * AXIS_WIDTH), cv2.LINE_AA, 4)
+
+
+def reference_image(robot_key: str) -> np.ndarray:
+    """The robot at home, seen from the front, [h w 3] uint8: the first of its nine views."""
+    return nine_views(robot_key)[0]
+
+
+def nine_views(robot_key: str) -> np.ndarray:
+    """The robot at home from nine azimuths 40 degrees apart, [9 h w 3] uint8, the first from the front."""
+    robot = get_robot(robot_key)
+    bodies, pose = robot_bodies(robot), robot_pose(robot, home_action(robot)[None])
+    cameras = _fitted_cameras(bodies, pose, [index * 360 / VIEW_COUNT for index in range(VIEW_COUNT)])
+    return np.concatenate([default_renderer().render(bodies, pose, camera, ground=False).rgb for camera in cameras])
+
+
+def articulation_clip(robot_key: str) -> np.ndarray:
+    """A clip of the robot, seen from the front, that sweeps every joint and both grippers (`articulation_action`): [17 h w 3]
+    uint8."""
+    robot = get_robot(robot_key)
+    bodies, pose = robot_bodies(robot), robot_pose(robot, articulation_action(robot))
+    camera = _fitted_cameras(bodies, pose, [0.0])[0]
+    return default_renderer().render(bodies, pose, camera, ground=False).rgb
+
+
+def articulation_action(robot: RobotSpec) -> np.ndarray:
+    """[17 16] commands that move all joints to both sides of home, within the limits of experts, close and open the
+    grippers and end where they began. The outer three joints swing twice while the others swing once."""
+    home = home_action(robot)
+    swing = 2 * np.pi * np.arange(CLIP_FRAMES) / (CLIP_FRAMES - 1)
+    action = np.tile(home, (CLIP_FRAMES, 1))
+    lower, upper = np.array(robot.joint_lower), np.array(robot.joint_upper)
+    for arm, gripper in ARMS:
+        middle = home[arm][: len(lower)]
+        rate = np.where(np.arange(len(lower)) < len(lower) - 3, 1, 2)
+        moved = middle + SWEEP * np.sin(swing[:, None] * rate)
+        action[:, arm.start : arm.start + len(lower)] = np.clip(moved, lower, upper)
+        action[:, gripper] = (1 + np.cos(swing)) / 2
+    return action
+
+
+def home_action(robot: RobotSpec) -> np.ndarray:
+    """[16] canonical joint positions at rest [rad], grippers open."""
+    action = np.zeros(16)
+    for (joints, gripper), arm in zip(ARMS, robot.arms, strict=True):
+        action[joints.start : joints.start + len(arm.home)] = arm.home
+        action[gripper] = 1.0
+    return action
+
+
+def _fitted_cameras(bodies: Sequence[Body], pose: np.ndarray, azimuths: Sequence[float]) -> list[Camera]:
+    """Cameras round the robot, equally far from its middle, so near that poses [t b 7] just fit into every image.
+
+    Azimuth 0 [deg] looks the robot in the face; from there it goes round towards the robot's left hand.
+    """
+    placed = [
+        np.einsum("tij,vj->tvi", frame[:, :3, :3], body.mesh.vertices) + frame[:, None, :3, 3]
+        for body, frame in zip(bodies, matrix_from_pose(pose).swapaxes(0, 1), strict=True)
+    ]
+    points = np.concatenate([vertices.reshape(-1, 3) for vertices in placed])
+    center = (points.min(0) + points.max(0)) / 2
+    cameras = [look_at(center + _toward(azimuth), center) for azimuth in azimuths]
+    distance = FIT_MARGIN * max(_fitting_distance(camera, points) for camera in cameras)
+    return [look_at(center + distance * _toward(azimuth), center) for azimuth in azimuths]
+
+
+def _toward(azimuth: float) -> np.ndarray:
+    """[3] unit vector from the robot to a camera at an azimuth [deg]."""
+    turn, rise = np.radians(azimuth), np.radians(VIEW_ELEVATION)
+    return np.array([-np.sin(turn) * np.cos(rise), np.cos(turn) * np.cos(rise), np.sin(rise)])
+
+
+def _fitting_distance(camera: Camera, points: np.ndarray) -> float:
+    """Least distance from a target 1 m ahead of the camera at which all points [p 3] are in the image [m]."""
+    seen = points @ camera.extrinsics[:3, :3].T + camera.extrinsics[:3, 3]
+    half_view = camera.intrinsics[:2, 2] / camera.intrinsics[[0, 1], [0, 1]]
+    return float((np.abs(seen[:, :2]) / half_view - (seen[:, 2:] - 1)).max())
+
+
+def _checked(action: np.ndarray) -> np.ndarray:
+    """The action as float64 [t 16]."""
+    action = np.asarray(action, float)
+    if action.ndim != 2 or action.shape[1] != 16:
+        raise ValueError(f"action has shape {action.shape}, expected (frames, 16): the canonical layout of xew.protocol.")
+    return action

@@ -1,0 +1,315 @@
+"""Robots of users: from a path to a `RobotSpec`, and kept beside the data that were made with them.
+
+Reads  a URDF, a folder with robot.yaml, a RoboTwin embodiment folder, or a robot kept in a data set
+Writes <data>/robots/<key>/: robot.yaml with nothing left open, the URDF and all files that it names
+
+Episodes name their robot by its key. Whoever reads them finds the robot in the folders that `XEW_ROBOTS` lists (as PATH
+does), to which `use_robots_of(data)` adds those of a data set; workers inherit it.
+"""
+
+import hashlib
+import os
+import re
+import shutil
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from xew.config import ConfigError
+from xew.episode import complete_folder
+from xew.protocol import ROBOT_NAMES
+from xew.sim_warp.embodiment.spec import Arm, RobotSpec
+from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
+from xew.sim_warp.robots.user.draft import OWN, ArmDraft, RobotDraft, find_description, read_draft
+
+FOLDERS = "XEW_ROBOTS"
+"""Environment variable: folders of robots, separated as in PATH."""
+KEPT = "robots"
+"""Folder of a data set that holds its robots."""
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+STROKE_TOLERANCE = 1e-3
+"""The two fingers of a hand move together: how far their strokes may differ [m]."""
+
+
+def is_path(name: str) -> bool:
+    """Is a robot named by where it lies, and not by a key or module:NAME?"""
+    return os.sep in name or name in (".", "..") or name.endswith((".urdf", ".yaml", ".yml"))
+
+
+def load_robot(path: Path | str) -> RobotSpec:
+    """The robot at a path; what it leaves open is found from the URDF and by inverse kinematics.
+
+    Args:
+        path: a .urdf, a robot.yaml, a RoboTwin config.yml, or a folder with one of them.
+
+    Raises:
+        ConfigError: there is no robot, it cannot be read, or it cannot do what every robot must.
+    """
+    description = find_description(Path(path)).resolve()
+    return _load(description, description.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=16)
+def _load(description: Path, modified: int) -> RobotSpec:
+    draft = read_draft(description)
+    return completed(draft, load_urdf(description.parent / draft.urdf), robot_key(description), str(description))
+
+
+def robot_key(description: Path) -> str:
+    """A name for folders: that of a URDF file, else of the folder; `_own` sets it apart from the project's robots."""
+    name = description.stem if description.suffix == ".urdf" else description.parent.name
+    key = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_-")
+    if not key:
+        raise ConfigError(f"{description}: the name {name!r} gives no key for the robot; give the folder a name of letters.")
+    return f"{key}_own" if key in ROBOT_NAMES else key
+
+
+# --- What a draft leaves open.
+
+
+def completed(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> RobotSpec:
+    """A RobotSpec of a draft and its URDF; `source` names the draft in errors."""
+    arms = _arms(draft, urdf, source)
+    counts = [len(arm.joints) for arm in arms]
+    if counts[0] != counts[1] or counts[0] not in (6, 7):
+        raise ConfigError(f"{source}: the arms have {counts[0]} and {counts[1]} joints; expected equal arms of six or seven.")
+    lower, upper, speed = _limits(draft, urdf, arms, source)
+    robot = RobotSpec(
+        key=key,
+        title=draft.title or urdf.name or key,
+        urdf=urdf.path,
+        arms=arms,
+        joint_lower=tuple(lower.tolist()),
+        joint_upper=tuple(upper.tolist()),
+        joint_velocity=tuple(speed.tolist()),
+    )
+    return _settled(draft, robot, source)
+
+
+def _arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]:
+    from xew.sim_warp.robots.user.infer import arm_joints, at_tips, find_fingers, finger_ends, hand_link, tool_frame
+
+    told = _alike(draft.arms)
+    found = [] if all(arm.fingers for arm in told) else find_fingers(urdf)
+    arms: list[Arm] = []
+    for side, given in enumerate(told):
+        fingers = given.fingers or found[min(side, len(found) - 1)]
+        _demand_joints(urdf, fingers, source)
+        joints = given.joints or arm_joints(urdf, fingers)
+        _demand_joints(urdf, joints, source)
+        ends = finger_ends(urdf, fingers)
+        closed, opened = given.finger_closed or ends[0], given.finger_open or ends[1]
+        link = _link_named(urdf, given.tool_link, source) if given.tool_link else hand_link(urdf, fingers)
+        tool = given.tool_pose or tool_frame(urdf, joints, fingers, ends[0])
+        if given.tool_pose and given.tool_at_tips:
+            tool = at_tips(urdf, link, Rotation.from_quat(given.tool_pose[3:]).as_matrix(), fingers, ends[0])
+        arms.append(
+            Arm(
+                root_pose=given.root_pose or IDENTITY,
+                joints=joints,
+                home=given.home or (0.0,) * len(joints),
+                tool_link=link,
+                tool_pose=tool,
+                fingers=fingers,
+                finger_closed=_inside(urdf, fingers, closed),
+                finger_open=_inside(urdf, fingers, opened),
+            )
+        )
+        _check_arm(urdf, arms[-1], source)
+    return arms[0], arms[1]
+
+
+def _alike(arms: tuple[ArmDraft, ArmDraft]) -> tuple[ArmDraft, ArmDraft]:
+    """Where the right arm is left open it is told as the left, but for its home."""
+    left, right = arms
+    return (left, replace(left, home=None)) if right == ArmDraft() else (left, right)
+
+
+def _demand_joints(urdf: Urdf, names: Sequence[str], source: str) -> None:
+    if missing := [name for name in names if name not in urdf.joints]:
+        raise ConfigError(
+            f"{source}: {urdf.path.name} has no joint {', '.join(missing)}; it has {', '.join(urdf.joint_names)}."
+        )
+
+
+def _link_named(urdf: Urdf, name: str, source: str) -> str:
+    """A link, or the child link of a joint, as RoboTwin names it."""
+    if name in urdf.links:
+        return name
+    if name in urdf.joints:
+        return urdf.joints[name].child
+    raise ConfigError(f"{source}: {urdf.path.name} has no link or joint {name}; name the one that carries the tool.")
+
+
+def _inside(urdf: Urdf, fingers: tuple[str, str], positions: tuple[float, float]) -> tuple[float, float]:
+    """Finger positions within the URDF's limits: RoboTwin's scales reach beyond them, to press."""
+    first, second = (
+        min(max(position, urdf.joints[name].lower), urdf.joints[name].upper)
+        for name, position in zip(fingers, positions, strict=True)
+    )
+    return first, second
+
+
+def _check_arm(urdf: Urdf, arm: Arm, source: str) -> None:
+    strokes = np.abs(np.subtract(arm.finger_open, arm.finger_closed))
+    if min(strokes) < 1e-3 or abs(strokes[0] - strokes[1]) > STROKE_TOLERANCE:
+        raise ConfigError(
+            f"{source}: the fingers {', '.join(arm.fingers)} move {1000 * strokes[0]:.0f} and {1000 * strokes[1]:.0f} mm from "
+            "closed to open; expected equal strokes of at least 1 mm. Check finger_closed and finger_open, or gripper_scale."
+        )
+    length = float(np.linalg.norm(arm.tool_pose[3:]))
+    if not (np.isfinite(arm.tool_pose).all() and np.isfinite(arm.root_pose).all() and abs(length - 1) < 1e-3):
+        raise ConfigError(f"{source}: tool_pose {arm.tool_pose} is no position and unit quaternion x y z w.")
+    chain = {joint.name for joint in urdf.chain(arm.tool_link)}
+    if loose := [name for name in arm.joints if name not in chain]:
+        raise ConfigError(f"{source}: {', '.join(loose)} do not lead to {arm.tool_link}; name the joints of this arm.")
+
+
+def _limits(draft: RobotDraft, urdf: Urdf, arms: tuple[Arm, Arm], source: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    from xew.sim_warp.robots.user.infer import joint_limits
+
+    both = [joint_limits(urdf, arm.joints) for arm in arms]
+    found = (np.maximum(both[0][0], both[1][0]), np.minimum(both[0][1], both[1][1]), np.minimum(both[0][2], both[1][2]))
+    given = (draft.joint_lower, draft.joint_upper, draft.joint_velocity)
+    lower, upper, speed = (inferred if said is None else np.array(said) for inferred, said in zip(found, given, strict=True))
+    if not len(lower) == len(upper) == len(speed) == len(arms[0].joints) or not (lower < upper).all() or not (speed > 0).all():
+        raise ConfigError(
+            f"{source}: joint_lower, joint_upper and joint_velocity need {len(arms[0].joints)} numbers each, lower below "
+            "upper and velocities above 0."
+        )
+    return lower, upper, speed
+
+
+def _settled(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
+    """The robot with bases and homes, given or found."""
+    from xew.sim_warp.robots.user import placement
+
+    left, right = _alike(draft.arms)
+    if left.root_pose is not None and left.home is not None and right.home is not None:
+        return robot
+    bases = robot.arms[0].root_pose, robot.arms[1].root_pose
+    near = (_posture(left, robot, source), _posture(right, robot, source))
+
+    def settle(robot: RobotSpec) -> RobotSpec:
+        if left.root_pose is None:
+            return placement.with_place(robot, near)
+        if not robot.one_urdf_holds_both_arms and bases[0][0] == bases[1][0]:
+            return placement.with_distance(robot, near, draft.distance)
+        return placement.with_home(robot, near)
+
+    return settle(robot) if left.tool_pose else placement.better_turned(robot, settle)
+
+
+def _posture(arm: ArmDraft, robot: RobotSpec, source: str) -> np.ndarray | None:
+    """Where to look for a home. Raises ConfigError if it does not fit the arm."""
+    near = arm.home or arm.near
+    if near is not None and len(near) != robot.arm_joint_count:
+        raise ConfigError(f"{source}: a home has {len(near)} joints, the arm {robot.arm_joint_count}; expected as many.")
+    return None if near is None else np.array(near)
+
+
+# --- Kept beside the data.
+
+
+def adopt_robots(names: Sequence[str], data: Path) -> tuple[str, ...]:
+    """Robots as jobs name them: paths become keys, and what lies there is kept in `<data>/robots/<key>`.
+
+    Raises:
+        ConfigError: a robot cannot be used, or the data set holds another of that key.
+    """
+    use_robots_of(data)
+    return tuple(_adopt(Path(name), data) if is_path(name) else name for name in names)
+
+
+def use_robots_of(data: Path) -> None:
+    """Let the robots that a data set holds be found by their keys, in this process and those that it starts."""
+    folder = str((Path(data) / KEPT).resolve())
+    known = [entry for entry in os.environ.get(FOLDERS, "").split(os.pathsep) if entry]
+    if folder not in known:
+        os.environ[FOLDERS] = os.pathsep.join([folder, *known])
+
+
+def kept_robot(key: str) -> RobotSpec | None:
+    """The robot of a key in the folders of `XEW_ROBOTS`, if there is one."""
+    for folder in os.environ.get(FOLDERS, "").split(os.pathsep):
+        if folder and (Path(folder) / key / OWN).is_file():
+            return load_robot(Path(folder) / key)
+    return None
+
+
+def _adopt(path: Path, data: Path) -> str:
+    description = find_description(path).resolve()
+    key, digest = robot_key(description), _digest(description)
+    kept = data / KEPT / key / OWN
+    if kept.is_file():
+        if read_draft(kept).source != digest:
+            raise ConfigError(
+                f"{kept.parent} holds another robot of that name than {path}, or that one before it changed; rename the "
+                "folder or file, or choose another --out."
+            )
+        return key
+    print(f"robot {key}: what {description.name} leaves open is being looked for, and kept in {kept}")
+    keep_robot(load_robot(path), data, digest)
+    return key
+
+
+def _digest(description: Path) -> str:
+    """SHA-256 over the description and all files that its URDF is read from."""
+    urdf = load_urdf(description.parent / read_draft(description).urdf)
+    digest = hashlib.sha256(description.read_bytes())
+    for file in urdf.files:
+        digest.update(file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def keep_robot(robot: RobotSpec, data: Path, digest: str = "") -> RobotSpec:
+    """Keep a robot as it is in a data set, under its key, unless one is kept there already; returns what is kept.
+
+    Args:
+        digest: SHA-256 of what the robot was made from, by which it is known again.
+    """
+    folder = Path(data) / KEPT / robot.key
+    if not (folder / OWN).is_file():
+        _write(robot, digest, folder)
+    return load_robot(folder)
+
+
+def _write(robot: RobotSpec, digest: str, folder: Path) -> None:
+    """robot.yaml, the URDF and its files under a folder, as they lie to one another."""
+    urdf = load_urdf(robot.urdf)
+    top = Path(os.path.commonpath([file.resolve().parent for file in urdf.files]))
+    with complete_folder(folder) as temporary:
+        for file in urdf.files[1:]:
+            copy = temporary / file.resolve().relative_to(top)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, copy)
+        inside = urdf.path.relative_to(top)
+        (temporary / inside).parent.mkdir(parents=True, exist_ok=True)
+        (temporary / inside).write_bytes(_with_relative_meshes(urdf))
+        content = _described(robot, str(inside), digest)
+        (temporary / OWN).write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+
+
+def _with_relative_meshes(urdf: Urdf) -> bytes:
+    """The URDF with every mesh named relative to it, so that it can be read wherever it is copied to."""
+    tree = ElementTree.parse(urdf.path)
+    for mesh in tree.iter("mesh"):
+        if found := urdf.meshes.get(mesh.get("filename", "")):
+            mesh.set("filename", os.path.relpath(found.resolve(), urdf.path.parent))
+    return ElementTree.tostring(tree.getroot(), encoding="utf-8", xml_declaration=True)
+
+
+def _described(robot: RobotSpec, urdf: str, digest: str) -> dict[str, object]:
+    """A robot.yaml that leaves nothing open."""
+    limits = {name: list(getattr(robot, name)) for name in ("joint_lower", "joint_upper", "joint_velocity")}
+    return {"urdf": urdf, "title": robot.title, "arms": [_plain(arm) for arm in robot.arms], **limits, "source": digest}
+
+
+def _plain(arm: Arm) -> dict[str, object]:
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(arm).items()}
