@@ -23,7 +23,7 @@ from xew.sim_warp.robots import ROBOTS, load_urdf
 class Args:
     seeds: int = 100
     workers: int = 2
-    """Threads of the nearest-neighbour search."""
+    """Threads of the nearest-neighbor search."""
     limit: float = 20.0
     """Seconds."""
 

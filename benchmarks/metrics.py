@@ -101,8 +101,8 @@ def draw_arm(wall: np.ndarray, angles: np.ndarray) -> tuple[np.ndarray, np.ndarr
     corners = np.cumsum([(160.0, 230.0), *(42 * np.stack([np.cos(turns), np.sin(turns)], axis=1))], axis=0)
     frame, mask = wall.copy(), np.zeros((HEIGHT, WIDTH), np.uint8)
     for i, (start, end) in enumerate(zip(corners[:-1].astype(int), corners[1:].astype(int), strict=True)):
-        for image, colour in ((frame, (230 - 20 * i, 120, 40 + 30 * i)), (mask, (1,))):
-            cv2.line(image, start.tolist(), end.tolist(), colour, 22 - 3 * i)
+        for image, color in ((frame, (230 - 20 * i, 120, 40 + 30 * i)), (mask, (1,))):
+            cv2.line(image, start.tolist(), end.tolist(), color, 22 - 3 * i)
     share = np.linspace(0, LINKS, POINTS)
     points = np.stack([np.interp(share, np.arange(LINKS + 1), corners[:, axis]) for axis in (0, 1)], axis=1)
     return frame, mask.astype(bool), points.astype(np.float32)

@@ -2,10 +2,10 @@
 
     python benchmarks/render.py [--device cpu|cuda:0] [--frames N] [--first 2] [--pictures DIR]
 
-The workload is what an episode needs, 320x240: the scene (two Panda arms and three things over the table, colour with
-anti-aliasing and shadows, robot mask, visibility of keypoints) and the robot alone by its commands (colour, mask, exact
+The workload is what an episode needs, 320x240: the scene (two Panda arms and three things over the table, color with
+anti-aliasing and shadows, robot mask, visibility of keypoints) and the robot alone by its commands (color, mask, exact
 optical flow). It is drawn with capsules for links, with the robot's own meshes, and with meshes of 2,000 triangles a link.
-SensorCamera is called once for each of the two: colour (MSAA 4; in the scene with the shadows of one light, where ours has
+SensorCamera is called once for each of the two: color (MSAA 4; in the scene with the shadows of one light, where ours has
 three), shape index for the mask, and depth, from which visibility and flow would have to be computed; that is not timed.
 Capsules are primitives to it and triangles to us. "kernels" is the time on the device, "with copies" until all images are on
 the host; on a CPU the two are one. Before a figure is told, the silhouettes of both are compared.
@@ -95,7 +95,7 @@ class Capsule:
 
 @dataclass(frozen=True)
 class Thing:
-    """A body of one colour; SensorCamera is given the capsule where there is one."""
+    """A body of one color; SensorCamera is given the capsule where there is one."""
 
     mesh: Mesh
     is_robot: bool
@@ -142,7 +142,7 @@ def workloads() -> list[Workload]:
     shapes = (Capsule(0.03, 0.0, 2, (0, 0, 0)), Capsule(0.04, 0.0, 2, (0, 0, 0)), Capsule(0.025, 0.03, 2, (0, 0, 0)))
     colors: tuple[Color, ...] = ((200, 60, 60), (60, 160, 60), (60, 60, 200))
     things = [Thing(shape.mesh(color), False, shape) for shape, color in zip(shapes, colors, strict=True)]
-    links = [one_colour(body.mesh) for body in robot_bodies(robot)]
+    links = [one_color(body.mesh) for body in robot_bodies(robot)]
     fitted = [fitting_capsule(mesh) for mesh in links]
     drawn = {
         "capsules": [Thing(capsule.mesh(main_color(mesh)), True, capsule) for capsule, mesh in zip(fitted, links, strict=True)],
@@ -158,8 +158,8 @@ def main_color(mesh: Mesh) -> Color:
     return red, green, blue
 
 
-def one_colour(mesh: Mesh) -> Mesh:
-    """A shape of Newton's has one colour, so all have."""
+def one_color(mesh: Mesh) -> Mesh:
+    """A shape of Newton's has one color, so all have."""
     colors = np.tile(np.array(main_color(mesh), np.uint8), (len(mesh.triangles), 1))
     return Mesh(mesh.vertices, mesh.triangles, colors, mesh.normals)
 
@@ -291,7 +291,7 @@ class Sensor:
         return self.color.numpy(), self.shape_index.numpy(), self.depth.numpy()
 
     def picture(self) -> tuple[np.ndarray, np.ndarray]:
-        """Colour [h w 3] uint8 and mask of robot and things [h w] of the first view."""
+        """Color [h w 3] uint8 and mask of robot and things [h w] of the first view."""
         color, shape_index, _ = self.render_to_host()
         rgba = color[0].view(np.uint8).reshape(*color[0].shape, 4)
         return rgba[..., :3].copy(), shape_index[0] < self.things
@@ -389,11 +389,11 @@ def race(work: Workload, renderer: Renderer, worlds: int, pictures: Path | None)
 def save_pictures(path: Path, panels: dict[str, np.ndarray]) -> None:
     """Pictures side by side at twice their size, two a row, with labels."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    labelled = []
+    labeled = []
     for label, image in panels.items():
         image = cv2.resize(np.ascontiguousarray(image), None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
-        labelled.append(cv2.putText(image, label, (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (200, 0, 0), 1, cv2.LINE_AA))
-    sheet = np.vstack([np.hstack(labelled[row : row + 2]) for row in range(0, len(labelled), 2)])
+        labeled.append(cv2.putText(image, label, (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (200, 0, 0), 1, cv2.LINE_AA))
+    sheet = np.vstack([np.hstack(labeled[row : row + 2]) for row in range(0, len(labeled), 2)])
     if not cv2.imwrite(str(path), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR)):
         raise OSError(f"{path} cannot be written; choose another folder with --pictures.")
 

@@ -5,7 +5,7 @@
 An episode of ours is planned and simulated, and its frames are rendered at 320x240 by SAPIEN (`pip install sapien`, a Vulkan
 device is needed) and by us: robot from the same URDF, things from the same meshes, table, wall, ground, lights and camera of
 RoboTwin. SAPIEN runs as its users run it, one scene frame by frame: `set_qpos`, `set_pose`, `update_render`, `take_picture`,
-`get_picture`. Rasterised is its shader pack "default", ray traced its "rt" with 32 samples a pixel, path depth 8 and the
+`get_picture`. Rasterized is its shader pack "default", ray traced its "rt" with 32 samples a pixel, path depth 8 and the
 denoiser OIDN, as in RoboTwin. Ours is `Renderer.render_batch` with shadows of all three lights and robot mask, up to images
 on the host. Physics: SAPIEN's PhysX on the CPU, one world, 4 ms a step, driven along the same commands; ours in MuJoCo's C
 engine, one world, and on a GPU in MuJoCo Warp. Before a figure is told, the robot's silhouettes in both pictures are compared.
@@ -120,7 +120,7 @@ class Theirs:
 
     Args:
         folder: for mesh files.
-        shader: "default" rasterises, "rt" traces rays.
+        shader: "default" rasterizes, "rt" traces rays.
         rendered: False leaves pictures out and puts collision shapes in.
     """
 
@@ -235,7 +235,7 @@ class Theirs:
         actors = []
         for number, body in enumerate(self.episode.things[0]):
             builder = self.scene.create_actor_builder()
-            for part, (mesh, color) in enumerate(one_colour_parts(body.mesh)):
+            for part, (mesh, color) in enumerate(one_color_parts(body.mesh)):
                 path = self.folder / f"thing{number}_{part}.obj"
                 mesh.export(path, include_normals=True)
                 builder.add_visual_from_file(str(path), material=self._material(color))
@@ -278,8 +278,8 @@ class Theirs:
         return camera
 
 
-def one_colour_parts(mesh: Mesh) -> list[tuple[trimesh.Trimesh, np.ndarray]]:
-    """The triangles of each colour, with a vertex and a normal for every corner."""
+def one_color_parts(mesh: Mesh) -> list[tuple[trimesh.Trimesh, np.ndarray]]:
+    """The triangles of each color, with a vertex and a normal for every corner."""
     parts = []
     for color in np.unique(mesh.colors, axis=0):
         own = (mesh.colors == color).all(1)
@@ -426,11 +426,11 @@ def picture(image: np.ndarray) -> np.ndarray:
 
 def save_pictures(folder: Path, panels: dict[str, np.ndarray]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    labelled = []
+    labeled = []
     for label, image in panels.items():
         image = cv2.resize(np.ascontiguousarray(image), None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
-        labelled.append(cv2.putText(image, label, (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (200, 0, 0), 1, cv2.LINE_AA))
-    cv2.imwrite(str(folder / "sapien.png"), cv2.cvtColor(np.hstack(labelled), cv2.COLOR_RGB2BGR))
+        labeled.append(cv2.putText(image, label, (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (200, 0, 0), 1, cv2.LINE_AA))
+    cv2.imwrite(str(folder / "sapien.png"), cv2.cvtColor(np.hstack(labeled), cv2.COLOR_RGB2BGR))
 
 
 def tell(label: str, rate: float, own: float | None, unit: str) -> None:
@@ -445,7 +445,7 @@ def compare_frames(args: Args, sapien: Any, episode: Episode, folder: Path, rend
     panels = {"xew": own_frames.rgb[middle]}
     rates = {}
     count = args.frames or len(episode.action)
-    for label, shader, most in (("rasterised", "default", count), ("ray traced", "rt", min(count, 60))):
+    for label, shader, most in (("rasterized", "default", count), ("ray traced", "rt", min(count, 60))):
         scene = Theirs(sapien, episode, folder, shader)
         scene.prepare()
         if shader == "default":
@@ -458,12 +458,12 @@ def compare_frames(args: Args, sapien: Any, episode: Episode, folder: Path, rend
     own = our_frames(renderer, episode, args.batch or (6144 if on_gpu else 24))
     print("\nframes of 320x240 on the host                                                                       ours is")
     tell("xew, shadows of three lights, anti-aliased, with robot mask", own, None, "frames/s")
-    tell("SAPIEN, rasterised, one scene", rates["rasterised"], own, "frames/s")
+    tell("SAPIEN, rasterized, one scene", rates["rasterized"], own, "frames/s")
     label = f"SAPIEN, ray traced, {args.samples} samples, depth {PATH_DEPTH}, denoiser {args.denoiser}, one scene"
     tell(label, rates["ray traced"], own, "frames/s")
     if args.scenes:
         batched = their_batched_frames(sapien, episode, folder, args.scenes)
-        tell(f"SAPIEN, rasterised, {args.scenes} scenes in a batch, left on the GPU", batched, own, "frames/s")
+        tell(f"SAPIEN, rasterized, {args.scenes} scenes in a batch, left on the GPU", batched, own, "frames/s")
     if args.pictures:
         save_pictures(args.pictures, panels)
 

@@ -1,6 +1,6 @@
 """Tiny paired data without a simulator: flat two-link arms that push a disc about, written as real episodes.
 
-The camera hangs one metre above the table and looks down; everything moves in the table's plane. As in real data, the
+The camera hangs one meter above the table and looks down; everything moves in the table's plane. As in real data, the
 scene and the path of the hands depend on (task, seed) alone and only looks and link lengths depend on the robot.
 """
 
@@ -24,7 +24,7 @@ DISC_RADIUS = 0.045
 
 @dataclass(frozen=True)
 class Look:
-    """How one synthetic robot differs from the others: colour and widths [pixels], link lengths [m]."""
+    """How one synthetic robot differs from the others: color and widths [pixels], link lengths [m]."""
 
     color: tuple[int, int, int]
     thickness: int
@@ -48,7 +48,7 @@ class Scene:
     """[h w 3] uint8."""
     disc_color: tuple[int, int, int]
     disc: np.ndarray
-    """[t 2] m, path of the disc's centre."""
+    """[t 2] m, path of the disc's center."""
     hands: np.ndarray
     """[t 2 2] m, paths of the left and right hand."""
 
@@ -140,7 +140,7 @@ def draw_disc(ground: np.ndarray, center: np.ndarray, color: tuple[int, int, int
 
 
 def shade(color: tuple[int, int, int], mask: np.ndarray) -> np.ndarray:
-    """The robot's colour [t h w 3], darker towards its rim."""
+    """The robot's color [t h w 3], darker towards its rim."""
     depth = np.stack([cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 3) for m in mask])
     light = 0.7 + 0.3 * np.minimum(depth / 5, 1)
     return np.clip(light[..., None] * np.array(color), 0, 254).astype(np.uint8)

@@ -151,8 +151,8 @@ def test_an_unknown_key_and_an_unknown_hash_are_named(folder: Path) -> None:
     edit(folder, hashes={"depth": "0"})
     with pytest.raises(EpisodeError, match="names a hash of 'depth', expected states, rgb, robot"):
         verify_episode(folder)
-    edit(folder, colour="red")
-    with pytest.raises(EpisodeError, match="colour"):
+    edit(folder, color="red")
+    with pytest.raises(EpisodeError, match="color"):
         read_record(folder)
 
 

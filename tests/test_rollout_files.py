@@ -79,7 +79,7 @@ def test_bits_that_are_lost_are_not_painted_over(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     ("pixels", "codec", "word"),
-    [("gray", "ffv1", "grey frames"), ("yuv420p10le", "ffv1", "10 bits a channel"), ("yuva420p", "ffv1", None)],
+    [("gray", "ffv1", "gray frames"), ("yuv420p10le", "ffv1", "10 bits a channel"), ("yuva420p", "ffv1", None)],
 )
 def test_only_rgb_of_8_bits_is_read(folder: Path, pixels: str, codec: str, word: str | None) -> None:
     write(folder / "rgb.mkv", pixels, codec)
@@ -130,7 +130,7 @@ def test_pngs_are_in_the_order_of_their_numbers_and_are_whole(folder: Path) -> N
     fails(folder, "7.png", "cannot be read")
     path.rmdir()
     for image, word in (
-        (VIDEO[0][..., 0], "grey"),
+        (VIDEO[0][..., 0], "gray"),
         (np.dstack([VIDEO[0], VIDEO[0][..., :1]]), "alpha"),
         (VIDEO[0].astype(np.uint16), "uint16"),
         (VIDEO[0][:-1], "sizes must be one"),
@@ -146,8 +146,8 @@ def test_pngs_are_in_the_order_of_their_numbers_and_are_whole(folder: Path) -> N
         ({"a": np.full(VIDEO.shape, np.nan)}, "NaN"),
         ({"a": VIDEO.astype(np.int64)}, "int64"),
         ({"a": VIDEO[:0]}, "no frame"),
-        ({"a": VIDEO[..., 0]}, "grey"),
-        ({"a": VIDEO[..., :1]}, "grey"),
+        ({"a": VIDEO[..., 0]}, "gray"),
+        ({"a": VIDEO[..., :1]}, "gray"),
         ({"a": np.concatenate([VIDEO, VIDEO[..., :1]], -1)}, "alpha"),
         ({"a": np.array([{}], object)}, "damaged"),
         ({"a": VIDEO, "b": VIDEO}, "['a', 'b']"),

@@ -8,7 +8,7 @@ An episode is a folder `<data>/<task>/<seed>/<robot>/`:
 Folders appear under their final name only when complete. A rejected cell keeps its episode.json and nothing else.
 
 Shape letters, here and everywhere: t frames, h w c image, j joints, a action, o objects, k keypoints, n worlds, b batch.
-Quaternions are x y z w; the world frame has its origin under the table's centre, x right, y away from the robot, z up.
+Quaternions are x y z w; the world frame has its origin under the table's center, x right, y away from the robot, z up.
 """
 
 import hashlib
@@ -64,7 +64,7 @@ class States:
     """[t o] float32, how deep the object and anything else, a finger, the table or another object, are in each other [m]."""
     keypoints: np.ndarray
     """[t k 2] float32, origins of the robot's links by forward kinematics of `joint_pos`, pixels (x right, y down,
-    (0, 0) the centre of the upper left pixel)."""
+    (0, 0) the center of the upper left pixel)."""
     keypoint_visible: np.ndarray
     """[t k] bool, in the image and not hidden by an object or by another link."""
     robot_mask: np.ndarray

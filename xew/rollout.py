@@ -217,7 +217,7 @@ def _read_container(path: Path, frame_rate: float | None) -> np.ndarray:
             stream = container.streams.video[0]
             _check_pixels(path, stream.codec_context.format)
             stream.codec_context.thread_count = 1
-            stream.codec_context.options = {"err_detect": "explode"}  # else what is lost is painted over from its neighbours
+            stream.codec_context.options = {"err_detect": "explode"}  # else what is lost is painted over from its neighbors
             for frame in container.decode(stream):
                 frames.append(_rgb(path, frame))
                 times.append(float(frame.pts * frame.time_base) if frame.pts is not None else np.nan)
@@ -247,11 +247,11 @@ def _rgb(path: Path, frame: Any) -> np.ndarray:
 
 
 def _check_pixels(path: Path, pixels: Any) -> None:
-    """Raise RolloutError unless the format is colour with 8 bits a channel."""
+    """Raise RolloutError unless the format is color with 8 bits a channel."""
     components = pixels.components if pixels else ()  # None where so little can be read that there is no format
     kind = ""
     if len(components) == 1 and not pixels.has_palette:
-        kind = "grey frames"
+        kind = "gray frames"
     elif any(component.bits > 8 for component in components):
         kind = f"{max(component.bits for component in components)} bits a channel"
     if kind:
@@ -331,7 +331,7 @@ def _checked(path: Path, video: np.ndarray) -> np.ndarray:
     elif video.ndim in (3, 4) and not video.size:
         kind = ", no frame at all"
     elif video.ndim == 3 or (video.ndim == 4 and video.shape[-1] == 1):
-        kind = ", grey"
+        kind = ", gray"
     elif video.ndim == 4 and video.shape[-1] == 4:
         kind = ", with an alpha channel"
     raise RolloutError(f"{path}: found {video.dtype} {video.shape}{kind}, expected uint8 [t h w 3]; convert before grading.")

@@ -39,7 +39,7 @@ PUBLISHED = {
     ("ur5_wsg", "piper"): (0.046, 0.0010),
     ("franka_panda", "piper"): (0.070, 0.0028),
 }
-"""Metres, and the standard deviation of one draw of the cloud over 100 seeds."""
+"""Meters, and the standard deviation of one draw of the cloud over 100 seeds."""
 
 rng = np.random.default_rng(0)
 
@@ -64,7 +64,7 @@ def features() -> Features:
 def test_kinematic_distances_are_the_published_ones(pair: tuple[str, str], features: Features) -> None:
     published, deviation = PUBLISHED[pair]
     a, b = (features.robots.index(name) for name in pair)
-    # The published value is itself one draw, rounded to a millimetre.
+    # The published value is itself one draw, rounded to a millimeter.
     assert features.kinematic[:, a, b].mean() == pytest.approx(published, abs=2 * deviation + 0.0005)
 
 
@@ -131,7 +131,7 @@ def test_a_robot_is_not_at_zero_from_its_own_next_draw() -> None:
     """The floor under all kinematic distances: for single arms a third to two thirds of the published ones."""
     names = ("aloha_agilex", "piper")
     aloha, piper = chamfer_floor({name: ROBOTS[name] for name in names}, range(3)).mean(axis=0)
-    assert 0.02 < piper < 0.03, "4,000 points in 1.3 cubic metres"
+    assert 0.02 < piper < 0.03, "4,000 points in 1.3 cubic meters"
     assert aloha < 0.012, "most of them are links that do not move"
     again = chamfer_floor({"piper": ROBOTS["piper"]}, range(1))
     assert again.shape == (1, 1) and again[0, 0] == chamfer_floor({"piper": ROBOTS["piper"]})[0, 0]
@@ -163,14 +163,14 @@ def test_chamfer_equals_brute_force_and_is_a_distance() -> None:
 
 
 def robot_picture(
-    colour: tuple[int, int, int], length: int = 50, angle: float = 30, place: tuple[int, int] = (80, 60)
+    color: tuple[int, int, int], length: int = 50, angle: float = 30, place: tuple[int, int] = (80, 60)
 ) -> np.ndarray:
     image = np.full((120, 160, 3), 255, np.uint8)
     box = cv2.boxPoints((place, (length, 14), 30))
-    return cv2.fillPoly(image, [box.astype(np.int32)], colour)
+    return cv2.fillPoly(image, [box.astype(np.int32)], color)
 
 
-def test_a_descriptor_sees_colour_and_shape_but_not_place() -> None:
+def test_a_descriptor_sees_color_and_shape_but_not_place() -> None:
     base = appearance_descriptor(robot_picture((200, 40, 40))[None])
     assert base.shape == (16 * 16 + 7,) and base[:256].sum() == pytest.approx(1)
     moved = appearance_descriptor(robot_picture((200, 40, 40), place=(60, 50))[None])

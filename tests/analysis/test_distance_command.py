@@ -65,7 +65,7 @@ def test_a_row_for_each_feature_of_each_robot(table: tuple[Path, str]) -> None:
     for robot in (*ROBOT_NAMES, "stick_0.2"):
         mine = pairs[(pairs["axis"] == "kinematic") & ((pairs["robot"] == robot) | (pairs["other"] == robot))]
         others = mine["robot"].where(mine["robot"] != robot, mine["other"])
-        # A robot that is not the paper's is no neighbour of those that are.
+        # A robot that is not the paper's is no neighbor of those that are.
         assert rows.loc[(robot, "kinematic"), "value"] == pytest.approx(mine["value"][others.isin(ROBOT_NAMES)].mean())
     assert rows.loc[("ur5_wsg", "volume"), "published"] == 2.771
 

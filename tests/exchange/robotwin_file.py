@@ -21,7 +21,7 @@ FRAMES = 5
 
 
 def placed() -> RobotSpec:
-    """The ARX X5 as RoboTwin has it: its bases, and the tool centre point 0.12 m from link 6."""
+    """The ARX X5 as RoboTwin has it: its bases, and the tool center point 0.12 m from link 6."""
     robot = ROBOTS["arx_x5"]
     arms = tuple(
         replace(arm, root_pose=base, tool_pose=(0.12, 0, 0, 0, 0, 0, 1)) for arm, base in zip(robot.arms, BASES, strict=True)
@@ -40,12 +40,12 @@ def grippers() -> np.ndarray:
 
 
 def tool_poses() -> np.ndarray:
-    """[t 2 7] tool centre points in the world, quaternion x y z w."""
+    """[t 2 7] tool center points in the world, quaternion x y z w."""
     return np.stack([pose_from_matrix(tool_matrix(placed(), arm, joints()[:, arm])) for arm in (0, 1)], 1)
 
 
 def end_poses() -> np.ndarray:
-    """[t 2 7] as RoboTwin stores them: 0.12 m behind the tool centre point, quaternion w x y z."""
+    """[t 2 7] as RoboTwin stores them: 0.12 m behind the tool center point, quaternion w x y z."""
     tools = matrix_from_pose(tool_poses())
     behind = tools[..., :3, 3] - 0.12 * tools[..., :3, 0]
     quaternion = Rotation.from_matrix(tools[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(FRAMES, 2, 4)

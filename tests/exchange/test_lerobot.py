@@ -67,7 +67,7 @@ def test_pictures_come_back_where_the_table_says(data: Path, exported: Path) -> 
         assert mine.sum() == row["length"] == states.frame_count
         assert np.abs(times[mine] - begin - np.arange(states.frame_count) * 0.06).max() < 1e-6
         error = np.abs(frames[mine].astype(int) - rgb)
-        assert error.mean() < 2.5, "lossy, but the same pictures in the same colours"
+        assert error.mean() < 2.5, "lossy, but the same pictures in the same colors"
         assert (row["xew/robot"], row["xew/task"], row["xew/seed"]) == (record.robot, record.task, record.seed)
     assert len(frames) == table[-1]["dataset_to_index"]
 
@@ -105,7 +105,7 @@ def test_statistics_are_those_of_all_frames(data: Path, exported: Path) -> None:
     assert stats["action"]["count"] == stats["observation.images.head"]["count"] == [len(actions)]
 
 
-def test_quantiles_of_colours() -> None:
+def test_quantiles_of_colors() -> None:
     video = np.random.default_rng(0).integers(0, 256, (2, 30, 40, 3)).astype(np.uint8)
     found = _color_statistics(color_counts(video), 2)
     for name, share in lerobot.QUANTILES.items():
@@ -198,6 +198,6 @@ def test_lerobot_reads_it(data: Path, exported: Path) -> None:
             assert (item["observation.state"].numpy() == states.joint_pos[frame]).all()
             assert item["task"] == (record.instruction or record.task)
             image = item["observation.images.head"].numpy().transpose(1, 2, 0) * 255
-            assert np.abs(image - rgb[frame]).mean() < 2.5, "the right frame in the right colours"
+            assert np.abs(image - rgb[frame]).mean() < 2.5, "the right frame in the right colors"
         start += states.frame_count
     assert len(dataset) == start and dataset.num_episodes == number + 1

@@ -1,4 +1,4 @@
-"""RoboTwin's HDF5 files become episodes: colours, quaternions, commands, what stays unknown, and what is told of bad files."""
+"""RoboTwin's HDF5 files become episodes: colors, quaternions, commands, what stays unknown, and what is told of bad files."""
 
 import shutil
 from collections.abc import Callable
@@ -53,7 +53,7 @@ def imported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 def test_a_red_block_stays_red(imported: Path) -> None:
     block = read_video(imported / "rgb.mkv")[:, HEIGHT // 4 + 8 : HEIGHT // 2 - 8, WIDTH // 4 + 8 : WIDTH // 2 - 8]
-    assert np.abs(block.reshape(-1, 3).astype(int) - made.RED).max() <= 4, "what JPEG does to a flat colour"
+    assert np.abs(block.reshape(-1, 3).astype(int) - made.RED).max() <= 4, "what JPEG does to a flat color"
 
 
 def test_a_quaternion_stays_itself(imported: Path) -> None:
@@ -188,7 +188,7 @@ def test_pictures_of_both_kinds() -> None:
     assert decode_picture(b"no picture") is None
 
 
-def test_tool_centre_of_a_hand_that_points_down() -> None:
+def test_tool_center_of_a_hand_that_points_down() -> None:
     down = np.array([[0.1, 0.2, 1.0, 0.5**0.5, 0.0, 0.5**0.5, 0.0]])  # w x y z: a quarter turn about y
     assert np.allclose(tool_center(down), [[0.1, 0.2, 0.88, 0.0, 0.5**0.5, 0.0, 0.5**0.5]])
 

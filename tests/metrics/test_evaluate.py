@@ -165,16 +165,16 @@ def test_touching_is_told_by_the_distance_that_tells_it_best_in_the_truth() -> N
 
 
 def test_projected_objects_lie_where_they_are_drawn(data: Path) -> None:
-    """The disc is the one thing that moves besides the robot; its colour is at its projected centre wherever that is free.
+    """The disc is the one thing that moves besides the robot; its color is at its projected center wherever that is free.
     What is put on a thing at rest hides it."""
     read = read_truth(episode_folder(data, TASK, SEED, "piper"), FRAMES, ("objects",))
     assert read.objects.shape == (FRAMES, 1, 2) and read.object_visible[0, 0]
-    colours = [
+    colors = [
         read.rgb[t, round(float(y)), round(float(x))]
         for t, ((x, y),) in enumerate(read.objects.tolist())
         if read.object_visible[t, 0]
     ]
-    assert len(colours) > 1 and (np.array(colours) == colours[0]).all()
+    assert len(colors) > 1 and (np.array(colors) == colors[0]).all()
     assert not read.object_visible[-1, 0] and read.mask[-1][tuple(np.round(read.objects[-1, 0, ::-1]).astype(int))]
     rgb, points = read.rgb.copy(), np.repeat(read.objects[:1], FRAMES, axis=0)
     rgb[:] = rgb[0]

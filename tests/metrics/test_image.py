@@ -75,7 +75,7 @@ def test_identical_videos_have_ssim_one() -> None:
         np.testing.assert_array_equal(ssim(video, video), 1)
 
 
-def test_frames_do_not_depend_on_their_neighbours_or_the_chunk() -> None:
+def test_frames_do_not_depend_on_their_neighbors_or_the_chunk() -> None:
     prediction, target = noise(5), noise(5)
     order = rng.permutation(5)
     np.testing.assert_array_equal(ssim(prediction, target)[order], ssim(prediction[order], target[order]))

@@ -71,7 +71,7 @@ def test_both_at_once_and_inside_a_jit_are_the_same_numbers() -> None:
     np.testing.assert_array_equal([scores[0] for scores in stacked], alone)
 
 
-def test_frames_do_not_depend_on_their_neighbours() -> None:
+def test_frames_do_not_depend_on_their_neighbors() -> None:
     prediction, target, order = blobs(5), blobs(5), rng.permutation(5)
     for metric in (mask_iou, boundary_f1):
         np.testing.assert_array_equal(metric(prediction, target)[order], metric(prediction[order], target[order]))

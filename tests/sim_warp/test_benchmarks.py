@@ -60,10 +60,10 @@ def test_without_sapien_its_benchmark_says_what_to_do() -> None:
         module.main(module.Args(device="cpu"))
 
 
-def test_parts_of_one_colour_make_up_the_mesh() -> None:
+def test_parts_of_one_color_make_up_the_mesh() -> None:
     module = benchmark("sapien_engine")
     mesh = module.robot_bodies(module.get_robot("franka_panda"))[0].mesh
-    parts = module.one_colour_parts(mesh)
+    parts = module.one_color_parts(mesh)
     assert len(parts) == len(np.unique(mesh.colors, axis=0)) > 1
     assert sum(len(part.faces) for part, _ in parts) == len(mesh.triangles)
     assert np.isclose(sum(part.area for part, _ in parts), module.trimesh.Trimesh(mesh.vertices, mesh.triangles).area)

@@ -19,7 +19,7 @@ from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks import TASKS
 
 SEEDS = 60
-MILLIMETRE, DEGREE = 0.001, np.radians(1)
+MILLIMETER, DEGREE = 0.001, np.radians(1)
 
 
 def sample(task: str, seed: int) -> Scene:
@@ -45,7 +45,7 @@ def test_tasks_draw_from_different_streams() -> None:
     assert len(draws) == len(TASKS)
 
 
-def test_the_hash_covers_poses_shapes_colours_hinges_and_words() -> None:
+def test_the_hash_covers_poses_shapes_colors_hinges_and_words() -> None:
     scene = sample("open_laptop", 0)
     laptop = scene.objects[0]
     assert laptop.hinge is not None
@@ -78,7 +78,7 @@ def test_no_pixel_without_the_robot_depends_on_the_robot(task: str) -> None:
 def test_objects_are_at_rest_when_the_episode_begins(task: str) -> None:
     robot = ROBOTS["arx_x5"]
     motion = simulate([World(robot, sample(task, 2), at_home(robot, 31))], "cpu")[0]
-    assert np.linalg.norm(motion.object_pose[..., :3] - motion.object_pose[:1, :, :3], axis=-1).max() < MILLIMETRE
+    assert np.linalg.norm(motion.object_pose[..., :3] - motion.object_pose[:1, :, :3], axis=-1).max() < MILLIMETER
     for index in range(motion.object_pose.shape[1]):
         turned = Rotation.from_quat(motion.object_pose[:, index, 3:])
         assert (turned[0].inv() * turned).magnitude().max() < DEGREE

@@ -27,7 +27,7 @@ ANOTHER_DRAW = 1_000_000
 """Between the seeds of two draws of one robot."""
 
 ROBOTWIN_OPEN = {"arx_x5": 0.045, "ur5_wsg": 0.06, "franka_panda": 0.05}
-"""Where RoboTwin's `gripper_scale` holds the fingers of open grippers, metres: beyond the limits of the URDF, to press. The
+"""Where RoboTwin's `gripper_scale` holds the fingers of open grippers, meters: beyond the limits of the URDF, to press. The
 paper does not say how its grippers stood; of five ways this one comes nearest to its reach and hull volume."""
 
 HUE_BINS = SATURATION_BINS = 16
@@ -47,11 +47,11 @@ class Workspace:
     """Where the links of a robot can be, by one draw of configurations."""
 
     cloud: np.ndarray
-    """[p 3] float64 at most 4,000 origins of links, metres."""
+    """[p 3] float64 at most 4,000 origins of links, meters."""
     reach: float
-    """Largest distance of a link's origin from the frame's origin over all configurations, metres."""
+    """Largest distance of a link's origin from the frame's origin over all configurations, meters."""
     volume: float
-    """Of the convex hull of all origins, cubic metres."""
+    """Of the convex hull of all origins, cubic meters."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,11 @@ class Features:
     links: np.ndarray
     """[n] links of the URDF."""
     reach: np.ndarray
-    """[s n] metres."""
+    """[s n] meters."""
     volume: np.ndarray
-    """[s n] cubic metres."""
+    """[s n] cubic meters."""
     kinematic: np.ndarray
-    """[s n n] workspace Chamfer distances, metres."""
+    """[s n n] workspace Chamfer distances, meters."""
 
 
 def measure(
@@ -80,7 +80,7 @@ def measure(
         robots: by name.
         seeds: of the sampling.
         frame: that clouds are in.
-        workers: threads of the nearest-neighbour search; -1 for all cores.
+        workers: threads of the nearest-neighbor search; -1 for all cores.
     """
     draws = [[workspace(robot, seed, frame) for robot in robots.values()] for seed in seeds]
     return Features(
@@ -94,7 +94,7 @@ def measure(
 
 
 def chamfer_floor(robots: Mapping[str, RobotSpec | Urdf], seeds: Sequence[int] = (0,), frame: Frame = "root") -> np.ndarray:
-    """How far a robot is from itself by another draw [s n], metres: what sampling makes of no distance at all. Ours."""
+    """How far a robot is from itself by another draw [s n], meters: what sampling makes of no distance at all. Ours."""
 
     def to_itself(robot: RobotSpec | Urdf, seed: int) -> float:
         return chamfer(workspace_cloud(robot, seed, frame), workspace_cloud(robot, seed + ANOTHER_DRAW, frame))
@@ -139,12 +139,12 @@ def workspace(robot: RobotSpec | Urdf, seed: int = 0, frame: Frame = "root") -> 
 
 
 def workspace_cloud(robot: RobotSpec | Urdf, seed: int = 0, frame: Frame = "root") -> np.ndarray:
-    """The points [p 3] of `workspace`, metres."""
+    """The points [p 3] of `workspace`, meters."""
     return workspace(robot, seed, frame).cloud
 
 
 def chamfer(a: np.ndarray, b: np.ndarray) -> float:
-    """Symmetric Chamfer distance of two clouds [p 3]: the mean of the two mean distances to the nearest point, metres."""
+    """Symmetric Chamfer distance of two clouds [p 3]: the mean of the two mean distances to the nearest point, meters."""
     return float(chamfer_matrix([a, b])[0, 1])
 
 
@@ -167,7 +167,7 @@ def appearance_descriptor(renders: np.ndarray) -> np.ndarray:
     For each view a 16 x 16 histogram of hue and saturation over the robot's pixels (sum 1) and the seven Hu moments of its
     silhouette, log-transformed; mean over views. The logarithms keep the moments' signs, as is customary. The last three
     moments are tiny and of either sign, so their logarithms jump between large positive and negative numbers and outweigh
-    all else, colours too.
+    all else, colors too.
 
     Args:
         renders: [v h w 3] uint8 RGB, the robot alone on white; the paper uses nine standard views.

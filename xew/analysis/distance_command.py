@@ -51,7 +51,7 @@ class Args:
     perceptual: str = "xew.metrics:lpips"
     """module:NAME of a distance of two videos [t h w 3] uint8, frame by frame; empty for none."""
     workers: int = -1
-    """Threads of the nearest-neighbour search; -1 for all cores."""
+    """Threads of the nearest-neighbor search; -1 for all cores."""
 
 
 @dataclass(frozen=True)

@@ -52,11 +52,11 @@ class PublishedRobot:
     dof: int
     links: int
     reach: float
-    """Metres."""
+    """Meters."""
     volume: float
-    """Of the hull of what it reaches, cubic metres."""
+    """Of the hull of what it reaches, cubic meters."""
     kinematic: float
-    """Metres."""
+    """Meters."""
     appearance: float
 
 

@@ -302,7 +302,7 @@ def _strip(
         f"{page.escape(' · '.join(filter(None, key[:2])))} · {word}, LPIPS {row['value']:.3f}"
     )
     columns = [f"frame {t}" for t in times]
-    html = page.labelled_picture(pictures.data_uri(image), caption, columns, ["observed", "predicted", "difference"])
+    html = page.labeled_picture(pictures.data_uri(image), caption, columns, ["observed", "predicted", "difference"])
     return Picture("_".join((*map(str, key[:5]), word)).replace("/", "-") + ".png", image, html)
 
 
@@ -323,7 +323,7 @@ def _contact_sheet(data: Path, records: Sequence[Record]) -> Picture:
     caption = "One seed of each task half-way through: the scene is the same for every robot."
     titles = [robot_title(robot) for robot in robots]
     names = [task.replace("_", " ") for task in tasks]
-    return Picture("data.png", image, page.labelled_picture(pictures.data_uri(image), caption, titles, names))
+    return Picture("data.png", image, page.labeled_picture(pictures.data_uri(image), caption, titles, names))
 
 
 def _task_row(data: Path, records: Sequence[Record], robots: Sequence[str]) -> list[np.ndarray]:

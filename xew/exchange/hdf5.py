@@ -20,7 +20,7 @@ import numpy as np
 from xew.episode import HEIGHT, WIDTH, EpisodeError
 
 TOOL_OFFSET = 0.12
-"""RoboTwin's end pose lies this far behind the tool centre point, along the approach [m], whatever the robot."""
+"""RoboTwin's end pose lies this far behind the tool center point, along the approach [m], whatever the robot."""
 RGB_MARK = b"XPL-RGB1"
 """JPEG comment of pictures that are ordinary JPEGs."""
 TABLE_CENTER = (0.0, 0.0, 0.74)
@@ -38,11 +38,11 @@ class Recorded:
     grippers: np.ndarray
     """[t 2] commanded, 0 closed to 1 open."""
     tool_pose: np.ndarray | None
-    """[t 2 7] measured tool centre points, world [m] and quaternion x y z w; None where the file has no end poses."""
+    """[t 2 7] measured tool center points, world [m] and quaternion x y z w; None where the file has no end poses."""
     rgb: np.ndarray
     """[t h w 3] uint8, the head camera."""
     intrinsics: np.ndarray
-    """[3 3] pixels, (0, 0) the centre of the upper left one."""
+    """[3 3] pixels, (0, 0) the center of the upper left one."""
     extrinsics: np.ndarray
     """[4 4] world to camera."""
     instruction: str
@@ -130,7 +130,7 @@ def _recorded(
 
 
 def tool_center(end_pose: np.ndarray) -> np.ndarray:
-    """RoboTwin's end poses [t 7] (quaternion w x y z) as tool frames [t 7] (x y z w) at the tool centre point."""
+    """RoboTwin's end poses [t 7] (quaternion w x y z) as tool frames [t 7] (x y z w) at the tool center point."""
     w, x, y, z = end_pose[:, 3:].T
     approach = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1)
     return np.concatenate([end_pose[:, :3] + TOOL_OFFSET * approach, end_pose[:, [4, 5, 6, 3]]], 1)
@@ -150,7 +150,7 @@ def _resized(image: np.ndarray) -> np.ndarray:
 
 
 def _pixels(intrinsics: np.ndarray, scale: float) -> np.ndarray:
-    """RoboTwin counts pixels from the upper left corner of the first, we from its centre."""
+    """RoboTwin counts pixels from the upper left corner of the first, we from its center."""
     found = intrinsics.copy()
     found[:2] /= scale
     found[:2, 2] -= 0.5

@@ -43,7 +43,7 @@ EMBODIMENTS = {
 }
 """RoboTwin's names of robots, and ours."""
 TOOL_DISTANCE = {"aloha_agilex": 0.12, "arx_x5": 0.12, "ur5_wsg": 0.11, "franka_panda": 0.08, "piper": 0.12}
-"""From the link that carries the tool to RoboTwin's tool centre point [m] (gripper_bias of its embodiments)."""
+"""From the link that carries the tool to RoboTwin's tool center point [m] (gripper_bias of its embodiments)."""
 FIT_POSITION, FIT_ROTATION = 0.01, 0.05
 """Median distance [m] and angle [rad] between end poses and those of a robot's joints, up to which it is that robot."""
 SAME_PLACE = 0.003

@@ -41,7 +41,7 @@ class Tracker(Protocol):
 
         Args:
             prediction, target: [t h w 3] uint8, predicted and true video.
-            points: [t k 2] float32, true projections [pixels, x right, y down, centre of the first pixel at 0].
+            points: [t k 2] float32, true projections [pixels, x right, y down, center of the first pixel at 0].
             visible: [t k] bool, where a true point is seen.
         """
 
@@ -60,7 +60,7 @@ class Backend(Generic[T_co]):
     open: Callable[..., T_co]
     """Called with its checkpoint, or with nothing where it needs none. Raises ConfigError where something is missing."""
     needs: str | None
-    """What checkpoint to get, from whom, under which licence; None: none."""
+    """What checkpoint to get, from whom, under which license; None: none."""
     summary: str
     """What it is, for the notes under a table."""
 
@@ -129,7 +129,7 @@ class ReferenceMasker:
 
 MASKERS: Mapping[str, Backend[Masker]] = {
     "default": Backend(
-        ReferenceMasker, None, "colour, background and gated flow against the true video (xew.metrics.estimators.masks)"
+        ReferenceMasker, None, "color, background and gated flow against the true video (xew.metrics.estimators.masks)"
     ),
     "sam2": Backend(
         open_sam2,

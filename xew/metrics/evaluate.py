@@ -32,7 +32,7 @@ from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, compared, grade
 from xew.metrics.grading.bundle import demand_none, differences, disagreements, read_bundle, write_bundle
 from xew.metrics.grading.jobs import BASELINES, Job, plan, prediction_of, shown_of
 from xew.metrics.grading.scores import CellStore, beside, check_out, describe, write_diagnostics, write_tables, write_whole
-from xew.metrics.grading.summary import summarise, to_markdown
+from xew.metrics.grading.summary import summarize, to_markdown
 from xew.metrics.grading.workers import Bench, compile_cache, not_needed, opener, worker_count
 from xew.metrics.truth import Truth, read_truth
 from xew.protocol import HELD_OUT_ROBOTS
@@ -133,7 +133,7 @@ def _write_summary(args: Args, rows: pd.DataFrame) -> str:
     """Write the summary's files and return what is printed."""
     if rows.empty:
         return "no scores"
-    summary = summarise(rows, args.resample, HELD_OUT_ROBOTS)
+    summary = summarize(rows, args.resample, HELD_OUT_ROBOTS)
     write_whole(beside(args.out, "summary.md"), to_markdown(summary).encode())
     write_whole(beside(args.out, "summary.csv"), summary.means.to_csv(index=False).encode())
     write_whole(beside(args.out, "pairs.csv"), summary.pairs.to_csv(index=False).encode())

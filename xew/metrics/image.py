@@ -110,18 +110,18 @@ def _frame_ssim(x: jax.Array, y: jax.Array) -> jax.Array:
     sum_x, sum_y = sum_x + n * offset, sum_y + n * offset
     # Of equal frames both ratios are of equal integers, treated alike: what lacks of 1 is exactly 0.
     samples = n * (n - 1)
-    numerator = _stabilised(2 * sum_x * sum_y, n * n, SSIM_C1) * _stabilised(2 * shared, samples, SSIM_C2)
-    denominator = _stabilised(sum_x * sum_x + sum_y * sum_y, n * n, SSIM_C1) * _stabilised(spread, samples, SSIM_C2)
+    numerator = _stabilized(2 * sum_x * sum_y, n * n, SSIM_C1) * _stabilized(2 * shared, samples, SSIM_C2)
+    denominator = _stabilized(sum_x * sum_x + sum_y * sum_y, n * n, SSIM_C1) * _stabilized(spread, samples, SSIM_C2)
     # One axis at a time: a single running float32 sum over 200,000 windows would lose the last three digits.
     return 1 - jnp.mean(jnp.mean(1 - numerator / denominator, axis=0))
 
 
-def _stabilised(total: jax.Array, size: int, constant: float) -> jax.Array:
+def _stabilized(total: jax.Array, size: int, constant: float) -> jax.Array:
     return total.astype(jnp.float32) / size + constant
 
 
 def _levels(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, float]:
-    """Both as [h w*3] in levels of 255 less an offset: integers as they are, floats centred to keep their squares small."""
+    """Both as [h w*3] in levels of 255 less an offset: integers as they are, floats centered to keep their squares small."""
     x, y = (image.reshape(len(image), -1) for image in (x, y))
     if x.dtype == jnp.uint8:
         return x.astype(jnp.int32), y.astype(jnp.int32), 0

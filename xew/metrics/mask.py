@@ -19,7 +19,7 @@ from xew.metrics.metric import check_masks
 BYTE = 8
 """Pixels that are packed together."""
 SQUARE = (1, 1)
-"""A pixel and its eight neighbours: half heights of the columns at distance 0 and 1."""
+"""A pixel and its eight neighbors: half heights of the columns at distance 0 and 1."""
 
 
 def mask_iou(prediction: jax.Array, target: jax.Array) -> jax.Array:
@@ -40,7 +40,7 @@ def boundary_f1(prediction: jax.Array, target: jax.Array, tolerance: float = 2) 
     """F1 of contour pixels matched within a tolerance, each frame in [0, 1], higher is better.
 
     Pinned, because each choice moves the value by up to 0.2: a contour pixel belongs to the mask and has one of its
-    eight neighbours outside (the image's border is no contour); pixels match within a Euclidean disc. Precision is the
+    eight neighbors outside (the image's border is no contour); pixels match within a Euclidean disc. Precision is the
     matched share of the prediction's contour, recall that of the target's.
 
     Args:
@@ -106,7 +106,7 @@ def _count(packed: jax.Array) -> jax.Array:
 
 @functools.partial(jax.jit, static_argnames="height")
 def _inner_edges(*masks: jax.Array, height: int) -> list[jax.Array]:
-    """Pixels of packed masks with an 8-neighbour outside. Beyond the image there is no outside."""
+    """Pixels of packed masks with an 8-neighbor outside. Beyond the image there is no outside."""
     image = np.packbits(np.arange(masks[0].shape[1] * BYTE) < height, bitorder="little")[:, None]
     return [mask & _grown(~mask & image, SQUARE) for mask in masks]
 
@@ -118,7 +118,7 @@ def _matched(edge_p: jax.Array, edge_t: jax.Array, disc: tuple[int, ...]) -> lis
 
 
 def _disc(radius: float) -> tuple[int, ...]:
-    """Half heights of a disc's columns at distances 0, 1, ... from its centre."""
+    """Half heights of a disc's columns at distances 0, 1, ... from its center."""
     if not radius >= 0:
         raise ValueError(f"the tolerance is {radius}, expected a radius of at least 0 pixels.")
     return tuple(math.isqrt(math.floor(radius * radius) - x * x) for x in range(math.floor(radius) + 1))

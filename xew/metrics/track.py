@@ -110,7 +110,7 @@ def _widened(contact: jax.Array, frames: int) -> jax.Array:
 
 @jax.jit
 def ndtw(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Array:
-    """Normalised dynamic time warping of each keypoint's path, mean over keypoints; lower is better, 0 is best.
+    """Normalized dynamic time warping of each keypoint's path, mean over keypoints; lower is better, 0 is best.
 
     Classic DTW with Euclidean cost, over the frames in which the point is valid and found, divided by the sum of the two
     lengths and by the mean over those frames of the diagonal d_t of `pck` (the paper's definition).

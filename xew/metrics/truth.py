@@ -25,8 +25,8 @@ NEEDS = {
 REST = 1.0
 """Pixels by which a resting object's point may move."""
 PATCH = 2
-"""Pixels to each side of a point whose mean is the colour of its place."""
-OTHER_COLOUR = 40
+"""Pixels to each side of a point whose mean is the color of its place."""
+OTHER_COLOR = 40
 """Levels of a channel. A shadow on a bright object may be one too: then its frames are left out, which costs little."""
 
 
@@ -98,7 +98,7 @@ def _visible(points: np.ndarray, rgb: np.ndarray, mask: np.ndarray) -> np.ndarra
 
 
 def _changed_at_rest(points: np.ndarray, free: np.ndarray, rgb: np.ndarray) -> np.ndarray:
-    """[t o] bool: the object is where it was when it was first free, and its place has another colour since.
+    """[t o] bool: the object is where it was when it was first free, and its place has another color since.
 
     So is what a robot puts on something, a cup on its coaster, told from the coaster.
     """
@@ -109,8 +109,8 @@ def _changed_at_rest(points: np.ndarray, free: np.ndarray, rgb: np.ndarray) -> n
     x, y = np.moveaxis(_pixels(points), -1, 0)[..., None]
     rows = np.clip(y + around, 0, rgb.shape[1] - 1)[..., :, None]
     columns = np.clip(x + around, 0, rgb.shape[2] - 1)[..., None, :]
-    colour = rgb[np.arange(t)[:, None, None, None], rows, columns].mean(axis=(2, 3))
-    changed = np.abs(colour - colour[first, objects]).max(axis=-1) > OTHER_COLOUR
+    color = rgb[np.arange(t)[:, None, None, None], rows, columns].mean(axis=(2, 3))
+    changed = np.abs(color - color[first, objects]).max(axis=-1) > OTHER_COLOR
     return at_rest & changed & free.any(axis=0)
 
 

@@ -141,7 +141,7 @@ def robot_mask(command: Command) -> np.ndarray:
 
 
 def optical_flow(command: Command) -> np.ndarray:
-    """The robot's exact motion as a colour wheel; white where nothing moves."""
+    """The robot's exact motion as a color wheel; white where nothing moves."""
     from xew.sim_warp.rendering.streams import flow_to_rgb
 
     return flow_to_rgb(command.streams.optical_flow)

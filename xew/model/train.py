@@ -97,7 +97,7 @@ class Meter:
     def take(self) -> dict[str, float]:
         """The values of a log line; begins anew."""
         results, seconds = jax.device_get(self.results), time.perf_counter() - self.since
-        values = summarise(results) | {
+        values = summarize(results) | {
             "time/step_s": seconds / len(results),
             "time/data_wait_s": self.wait_s / len(results),
             "time/samples_per_s": len(results) * self.samples / seconds,
@@ -117,7 +117,7 @@ class Meter:
         self.since += time.perf_counter() - begin
 
 
-def summarise(results: Sequence[StepResult]) -> dict[str, float]:
+def summarize(results: Sequence[StepResult]) -> dict[str, float]:
     """Means of the loss, of the loss by noise level and of the gradient norm over some steps."""
     losses, sigma, weights = (np.concatenate([getattr(r, name) for r in results]) for name in ("losses", "sigma", "weights"))
     norms = [float(result.gradient_norm) for result in results]

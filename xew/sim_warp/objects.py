@@ -1,6 +1,6 @@
 """The things on the table: what they look like and the convex pieces that they collide with.
 
-Each function returns a `Shape` in the object's own frame: z up, origin at the centre of the bottom face, so that an
+Each function returns a `Shape` in the object's own frame: z up, origin at the center of the bottom face, so that an
 object stands on the table when its origin is at table height. Sizes follow RoboTwin 2.0's objects, brought down to
 what a parallel gripper of 80 mm can hold (graspable widths at most 65 mm).
 """
@@ -48,7 +48,7 @@ def moved(shape: Shape, xyz: tuple[float, float, float]) -> Shape:
 
 
 def darker(color: Color, share: float) -> Color:
-    """A colour at `share` of its brightness."""
+    """A color at `share` of its brightness."""
     red, green, blue = color
     return int(share * red), int(share * green), int(share * blue)
 
@@ -85,13 +85,13 @@ def vessel(outline: list[tuple[float, float]], wall: float, color: Color, inside
     Args:
         outline: (outer radius, height) pairs [m] from the bottom to the rim.
         wall: thickness [m] of wall and floor.
-        color, inside: outer and inner sRGB colour.
+        color, inside: outer and inner sRGB color.
     """
     outer = np.asarray(outline, float)
     inner = np.stack([outer[:, 0] - wall, np.maximum(outer[:, 1], wall)], -1)
     shell = meshes.revolve([(0, 0), *outer, *inner[::-1], (0, wall)], color)
-    centres = shell.vertices[shell.triangles].mean(1)
-    outward = (shell.normals.mean(1)[:, :2] * centres[:, :2]).sum(-1) >= 0
+    centers = shell.vertices[shell.triangles].mean(1)
+    outward = (shell.normals.mean(1)[:, :2] * centers[:, :2]).sum(-1) >= 0
     colors = np.where(outward[:, None], np.array(color, np.uint8), np.array(inside or color, np.uint8))
     mesh = Mesh(shell.vertices, shell.triangles, colors, shell.normals)
     return Shape(mesh, (*_wall_hulls(outer, inner), _ring(outer[0, 0], 0, wall)))

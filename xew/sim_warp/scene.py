@@ -93,7 +93,7 @@ class Scene:
     seed: int
     objects: tuple[SceneObject, ...]
     words: dict[str, str] = field(default_factory=dict)
-    """What the instruction's slots say of this scene (colours, sizes)."""
+    """What the instruction's slots say of this scene (colors, sizes)."""
     targets: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Places drawn with the scene that are no objects, such as where a row of blocks goes: x y [m]."""
 

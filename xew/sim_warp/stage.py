@@ -1,6 +1,6 @@
 """What never moves: table, wall, ground and lights, as plain data. The scene, the physics and the renderer read it here.
 
-Reads nothing, writes nothing. Sizes and lights are RoboTwin 2.0's (`demo_clean`); metres, world frame.
+Reads nothing, writes nothing. Sizes and lights are RoboTwin 2.0's (`demo_clean`); meters, world frame.
 To change the place where everything happens, change these constants.
 """
 
@@ -13,7 +13,7 @@ from xew.sim_warp.geometry.meshes import Color, Mesh, box, merge
 TABLE_TOP = 0.74
 """Height of the table's surface [m]."""
 TABLE_SIZE = (1.2, 0.7, 0.05)
-"""Full size of the table's plate [m]; its centre is over the world's origin."""
+"""Full size of the table's plate [m]; its center is over the world's origin."""
 LEG_SIZE = 0.05
 LEG_XY = (0.55, 0.30)
 """A leg stands at every (+-x, +-y) [m]."""
@@ -54,7 +54,7 @@ LIGHTS = (
     Light(1.0, (1.0, 0.0, -0.95), (-1.0, 0.0, 1.8)),
 )
 SKY = (1.0, 1.0, 1.0)
-"""Linear colour where there is nothing, and of the ground of a render without the stage."""
+"""Linear color where there is nothing, and of the ground of a render without the stage."""
 SHADOW_CENTER = (0.0, -0.1, 0.85)
 """Middle of what the directional light's shadow map holds [m]."""
 SHADOW_WIDTH = 1.8

@@ -47,7 +47,7 @@ LOOK = """() => {
 
 @dataclass(frozen=True)
 class Sight:
-    """What was found at one width and colour scheme."""
+    """What was found at one width and color scheme."""
 
     complaints: tuple[str, ...]
     """Of the console, of scripts, and requests that failed or left the machine."""

@@ -28,7 +28,7 @@ def test_the_registries_hold_what_the_documents_name() -> None:
 
 
 @pytest.mark.parametrize(("open_", "name"), NEEDY, ids=[name for _, name in NEEDY])
-def test_a_missing_checkpoint_is_named_with_its_source_licence_and_option(
+def test_a_missing_checkpoint_is_named_with_its_source_license_and_option(
     open_: Callable[..., object], name: str, tmp_path: Path
 ) -> None:
     for checkpoint in (None, tmp_path / "absent.pt"):
@@ -36,7 +36,7 @@ def test_a_missing_checkpoint_is_named_with_its_source_licence_and_option(
             open_(name, checkpoint, option="--the-option")
         message = str(caught.value)
         assert "\n" not in message and "--the-option" in message
-        assert any(licence in message for licence in ("Apache-2.0", "CC-BY-NC 4.0", "BSD-3-Clause"))
+        assert any(license in message for license in ("Apache-2.0", "CC-BY-NC 4.0", "BSD-3-Clause"))
         assert any(source in message for source in ("github.com", "Hugging Face", "torchvision"))
         assert checkpoint is None or str(checkpoint) in message
 

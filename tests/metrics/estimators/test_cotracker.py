@@ -1,7 +1,7 @@
 """CoTracker3's adapter: checkpoint, queries, directions and what counts as lost.
 
-The package is not on PyPI and its licence keeps it out of here, so a stand-in with the published signature is called: it reads
-a state dict and follows colours. `test_the_real_network` runs where somebody has installed the package.
+The package is not on PyPI and its license keeps it out of here, so a stand-in with the published signature is called: it reads
+a state dict and follows colors. `test_the_real_network` runs where somebody has installed the package.
 """
 
 import sys
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.metrics.estimators.coloured_squares import squares
+from tests.metrics.estimators.colored_squares import squares
 from xew.config import ConfigError
 from xew.metrics.backends import open_tracker
 from xew.metrics.estimators.adapters import query_frames
@@ -22,7 +22,7 @@ torch = pytest.importorskip("torch")
 
 
 class StandIn(torch.nn.Module):
-    """Follows the colour under each query; what it has not been asked for it answers with nonsense."""
+    """Follows the color under each query; what it has not been asked for it answers with nonsense."""
 
     opened: dict[str, Any]
 
@@ -38,9 +38,9 @@ class StandIn(torch.nn.Module):
         tracks = torch.full((1, video.shape[1], queries.shape[1], 2), -1000.0)
         seen = torch.zeros(tracks.shape[:3], dtype=bool)
         for point, (start, x, y) in enumerate(queries[0]):
-            colour = video[0, int(start), :, int(y.round()), int(x.round())]
+            color = video[0, int(start), :, int(y.round()), int(x.round())]
             for frame in range(0 if backward_tracking else int(start), video.shape[1]):
-                same = ((video[0, frame] - colour[:, None, None]).abs().amax(0) < 8).nonzero().float()
+                same = ((video[0, frame] - color[:, None, None]).abs().amax(0) < 8).nonzero().float()
                 if len(same):
                     tracks[0, frame, point], seen[0, frame, point] = same.mean(0).flip(0), True
         return tracks, seen
@@ -73,7 +73,7 @@ def test_points_are_followed_both_ways_from_where_most_are_seen(tmp_path: Path) 
 
 
 @pytest.mark.usefixtures("package")
-def test_its_licence_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_its_license_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     open_cotracker(save(tmp_path / "scaled_offline.pth"))
     assert "CC-BY-NC 4.0" in capsys.readouterr().err
 

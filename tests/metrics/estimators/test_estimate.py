@@ -55,7 +55,7 @@ def test_a_wrong_motion_is_scored_as_wrong_as_it_is(name: str, episode: tuple[np
 
 
 def test_a_motion_that_the_truth_never_shows_is_scored_too(episode: tuple[np.ndarray, np.ndarray]) -> None:
-    """Everything is shifted: no true frame shows it, so that flow, colours and background have to do."""
+    """Everything is shifted: no true frame shows it, so that flow, colors and background have to do."""
     video, mask = episode
     shift = np.array([[1, 0, 8], [0, 1, 0.0]])
     moved, shown = (
@@ -87,7 +87,7 @@ def test_it_is_the_same_every_time(episode: tuple[np.ndarray, np.ndarray]) -> No
 
 
 def test_what_the_true_robot_hides_of_a_thing_that_it_carries_is_no_robot() -> None:
-    """A thing, half in the robot's colours, is carried by a robot that is too high: no true frame shows what this uncovers."""
+    """A thing, half in the robot's colors, is carried by a robot that is too high: no true frame shows what this uncovers."""
     rng = np.random.default_rng(0)
     ground, robot, thing = (_cloth(rng, *settings) for settings in ((120, 200, 210), (60, 30, 90), (40, 40, 90)))
     thing[:, :20] = thing[:, :20] // 3 + np.uint8([0, 0, 140])
@@ -111,6 +111,6 @@ def test_what_the_true_robot_hides_of_a_thing_that_it_carries_is_no_robot() -> N
 
 
 def _cloth(rng: np.random.Generator, height: int, width: int, level: int) -> np.ndarray:
-    """[h w 3] uint8, soft grey blotches round a level."""
+    """[h w 3] uint8, soft gray blotches round a level."""
     blotches = cv2.GaussianBlur(rng.normal(0, 1, (height, width)), (0, 0), 2)
     return np.repeat(np.clip(level + 100 * blotches, 0, 255).astype(np.uint8)[..., None], 3, axis=2)

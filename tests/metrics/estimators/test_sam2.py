@@ -165,7 +165,7 @@ def test_frames_go_in_one_by_one_and_give_what_all_at_once_gives(folder: Path, v
     assert [output.frame_idx for output in outputs] == [1, 2]
 
 
-def test_frames_are_normalised_as_the_authors_do() -> None:
+def test_frames_are_normalized_as_the_authors_do() -> None:
     frame = np.full((1, 6, 8, 3), (255, 0, 128), np.uint8)
     tensor = Frames(frame, 4)[0].numpy()
     assert tensor.shape == (3, 4, 4)

@@ -1,6 +1,6 @@
 """TAPIR's adapter: checkpoint, coordinates, queries and what counts as lost.
 
-The package `tapnet` is not on PyPI, so a stand-in with the published signature is called: it follows colours in the network's
+The package `tapnet` is not on PyPI, so a stand-in with the published signature is called: it follows colors in the network's
 own coordinates. `test_the_real_network` runs where somebody has installed the package.
 """
 
@@ -14,14 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.metrics.estimators.coloured_squares import squares
+from tests.metrics.estimators.colored_squares import squares
 from xew.config import ConfigError
 from xew.metrics.backends import open_tracker
 from xew.metrics.estimators.tapir import open_tapir, read_checkpoint
 
 
 class StandIn:
-    """Follows the colour under each query, in pixels whose centres are at halves, as tolerantly as its parameter says."""
+    """Follows the color under each query, in pixels whose centers are at halves, as tolerantly as its parameter says."""
 
     options: dict[str, Any]
 
@@ -32,11 +32,11 @@ class StandIn:
     def __call__(self, video: Any, is_training: bool, query_points: Any, query_chunk_size: int) -> dict[str, Any]:
         assert video.shape[2:] == (256, 256, 3) and not is_training and query_chunk_size > 0
         t, y, x = query_points[0].astype(int).T
-        colours = video[0, t, y, x]
-        same = jnp.abs(video[0, None] - colours[:, None, None, None]).max(-1) < self.tolerance  # [k t h w]
+        colors = video[0, t, y, x]
+        same = jnp.abs(video[0, None] - colors[:, None, None, None]).max(-1) < self.tolerance  # [k t h w]
         count = same.sum((2, 3))
-        centre = jnp.arange(256) + 0.5
-        tracks = jnp.stack([(same.sum(axis) * centre).sum(-1) / jnp.maximum(count, 1) for axis in (2, 3)], -1)
+        center = jnp.arange(256) + 0.5
+        tracks = jnp.stack([(same.sum(axis) * center).sum(-1) / jnp.maximum(count, 1) for axis in (2, 3)], -1)
         logit = jnp.where(count > 0, -5.0, 5.0)
         return {"tracks": tracks[None], "occlusion": logit[None], "expected_dist": jnp.full_like(logit, -5.0)[None]}
 

@@ -78,7 +78,7 @@ PLACES = [
     (files.os, "replace", CELLS + 1),  # the curves
     (files.os, "replace", CELLS + 2),  # the scores, whose curves are there
     (evaluate, "write_bundle", 1),
-    (evaluate, "summarise", 1),
+    (evaluate, "summarize", 1),
 ]
 
 

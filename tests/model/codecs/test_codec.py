@@ -183,7 +183,7 @@ def test_the_autoencoder_s_next_reference(vae_codec: WanVaeCodec) -> None:
     latents = vae_codec.encode(smooth_clip(9, frames=13))
     found = jax.jit(lambda codec, latents: codec.next_reference(latents))(vae_codec, latents[None])
     expected = vae_codec.encode(vae_codec.decode(latents)[-1:])
-    np.testing.assert_allclose(found[0], expected, atol=0.05)  # one grey level, where rounding falls the other way
+    np.testing.assert_allclose(found[0], expected, atol=0.05)  # one gray level, where rounding falls the other way
     assert np.abs(found[0] - expected).mean() < 1e-3
 
 

@@ -116,9 +116,9 @@ def test_statistics(vae: VideoVae) -> None:
     other.latents_mean.set_value(jnp.asarray(mean))
     other.latents_std.set_value(jnp.asarray(std))
     row = (1, 1, 1, 1, -1)
-    normalised = encode(other, video)
-    np.testing.assert_allclose(normalised, (latents - mean.reshape(row)) / std.reshape(row), atol=1e-5)
-    np.testing.assert_allclose(decode(other, normalised), decode(vae, latents), atol=1e-5)
+    normalized = encode(other, video)
+    np.testing.assert_allclose(normalized, (latents - mean.reshape(row)) / std.reshape(row), atol=1e-5)
+    np.testing.assert_allclose(decode(other, normalized), decode(vae, latents), atol=1e-5)
 
 
 def test_published_statistics() -> None:

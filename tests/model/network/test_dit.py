@@ -152,7 +152,7 @@ def test_rotary_split(head_dim: int, parts: tuple[int, int, int]) -> None:
     np.testing.assert_allclose(last, np.concatenate(series), rtol=1e-12)
 
 
-def test_rotation_is_a_complex_product_of_neighbouring_pairs() -> None:
+def test_rotation_is_a_complex_product_of_neighboring_pairs() -> None:
     values, angles = np.asarray(normal(6, 1, 12, 2, 16)), dit.rotary_angles((3, 2, 2), 16)
     pairs = values[..., 0::2] + 1j * values[..., 1::2]
     expected = pairs * np.exp(1j * angles)[None, :, None]
@@ -178,7 +178,7 @@ def test_patchify_orders_features_as_wan() -> None:
 
 
 def test_query_norm_spans_all_heads() -> None:
-    """Wan normalises before the split: scaling one head's queries changes the others' logits."""
+    """Wan normalizes before the split: scaling one head's queries changes the others' logits."""
     attention = tiny().blocks.self_attn
     assert attention.norm_q.scale.shape == (MODELS["tiny"].depth, MODELS["tiny"].dim)
 

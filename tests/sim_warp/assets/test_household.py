@@ -49,14 +49,14 @@ def test_variants_differ_in_size_and_looks(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", THINGS)
 def test_what_is_seen_is_what_collides(kind: str) -> None:
-    """Decorations stand out by a few millimetres at most."""
+    """Decorations stand out by a few millimeters at most."""
     for thing in variants(kind)[:10]:
         solid = np.concatenate(thing.shape.hulls)
         seen = thing.shape.mesh.vertices
         assert np.abs(seen.min(0) - solid.min(0)).max() < 0.004 and np.abs(seen.max(0) - solid.max(0)).max() < 0.004
 
 
-def test_a_mat_has_another_colour_than_what_lies_on_it() -> None:
+def test_a_mat_has_another_color_than_what_lies_on_it() -> None:
     colors = {mat_color(np.random.default_rng(seed), "red stapler") for seed in range(60)}
     assert colors == set(MATS) - {"red"}
 

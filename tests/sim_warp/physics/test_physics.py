@@ -62,7 +62,7 @@ def test_canonical_joints_survive_the_template(key: str) -> None:
 
 
 @pytest.mark.parametrize("key", ROBOTS)
-def test_the_template_counts_fingers_in_metres_from_closed(key: str) -> None:
+def test_the_template_counts_fingers_in_meters_from_closed(key: str) -> None:
     robot = ROBOTS[key]
     action = np.zeros((2, 16))
     action[1, 7] = 1.0

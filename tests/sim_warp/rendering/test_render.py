@@ -44,7 +44,7 @@ def tumbling(frames: int, bodies: int, seed: int = 0) -> np.ndarray:
 
 
 def ray_cast(mesh: Mesh, pose: np.ndarray, camera: Camera) -> np.ndarray:
-    """[h w] depth of the first front face met by the ray of every pixel's centre beyond the near plane, inf if none."""
+    """[h w] depth of the first front face met by the ray of every pixel's center beyond the near plane, inf if none."""
     world = Rotation.from_quat(pose[3:]).apply(mesh.vertices) + pose[:3]
     corners = (world @ camera.extrinsics[:3, :3].T + camera.extrinsics[:3, 3])[mesh.triangles]
     x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
@@ -210,7 +210,7 @@ def test_lit_faces_have_no_shadow_acne(renderer: Renderer) -> None:
 
 
 def checkered() -> Mesh:
-    """A ball whose triangles have colours of their own."""
+    """A ball whose triangles have colors of their own."""
     colors = np.random.default_rng(0).integers(0, 255, (len(BALL.triangles) // 4, 1)).repeat(4, 0).repeat(3, 1)
     return Mesh(BALL.vertices, BALL.triangles, colors.astype(np.uint8), BALL.normals)
 

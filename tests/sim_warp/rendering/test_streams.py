@@ -202,8 +202,8 @@ def test_zero_flow_is_white_and_frames_hold_the_motion_before_them() -> None:
     video = flow_to_rgb(flow)
     assert video.shape == (3, 4, 5, 3)
     assert (video[:2] == 255).all()
-    coloured = (video[2] != 255).any(-1)
-    assert np.argwhere(coloured).tolist() == [[1, 2]]
+    colored = (video[2] != 255).any(-1)
+    assert np.argwhere(colored).tolist() == [[1, 2]]
 
 
 def test_hue_is_direction_and_saturation_is_length() -> None:
@@ -233,7 +233,7 @@ def test_ray_map_marks_the_tools(robot_key: str) -> None:
     assert not np.array_equal(ray_map(robot_key, action[:1]), ray_map(robot_key, closing))
 
 
-def test_ray_map_has_three_axes_and_a_base_marker_in_the_gripper_s_colour(robot_key: str) -> None:
+def test_ray_map_has_three_axes_and_a_base_marker_in_the_gripper_s_color(robot_key: str) -> None:
     action = np.tile(in_view(robot_key)[:1], (2, 1))
     action[:, [7, 15]] = [[0.0, 1.0], [1.0, 0.0]]
     drawn = ray_map(robot_key, action)

@@ -10,7 +10,7 @@ import yaml
 from PIL import Image
 
 STRIPES = ((210, 40, 30), (30, 60, 200))
-"""Colours of the texture: left half, right half."""
+"""Colors of the texture: left half, right half."""
 
 JOINTS = (
     ("0 0 0.06", "0 0 0", "0 0 1", -3.1, 2.6),
@@ -48,7 +48,7 @@ def urdf(changes: dict[str, str] | None = None) -> str:
 
 def _link(name: str, mesh: str, scale: str, center: str) -> str:
     geometry = f'<origin xyz="{center}"/><geometry><mesh filename="meshes/{mesh}" scale="{scale}"/></geometry>'
-    material = "" if mesh.endswith(".obj") else '<material name="grey"><color rgba="0.6 0.6 0.65 1"/></material>'
+    material = "" if mesh.endswith(".obj") else '<material name="gray"><color rgba="0.6 0.6 0.65 1"/></material>'
     inertia = '<inertia ixx="0.001" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.001"/>'
     return (
         f'<link name="{name}"><inertial><mass value="0.3"/>{inertia}</inertial>'

@@ -51,7 +51,7 @@ def write_yaml(folder: Path, **content: Any) -> Path:
 
 
 def at_home(robot: RobotSpec) -> np.ndarray:
-    """[2] how far both tools are from home, in metres and radians together."""
+    """[2] how far both tools are from home, in meters and radians together."""
     off = []
     for arm, home in enumerate(HOME):
         pose = tool_pose(robot, arm, np.array([robot.arms[arm].home]))[0]
@@ -85,7 +85,7 @@ def test_the_tool_frame_is_turned_as_delta_matrix_says(tmp_path: Path) -> None:
     assert draft.tool_pose == pytest.approx((0, 0, 0.12, 0.5**0.5, 0, 0.5**0.5, 0))
 
 
-def test_textures_colour_the_triangles(embodiment: Path) -> None:
+def test_textures_color_the_triangles(embodiment: Path) -> None:
     mesh = load_urdf(embodiment / "small.urdf").links["link3"].visual
     assert mesh is not None
     height = mesh.vertices[mesh.triangles].mean(1)[:, 2]
@@ -209,7 +209,7 @@ BAD_URDFS: list[tuple[dict[str, str], str]] = [
     ({LINK4: LINK4.replace("0.001", "nan")}, "the inertial of link link4 has a number that is not finite"),
     ({LINK4: LINK4.replace("0.3", "-1")}, "the inertial of link link4 has a mass of -1 kg"),
     ({'xyz="0 0 0.06"': 'xyz="0 0 inf"'}, "the origin of joint arm1 has a number that is not finite"),
-    ({'scale="0.26 0.04 0.04"': 'scale="260 40 40"'}, "link link2 is 260 m large; is its mesh in millimetres?"),
+    ({'scale="0.26 0.04 0.04"': 'scale="260 40 40"'}, "link link2 is 260 m large; is its mesh in millimeters?"),
     ({'<link name="link2">': '<link name="link1">'}, "more than one link is called link1; names must be unique"),
     ({'type="prismatic"': 'type="revolute"'}, "found 0 hands (a link with two prismatic finger joints)"),
     ({'name="arm1" type="revolute"': 'name="arm1" type="fixed"'}, "5 joints turn on the way to link6"),

@@ -1,6 +1,6 @@
 """Stage 11 of 11: the report's charts. A chart is panels beside one another, and the numbers that they draw.
 
-On the page each panel is an SVG of its own, so that they stand one below the other on a narrow screen, and takes its colours
+On the page each panel is an SVG of its own, so that they stand one below the other on a narrow screen, and takes its colors
 from the page, light or dark. For Markdown and LaTeX all panels are one PNG and one PDF.
 """
 
@@ -21,8 +21,8 @@ from matplotlib.lines import Line2D
 INK, SOFT, LINE, GROUND = "#1f2328", "#57606a", "#d0d7de", "#ffffff"
 SERIES = ("#1f6feb", "#c2410c", "#15803d", "#7e22ce", "#a16207", "#0e7490")
 """Of series in order; baselines are SOFT. The page has a lighter one for each in the dark."""
-THEME = {INK: "ink", SOFT: "soft", LINE: "line", GROUND: "page"} | {colour: f"c{i}" for i, colour in enumerate(SERIES)}
-"""The page's variable for each colour."""
+THEME = {INK: "ink", SOFT: "soft", LINE: "line", GROUND: "page"} | {color: f"c{i}" for i, color in enumerate(SERIES)}
+"""The page's variable for each color."""
 PANEL = (3.5, 2.5)
 """Inches."""
 STYLE: dict[Any, Any] = {
@@ -54,7 +54,7 @@ class Series:
     """A line of the legend."""
 
     label: str
-    colour: str
+    color: str
     dash: Literal["-", "--", ":", "o"] = "-"
     """'-', '--' or ':'; 'o' is a hollow mark."""
 
@@ -82,7 +82,7 @@ class Chart:
 
 
 def panel_svg(chart: Chart, panel: Panel) -> str:
-    """One panel as an <svg> element that takes its colours from the page."""
+    """One panel as an <svg> element that takes its colors from the page."""
     with matplotlib.rc_context({**STYLE, "svg.hashsalt": f"{chart.name} {panel.title}"}):
         figure = Figure(figsize=(PANEL[0], panel.height), layout="constrained")
         axes = figure.subplots()
@@ -94,14 +94,14 @@ def panel_svg(chart: Chart, panel: Panel) -> str:
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
     svg = re.sub(r'<g id="[^"]*">', "<g>", svg)  # the same in every panel; nothing refers to them
     svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg))
-    for colour in THEME:
-        svg = svg.replace(colour, themed(colour))
+    for color in THEME:
+        svg = svg.replace(color, themed(color))
     return svg.replace("<svg ", '<svg aria-hidden="true" ', 1)
 
 
-def themed(colour: str) -> str:
-    """The page's variable that stands for a colour."""
-    return f"var(--{THEME[colour]})"
+def themed(color: str) -> str:
+    """The page's variable that stands for a color."""
+    return f"var(--{THEME[color]})"
 
 
 def chart_files(chart: Chart) -> dict[str, bytes]:
@@ -130,8 +130,8 @@ def chart_files(chart: Chart) -> dict[str, bytes]:
 
 def _handle(series: Series) -> Line2D:
     if series.dash == "o":
-        return Line2D([], [], color=series.colour, marker="o", fillstyle="none", linestyle="", label=series.label)
-    return Line2D([], [], color=series.colour, linestyle=series.dash, linewidth=2, label=series.label)
+        return Line2D([], [], color=series.color, marker="o", fillstyle="none", linestyle="", label=series.label)
+    return Line2D([], [], color=series.color, linestyle=series.dash, linewidth=2, label=series.label)
 
 
 def bars(axes: Axes, labels: Sequence[str], groups: Sequence[tuple[str, np.ndarray, np.ndarray]], unit: str) -> None:
@@ -139,13 +139,13 @@ def bars(axes: Axes, labels: Sequence[str], groups: Sequence[tuple[str, np.ndarr
 
     Args:
         labels: from top to bottom.
-        groups: colour, [n 3] value and its interval's ends, [n] the paper's values; NaN where there is none.
+        groups: color, [n 3] value and its interval's ends, [n] the paper's values; NaN where there is none.
         unit: of the values.
     """
     height = 0.8 / len(groups)
-    for g, (colour, values, paper) in enumerate(groups):
+    for g, (color, values, paper) in enumerate(groups):
         y = np.arange(len(labels)) + (g - (len(groups) - 1) / 2) * height
-        axes.barh(y, np.nan_to_num(values[:, 0]), height * 0.9, color=colour)
+        axes.barh(y, np.nan_to_num(values[:, 0]), height * 0.9, color=color)
         known = ~np.isnan(values[:, 1])
         axes.hlines(y[known], values[known, 1], values[known, 2], color=INK, linewidth=1)
         axes.plot(paper, y, "o", color=INK, fillstyle="none", markersize=4, markeredgewidth=1)
@@ -183,13 +183,13 @@ def lines(
     """Lines with bands: each with x [n], y [n] and the band's ends [n 2] or None."""
     for style, x, y, band in series:
         if band is not None:
-            axes.fill_between(x, band[:, 0], band[:, 1], color=style.colour, alpha=0.15, linewidth=0)
+            axes.fill_between(x, band[:, 0], band[:, 1], color=style.color, alpha=0.15, linewidth=0)
         marker = "o" if len(x) < 6 else None
-        axes.plot(x, y, style.dash, color=style.colour, linewidth=1.8, marker=marker, markersize=4)
+        axes.plot(x, y, style.dash, color=style.color, linewidth=1.8, marker=marker, markersize=4)
     axes.set_xlabel(xlabel)
     axes.set_ylabel(ylabel)
 
 
-def colour_of(names: Sequence[str]) -> Mapping[str, str]:
-    """A colour for each name, in order."""
+def color_of(names: Sequence[str]) -> Mapping[str, str]:
+    """A color for each name, in order."""
     return {name: SERIES[i % len(SERIES)] for i, name in enumerate(names)}

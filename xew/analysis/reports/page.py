@@ -126,7 +126,7 @@ def chart(shown: Chart) -> str:
 
 def _swatch(series: Series) -> str:
     kind = {"-": "line", "--": "dashed", ":": "dotted", "o": "ring"}[series.dash]
-    return f'<i class="{kind}" style="border-color: {themed(series.colour)}"></i>'
+    return f'<i class="{kind}" style="border-color: {themed(series.color)}"></i>'
 
 
 def claims(findings: Sequence[Finding], papers: Sequence[Finding] | None) -> str:
@@ -162,7 +162,7 @@ def _answers(answers: Sequence[Answer]) -> str:
     return f"<ul>{items}</ul>" if answers else ""
 
 
-def labelled_picture(source: str, caption: str, columns: Sequence[str], rows: Sequence[str]) -> str:
+def labeled_picture(source: str, caption: str, columns: Sequence[str], rows: Sequence[str]) -> str:
     """A sheet of pictures with the names of its columns above and of its rows at the left. The caption is HTML."""
     heads = "".join(f"<span>{escape(name)}</span>" for name in columns)
     sides = "".join(f"<span>{escape(name)}</span>" for name in rows)

@@ -17,7 +17,7 @@ FRAME = (208, 215, 222)
 
 
 def difference_picture(predicted: np.ndarray, observed: np.ndarray) -> np.ndarray:
-    """Largest channel difference of two uint8 frames [h w 3] as colour: white is none, black DIFFERENCE_FULL or more."""
+    """Largest channel difference of two uint8 frames [h w 3] as color: white is none, black DIFFERENCE_FULL or more."""
     difference = cv2.absdiff(predicted, observed).max(axis=-1) / DIFFERENCE_FULL
     picture = (matplotlib.colormaps["gist_heat_r"](np.minimum(difference, 1))[..., :3] * 255).astype(np.uint8)
     height, width = picture.shape[:2]

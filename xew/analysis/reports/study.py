@@ -259,7 +259,7 @@ def _part_section(content: Content, part: str) -> str:
     if part in content.strips:
         strip = content.strips[part]
         source = pictures.data_uri(strip.image)
-        parts.append(page.labelled_picture(source, page.escape(strip.caption), strip.columns, strip.rows))
+        parts.append(page.labeled_picture(source, page.escape(strip.caption), strip.columns, strip.rows))
     if FRAME_CHARTS.get(part) in content.charts:
         parts.append(page.chart(content.charts[FRAME_CHARTS[part]]))
     hidden = [content.tables[name] for name in folded if name in content.tables]

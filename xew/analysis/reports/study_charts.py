@@ -21,7 +21,7 @@ from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS
 BAR_METRICS = ("lpips", "region_lpips", "mask_iou", "pck")
 CURVE_METRIC = "lpips"
 BASELINE_STYLES = {COPY: "frozen first frame", TRUTH: "ground truth"}
-ROBOT_COLOURS = dict(zip(HELD_OUT_ROBOTS, SERIES, strict=False))
+ROBOT_COLORS = dict(zip(HELD_OUT_ROBOTS, SERIES, strict=False))
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,12 @@ def gain_chart(builder: Builder, steps: Steps) -> Chart:
         groups = []
         for robot in HELD_OUT_ROBOTS:
             chosen = data[(data["metric"] == metric) & (data["robot"] == robot)]
-            groups.append((ROBOT_COLOURS[robot], chosen[["gain", "low", "high"]].to_numpy(), chosen["paper"].to_numpy()))
+            groups.append((ROBOT_COLORS[robot], chosen[["gain", "low", "high"]].to_numpy(), chosen["paper"].to_numpy()))
         charts.bars(axes, labels, groups, f"better by [%], {steps.title}")
 
     height = 1.0 + 0.42 * len(steps.rows(HELD_OUT_ROBOTS[0]))
     panels = [Panel(METRIC_TITLES[metric], partial(draw, metric=metric), height) for metric in metrics]
-    legend = [Series(ROBOT_TITLES[robot], ROBOT_COLOURS[robot]) for robot in HELD_OUT_ROBOTS]
+    legend = [Series(ROBOT_TITLES[robot], ROBOT_COLORS[robot]) for robot in HELD_OUT_ROBOTS]
     caption = f"Relative improvement {steps.title}; to the right is better. Lines: 95 % intervals, paired by scene."
     if builder.paper:
         legend.append(Series("the paper", charts.INK, "o"))
@@ -183,8 +183,8 @@ def frame_chart(curves: pd.DataFrame, part: str, labels: Mapping[str, str]) -> C
     still = chosen[chosen["model"] == COPY].assign(row="frozen first frame")
     grouped = pd.concat([own, still]).groupby(["robot", "row", "frame"], sort=False)["value"]
     data = pd.DataFrame({"mean": grouped.mean(), "low": grouped.quantile(0.25), "high": grouped.quantile(0.75)}).reset_index()
-    colours = charts.colour_of(list(names.values()))
-    styles = [Series(label, colours[label]) for label in names.values() if label in set(own["row"])]
+    colors = charts.color_of(list(names.values()))
+    styles = [Series(label, colors[label]) for label in names.values() if label in set(own["row"])]
     styles += [Series("frozen first frame", SOFT, "--")] if len(still) else []
 
     def draw(axes: Axes, robot: str) -> None:
@@ -212,7 +212,7 @@ def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Seque
     grouped = shown.groupby(["metric", "robot", "row", "frame"], sort=False)["value"]
     data = pd.DataFrame({"mean": grouped.mean(), "low": grouped.quantile(0.25), "high": grouped.quantile(0.75)}).reset_index()
     own = [row for row in dict.fromkeys(shown["row"]) if row not in BASELINE_STYLES.values()]
-    styles = [Series(label, colour) for label, colour in charts.colour_of(own).items()]
+    styles = [Series(label, color) for label, color in charts.color_of(own).items()]
     dashes: Mapping[str, Literal["--", ":"]] = {COPY: "--", TRUTH: ":"}
     styles += [Series(BASELINE_STYLES[m], SOFT, dash) for m, dash in dashes.items() if BASELINE_STYLES[m] in set(data["row"])]
 
@@ -222,7 +222,7 @@ def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Seque
             line = data[(data["metric"] == metric.name) & (data["robot"] == robot) & (data["row"] == style.label)]
             line = line.sort_values("frame")  # the first episode may lack early frames
             if len(line):
-                band = line[["low", "high"]].to_numpy() if style.colour != SOFT else None
+                band = line[["low", "high"]].to_numpy() if style.color != SOFT else None
                 lines.append((style, line["frame"].to_numpy(), line["mean"].to_numpy(), band))
         charts.lines(axes, lines, "frame", metric_title(metric))
 

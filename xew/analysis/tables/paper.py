@@ -70,7 +70,7 @@ class PrintedBuilder(Builder):
 
 @cache
 def frame_distances() -> dict[Frame, np.ndarray]:
-    """Mean kinematic distances of our five robots to the other four by frame, a row for each seed [s 5], metres."""
+    """Mean kinematic distances of our five robots to the other four by frame, a row for each seed [s 5], meters."""
     robots = {name: ROBOTS[name] for name in ROBOT_NAMES}
     return {frame: mean_distances(measure(robots, SEEDS, frame).kinematic) for frame in FRAME_TITLES}
 
@@ -192,7 +192,7 @@ def base_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
         cells.append(tables.Cell(f"{floor[i]:.3f}", value=float(floor[i])))
         rows.append(Row((ROBOT_TITLES[name],), tuple(cells)))
     caption = (
-        f"Metres. ± is the standard deviation of one draw of configurations, over {len(SEEDS)} draws. Right: how far a robot "
+        f"Meters. ± is the standard deviation of one draw of configurations, over {len(SEEDS)} draws. Right: how far a robot "
         "is from itself by another draw in the root frame, which is what 4,000 points make of no distance at all."
     )
     columns = [Column(head) for head in ("As printed", *FRAME_TITLES.values(), "The same robot twice (ours)")]

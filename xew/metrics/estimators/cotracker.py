@@ -25,14 +25,14 @@ from xew.metrics.estimators.adapters import (
     torch_device,
 )
 
-LICENCE = "CoTracker3, code and weights, is CC-BY-NC 4.0: scores that use it are not for commercial use"
+LICENSE = "CoTracker3, code and weights, is CC-BY-NC 4.0: scores that use it are not for commercial use"
 INSTALL = "install it from the sources of github.com/facebookresearch/co-tracker, January 2025 or later (it is not on PyPI)"
 SHORTEST_OFFLINE = 17
 """Frames of time embedding: the online network has 16, the offline one 60."""
 
 
 def open_cotracker(checkpoint: Path) -> "CoTracker":
-    """CoTracker3 offline from a local `scaled_offline.pth`, on the thread's GPU or else the CPU; says its licence on stderr.
+    """CoTracker3 offline from a local `scaled_offline.pth`, on the thread's GPU or else the CPU; says its license on stderr.
 
     Raises:
         ConfigError: PyTorch or the package `cotracker` is absent, or the file is damaged or of another network.
@@ -43,7 +43,7 @@ def open_cotracker(checkpoint: Path) -> "CoTracker":
         predictor = package.CoTrackerPredictor(checkpoint=str(checkpoint), offline=True, v2=False, window_len=window)
     except RuntimeError as error:
         raise ConfigError(f"{checkpoint} is no checkpoint of CoTracker3 offline: {str(error)[:300]}") from error
-    print(f"note: {LICENCE}", file=sys.stderr)
+    print(f"note: {LICENSE}", file=sys.stderr)
     return CoTracker(predictor.to(torch_device()))
 
 

@@ -24,7 +24,7 @@ RAFT_WIDTHS = {64: "raft_large", 32: "raft_small"}
 
 
 def dis_flow(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Dense inverse search (Kroeger et al. 2016) of OpenCV, medium preset, on grey images.
+    """Dense inverse search (Kroeger et al. 2016) of OpenCV, medium preset, on gray images.
 
     Args:
         start, end: [n h w 3] uint8 RGB, at least 12 pixels a side.

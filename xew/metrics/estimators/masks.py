@@ -2,7 +2,7 @@
 
 Each predicted frame is read with the help of the true episode, whose masks are known. Three kinds of evidence add up, as
 log-likelihood ratios learnt from the true video itself:
-    colour      how much more often the robot has this colour than everything else has
+    color      how much more often the robot has this color than everything else has
     background  how far the pixel is from the empty scene behind it (the camera stands still)
     shape       a true mask, carried along by optical flow onto the predicted frame: that of the same frame or, where it
                 explains a pixel better, that of the true frame which looks most like the predicted one; where neither does,
@@ -21,7 +21,7 @@ import numpy as np
 
 from xew.metrics.estimators.alike import most_alike
 
-COLOUR_BINS = 24
+COLOR_BINS = 24
 """Per channel of Lab."""
 LEARNING_FRAMES = 32
 """The appearance is learnt from at most so many frames, spread evenly."""
@@ -32,7 +32,7 @@ RESIDUAL_SOFTNESS = 1.5
 EVIDENCE_LIMIT = 4.0
 """No single kind of evidence may say more than exp(4) : 1; histograms of one episode know no better."""
 SHAPE_WEIGHT = 9.0
-"""More than both other kinds together: where flow explains a pixel fully, an object in the robot's colours stays out."""
+"""More than both other kinds together: where flow explains a pixel fully, an object in the robot's colors stays out."""
 SHAPE_REACH = 1.0
 """Pixels from the carried contour at which shape evidence is three quarters of its full weight."""
 SHAPE_TRUST = 0.8
@@ -40,7 +40,7 @@ SHAPE_TRUST = 0.8
 SMALLEST_PIECE = 24
 """Pixels; what is smaller is the rim of some object, not a robot."""
 RESIDUAL_SCALE = 25.0
-"""Colour difference (levels) between a pixel and the one that flow says it came from, at which the gate is 1/e."""
+"""Color difference (levels) between a pixel and the one that flow says it came from, at which the gate is 1/e."""
 CLOSURE_SCALE = 3.0
 """Distance (pixels) by which flow there and back misses its start, at which the gate is 1/e."""
 
@@ -49,8 +49,8 @@ CLOSURE_SCALE = 3.0
 class Appearance:
     """What the true episode teaches of its robot's looks."""
 
-    colour: np.ndarray
-    """[bins bins bins] float32, log-likelihood ratio robot : rest of a Lab colour."""
+    color: np.ndarray
+    """[bins bins bins] float32, log-likelihood ratio robot : rest of a Lab color."""
     background: np.ndarray
     """[h w 3] uint8, the scene without the robot; what no frame uncovers is filled in from around."""
     difference: np.ndarray
@@ -86,18 +86,18 @@ def estimate_masks(
 def learn_appearance(video: np.ndarray, mask: np.ndarray) -> Appearance:
     """Learn the looks of a robot and its background from true video [t h w 3] uint8 and masks [t h w] bool.
 
-    Colours and differences are learnt from the frames as they are and softened, as predicted video is: else every soft
+    Colors and differences are learnt from the frames as they are and softened, as predicted video is: else every soft
     edge of an object would differ from the background as only a robot does.
     """
     picked = np.unique(np.linspace(0, len(video) - 1, LEARNING_FRAMES).round().astype(int))
     background, uncovered = _background(video[picked], mask[picked])
     video = np.concatenate([video[picked], *([_soften(frame, s) for frame in video[picked]] for s in SOFTNESS)])
     mask = np.tile(mask[picked], (1 + len(SOFTNESS), 1, 1))
-    colour = _colour_bins(video)
+    color = _color_bins(video)
     difference = np.stack([_difference(frame, background) for frame in video])
     seen = np.broadcast_to(uncovered, mask.shape)
     return Appearance(
-        colour=_log_ratio(colour, mask, COLOUR_BINS**3, smooth=(COLOUR_BINS,) * 3),
+        color=_log_ratio(color, mask, COLOR_BINS**3, smooth=(COLOR_BINS,) * 3),
         background=background,
         difference=_log_ratio(difference[seen], mask[seen], 256, smooth=(256,)),
         uncovered=uncovered,
@@ -119,10 +119,10 @@ def _estimate_frame(
 
 
 def _looks(appearance: Appearance, frame: np.ndarray) -> np.ndarray:
-    """[h w] float32, evidence of colour and background."""
-    colour = appearance.colour.reshape(-1)[_colour_bins(frame)]
+    """[h w] float32, evidence of color and background."""
+    color = appearance.color.reshape(-1)[_color_bins(frame)]
     difference = appearance.difference[_difference(frame, appearance.background)]
-    looks = np.clip(colour, -EVIDENCE_LIMIT, EVIDENCE_LIMIT)
+    looks = np.clip(color, -EVIDENCE_LIMIT, EVIDENCE_LIMIT)
     looks += np.where(appearance.uncovered, np.clip(difference, -EVIDENCE_LIMIT, EVIDENCE_LIMIT), 0)
     return cv2.GaussianBlur(looks.astype(np.float32), (0, 0), 0.8)
 
@@ -157,9 +157,9 @@ def _drop_specks(mask: np.ndarray) -> np.ndarray:
 
 def _carried_shape(frame: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> Shape:
     """A true frame's mask carried onto a predicted frame by flow."""
-    grey, grey_target = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame, target))
-    there, back = _flow(grey, grey_target), _flow(grey_target, grey)
-    source = _grid(grey.shape) + there
+    gray, gray_target = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame, target))
+    there, back = _flow(gray, gray_target), _flow(gray_target, gray)
+    source = _grid(gray.shape) + there
     closure = np.hypot(*cv2.split(there + _sample(back, source)))
     soft_frame, soft_target = (_soften(image, RESIDUAL_SOFTNESS).astype(np.float32) for image in (frame, target))
     residual = _difference(soft_frame, _sample(soft_target, source))
@@ -172,7 +172,7 @@ def _soften(image: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _flow(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """[h w 2] pixels from each pixel of one grey image to its place in the other (DIS)."""
+    """[h w 2] pixels from each pixel of one gray image to its place in the other (DIS)."""
     return cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(start, end, None)
 
 
@@ -210,11 +210,11 @@ def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return functools.reduce(np.maximum, cv2.split(cv2.absdiff(a, b)))
 
 
-def _colour_bins(video: np.ndarray) -> np.ndarray:
-    """Index of each pixel's Lab colour among the bins."""
+def _color_bins(video: np.ndarray) -> np.ndarray:
+    """Index of each pixel's Lab color among the bins."""
     flat = video.reshape(-1, video.shape[-2], 3)
-    lab = cv2.cvtColor(flat, cv2.COLOR_RGB2LAB).reshape(video.shape).astype(np.int32) * COLOUR_BINS // 256
-    return (lab[..., 0] * COLOUR_BINS + lab[..., 1]) * COLOUR_BINS + lab[..., 2]
+    lab = cv2.cvtColor(flat, cv2.COLOR_RGB2LAB).reshape(video.shape).astype(np.int32) * COLOR_BINS // 256
+    return (lab[..., 0] * COLOR_BINS + lab[..., 1]) * COLOR_BINS + lab[..., 2]
 
 
 def _log_ratio(values: np.ndarray, robot: np.ndarray, count: int, smooth: tuple[int, ...]) -> np.ndarray:
@@ -228,7 +228,7 @@ def _log_ratio(values: np.ndarray, robot: np.ndarray, count: int, smooth: tuple[
 
 
 def _blur(histogram: np.ndarray) -> np.ndarray:
-    """Each bin shared with its neighbours along every axis, 1 : 2 : 1."""
+    """Each bin shared with its neighbors along every axis, 1 : 2 : 1."""
     for axis in range(histogram.ndim):
         padded = np.pad(histogram, [(1, 1) if i == axis else (0, 0) for i in range(histogram.ndim)], mode="edge")
         before, after = (np.take(padded, range(s, s + histogram.shape[axis]), axis) for s in (0, 2))

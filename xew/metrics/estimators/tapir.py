@@ -64,7 +64,7 @@ class Tapir:
         if len(asked) == 0:
             return tracks
         scale = SIDE / np.array(prediction.shape[2:0:-1], np.float32)  # of x and y
-        # Its pixels' centres are at halves, ours at whole numbers.
+        # Its pixels' centers are at halves, ours at whole numbers.
         x, y = ((points[frames[asked], asked] + 0.5) * scale).T
         queries = np.column_stack([frames[asked], y, x]).astype(np.float32)
         found, seen = (np.asarray(array) for array in self._run(self._weights, _resize(prediction), queries))

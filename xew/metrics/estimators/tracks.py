@@ -61,7 +61,7 @@ class _TrueFrame:
 
     soft: np.ndarray
     """[h w 3] uint8, softened."""
-    grey: np.ndarray
+    gray: np.ndarray
     points: np.ndarray
     """[k 2] float32 [pixels]."""
     visible: np.ndarray
@@ -73,7 +73,7 @@ def estimate_tracks(prediction: np.ndarray, target: np.ndarray, points: np.ndarr
 
     Args:
         prediction, target: [t h w 3] uint8 RGB, predicted and true video of one episode, same frames.
-        points: [t k 2] float32, true projections [pixels, x right, y down, the centre of the first pixel at 0].
+        points: [t k 2] float32, true projections [pixels, x right, y down, the center of the first pixel at 0].
         visible: [t k] bool, where a true point is seen; elsewhere nothing is looked for.
 
     Returns:
@@ -83,18 +83,18 @@ def estimate_tracks(prediction: np.ndarray, target: np.ndarray, points: np.ndarr
     points = np.nan_to_num(points).astype(np.float32)
     if points.shape[1] == 0:
         return points
-    greys, true_greys = (np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in v]) for v in (prediction, target))
+    grays, true_grays = (np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in v]) for v in (prediction, target))
     alike, difference = most_alike(prediction, target)
-    truth = [_TrueFrame(_soften(frame), *rest) for frame, *rest in zip(target, true_greys, points, visible, strict=True)]
+    truth = [_TrueFrame(_soften(frame), *rest) for frame, *rest in zip(target, true_grays, points, visible, strict=True)]
     paths = _Paths()
     carried = np.repeat(points[0][:, None], 3 + PEAKS, axis=1)
     inner = np.zeros_like(points[0])
     for t, frame in enumerate(prediction):
         if t:
-            carried = _follow(paths.places[-1], greys[t - 1], greys[t])
+            carried = _follow(paths.places[-1], grays[t - 1], grays[t])
             inner = _inner_motion(truth[t - 1], truth[t])
         same, other = truth[t], truth[alike[t]] if alike[t] != t else None
-        place, cost = _propose(_soften(frame), greys[t], same, other, paths.cheapest(carried))
+        place, cost = _propose(_soften(frame), grays[t], same, other, paths.cheapest(carried))
         if other is not None and difference[t] < SAME_MOMENT:
             hidden = ~other.visible
             place[hidden, 1], cost[hidden, 1] = other.points[hidden], HIDDEN
@@ -107,7 +107,7 @@ def estimate_tracks(prediction: np.ndarray, target: np.ndarray, points: np.ndarr
 
 
 def _propose(
-    frame: np.ndarray, grey: np.ndarray, same: _TrueFrame, other: _TrueFrame | None, carried: np.ndarray
+    frame: np.ndarray, gray: np.ndarray, same: _TrueFrame, other: _TrueFrame | None, carried: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places [k 3 + PEAKS 2] where the points of a frame may be, and their costs [k 3 + PEAKS].
 
@@ -117,20 +117,20 @@ def _propose(
     cost = np.full(place.shape[:2], GIVEN_UP)
     sources = [same] if other is None else [same, other]
     for column, source in enumerate(sources):
-        place[source.visible, column] = _flow_points(source, grey)[source.visible]
+        place[source.visible, column] = _flow_points(source, gray)[source.visible]
     place[:, 2] = carried
     for source in sources:
-        _improve(place, cost, slice(0, 3), frame, grey, source)
+        _improve(place, cost, slice(0, 3), frame, gray, source)
     unsure = same.visible & (np.min(cost, axis=1) > 1 - SURE)
     if unsure.any():
         place[unsure, 3:] = _search(frame, same.soft, same.points[unsure])
         for source in sources:
-            _improve(place, cost, slice(3, None), frame, grey, source)
+            _improve(place, cost, slice(3, None), frame, gray, source)
     return np.where(np.isfinite(place), place, 0), cost
 
 
 def _improve(
-    place: np.ndarray, cost: np.ndarray, columns: slice, frame: np.ndarray, grey: np.ndarray, source: _TrueFrame
+    place: np.ndarray, cost: np.ndarray, columns: slice, frame: np.ndarray, gray: np.ndarray, source: _TrueFrame
 ) -> None:
     """Shift proposals to their best fit to a true frame, and take over what fits better than before."""
     proposed = np.isfinite(place[:, columns]).all(-1) & source.visible[:, None]
@@ -139,7 +139,7 @@ def _improve(
         return
     column = column + (columns.start or 0)
     start = place[point, column]
-    fitted = _flow_points(source, grey, point, start)
+    fitted = _flow_points(source, gray, point, start)
     near = np.linalg.norm(fitted - start, axis=-1) < REFINEMENT
     fitted = np.where(near[:, None], fitted, start)
     like = likeness(frame, fitted, source.soft, source.points[point])
@@ -161,7 +161,7 @@ def _stands_there(
 def likeness(image: np.ndarray, places: np.ndarray, true_image: np.ndarray, points: np.ndarray) -> np.ndarray:
     """[n] how alike the patches round places [n 2] of one image and points [n 2] of another are: 1 equal, 0 unrelated.
 
-    One less the mean squared difference over the sum of both variances; brightness and colour count, not contrast alone.
+    One less the mean squared difference over the sum of both variances; brightness and color count, not contrast alone.
     Only what lies inside both images is compared; of a place or point far outside the answer says nothing.
     """
     patch, true_patch = _patches(image, places), _patches(true_image, points)
@@ -176,7 +176,7 @@ def likeness(image: np.ndarray, places: np.ndarray, true_image: np.ndarray, poin
 
 
 def _patches(image: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """[n p 3] float32 colours round points [n 2], read between the pixels."""
+    """[n p 3] float32 colors round points [n 2], read between the pixels."""
     return _sample(image, _around(points)).astype(np.float32)
 
 
@@ -194,19 +194,19 @@ def _inside(points: np.ndarray, image: np.ndarray) -> np.ndarray:
 
 
 def _flow_points(
-    source: _TrueFrame, grey: np.ndarray, index: np.ndarray | None = None, start: np.ndarray | None = None
+    source: _TrueFrame, gray: np.ndarray, index: np.ndarray | None = None, start: np.ndarray | None = None
 ) -> np.ndarray:
     """Where Lucas-Kanade flow takes a true frame's points, or those of an index [n] from a first guess [n 2]."""
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.03)
     points = source.points if index is None else source.points[index]
     if start is None:
         found, _, _ = cv2.calcOpticalFlowPyrLK(
-            source.grey, grey, points[:, None], None, winSize=(15, 15), maxLevel=3, criteria=criteria
+            source.gray, gray, points[:, None], None, winSize=(15, 15), maxLevel=3, criteria=criteria
         )
     else:
         found, _, _ = cv2.calcOpticalFlowPyrLK(
-            source.grey,
-            grey,
+            source.gray,
+            gray,
             points[:, None],
             start[:, None].copy(),
             winSize=(15, 15),
@@ -225,7 +225,7 @@ def _search(frame: np.ndarray, true_frame: np.ndarray, points: np.ndarray) -> np
     variance = _local_variance(small, 2 * half + 1)
     found = np.full((len(points), PEAKS, 2), np.nan, np.float32)
     for i, point in enumerate(points):
-        x, y = np.round((point - 0.5) / 2).astype(int)  # the centre of small pixel i is at 2 i + 0.5
+        x, y = np.round((point - 0.5) / 2).astype(int)  # the center of small pixel i is at 2 i + 0.5
         patch = true_small[y + reach : y + reach + 2 * half + 1, x + reach : x + reach + 2 * half + 1]
         window = small[y : y + 2 * margin + 1, x : x + 2 * margin + 1]
         if patch.shape[:2] != (2 * half + 1, 2 * half + 1) or window.shape[:2] != (2 * margin + 1, 2 * margin + 1):
@@ -265,14 +265,14 @@ def _local_variance(image: np.ndarray, side: int) -> np.ndarray:
 
 
 def _follow(places: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Places [... 2] of one grey image, carried to the next by dense optical flow."""
+    """Places [... 2] of one gray image, carried to the next by dense optical flow."""
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(before, after, None)
     return places + _sample(flow, places.reshape(1, -1, 2)).reshape(places.shape)
 
 
 def _inner_motion(before: _TrueFrame, after: _TrueFrame) -> np.ndarray:
     """[k 2] how each true point moves otherwise than flow says; 0 where that is unknown or too much to be believed."""
-    inner = after.points - _follow(before.points, before.grey, after.grey)
+    inner = after.points - _follow(before.points, before.gray, after.gray)
     sane = before.visible & after.visible & (np.linalg.norm(inner, axis=-1) < INNER_MOTION)
     return np.where(sane[:, None], inner, 0)
 

@@ -43,8 +43,8 @@ class Summary:
     """What was resampled, a key of UNITS."""
 
 
-def summarise(rows: pd.DataFrame, unit: str = "scene", robots_first: Sequence[str] = ()) -> Summary:
-    """Summarise a score table.
+def summarize(rows: pd.DataFrame, unit: str = "scene", robots_first: Sequence[str] = ()) -> Summary:
+    """Summarize a score table.
 
     Args:
         rows: model condition task seed robot metric value.

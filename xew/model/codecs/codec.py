@@ -156,8 +156,8 @@ class Basis:
 
     def encode(self, patches: Array) -> Array:
         """[... p] -> [... c]. At the highest precision: TF32, the default of some GPUs, costs the codec decibels."""
-        centred = patches - over_last(self.mean, patches.ndim)
-        return jnp.matmul(centred, self.directions, precision=lax.Precision.HIGHEST) / over_last(self.scale, patches.ndim)
+        centered = patches - over_last(self.mean, patches.ndim)
+        return jnp.matmul(centered, self.directions, precision=lax.Precision.HIGHEST) / over_last(self.scale, patches.ndim)
 
     def decode(self, latents: Array) -> Array:
         """[... c] -> [... p]."""
@@ -276,7 +276,7 @@ class WanVaeCodec(BatchCodec):
         return nnx.merge(self.graph, self.params)
 
     def encode_batch(self, frames: Array) -> Array:
-        """Float [b t h w 3] in [-1, 1] -> float32 [b t' h' w' c]: normalised means, as Wan's diffusion takes them."""
+        """Float [b t h w 3] in [-1, 1] -> float32 [b t' h' w' c]: normalized means, as Wan's diffusion takes them."""
         return self.vae.encode(frames, self.chunk)
 
     def decode_batch(self, latents: Array) -> Array:
@@ -390,11 +390,11 @@ def join_patches(first: Array, later: Array, factor: int) -> Array:
     return frames.transpose(0, 1, 2, 4, 3, 5, 6).reshape(b, -1, h * factor, w * factor, 3)
 
 
-def _fit(patches: np.ndarray, channels: int, whitening: float, centred: bool) -> Basis:
+def _fit(patches: np.ndarray, channels: int, whitening: float, centered: bool) -> Basis:
     """Leading principal directions of patches [m p], by the eigenvectors of their second moments."""
-    mean = patches.mean(0) if centred else np.zeros(patches.shape[1], np.float32)
-    centred_patches = patches - mean
-    moments = centred_patches.T.astype(np.float64) @ centred_patches.astype(np.float64) / len(patches)
+    mean = patches.mean(0) if centered else np.zeros(patches.shape[1], np.float32)
+    centered_patches = patches - mean
+    moments = centered_patches.T.astype(np.float64) @ centered_patches.astype(np.float64) / len(patches)
     values, vectors = np.linalg.eigh(moments)
     variance = np.maximum(values[::-1][:channels], 1e-8)
     directions = vectors[:, ::-1][:, :channels]

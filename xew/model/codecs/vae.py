@@ -104,7 +104,7 @@ class VideoVae(nnx.Module):
         self.latents_mean, self.latents_std = LatentStatistic(mean), LatentStatistic(std)
 
     def moments(self, frames: Array, chunk: int = 0) -> tuple[Array, Array]:
-        """Mean and log variance of the latents, not normalised.
+        """Mean and log variance of the latents, not normalized.
 
         Args:
             frames: [b t h w 3] in [-1, 1]; t = 4 k + 1, sides multiples of the size's factor.
@@ -123,11 +123,11 @@ class VideoVae(nnx.Module):
         return mean, jnp.clip(log_variance, *LOG_VARIANCE_RANGE)
 
     def encode(self, frames: Array, chunk: int = 0) -> Array:
-        """Normalised mean latents [b k+1 h' w' c] float32; arguments as of `moments`."""
-        return self.normalise(self.moments(frames, chunk)[0])
+        """Normalized mean latents [b k+1 h' w' c] float32; arguments as of `moments`."""
+        return self.normalize(self.moments(frames, chunk)[0])
 
     def decode(self, latents: Array, chunk: int = 0, *, last_only: bool = False) -> Array:
-        """Frames of normalised latents.
+        """Frames of normalized latents.
 
         Args:
             latents: [b t' h' w' c].
@@ -151,12 +151,12 @@ class VideoVae(nnx.Module):
         decoded = in_chunks(step, self.post_quant(latents.astype(self.dtype)), chunk)
         return (decoded[:, -1:] if last_only else decoded).astype(jnp.float32)
 
-    def normalise(self, mean: Array) -> Array:
+    def normalize(self, mean: Array) -> Array:
         """Latents of about unit size."""
         return (mean - _row(self.latents_mean[...])) / _row(self.latents_std[...])
 
     def denormalise(self, latents: Array) -> Array:
-        """The inverse of `normalise`."""
+        """The inverse of `normalize`."""
         return latents.astype(jnp.float32) * _row(self.latents_std[...]) + _row(self.latents_mean[...])
 
     def _check(self, shape: tuple[int, ...]) -> None:

@@ -108,7 +108,7 @@ class Block(nnx.Module):
 
 
 class Attention(nnx.Module):
-    """Multi-head attention; queries and keys are normalised over the full width, before they are split into heads."""
+    """Multi-head attention; queries and keys are normalized over the full width, before they are split into heads."""
 
     def __init__(self, size: ModelSize, dtype: jnp.dtype, implementation: AttentionName, rngs: nnx.Rngs) -> None:
         self.heads, self.dtype, self.implementation = size.heads, dtype, implementation
@@ -208,8 +208,8 @@ class TwoLayer(nnx.Module):
 def modulate(tokens: Array, shift: Array, scale: Array, dtype: jnp.dtype = jnp.float32) -> Array:
     """LayerNorm without parameters in float32, then scale and shift [b s d], rounded once for all who read it."""
     tokens = tokens.astype(jnp.float32)
-    centred = tokens - tokens.mean(-1, keepdims=True)
-    normed = centred * jax.lax.rsqrt(jnp.square(centred).mean(-1, keepdims=True) + EPSILON)
+    centered = tokens - tokens.mean(-1, keepdims=True)
+    normed = centered * jax.lax.rsqrt(jnp.square(centered).mean(-1, keepdims=True) + EPSILON)
     return (normed * (1 + scale) + shift).astype(dtype)
 
 
@@ -249,7 +249,7 @@ _gather_rows.defvjp(_gather_rows_forward, _gather_rows_backward)
 
 
 def rotate(values: Array, rotary: Rotary) -> Array:
-    """Turn neighbouring pairs of features of [b s n k] by each token's angles, in float32."""
+    """Turn neighboring pairs of features of [b s n k] by each token's angles, in float32."""
     cos, sin = (table[None, :, None, :, None] for table in rotary)
     pairs = values.reshape(*values.shape[:-1], -1, 2)
     return (pairs * cos + pairs[..., ::-1] * jnp.concatenate([-sin, sin], axis=-1)).reshape(values.shape)

@@ -1,6 +1,6 @@
 """Bottles, cans, pill bottles and pots: closed containers, drawn from a random stream so that no two need be alike.
 
-Each function returns a `Shape` in the object's own frame: z up, origin at the centre of the bottom face, round about z.
+Each function returns a `Shape` in the object's own frame: z up, origin at the center of the bottom face, round about z.
 What collides is a column of few flat sides, whose flats look along x and y: a finger pad that meets one lies on it, and a
 bottle lying on one does not roll. The looks lie inside of it by at most 8 % of the radius. Sizes follow RoboTwin 2.0's,
 brought down to what a parallel gripper of 80 mm can hold.
@@ -58,13 +58,13 @@ def turned(outline: Outline, color: Color, bands: Sequence[Band] = (), facing: f
         facing: the direction of the labels' fronts about z [rad].
     """
     mesh = meshes.revolve([(0.0, outline[0][1]), *outline, (0.0, outline[-1][1])], color, SECTIONS)
-    centres = mesh.vertices[mesh.triangles].mean(1)
+    centers = mesh.vertices[mesh.triangles].mean(1)
     sector = 2 * np.pi / SECTIONS
-    around = (np.floor(np.arctan2(centres[:, 1], centres[:, 0]) / sector) + 0.5) * sector
+    around = (np.floor(np.arctan2(centers[:, 1], centers[:, 0]) / sector) + 0.5) * sector
     away = np.abs((around - facing + np.pi) % (2 * np.pi) - np.pi)
     colors = mesh.colors.copy()
     for band in bands:
-        inside = (centres[:, 2] > band.low) & (centres[:, 2] < band.high)
+        inside = (centers[:, 2] > band.low) & (centers[:, 2] < band.high)
         colors[inside] = band.color
         colors[inside & (away < np.pi / 3)] = band.front or band.color
     return Mesh(mesh.vertices, mesh.triangles, colors, mesh.normals)
@@ -85,7 +85,7 @@ def column(radii: tuple[float, float], low: float, high: float, sides: int) -> n
 
 
 def balance(shape: Shape) -> np.ndarray:
-    """[3] centre of mass [m] of a shape's convex pieces, all of one density."""
+    """[3] center of mass [m] of a shape's convex pieces, all of one density."""
     pieces = [trimesh.convex.convex_hull(np.asarray(points, float)) for points in shape.hulls]
     volumes = np.array([piece.volume for piece in pieces])
     return np.array(volumes @ [piece.center_mass for piece in pieces] / volumes.sum())
@@ -97,7 +97,7 @@ def height(shape: Shape) -> float:
 
 
 def palette(rng: np.random.Generator, count: int) -> list[str]:
-    """Names of different colours of `objects.PALETTE`."""
+    """Names of different colors of `objects.PALETTE`."""
     return [str(name) for name in rng.permutation(sorted(objects.PALETTE))[:count]]
 
 
@@ -105,7 +105,7 @@ def palette(rng: np.random.Generator, count: int) -> list[str]:
 
 
 def can(rng: np.random.Generator) -> tuple[Shape, str]:
-    """A tin can with a paper label, and its colour's name: radius 25 to 29 mm, 88 to 108 mm high."""
+    """A tin can with a paper label, and its color's name: radius 25 to 29 mm, 88 to 108 mm high."""
     radius, top = rng.uniform([0.025, 0.088], [0.029, 0.108])
     label, stripe = palette(rng, 2)
     middle = rng.uniform(0.35, 0.65) * top
@@ -129,7 +129,7 @@ def can(rng: np.random.Generator) -> tuple[Shape, str]:
 
 
 def pill_bottle(rng: np.random.Generator) -> tuple[Shape, str]:
-    """A short bottle with a wide screw cap, and the name of its body's colour: radius 23 to 27 mm, 80 to 100 mm high."""
+    """A short bottle with a wide screw cap, and the name of its body's color: radius 23 to 27 mm, 80 to 100 mm high."""
     radius, top = rng.uniform([0.023, 0.080], [0.027, 0.100])
     cap = rng.uniform(0.018, 0.023)
     name, color = _pill_colors()[rng.integers(len(_pill_colors()))]
@@ -188,7 +188,7 @@ def lying(name: str, shape: Shape, xy: Point, yaw: float, mass: float) -> SceneO
 
 
 def bottle(rng: np.random.Generator) -> tuple[Shape, str]:
-    """A bottle of one of four kinds, and its colour's name: 165 to 205 mm long, 50 to 60 mm wide."""
+    """A bottle of one of four kinds, and its color's name: 165 to 205 mm long, 50 to 60 mm wide."""
     kinds = (_drink_bottle, _sauce_bottle, _flask, _shampoo)
     return kinds[rng.integers(len(kinds))](rng)
 
@@ -287,10 +287,10 @@ def _rounded(width: float, depth: float, low: float, high: float, edge: float = 
 
 
 def pot(rng: np.random.Generator, radius: tuple[float, float], height: tuple[float, float], reach: float) -> tuple[Shape, str]:
-    """A cooking pot with a loop handle at either end of its x axis, lidded or open, and its colour's name.
+    """A cooking pot with a loop handle at either end of its x axis, lidded or open, and its color's name.
 
     Args:
-        rng: for its size, colours and lid.
+        rng: for its size, colors and lid.
         radius, height: of the body, ranges [m].
         reach: of the handles' bars beyond the body [m].
     """

@@ -1,7 +1,7 @@
 """Everyday objects that several tasks share: their looks, what they collide with, and how a hand takes them from above.
 
-Each function of `THINGS` draws one variant (form, size, colour) and returns a `Thing` in the object's own frame: z up,
-origin at the centre of the bottom face, the longer side along y, so that fingers that open along x take it across.
+Each function of `THINGS` draws one variant (form, size, color) and returns a `Thing` in the object's own frame: z up,
+origin at the center of the bottom face, the longer side along y, so that fingers that open along x take it across.
 Kinds and sizes follow RoboTwin 2.0's objects, brought down to what a parallel gripper of 80 mm can hold (graspable
 widths at most 65 mm). Looks are built from few flat pieces; what collides is one to three convex hulls.
 """
@@ -36,12 +36,12 @@ MATS: dict[str, Color] = {name: COLORS[name] for name in ("red", "green", "blue"
     "cyan": (70, 190, 205),
     "magenta": (190, 60, 150),
 }
-"""RoboTwin's eight colours of the mats on which things are put."""
+"""RoboTwin's eight colors of the mats on which things are put."""
 MAT_THICKNESS = 0.001
 
 
 def mat_color(rng: np.random.Generator, words: str) -> str:
-    """A colour out of `MATS` that differs from that of the thing, called `words`, that is to lie on the mat."""
+    """A color out of `MATS` that differs from that of the thing, called `words`, that is to lie on the mat."""
     return str(rng.choice([name for name in sorted(MATS) if name not in words.split()]))
 
 
@@ -127,7 +127,7 @@ def slab(size: Sequence[float], cut: float, color: Color, z: float = 0.0) -> Mes
 
 
 def part(size: Sequence[float], at: Sequence[float], color: Color) -> Mesh:
-    """A decoration: a box of full edge lengths `size` [m] about the centre `at`."""
+    """A decoration: a box of full edge lengths `size` [m] about the center `at`."""
     return meshes.box(size, color).transformed(at)
 
 
@@ -310,7 +310,7 @@ CUBE_FACES: tuple[Color, ...] = ((200, 45, 40), (225, 120, 45), (240, 240, 235),
 
 
 def rubik_cube(rng: np.random.Generator) -> Thing:
-    """A magic cube, scrambled (every sticker of a random colour) or solved."""
+    """A magic cube, scrambled (every sticker of a random color) or solved."""
     edge = rng.uniform(0.048, 0.057)
     scrambled = rng.random() < 0.7
     colors = rng.permutation(54) // 9 if scrambled else np.repeat(np.arange(6), 9)
@@ -401,7 +401,7 @@ def wooden_block(rng: np.random.Generator) -> Thing:
 
 
 def tea_box(rng: np.random.Generator) -> Thing:
-    """A carton of tea: a coloured box with a pale label and a leaf on it."""
+    """A carton of tea: a colored box with a pale label and a leaf on it."""
     name, color = _color(rng, ("green", "teal", "red", "purple", "yellow"))
     width, length, height = rng.uniform([0.048, 0.070, 0.042], [0.060, 0.092, 0.060])
     leaf = meshes.cylinder(0.013, 2 * SKIN, (70, 125, 60), sections=16)
@@ -419,7 +419,7 @@ def tea_box(rng: np.random.Generator) -> Thing:
 
 
 def coffee_box(rng: np.random.Generator) -> Thing:
-    """A carton of coffee: a dark box with a coloured label and a bean on it."""
+    """A carton of coffee: a dark box with a colored label and a bean on it."""
     box: Color = ((84, 54, 38), (58, 44, 40), (120, 72, 44))[rng.integers(3)]
     name, label = _color(rng, ("orange", "yellow", "red", "gray"))
     width, length, height = rng.uniform([0.050, 0.066, 0.044], [0.062, 0.084, 0.062])

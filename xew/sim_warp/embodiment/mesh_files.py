@@ -1,9 +1,9 @@
-"""Mesh files to coloured triangles: what trimesh reads, with the texture sampled to one colour a triangle.
+"""Mesh files to colored triangles: what trimesh reads, with the texture sampled to one color a triangle.
 
 Reads  a mesh file and what it names in turn (materials, textures), by trimesh and Pillow
-Writes `Part`s: triangles with colours of their own, or none where the file says nothing of colour
+Writes `Part`s: triangles with colors of their own, or none where the file says nothing of color
 
-The renderer shades one colour a triangle, so a texture is sampled at seven points of each and averaged: patterns finer than
+The renderer shades one color a triangle, so a texture is sampled at seven points of each and averaged: patterns finer than
 the triangles are lost, everything else looks as it should.
 """
 
@@ -71,7 +71,7 @@ def read_mesh(path: Path) -> MeshFile:
 
 
 def face_colors(shape: trimesh.Trimesh) -> np.ndarray | None:
-    """[f 3] uint8 colours of the triangles by the mesh's own texture, material or vertex colours; None without any."""
+    """[f 3] uint8 colors of the triangles by the mesh's own texture, material or vertex colors; None without any."""
     visual = shape.visual
     if isinstance(visual, TextureVisuals):
         return _textured(shape, visual)
@@ -81,7 +81,7 @@ def face_colors(shape: trimesh.Trimesh) -> np.ndarray | None:
 
 
 def sampled(image: Any, uv: np.ndarray, faces: np.ndarray, factor: np.ndarray) -> np.ndarray:
-    """Mean colours of triangles under a texture.
+    """Mean colors of triangles under a texture.
 
     Args:
         image: a Pillow image, sRGB.

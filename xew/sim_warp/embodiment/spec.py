@@ -20,7 +20,7 @@ class Arm:
     """The link that carries the tool frame."""
     tool_pose: Pose
     """Tool frame in `tool_link`: x approach (out of the hand), y along which the fingers open, origin between
-    the finger pads where an object is held (the tool centre point, TCP)."""
+    the finger pads where an object is held (the tool center point, TCP)."""
     fingers: tuple[str, str]
     """The two prismatic joints of the gripper."""
     finger_closed: tuple[float, float]

@@ -1,7 +1,7 @@
-"""Reading URDFs: `load_urdf(path)` gives links, joints, coloured meshes and convex collision shapes.
+"""Reading URDFs: `load_urdf(path)` gives links, joints, colored meshes and convex collision shapes.
 
 yourdfpy parses the XML, trimesh the mesh files; what comes out is a small tree of our own, so that the rest of the
-room knows neither. Units are metres, kilograms and radians; every shape is in the frame of its link.
+room knows neither. Units are meters, kilograms and radians; every shape is in the frame of its link.
 """
 
 import math
@@ -24,7 +24,7 @@ DEFAULT_COLOR: Color = (190, 190, 190)
 HULL_POINTS = 64
 """Corners of a collision hull; of finer ones those are kept that lie farthest out in as many directions."""
 LARGEST_LINK = 10.0
-"""Extent of a link [m] beyond which its mesh must be in millimetres."""
+"""Extent of a link [m] beyond which its mesh must be in millimeters."""
 
 
 class UrdfError(ConfigError):
@@ -38,9 +38,9 @@ class Inertial:
     mass: float
     """kg."""
     center: np.ndarray
-    """[3] centre of mass in the link frame, m."""
+    """[3] center of mass in the link frame, m."""
     inertia: np.ndarray
-    """[3 3] about the centre of mass, along the axes of the link frame, kg m2."""
+    """[3 3] about the center of mass, along the axes of the link frame, kg m2."""
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ def _link(link: yourdfpy.Link, source: _Source) -> Link:
     if visual is not None and np.ptp(visual.vertices, axis=0).max() > LARGEST_LINK:
         size = np.ptp(visual.vertices, axis=0).max()
         raise UrdfError(
-            f"{source.path}: link {link.name} is {size:.0f} m large; is its mesh in millimetres? Then give it "
+            f"{source.path}: link {link.name} is {size:.0f} m large; is its mesh in millimeters? Then give it "
             f'scale="0.001 0.001 0.001".'
         )
     collisions = tuple(_collision(collision, link.name, source) for collision in link.collisions)
@@ -254,7 +254,7 @@ def _inertial(link: yourdfpy.Link, path: Path) -> Inertial | None:
 
 
 def _visual(visual: yourdfpy.Visual, link: str, source: _Source) -> Iterable[Mesh]:
-    """A mesh a part, coloured by the visual's material or else by the mesh file."""
+    """A mesh a part, colored by the visual's material or else by the mesh file."""
     origin = _origin(visual.origin, source.path, f"a visual of link {link}")
     color = _material_color(visual, source)
     for part in _shape(visual.geometry, link, source):
@@ -266,7 +266,7 @@ def _visual(visual: yourdfpy.Visual, link: str, source: _Source) -> Iterable[Mes
 
 
 def _material_color(visual: yourdfpy.Visual, source: _Source) -> Color | None:
-    """The visual's own colour, or that of the material it names; None where the mesh file decides."""
+    """The visual's own color, or that of the material it names; None where the mesh file decides."""
     material = visual.material
     known = material and source.materials.get(material.name)
     color = material and (material.color or (known and known.color))

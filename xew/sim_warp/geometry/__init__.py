@@ -1,6 +1,6 @@
 """Shapes and places: triangle meshes, poses with their transforms, and the pinhole camera.
 
-Arrays in metres and radians in, arrays out; nothing here knows robots, tasks or a device.
+Arrays in meters and radians in, arrays out; nothing here knows robots, tasks or a device.
 """
 
 __all__ = ["camera", "meshes", "poses"]

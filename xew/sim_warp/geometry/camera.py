@@ -1,6 +1,6 @@
 """Pinhole cameras: where a point of the world lands in the image. NumPy only.
 
-Pixels: x right, y down, (0, 0) is the centre of the upper left pixel. Camera frame: x right, y down, z forward.
+Pixels: x right, y down, (0, 0) is the center of the upper left pixel. Camera frame: x right, y down, z forward.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ class Camera:
     """A pinhole camera without distortion or skew."""
 
     intrinsics: np.ndarray = field(repr=False)
-    """[3 3] float64, K [pixels]; the principal point of a centred camera is ((width - 1) / 2, (height - 1) / 2)."""
+    """[3 3] float64, K [pixels]; the principal point of a centered camera is ((width - 1) / 2, (height - 1) / 2)."""
     extrinsics: np.ndarray
     """[4 4] float64, world to camera [m]."""
     width: int = WIDTH
@@ -24,7 +24,7 @@ class Camera:
 
     @property
     def position(self) -> np.ndarray:
-        """[3] centre of projection, world frame [m]."""
+        """[3] center of projection, world frame [m]."""
         return -self.extrinsics[:3, :3].T @ self.extrinsics[:3, 3]
 
 
@@ -36,7 +36,7 @@ def look_at(
     width: int = WIDTH,
     height: int = HEIGHT,
 ) -> Camera:
-    """A centred camera at `position` [m] that looks at `target` [m], `up` upwards in the image.
+    """A centered camera at `position` [m] that looks at `target` [m], `up` upwards in the image.
 
     Args:
         vertical_fov: full vertical angle of view [deg].
@@ -60,7 +60,7 @@ def look_at(
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World points [... 3] in metres -> (pixels [... 2], depth along the optical axis [...] in metres).
+    """World points [... 3] in meters -> (pixels [... 2], depth along the optical axis [...] in meters).
 
     Points at or behind the camera (depth <= 0) have no image; their pixels are NaN.
     """

@@ -1,7 +1,7 @@
 """Triangle meshes: what robots and objects look like and, as hulls, what they collide with.
 
-Units are metres, frames are those of the body that carries the mesh, triangles run counter-clockwise seen from
-outside. Shapes come from trimesh; a `Mesh` adds a colour per triangle and a normal per corner.
+Units are meters, frames are those of the body that carries the mesh, triangles run counter-clockwise seen from
+outside. Shapes come from trimesh; a `Mesh` adds a color per triangle and a normal per corner.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ Color = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Mesh:
-    """A coloured triangle mesh in the frame of its body."""
+    """A colored triangle mesh in the frame of its body."""
 
     vertices: np.ndarray
     """[v 3] float32, m."""
@@ -36,7 +36,7 @@ class Mesh:
 
 
 def from_trimesh(shape: trimesh.Trimesh, color: Color, crease_angle: float = np.radians(40)) -> Mesh:
-    """A `Mesh` of one colour; edges sharper than `crease_angle` [rad] stay sharp, the others are shaded smooth."""
+    """A `Mesh` of one color; edges sharper than `crease_angle` [rad] stay sharp, the others are shaded smooth."""
     triangles = np.asarray(shape.faces, np.int32)
     face_normals = np.asarray(shape.face_normals)
     return Mesh(
@@ -58,24 +58,24 @@ def _corner_normals(shape: trimesh.Trimesh, face_normals: np.ndarray, crease_ang
 
 
 def box(size: Sequence[float], color: Color) -> Mesh:
-    """A box of full edge lengths `size` [m], centred."""
+    """A box of full edge lengths `size` [m], centered."""
     return from_trimesh(trimesh.creation.box(size), color)
 
 
 def cylinder(radius: float, length: float, color: Color, sections: int = 24) -> Mesh:
-    """A cylinder along z, centred."""
+    """A cylinder along z, centered."""
     return from_trimesh(trimesh.creation.cylinder(radius, length, sections=sections), color)
 
 
 def capsule(radius: float, length: float, color: Color, sections: int = 16) -> Mesh:
-    """A capsule along z, centred; `length` [m] is that of its cylinder."""
+    """A capsule along z, centered; `length` [m] is that of its cylinder."""
     shape = trimesh.creation.capsule(length, radius, count=(sections // 2, sections))
     shape.apply_translation(-shape.bounds.mean(0))
     return from_trimesh(shape, color)
 
 
 def sphere(radius: float, color: Color, subdivisions: int = 2) -> Mesh:
-    """A sphere, centred."""
+    """A sphere, centered."""
     return from_trimesh(trimesh.creation.icosphere(subdivisions, radius), color)
 
 

@@ -95,7 +95,7 @@ class BatchedKinematics:
 
         Returns:
             [n l 7] of this dtype; the order of the l links is that of `links`. What comes after the last link of a robot with
-            fewer links than another is not written. The array is a view: numbers of neighbouring rows lie side by side.
+            fewer links than another is not written. The array is a view: numbers of neighboring rows lie side by side.
 
         Raises:
             ValueError: an array does not fit.

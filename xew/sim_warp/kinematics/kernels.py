@@ -49,7 +49,7 @@ def kinematics_kernels(scalar: type) -> SimpleNamespace:
         robot: wp.array(dtype=int),  # [n], or no elements where there is one robot
         joint_pos: wp.array2d(dtype=scalar),  # [n j]
         # Out:
-        pose_out: wp.array3d(dtype=scalar),  # [l 7 n], so that neighbouring threads write neighbouring numbers
+        pose_out: wp.array3d(dtype=scalar),  # [l 7 n], so that neighboring threads write neighboring numbers
     ):
         row = wp.tid()
         which = 0

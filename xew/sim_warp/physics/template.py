@@ -75,7 +75,7 @@ class RigidGroup:
     center: np.ndarray
     """[3] m."""
     inertia: np.ndarray
-    """[3 3] about the centre of mass, kg m2."""
+    """[3 3] about the center of mass, kg m2."""
     hulls: tuple[tuple[str, np.ndarray], ...]
     """(name, points [k 3])."""
 
@@ -114,7 +114,7 @@ def _from_last_moving(urdf: Urdf, joint: Joint, moving: list[str]) -> np.ndarray
 def _mass_properties(
     urdf: Urdf, parts: list[tuple[str, np.ndarray]], hulls: tuple[tuple[str, np.ndarray], ...]
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass, centre and inertia of links together (parallel axes)."""
+    """Mass, center and inertia of links together (parallel axes)."""
     known = [(inertial, pose) for link, pose in parts if (inertial := urdf.links[link].inertial) is not None]
     mass = sum((inertial.mass for inertial, _ in known), 0.0)
     if mass <= 0:
@@ -134,7 +134,7 @@ def _mass_properties(
 
 
 def solid(mass: float, hulls: Sequence[np.ndarray]) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass [kg], centre of mass [3] and inertia about it [3 3] of convex pieces of one density."""
+    """Mass [kg], center of mass [3] and inertia about it [3 3] of convex pieces of one density."""
     return _solid(mass, tuple(np.asarray(points, np.float32).tobytes() for points in hulls))
 
 

@@ -2,7 +2,7 @@
 
 Every frame is a row of a chunk; a chunk mixes frames of different worlds. A sample of the image keeps one 64-bit key:
 the bits of 1 / depth over the index of the triangle. Keys meet in an atomic maximum, which has no order, so an image
-has the same bytes whatever the device's schedule and whatever else is in the chunk. Colours are made afterwards
+has the same bytes whatever the device's schedule and whatever else is in the chunk. Colors are made afterwards
 (shading_kernels.py). Triangles are counter-clockwise seen from outside, camera frame x right, y down, z forward.
 """
 
@@ -18,7 +18,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 NEAR = wp.constant(0.1)
 """Near plane of the camera [m]; triangles are cut there."""
 SAMPLES = wp.constant(5)
-"""Four samples of a rotated grid make the colour; the fifth, the pixel's centre, makes mask, depth, flow and body."""
+"""Four samples of a rotated grid make the color; the fifth, the pixel's center, makes mask, depth, flow and body."""
 vec5 = wp.types.vector(length=5, dtype=float)
 OFFSET_X = wp.constant(vec5(-0.125, 0.375, -0.375, 0.125, 0.0))
 OFFSET_Y = wp.constant(vec5(-0.375, -0.125, 0.125, 0.375, 0.0))
@@ -117,7 +117,7 @@ def place_vertices(
 
 @wp.func
 def crossing(p: wp.vec3, q: wp.vec3, y: float) -> float:
-    """x at which an edge meets a scanline; the ends are put in order so that both neighbours get the same bits."""
+    """x at which an edge meets a scanline; the ends are put in order so that both neighbors get the same bits."""
     if p[1] < q[1]:
         return p[0] + (q[0] - p[0]) * ((y - p[1]) / (q[1] - p[1]))
     return q[0] + (p[0] - q[0]) * ((y - q[1]) / (p[1] - q[1]))

@@ -58,14 +58,14 @@ class Frames:
     rgb: np.ndarray
     """[t h w 3] uint8, sRGB, anti-aliased."""
     robot_mask: np.ndarray
-    """[t h w] bool, the first thing that the ray through the pixel's centre meets is the robot."""
+    """[t h w] bool, the first thing that the ray through the pixel's center meets is the robot."""
     depth: np.ndarray = field(default_factory=_nothing)
-    """[t h w] float32, along the optical axis at the pixel's centre [m], 0 where nothing is."""
+    """[t h w] float32, along the optical axis at the pixel's center [m], 0 where nothing is."""
     body: np.ndarray = field(default_factory=_nothing)
-    """[t h w] int16, index of the body at the pixel's centre, -1 where there is none."""
+    """[t h w] int16, index of the body at the pixel's center, -1 where there is none."""
     optical_flow: np.ndarray = field(default_factory=_nothing)
     """[t h w 2] float32, motion (x right, y down) [pixels] from this frame to the next of the robot's surface point
-    under the pixel's centre, no longer than `FLOW_LIMIT`; zero off the robot and in the last frame."""
+    under the pixel's center, no longer than `FLOW_LIMIT`; zero off the robot and in the last frame."""
     point_body: np.ndarray = field(default_factory=_nothing)
     """[t k] int32, index of the body seen in the pixel of each of the world's points, -1 none, -2 outside the image."""
     point_depth: np.ndarray = field(default_factory=_nothing)

@@ -1,6 +1,6 @@
-"""Warp kernels, second half: from what each sample shows (raster_kernels.py) to colours, masks, depth and optical flow.
+"""Warp kernels, second half: from what each sample shows (raster_kernels.py) to colors, masks, depth and optical flow.
 
-A pixel's colour is made once per triangle that it shows, at the mean of that triangle's samples, in linear light. The
+A pixel's color is made once per triangle that it shows, at the mean of that triangle's samples, in linear light. The
 light on what never moves is kept per camera and source; a frame only multiplies it with its shadows.
 """
 
@@ -137,7 +137,7 @@ def surface_at(
     frame: int,
     vertex_in: wp.array2d(dtype=wp.vec3),
 ) -> Surface:
-    """The point `seen` (camera's frame) of a triangle: point and shading normal in the world, colour."""
+    """The point `seen` (camera's frame) of a triangle: point and shading normal in the world, color."""
     corner = geometry.triangle[packed]
     weight = corner_weights(vertex_in[frame, corner[0]], vertex_in[frame, corner[1]], vertex_in[frame, corner[2]], seen)
     normal = (
@@ -327,7 +327,7 @@ def shade_pixels(
     tile_in: wp.array4d(dtype=wp.uint32),
     rgb_out: wp.array4d(dtype=wp.uint8),
 ):
-    """Colour: each triangle among a pixel's four samples is lit once, at the mean of its samples."""
+    """Color: each triangle among a pixel's four samples is lit once, at the mean of its samples."""
     frame, row, column = wp.tid()
     drawn = key_in[frame, 0, row, column] | key_in[frame, 1, row, column]
     drawn = drawn | key_in[frame, 2, row, column] | key_in[frame, 3, row, column]
@@ -397,7 +397,7 @@ def measure_pixels(
     depth_out: wp.array3d(dtype=float),
     flow_out: wp.array3d(dtype=wp.vec2),
 ):
-    """Geometry at the pixel's centre; outputs of shape zero are left out."""
+    """Geometry at the pixel's center; outputs of shape zero are left out."""
     frame, row, column = wp.tid()
     world = frame_world[frame]
     body = -1
@@ -433,7 +433,7 @@ def probe_pixels(
     body_out: wp.array2d(dtype=int),
     depth_out: wp.array2d(dtype=float),
 ):
-    """Body (-1 none, -2 outside the image) and depth at the centres of a few pixels (x, y) of every frame."""
+    """Body (-1 none, -2 outside the image) and depth at the centers of a few pixels (x, y) of every frame."""
     frame, k = wp.tid()
     column = pixel[frame, k][0]
     row = pixel[frame, k][1]

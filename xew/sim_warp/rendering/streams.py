@@ -98,7 +98,7 @@ def _worlds(commands: Sequence[tuple[str, np.ndarray]]) -> list[World]:
 def flow_to_rgb(flow: np.ndarray, clip: float = FLOW_LIMIT) -> np.ndarray:
     """Optical flow as a video that an image codec can take: direction is hue, length is saturation, rest is white.
 
-    The colour wheel is FlowWAM's. Frame 0 is white and frame k holds the motion from k - 1 to k, so that the video has
+    The color wheel is FlowWAM's. Frame 0 is white and frame k holds the motion from k - 1 to k, so that the video has
     as many frames as the RGB beside it.
 
     Args:
@@ -129,7 +129,7 @@ def color_wheel() -> np.ndarray:
 def ray_map(robot_key: str, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> np.ndarray:
     """The commanded tool frames drawn into the image: [t h w 3] uint8.
 
-    On grey, each tool has a base marker, a disc at the origin of its frame whose colour goes with the gripper, and over it
+    On gray, each tool has a base marker, a disc at the origin of its frame whose color goes with the gripper, and over it
     its x (approach), y (along which the fingers open) and z axes in red, green and blue, 0.1 m long, in the proportions of
     EnerVerse-AC's trajectory maps. A tool that is nearer covers one that is farther; a tool that is not in front of the
     camera is left out.

@@ -6,7 +6,7 @@
 Reference renders do not depend on a task: for every robot <references>/<key>/ holds front.png (the canonical front view),
 view_000.png to view_320.png (nine azimuths in degrees), clip.mkv (17 frames that sweep every joint, lossless) with clip.png
 (the same side by side), and ray_map.png (the head camera's ray map of the clip's commands, every fourth frame).
-Look at the sheets after every change of a shape: a robot that a person would not recognise is a defect.
+Look at the sheets after every change of a shape: a robot that a person would not recognize is a defect.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,8 @@
 """Task: pick up a hammer and strike a block with its face.
 
-Randomisation: the block (fixed to the table) at |x| in [.05, .25], y in [-.05, .15], yaw within 29 degrees; its colour.
+Randomisation: the block (fixed to the table) at |x| in [.05, .25], y in [-.05, .15], yaw within 29 degrees; its color.
     The hammer stands on its head at (0, -.06), its handle towards the robot.
-Success: the centre of the hammer's face within 20 mm of the block's top centre in x and y, and on it (6 mm).
+Success: the center of the hammer's face within 20 mm of the block's top center in x and y, and on it (6 mm).
 After RoboTwin 2.0's beat_block_hammer.
 """
 

@@ -1,6 +1,6 @@
 """Task: lift a roller with both hands at once, one at each end.
 
-Randomisation: centre at |x| at most .15, y in [-.25, -.05], yaw within 46 degrees; length, thickness and colour.
+Randomisation: center at |x| at most .15, y in [-.25, -.05], yaw within 46 degrees; length, thickness and color.
 Success: roller higher than .80, both grippers closed on it.
 After RoboTwin 2.0's grab_roller.
 """

@@ -1,6 +1,6 @@
 """Task: lift a cooking pot level with both hands, one at each handle.
 
-Randomisation: the pot at |x| at most .05, y in [-.05, .05], its handles within 22 degrees of x; its size, colours and lid.
+Randomisation: the pot at |x| at most .05, y in [-.05, .05], its handles within 22 degrees of x; its size, colors and lid.
 Success: pot higher than .82 and upright within 37 degrees, each tool within 30 mm of its handle.
 After RoboTwin 2.0's lift_pot.
 """

@@ -1,7 +1,7 @@
 """Task: open a laptop with one hand, a finger under the edge of its lid.
 
-Randomisation: centre at |x| at most .05, y in [-.08, .03]; its front turned up to 45 degrees to the left or right (the arm
-    on that side works); size of the lid, colour. The lid begins at 20 % of its range, the base is fixed.
+Randomisation: center at |x| at most .05, y in [-.08, .03]; its front turned up to 45 degrees to the left or right (the arm
+    on that side works); size of the lid, color. The lid begins at 20 % of its range, the base is fixed.
 Success: lid open beyond 40 % of its range, the tool within 10 cm of the lid's free edge.
 After RoboTwin 2.0's open_laptop, whose front turns up to 60 degrees and whose expert grasps the lid.
 """

@@ -2,7 +2,7 @@
 
 Randomisation: breads at |x| in [.15, .28], y in [-.20, .02], at least .20 from the basket's middle and .14 apart, turned up
     to 45 degrees from the direction in which their side's arm reaches; three times in four there are two. Basket (fixed) at
-    (0, -.15): round or square, yaw within 14 degrees, colour; kind, size and colour of the breads.
+    (0, -.15): round or square, yaw within 14 degrees, color; kind, size and color of the breads.
 Success: every bread within 60 mm of the basket's middle in x and y and inside it (its bottom below the rim), both grippers
     open.
 After RoboTwin 2.0's place_bread_basket, whose free basket stands at y = -.2 with any yaw, and which lets breads fall on each

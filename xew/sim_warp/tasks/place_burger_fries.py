@@ -1,7 +1,7 @@
 """Task: put a burger and a portion of fries on a tray, both grasped at once, set down one after the other.
 
 Randomisation: tray (fixed) in the middle at y in [-.15, -.10]; burger at x in [-.30, -.25], fries at x in [.20, .30], both at
-    y in [-.15, -.07]; filling and size of the burger, colour and size of the carton, colour of the tray.
+    y in [-.15, -.07]; filling and size of the burger, color and size of the carton, color of the tray.
 Success: burger within 80 mm of the middle of the tray's left half, fries of its right half, both on the tray (15 mm), both
     grippers open. (RoboTwin 2.0 does not test the height.)
 After RoboTwin 2.0's place_burger_fries.

@@ -1,8 +1,8 @@
 """Task: put a bowl or a cup on a plate, with one hand by the rim.
 
 Randomisation: a bowl or a cup at |x| in [.20, .28], y in [-.10, .05]; the plate (fixed to the table) on the same side,
-    |x| in [.02, .08], y in [-.15, -.10], clear of the container; size and colours of both.
-Success: container within 50 mm of the plate's centre in x and y and standing on it (10 mm), both grippers open.
+    |x| in [.02, .08], y in [-.15, -.10], clear of the container; size and colors of both.
+Success: container within 50 mm of the plate's center in x and y and standing on it (10 mm), both grippers open.
 After RoboTwin 2.0's place_container_plate, whose plate is wider by a quarter.
 """
 
@@ -20,7 +20,7 @@ from xew.sim_warp.tasks.task import Moment, Task, pick, place, radial_yaw, rim_g
 WALL = 0.005
 RIM_DEPTH = 0.007
 CLEAR = 0.17
-"""Least distance between the centres of container and plate [m]."""
+"""Least distance between the centers of container and plate [m]."""
 SLOPE, PLATE_HEIGHT = 0.030, 0.014
 """Width and height of a plate's rim [m]."""
 CHINA: Color = (240, 238, 232)
@@ -37,7 +37,7 @@ def cup(rng: np.random.Generator, color: Color) -> Shape:
 
 
 def plate(rng: np.random.Generator, color: Color) -> Shape:
-    """A shallow white plate with a coloured rim."""
+    """A shallow white plate with a colored rim."""
     radius, rim = rng.uniform([0.086, 0.006], [0.094, 0.024])
     flat, edge = radius - SLOPE, radius - rim
     shape = objects.vessel([(flat, 0), (radius, PLATE_HEIGHT)], WALL, CHINA)

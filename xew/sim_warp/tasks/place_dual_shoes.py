@@ -2,7 +2,7 @@
 
 Randomisation: box (fixed) at (0, -.14); left shoe at x in [-.29, -.22], right shoe at x in [.22, .29], both at y in
     [-.15, -.07]; tips up to 75 degrees from the left, of the left shoe towards the robot, of the right shoe away from it
-    (and 12 degrees the other way); size, kind and colours of the shoes, colour of the box.
+    (and 12 degrees the other way); size, kind and colors of the shoes, color of the box.
 Success: the left shoe within 50 mm in x and y of the box's nearer place, the right one of the farther, tips to the left
     (within 15 degrees), on the box's floor (15 mm), both grippers open.
 After RoboTwin 2.0's place_dual_shoes, which lowers the table by .1 m for a box 106 mm high. Our table stays: the box is the
@@ -41,7 +41,7 @@ SOLE = 0.012
 GRASP_HEIGHT = 0.036
 """Of the tool above the sole's bottom [m]: the pads end above the rim of the sole."""
 GRASP_AT = -0.010
-"""y of the grasp in a shoe's frame [m]: its centre of mass is there."""
+"""y of the grasp in a shoe's frame [m]: its center of mass is there."""
 LEATHERS: dict[str, Color] = objects.PALETTE | {"black": (52, 53, 58), "white": (236, 236, 232), "brown": (122, 78, 46)}
 
 

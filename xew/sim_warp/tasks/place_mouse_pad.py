@@ -2,8 +2,8 @@
 
 Randomisation: mouse at |x| in [.05, .25], y in [-.20, 0], its long side within 55 degrees of the direction from its arm's
     shoulder, either way round; mat (70 x 130 mm, its long side along y) on the same side in the same range, at least .13
-    away; size and colour of the mouse, one of eight colours of the mat, not its own.
-Success: mouse within 15 mm in x and 12 mm in y of the mat's centre, its long side within 15 degrees of y, both grippers open.
+    away; size and color of the mouse, one of eight colors of the mat, not its own.
+Success: mouse within 15 mm in x and 12 mm in y of the mat's center, its long side within 15 degrees of y, both grippers open.
 After RoboTwin 2.0's place_mouse_pad, whose mouse lies at any yaw and at least .10 from the mat.
 """
 

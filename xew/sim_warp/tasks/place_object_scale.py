@@ -3,8 +3,8 @@
 Randomisation: one of mouse, stapler, bell at |x| in [.04, .25], y in [-.20, 0], its long side within 55 degrees of the
     direction from its arm's shoulder, either way round; scale on the same side at |x| in [.04, .25], y in [-.18, .02], its
     display turned at most 40 degrees off the robot, 20 mm free of it; variant of the thing, form (round or square pan),
-    size and colour of the scale, which is fixed to the table.
-Success: thing within 35 mm of the pan's centre in the plane and not below the pan (10 mm), both grippers open.
+    size and color of the scale, which is fixed to the table.
+Success: thing within 35 mm of the pan's center in the plane and not below the pan (10 mm), both grippers open.
 After RoboTwin 2.0's place_object_scale, whose scale is free and stands at any yaw, and whose thing and scale reach y = .05.
 """
 
@@ -27,7 +27,7 @@ PLATE = 0.006
 
 
 def scale(rng: np.random.Generator) -> tuple[str, Shape]:
-    """The colour and the shape of a kitchen scale: a pan over the frame's origin, a body under it that reaches out in front
+    """The color and the shape of a kitchen scale: a pan over the frame's origin, a body under it that reaches out in front
     (-y), where the display lies."""
     name = str(rng.choice(COLORS))
     width, depth, height = rng.uniform([0.112, 0.140, 0.034], [0.128, 0.156, 0.044])
@@ -66,21 +66,21 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     )
 
 
-def pan_centre(scene: Scene) -> np.ndarray:
+def pan_center(scene: Scene) -> np.ndarray:
     """[3] the middle of the pan's upper face, world [m]."""
     scale = scene.object("scale")
     return np.array(scale.pose[:3]) + [0, 0, scale.shape.mesh.vertices[:, 2].max()]
 
 
 def plan(scene: Scene) -> Timeline:
-    thing, goal = scene.object("thing"), pan_centre(scene)
+    thing, goal = scene.object("thing"), pan_center(scene)
     timeline = Timeline()
     carry(timeline, thing, goal, easy_turn(thing, goal))
     return timeline
 
 
 def success(scene: Scene, now: Moment) -> bool:
-    offset = now.object_pose[scene.index("thing"), :3] - pan_centre(scene)
+    offset = now.object_pose[scene.index("thing"), :3] - pan_center(scene)
     return bool(np.hypot(*offset[:2]) < 0.035 and offset[2] > -0.01 and now.both_open)
 
 

@@ -3,8 +3,8 @@
 Randomisation: one of mouse, stapler, bell, magic cube, toy car, remote control at |x| in [.20, .28], y in [-.05, .05], its
     long side within 45 degrees of the direction from its arm's shoulder, either way round; stand at |x| at most .05 on the
     same side, y in [-.15, -.10], its yaw within 30 degrees, free of the thing; variant of the thing, form (round, square,
-    long), size and colour of the stand.
-Success: thing within 30 mm of the stand's centre in x and y, on top of it (10 mm), both grippers open.
+    long), size and color of the stand.
+Success: thing within 30 mm of the stand's center in x and y, on top of it (10 mm), both grippers open.
 After RoboTwin 2.0's place_object_stand, whose thing lies within 60 degrees and whose test asks for no height.
 """
 
@@ -32,7 +32,7 @@ SEATED = 0.01
 
 
 def stand(rng: np.random.Generator) -> tuple[str, Shape]:
-    """The colour and the shape of a stand: a foot, a column, and a plate whose upper face is the place for a thing."""
+    """The color and the shape of a stand: a foot, a column, and a plate whose upper face is the place for a thing."""
     name, form = str(rng.choice(COLORS)), str(rng.choice(["round", "square", "long"]))
     height, span = rng.uniform([0.040, 0.104], [0.060, 0.124])
     width = 1.35 * span if form == "long" else span

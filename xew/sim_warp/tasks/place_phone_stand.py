@@ -1,8 +1,8 @@
 """Task: put a phone that lies on its back on a stand, where it leans against the rest.
 
 Randomisation: phone at |x| in [.05, .25], y in [-.20, -.05], yaw within 40 degrees; stand (fixed) on the same side at |x| at
-    most .15, y in [.02, .12], at least .17 away, turned to the shoulder of that side's arm; size and colour of the phone,
-    form and colour of the stand.
+    most .15, y in [.02, .12], at least .17 away, turned to the shoulder of that side's arm; size and color of the phone,
+    form and color of the stand.
 Success: the middle of the phone's lower edge within 45, 40 and 40 mm of its place on the stand's ledge, in x, y and z; the
     phone leans 30 to 50 degrees from lying flat; both grippers open.
 After RoboTwin 2.0's place_phone_stand, which does not test the lean, and whose stand holds the phone 27 degrees from

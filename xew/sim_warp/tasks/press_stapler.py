@@ -1,6 +1,6 @@
 """Task: press a stapler shut twice with the closed fingers of one hand, and hold it down.
 
-Randomisation: stapler at |x| at most .20, y in [-.10, .05], any yaw (the arm on its side works); its size and colour. Its
+Randomisation: stapler at |x| at most .20, y in [-.10, .05], any yaw (the arm on its side works); its size and color. Its
     foot is fixed to the table, its arm stands on a sprung hinge.
 Success: arm of the stapler pressed down beyond 60 % of its way, closed fingers on it, the tool within 40 mm of the place to
     press.
@@ -20,7 +20,7 @@ from xew.sim_warp.tasks.task import GRIPPER_CLOSED, TURN_TILT, Moment, Task, arm
 PRESS_AT = 0.28
 """y of the place to press, as a share of the stapler's length."""
 PRESSED, DONE = 1.3, 0.6
-"""Shares of the arm's way to which the expert means to press it, past the stop since a robot gives way by a millimetre or two
+"""Shares of the arm's way to which the expert means to press it, past the stop since a robot gives way by a millimeter or two
 under the spring, and from which it counts as pressed."""
 STIFFNESS, PRELOAD = 1.0, 0.15
 """Of the spring [N m/rad], and the angle [rad] by which it is wound when the arm stands open: 2 N at the fingers, 4 N shut."""

@@ -1,7 +1,7 @@
 """Task: take a lying bottle, turn it upright and shake it.
 
 Randomisation: a bottle of one of four kinds, on its side, |x| in [.10, .15], y in [-.15, -.05], its neck away from the
-    robot and within 45 degrees of the direction in which its side's arm reaches; sizes and colours.
+    robot and within 45 degrees of the direction in which its side's arm reaches; sizes and colors.
 Success: the bottle above .80.
 After RoboTwin 2.0's shake_bottle, whose bottles stand upright in the hand: here they lean 20 degrees forwards, as far up as all
 five robots can turn them in the head camera's view. The hand shakes at one place for each arm.

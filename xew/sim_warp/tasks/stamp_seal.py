@@ -1,8 +1,8 @@
-"""Task: stamp a seal on a coloured square, with one hand.
+"""Task: stamp a seal on a colored square, with one hand.
 
 Randomisation: the seal upright at |x| in [.05, .25], |y| at most .05, one of eight turns; the square (only seen, 70 mm wide)
     on the same side at |x| in [.05, .25], |y| at most .05, at least .10 away; round, square or eight-sided foot, sizes,
-    kind of wood, colour of the square.
+    kind of wood, color of the square.
 Success: the seal's middle within 10 mm of the square's in x and y, standing on the table (5 mm, upright within 8 degrees),
     both grippers open. (RoboTwin 2.0 tests x, y and the grippers.)
 After RoboTwin 2.0's stamp_seal.

@@ -189,7 +189,7 @@ def aside(working: Collection[int]) -> dict[int, Tool]:
 def place(timeline: Timeline, arm: int, name: str, goal: Tool, *, above: float, retreat: float, release: float) -> None:
     """Bring what `arm` has held since its last grip to `goal` from `above` [m], let go, draw back upwards and open.
 
-    `release` is the gripper's opening between letting go and being clear of the object and its neighbours.
+    `release` is the gripper's opening between letting go and being clear of the object and its neighbors.
     """
     timeline.move({arm: goal.moved(z=above)})
     timeline.move({arm: goal})

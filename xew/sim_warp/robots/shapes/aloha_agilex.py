@@ -1,4 +1,4 @@
-"""Shapes of the ALOHA-AgileX: black arms of the X5 family on an aluminium frame over a mobile base."""
+"""Shapes of the ALOHA-AgileX: black arms of the X5 family on an aluminum frame over a mobile base."""
 
 from xew.sim_warp.robots.shapes import arx_x5
 from xew.sim_warp.robots.shapes.solids import Box, Part, Vector, box_solid, camera, cylinder, hull, rounded_box
@@ -7,7 +7,7 @@ MATERIALS = {
     "black": (46, 46, 50),
     "dark": (86, 87, 92),
     "rubber": (20, 20, 22),
-    "aluminium": (178, 182, 188),
+    "aluminum": (178, 182, 188),
     "panel": (226, 228, 230),
     "case": (150, 152, 156),
     "lens": (24, 24, 28),
@@ -67,10 +67,10 @@ def deck_parts() -> list[Part]:
 
 
 def profile(low: Vector, high: Vector) -> Part:
-    """A length of aluminium profile on box2_Link, its corners given in the frame of `footprint`."""
+    """A length of aluminum profile on box2_Link, its corners given in the frame of `footprint`."""
     solid = box_solid(Box(low, high))
     solid.apply_translation((-0.158, 0.385, -0.015))
-    return ("aluminium", solid)
+    return ("aluminum", solid)
 
 
 def frame_parts() -> list[Part]:
@@ -87,8 +87,8 @@ def frame_parts() -> list[Part]:
 def mast_parts() -> list[Part]:
     """The pole of the cameras, behind the head camera so that it never shows in its picture."""
     return [
-        ("aluminium", rounded_box((-0.045, -0.02, 0), (-0.015, 0.02, 0.647), 0.003)),
-        ("aluminium", rounded_box((-0.069, -0.035, -0.074), (0.025, 0.035, 0.004), 0.003)),
+        ("aluminum", rounded_box((-0.045, -0.02, 0), (-0.015, 0.02, 0.647), 0.003)),
+        ("aluminum", rounded_box((-0.069, -0.035, -0.074), (0.025, 0.035, 0.004), 0.003)),
     ]
 
 

@@ -19,7 +19,7 @@ from xew.sim_warp.robots.shapes.solids import (
 MATERIALS = {
     "white": (244, 244, 245),
     "shell": (226, 230, 232),
-    "grey": (66, 68, 72),
+    "gray": (66, 68, 72),
     "blue": (10, 138, 199),
     "rubber": (30, 30, 32),
     "case": (150, 152, 156),
@@ -70,7 +70,7 @@ COLLISIONS = {
 def drum(start: Vector, end: Vector, radius: float = 0.0545) -> list[Part]:
     """Half of a joint: dark at the seam where it starts, a white dome where it ends."""
     seam = between(start, end, 0.06)
-    return [("grey", cylinder(start, seam, 0.96 * radius)), ("white", dome(seam, end, radius))]
+    return [("gray", cylinder(start, seam, 0.96 * radius)), ("white", dome(seam, end, radius))]
 
 
 def base_parts() -> list[Part]:
@@ -80,7 +80,7 @@ def base_parts() -> list[Part]:
         rounded_box((-0.154, -0.06, 0), (-0.06, 0.06, 0.05), 0.008), cylinder((-0.04, 0, 0.1), (-0.04, 0, 0.125), 0.045)
     )
     plate = rounded_box((-0.14, -0.094, 0), (0.0716, 0.094, 0.01), 0.002)
-    return [("white", foot), ("shell", tail), ("grey", plate), ("grey", cylinder((0, 0, 0.135), (0, 0, 0.141), 0.052))]
+    return [("white", foot), ("shell", tail), ("gray", plate), ("gray", cylinder((0, 0, 0.135), (0, 0, 0.141), 0.052))]
 
 
 def link1_parts() -> list[Part]:
@@ -95,7 +95,7 @@ def link2_parts() -> list[Part]:
     column = cylinder((0, -0.142, 0), (0, -0.19, 0), 0.0548)
     neck = hull(cylinder((0, -0.145, 0), (0, -0.142, 0), 0.0548), cylinder((0, 0, 0.02), (0, 0, 0.1), 0.052))
     collar = cylinder((0, -0.19, 0), (0, -0.195, 0), 0.0525)
-    return [("white", column), ("white", neck), ("grey", collar), *drum((0, 0, 0), (0, 0, 0.1295))]
+    return [("white", column), ("white", neck), ("gray", collar), *drum((0, 0, 0), (0, 0, 0.1295))]
 
 
 def link3_parts() -> list[Part]:
@@ -110,7 +110,7 @@ def link4_parts() -> list[Part]:
     column = cylinder((-0.0825, 0.078, 0), (-0.0825, 0.119, 0), 0.0548)
     neck = hull(cylinder((-0.0825, 0.078, 0), (-0.0825, 0.083, 0), 0.0548), cylinder((0, 0, 0.015), (0, 0, 0.085), 0.052))
     collar = cylinder((-0.0825, 0.119, 0), (-0.0825, 0.1245, 0), 0.0525)
-    return [("white", column), ("white", neck), ("grey", collar), *drum((0, 0, 0), (0, 0, 0.1111))]
+    return [("white", column), ("white", neck), ("gray", collar), *drum((0, 0, 0), (0, 0, 0.1111))]
 
 
 def link5_parts() -> list[Part]:
@@ -129,7 +129,7 @@ def link5_parts() -> list[Part]:
         ("white", taper),
         ("white", shin),
         ("white", dome((0, 0.09, 0), (0, 0.1299, 0), 0.0505)),
-        ("grey", cylinder((0, 0.016, 0), (0, 0.021, 0), 0.048)),
+        ("gray", cylinder((0, 0.016, 0), (0, 0.021, 0), 0.048)),
     ]
 
 
@@ -147,7 +147,7 @@ def link7_parts() -> list[Part]:
     """The flange and the pilot's button head beside it."""
     flange = cylinder((0, 0, 0.052), (0, 0, 0.1068), 0.0438, bevel=0.004)
     pilot = hull(rounded_box((0.0, -0.028, 0.056), (0.082, 0.028, 0.093), 0.008, (0, 0, 0.7853982)))
-    return [("grey", cylinder((0, 0, 0.049), (0, 0, 0.052), 0.041)), ("white", flange), ("shell", pilot)]
+    return [("gray", cylinder((0, 0, 0.049), (0, 0, 0.052), 0.041)), ("white", flange), ("shell", pilot)]
 
 
 def hand_parts() -> list[Part]:
@@ -163,8 +163,8 @@ def hand_parts() -> list[Part]:
     )
     return [
         ("white", shell),
-        ("grey", rounded_box((-0.018, -0.096, 0.058), (0.018, 0.096, 0.066), 0.002)),
-        ("grey", cylinder((0, 0, -0.026), (0, 0, -0.016), 0.0316)),
+        ("gray", rounded_box((-0.018, -0.096, 0.058), (0.018, 0.096, 0.066), 0.002)),
+        ("gray", cylinder((0, 0, -0.026), (0, 0, -0.016), 0.0316)),
     ]
 
 

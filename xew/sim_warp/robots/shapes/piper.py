@@ -16,7 +16,7 @@ from xew.sim_warp.robots.shapes.solids import (
 
 MATERIALS = {
     "dark": (70, 73, 80),
-    "grey": (128, 131, 137),
+    "gray": (128, 131, 137),
     "black": (36, 37, 41),
     "red": (208, 38, 38),
     "rubber": (20, 20, 22),
@@ -64,7 +64,7 @@ def base_parts() -> list[Part]:
     return [
         ("dark", foot),
         ("dark", cylinder((0, 0, 0.03), (0, 0, 0.08), 0.0375)),
-        ("grey", cylinder((0, 0, 0.08), (0, 0, 0.084), 0.035)),
+        ("gray", cylinder((0, 0, 0.08), (0, 0, 0.084), 0.035)),
     ]
 
 
@@ -73,7 +73,7 @@ def link1_parts() -> list[Part]:
     head = hull(cylinder((0, 0, -0.035), (0, 0, -0.02), 0.035), cylinder((-0.034, 0, 0), (0.034, 0, 0), 0.029))
     return [
         ("dark", head),
-        ("grey", cylinder((0, 0, -0.043), (0, 0, -0.035), 0.033)),
+        ("gray", cylinder((0, 0, -0.043), (0, 0, -0.035), 0.033)),
         ("black", cylinder((-0.0405, 0, 0), (0.0367, 0, 0), 0.022)),
     ]
 
@@ -123,7 +123,7 @@ def link3_parts() -> list[Part]:
     stripe = rounded_box((0.0504, 0.15, -0.006), (0.0515, 0.195, 0.006), 0.0004)
     for solid in (hub, end, stripe):
         solid.apply_transform(transform(rpy=FOREARM))
-    return [("dark", tube), ("black", hub), ("grey", end), ("red", stripe)]
+    return [("dark", tube), ("black", hub), ("gray", end), ("red", stripe)]
 
 
 def link4_parts() -> list[Part]:
@@ -146,7 +146,7 @@ def link5_parts() -> list[Part]:
         ],
         corner=0.5,
     )
-    return [("dark", yoke), ("dark", motor), ("grey", cylinder((0, 0.087, 0.001), (0, 0.091, 0.001), 0.026))]
+    return [("dark", yoke), ("dark", motor), ("gray", cylinder((0, 0.087, 0.001), (0, 0.091, 0.001), 0.026))]
 
 
 def link6_parts() -> list[Part]:
@@ -163,7 +163,7 @@ def link6_parts() -> list[Part]:
             (0.0725, -0.0113, 0.0113, 0.046, 0.067),
         ],
     )
-    return [("grey", cylinder((0, 0, 0), (0, 0, 0.004), 0.0265)), ("dark", body), ("black", rail)]
+    return [("gray", cylinder((0, 0, 0), (0, 0, 0.004), 0.0265)), ("dark", body), ("black", rail)]
 
 
 def finger_parts(side: int) -> list[Part]:

@@ -1,4 +1,4 @@
-"""The few solids that robot shapes are built from. Metres; frames are those of the link that carries the shape."""
+"""The few solids that robot shapes are built from. Meters; frames are those of the link that carries the shape."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ Part = tuple[str, trimesh.Trimesh]
 """Name of a material, and a solid in the frame of its link."""
 
 PAD_HALF_WIDTH, PAD_THICKNESS = 0.011, 0.008
-"""A gripping face reaches this far to either side of the tool centre point, and outwards [m]."""
+"""A gripping face reaches this far to either side of the tool center point, and outwards [m]."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Shapes of the UR5 with WSG-50: light grey tubes, blue caps, a silver gripper, after the link sizes of the vendors' meshes."""
+"""Shapes of the UR5 with WSG-50: light gray tubes, blue caps, a silver gripper, after the link sizes of the vendors' meshes."""
 
 from xew.sim_warp.robots.shapes.solids import (
     PAD_HALF_WIDTH,
@@ -16,7 +16,7 @@ from xew.sim_warp.robots.shapes.solids import (
 )
 
 MATERIALS = {
-    "grey": (206, 209, 212),
+    "gray": (206, 209, 212),
     "blue": (112, 168, 208),
     "dark": (78, 80, 84),
     "silver": (158, 161, 166),
@@ -44,9 +44,9 @@ COLLISIONS = {
 
 
 def housing(start: Vector, end: Vector, radius: float) -> list[Part]:
-    """A joint's housing along its axis: grey, with a blue cap over its end."""
+    """A joint's housing along its axis: gray, with a blue cap over its end."""
     seam = between(start, end, 0.78)
-    return [("grey", cylinder(start, seam, radius)), ("blue", dome(seam, end, 0.985 * radius))]
+    return [("gray", cylinder(start, seam, radius)), ("blue", dome(seam, end, 0.985 * radius))]
 
 
 def ring(start: Vector, end: Vector, radius: float) -> Part:
@@ -59,7 +59,7 @@ def tee(axis: int) -> list[Part]:
     swap = (lambda x, y, z: (x, y, z)) if axis == 1 else (lambda x, y, z: (x, z, y))
     return [
         ring(swap(0, 0.0475, 0), swap(0, 0.052, 0), 0.036),
-        ("grey", cylinder(swap(0, 0.052, 0), swap(0, 0.093, 0), 0.0375)),
+        ("gray", cylinder(swap(0, 0.052, 0), swap(0, 0.093, 0), 0.0375)),
         *housing(swap(0, 0.093, 0.0435), swap(0, 0.093, -0.057), 0.0385),
         ring(swap(0, 0.093, 0.0435), swap(0, 0.093, 0.0475), 0.036),
     ]
@@ -71,10 +71,10 @@ def upper_arm_parts() -> list[Part]:
         *ends,
         ring((0, -0.0652, 0), (0, -0.061, 0), 0.056),
         ring((0, -0.0652, 0.425), (0, -0.061, 0.425), 0.056),
-        ("grey", cylinder((0, 0, 0.04), (0, 0, 0.385), 0.05)),
-        ("grey", hull(cylinder((0, 0, 0.03), (0, 0, 0.085), 0.0545, 0.05), cylinder((0, -0.05, 0), (0, 0.045, 0), 0.0565))),
+        ("gray", cylinder((0, 0, 0.04), (0, 0, 0.385), 0.05)),
+        ("gray", hull(cylinder((0, 0, 0.03), (0, 0, 0.085), 0.0545, 0.05), cylinder((0, -0.05, 0), (0, 0.045, 0), 0.0565))),
         (
-            "grey",
+            "gray",
             hull(cylinder((0, 0, 0.34), (0, 0, 0.395), 0.05, 0.0545), cylinder((0, -0.05, 0.425), (0, 0.045, 0.425), 0.0565)),
         ),
     ]
@@ -83,8 +83,8 @@ def upper_arm_parts() -> list[Part]:
 def forearm_parts() -> list[Part]:
     return [
         *housing((0, 0.0545, 0), (0, -0.034, 0), 0.0575),
-        ("grey", hull(cylinder((0, 0, 0.03), (0, 0, 0.1), 0.05, 0.039), cylinder((0, -0.02, 0), (0, 0.045, 0), 0.055))),
-        ("grey", cylinder((0, 0, 0.1), (0, 0, 0.365), 0.039)),
+        ("gray", hull(cylinder((0, 0, 0.03), (0, 0, 0.1), 0.05, 0.039), cylinder((0, -0.02, 0), (0, 0.045, 0), 0.055))),
+        ("gray", cylinder((0, 0, 0.1), (0, 0, 0.365), 0.039)),
         *housing((0, 0.0475, 0.39225), (0, -0.0572, 0.39225), 0.0388),
     ]
 
@@ -108,13 +108,13 @@ def finger_parts() -> list[Part]:
 
 PARTS: dict[str, list[Part]] = {
     "base_link": [
-        ("grey", cylinder((0, 0, 0), (0, 0, 0.02), 0.0745, bevel=0.004, sections=20)),
+        ("gray", cylinder((0, 0, 0), (0, 0, 0.02), 0.0745, bevel=0.004, sections=20)),
         ("dark", cylinder((0, 0, 0.02), (0, 0, 0.0265), 0.058)),
     ],
     "shoulder_link": [
-        ("grey", cylinder((0, 0, -0.062), (0, 0, 0.03), 0.0585)),
+        ("gray", cylinder((0, 0, -0.062), (0, 0, 0.03), 0.0585)),
         ("blue", dome((0, 0, 0.03), (0, 0, 0.0685), 0.0578)),
-        ("grey", cylinder((0, 0, 0), (0, 0.066, 0), 0.057)),
+        ("gray", cylinder((0, 0, 0), (0, 0.066, 0), 0.057)),
         ring((0, 0.066, 0), (0, 0.0705, 0), 0.055),
     ],
     "upper_arm_link": upper_arm_parts(),

@@ -3,7 +3,7 @@
 Reads  a URDF, a folder with a robot.yaml, or a RoboTwin embodiment folder (config.yml)
 Writes RobotDraft; `xew.sim_warp.robots.user.own` fills in what is open
 
-A robot.yaml holds the fields of RobotDraft and nothing else; lengths in metres, angles in radians, quaternions x y z w.
+A robot.yaml holds the fields of RobotDraft and nothing else; lengths in meters, angles in radians, quaternions x y z w.
 """
 
 from dataclasses import dataclass
@@ -99,7 +99,7 @@ def robotwin_draft(config: dict[str, Any], source: str) -> RobotDraft:
 
     Taken: URDF, arm joints, gripper joints with their scale, the tool frame's link and orientation (ee joint, `delta_matrix`),
     base poses, and `homestate` as the posture near which our home is looked for. `gripper_bias` is where RoboTwin's planner
-    has its tool centre point, 5 to 29 mm behind ours: our plans count on fingertips that are 15 mm beyond it.
+    has its tool center point, 5 to 29 mm behind ours: our plans count on fingertips that are 15 mm beyond it.
     `global_trans_matrix` undoes the orientation that SAPIEN gives joint frames and has no part in ours; drive gains, planner,
     cameras, `rotate_lim` and `grasp_perfect_direction` belong to RoboTwin's experts.
 

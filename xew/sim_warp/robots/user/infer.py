@@ -85,7 +85,7 @@ def _middle(joint: Joint, urdf: Urdf) -> float:
     if joint.kind != "prismatic" or not math.isfinite(joint.upper - joint.lower) or joint.upper - joint.lower < 1e-4:
         raise ConfigError(
             f"{urdf.path}: the finger {joint.name} is {joint.kind} from {joint.lower:g} to {joint.upper:g}; expected a "
-            "prismatic joint with limits (metres) between which it opens."
+            "prismatic joint with limits (meters) between which it opens."
         )
     return (joint.lower + joint.upper) / 2
 

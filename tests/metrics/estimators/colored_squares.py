@@ -1,15 +1,15 @@
-"""A video in which every point has a colour of its own, so that a stand-in tracker can be exact."""
+"""A video in which every point has a color of its own, so that a stand-in tracker can be exact."""
 
 import numpy as np
 
 SIZE = (96, 128)
 HALF = 6
-"""Squares have sides of 13 pixels, so that a centre is the centre of a pixel."""
-COLOURS = np.array([(250, 40, 40), (40, 250, 40), (60, 60, 250)], np.uint8)
+"""Squares have sides of 13 pixels, so that a center is the center of a pixel."""
+COLORS = np.array([(250, 40, 40), (40, 250, 40), (60, 60, 250)], np.uint8)
 
 
 def squares() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Video [5 96 128 3], centres [5 4 2] float32, where they are seen [5 4].
+    """Video [5 96 128 3], centers [5 4 2] float32, where they are seen [5 4].
 
     The first point is always seen, the second from frame 1 to 3, the third in frame 0 alone, and the fourth never.
     """
@@ -19,5 +19,5 @@ def squares() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     video = np.full((5, *SIZE, 3), 12, np.uint8)
     for t, k in np.argwhere(visible):
         x, y = points[t, k].astype(int)
-        video[t, y - HALF : y + HALF + 1, x - HALF : x + HALF + 1] = COLOURS[k]
+        video[t, y - HALF : y + HALF + 1, x - HALF : x + HALF + 1] = COLORS[k]
     return video, points, visible
