@@ -19,8 +19,8 @@ from xew.sim_warp.embodiment.urdf import load_urdf
 from xew.sim_warp.geometry.poses import matrix_from_pose
 from xew.sim_warp.kinematics.forward import link_poses
 from xew.sim_warp.kinematics.inverse import ArmSolver
+from xew.sim_warp.kinematics.reachability import GRASP_TILT, WORK_X, WORK_Y, WORK_Z, radial_yaw, reaches
 from xew.sim_warp.plan import ASIDE, HOME
-from xew.sim_warp.robots.reach import GRASP_TILT, WORK_X, WORK_Y, WORK_Z, radial_yaw, reached
 from xew.sim_warp.stage import TABLE_SIZE, TABLE_TOP
 
 DISTANCES = (0.6, 0.7, 0.8, 0.5, 0.4)
@@ -198,7 +198,7 @@ def _share(solver: ArmSolver, arm: int) -> float:
     cells = list(product(OFFSETS, product(WORK_X[::2], WORK_Y[::2], WORK_Z[::2])))
     positions = np.array([ASIDE[0].position, *(position for _, position in cells)])
     yaws = np.array([0.0, *(radial_yaw(np.array(position)) + offset for offset, position in cells)])
-    found = reached(solver, arm, positions, np.full(len(positions), float(GRASP_TILT)), yaws)
+    found = reaches(solver, arm, positions, np.full(len(positions), float(GRASP_TILT)), yaws)
     return float(found[1:].mean()) * (1.0 if found[0] else 0.25)
 
 
