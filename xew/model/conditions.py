@@ -61,11 +61,9 @@ class Command:
     @cached_property
     def tools(self) -> np.ndarray:
         """float64 [t 2 7], commanded world poses of the left and right tool, x y z w quaternions, by forward kinematics."""
-        from xew.sim_warp.kinematics.forward import tool_pose
+        from xew.sim_warp.kinematics.forward import tool_poses
 
-        robot = self.robot_spec
-        joints = [self.action[:, arm_joints][:, : robot.arm_joint_count] for arm_joints, _ in ARMS]
-        return np.stack([tool_pose(robot, arm, arm_pos) for arm, arm_pos in enumerate(joints)], axis=1)
+        return tool_poses(self.robot_spec, self.action)
 
     @cached_property
     def robot_spec(self) -> "RobotSpec":

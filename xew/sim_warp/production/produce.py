@@ -33,7 +33,7 @@ from xew.episode import (
 )
 from xew.protocol import ARMS
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
-from xew.sim_warp.kinematics.forward import tool_pose
+from xew.sim_warp.kinematics.forward import tool_poses
 from xew.sim_warp.physics import Motion, World, simulate
 from xew.sim_warp.physics.plausibility import implausible
 from xew.sim_warp.plan import ToolPath
@@ -183,8 +183,7 @@ def render_cells(cells: Sequence[Cell], renderer: Renderer) -> list[Pixels]:
 
 def measured_tools(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
     """[t 2 7] tool poses at canonical joint positions [t 16], world."""
-    arms = [joint_pos[:, joints][:, : robot.arm_joint_count] for joints, _ in ARMS]
-    return np.stack([tool_pose(robot, side, arm) for side, arm in enumerate(arms)], 1).astype(np.float32)
+    return tool_poses(robot, joint_pos).astype(np.float32)
 
 
 def moment(action: np.ndarray, motion: Motion, tools: np.ndarray, frame: int) -> Moment:

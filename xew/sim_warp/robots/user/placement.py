@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError
+from xew.protocol import ACTION_DIM, ARMS
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import load_urdf
 from xew.sim_warp.geometry.poses import matrix_from_pose
@@ -205,8 +206,9 @@ def _share(solver: ArmSolver, arm: int) -> float:
 def _is_clear(robot: RobotSpec, arm: int) -> bool:
     """Do all links that an arm's second joint and those after it move stay off the table and on their own side?"""
     urdf = load_urdf(robot.urdf)
-    row = np.zeros((1, 16))
-    row[0, 8 * arm : 8 * arm + robot.arm_joint_count] = robot.arms[arm].home
+    joints, _ = ARMS[arm]
+    row = np.zeros((1, ACTION_DIM))
+    row[0, joints][: robot.arm_joint_count] = robot.arms[arm].home
     frames = link_poses(robot, row)[0 if robot.one_urdf_holds_both_arms else arm]
     moved = [name for name in urdf.links if urdf.joints[robot.arms[arm].joints[1]] in urdf.chain(name)]
     for name in moved:
