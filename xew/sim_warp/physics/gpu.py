@@ -11,7 +11,7 @@ import warp as wp
 
 from xew.protocol import FRAME_RATE
 from xew.sim_warp.devices.waiting import wait_for
-from xew.sim_warp.physics.kernels import advance, record_contacts, record_joints, set_targets
+from xew.sim_warp.physics.kernels import advance_frame, record_contacts, record_joints, set_targets
 from xew.sim_warp.physics.worlds import (
     ROBOT_DOFS,
     STEPS_PER_FRAME,
@@ -100,7 +100,7 @@ class Batch:
                 [self.data.ctrl],
             )
             mjw.step(self.model, self.data)
-        wp.launch(advance, 1, [self.frame])
+        wp.launch(advance_frame, 1, [self.frame], [self.frame])
         self._record()
 
     def _record(self) -> None:
