@@ -8,7 +8,7 @@ import numpy as np
 
 from xew.protocol import ARMS
 from xew.sim_warp.physics import Motion
-from xew.sim_warp.physics.plausibility import implausible
+from xew.sim_warp.physics.plausibility import find_implausible
 from xew.sim_warp.plan import ToolPath
 from xew.sim_warp.scene import Scene
 from xew.sim_warp.tasks import Moment, Task
@@ -43,7 +43,7 @@ def find_failure(
         return "plan", "the scene is solved before it begins"
     if not task.success(scene, last):
         return _find_lost_hold(scene, path, motion)
-    problem = implausible(scene, path.holds, motion.object_pose, motion.penetration, tools, path.frame_rate)
+    problem = find_implausible(scene, path.holds, motion.object_pose, motion.penetration, tools, path.frame_rate)
     return ("physics", problem) if problem else None
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from xew.episode import EpisodeError, Record, array_hash, demand_known, read_record, read_states, states_hash, write_episode
-from xew.sim_warp.physics.plausibility import implausible
+from xew.sim_warp.physics.plausibility import find_implausible
 from xew.sim_warp.rendering.observe import observe, scene_recording
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import command_renders
@@ -60,7 +60,7 @@ def demand_plausible(folder: Path) -> None:
     record, states = read_record(folder), read_states(folder)
     scene = _sample_again(folder, record)
     holds = get_task(record.task).plan(scene).path().holds
-    problem = implausible(scene, holds, states.object_pose, states.penetration, states.tool_pose, record.frame_rate)
+    problem = find_implausible(scene, holds, states.object_pose, states.penetration, states.tool_pose, record.frame_rate)
     if problem:
         raise EpisodeError(f"{folder}: {problem}; delete it and run generate again.")
 
