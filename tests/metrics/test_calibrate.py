@@ -40,7 +40,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An episode of the simulation, twelve frames."""
-    from xew.sim_warp.production.produce import Job, produce
+    from xew.sim_warp.production.cells import Job
+    from xew.sim_warp.production.produce import produce
     from xew.sim_warp.rendering.render import Renderer
 
     root = tmp_path_factory.mktemp("simulated")

@@ -18,7 +18,8 @@ from xew.protocol import TEST_SEED_START
 from xew.sim_warp import generate as command
 from xew.sim_warp.devices.workers import Workers
 from xew.sim_warp.generate import Args, Family, generate, main, yield_table
-from xew.sim_warp.production.produce import Job, produce
+from xew.sim_warp.production.cells import Job
+from xew.sim_warp.production.produce import produce
 from xew.sim_warp.rendering.render import Renderer
 
 ROOT = Path(__file__).parents[2]

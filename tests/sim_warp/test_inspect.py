@@ -26,7 +26,8 @@ from xew.sim_warp.inspect import (
     strip,
     tiled,
 )
-from xew.sim_warp.production.produce import Job, produce
+from xew.sim_warp.production.cells import Job
+from xew.sim_warp.production.produce import produce
 from xew.sim_warp.rendering.render import Renderer
 
 ROBOTS = ("franka_panda", SLOW)

@@ -29,7 +29,8 @@ from xew.episode import EpisodeError, Record, episode_folder, find_records, remo
 from xew.protocol import TEST_SEED_START, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK
 from xew.sim_warp.devices.workers import Workers, has_kernels, named_device, quiet_warp, worker_count
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
-from xew.sim_warp.production.produce import Job, produce
+from xew.sim_warp.production.cells import Job
+from xew.sim_warp.production.produce import produce
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS, adopt_robots, get_robot, is_path
 from xew.sim_warp.tasks import TASKS, get_task

@@ -35,7 +35,7 @@ from xew.episode import (
 )
 from xew.sim_warp.devices.workers import Workers, quiet_warp
 from xew.sim_warp.generate import yield_table
-from xew.sim_warp.production.produce import add_videos, demand_plausible, render_again
+from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS
 

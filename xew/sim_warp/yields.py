@@ -24,7 +24,8 @@ from tqdm import tqdm
 from xew.config import user_errors
 from xew.episode import EpisodeError, Record
 from xew.sim_warp.devices.workers import Workers, has_kernels, named_device, quiet_warp, worker_count
-from xew.sim_warp.production.produce import Job, header, plan_cells, simulate_cells
+from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
+from xew.sim_warp.production.episodes import header
 from xew.sim_warp.robots import ROBOTS, get_robot
 from xew.sim_warp.tasks import TASKS, Task, get_task
 

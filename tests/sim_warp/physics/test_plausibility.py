@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from xew.protocol import FRAME_RATE
 from xew.sim_warp import objects
-from xew.sim_warp.physics.plausibility import implausible, slip
+from xew.sim_warp.physics.plausibility import find_implausible, measure_slip
 from xew.sim_warp.plan import Hold
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
@@ -33,12 +33,12 @@ def parts():
 
 def verdict(parts, holds=(HOLD,)):
     scene, pose, penetration, tools = parts
-    return implausible(scene, holds, pose, penetration, tools, FRAME_RATE)
+    return find_implausible(scene, holds, pose, penetration, tools, FRAME_RATE)
 
 
 def test_what_moves_with_the_hand_is_plausible(parts):
     assert verdict(parts) is None
-    assert slip(parts[3][:, 0], parts[1][:, 0]) < 1e-6
+    assert measure_slip(parts[3][:, 0], parts[1][:, 0]) < 1e-6
 
 
 def test_a_blow_passes_and_what_stays_sunk_does_not(parts):

@@ -21,7 +21,7 @@ from xew.sim_warp.embodiment import mesh_files
 from xew.sim_warp.generate import Args, generate
 from xew.sim_warp.kinematics import tool_pose
 from xew.sim_warp.plan import HOME
-from xew.sim_warp.production.produce import render_again
+from xew.sim_warp.production.rerender import render_again
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import RobotSpec, adopt_robots, get_robot, load_robot, load_urdf
 from xew.sim_warp.robots.user.own import FOLDERS

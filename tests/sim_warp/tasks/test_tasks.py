@@ -11,7 +11,8 @@ from tests.sim_warp.small import SLOW, TASK
 from xew.config import ConfigError
 from xew.episode import FAILURES, EpisodeError, Record
 from xew.sim_warp.plan import LEFT, RIGHT
-from xew.sim_warp.production.produce import Cell, Job, moment, plan_cells, simulate_cells
+from xew.sim_warp.production.cells import Cell, Job, plan_cells, simulate_cells
+from xew.sim_warp.production.outcome import moment
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.scene import Scene, scene_rng
 from xew.sim_warp.tasks import TASKS, get_task

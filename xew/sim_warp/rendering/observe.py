@@ -1,4 +1,4 @@
-"""Stage 4a: recorded states to what the head camera sees. Everything here is a view of states.
+"""What the head camera sees of recorded states: a pure function of them.
 
 Reads  `Recording`s: a robot, its measured joints, and things with their measured poses
 Writes `Observation`s: RGB, robot mask, keypoints and their visibility, as `xew.episode.States` keeps them
@@ -56,6 +56,20 @@ def observe(renderer: Renderer, recordings: Sequence[Recording], camera: Camera 
     worlds = [_world(recording, at) for recording, at in zip(recordings, points, strict=True)]
     frames = renderer.render_batch(worlds, camera)
     return [_observation(*seen, camera) for seen in zip(recordings, points, frames, strict=True)]
+
+
+def scene_recording(
+    robot: RobotSpec, scene: Scene, joint_pos: np.ndarray, object_pose: np.ndarray, object_joint: np.ndarray
+) -> Recording:
+    """What the camera looks at, from recorded states.
+
+    Args:
+        joint_pos: [t 16] canonical joint positions [rad] and grippers [0 closed, 1 open].
+        object_pose: [t o 7] xyz [m] and quaternion xyzw, world.
+        object_joint: [t o] hinge angles [rad].
+    """
+    things, thing_pose = scene_things(scene, object_pose, object_joint)
+    return Recording(robot, joint_pos, things, thing_pose)
 
 
 def scene_things(scene: Scene, object_pose: np.ndarray, object_joint: np.ndarray) -> tuple[list[Body], np.ndarray]:

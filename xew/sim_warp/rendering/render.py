@@ -91,7 +91,7 @@ class Renderer:
         ramp = stage.srgb_from_linear(np.linspace(0, 1, shading.COLORS))
         self._srgb = wp.array(ramp, dtype=wp.uint8, device=self.device)
         self._pinned = wp.empty(0, dtype=wp.uint8, device="cpu")
-        self._stages: dict[tuple[bytes, int, int], shading.Stage] = {}
+        self._stages: dict[tuple[bytes, int, int], shading.LitStage] = {}
 
     def render(
         self,
@@ -255,7 +255,7 @@ class Renderer:
         )
         return images
 
-    def _stage(self, camera: Camera, ground: bool) -> shading.Stage:
+    def _stage(self, camera: Camera, ground: bool) -> shading.LitStage:
         """What never moves as this camera sees it; drawn and lit at first use. Nothing looks the same from anywhere."""
         view = camera.intrinsics.tobytes() + camera.extrinsics.tobytes() if ground else b""
         key = (view, camera.width, camera.height)
@@ -265,7 +265,7 @@ class Renderer:
             self._stages[key] = self._lit_stage(camera, ground)
         return self._stages[key]
 
-    def _lit_stage(self, camera: Camera, ground: bool) -> shading.Stage:
+    def _lit_stage(self, camera: Camera, ground: bool) -> shading.LitStage:
         bodies = [Body(stage.stage_mesh(), False)] if ground else []
         rows, pose = pack_frames([World(bodies, np.tile(IDENTITY, (1, len(bodies), 1)))], [0])
         job = _Job(
@@ -273,12 +273,12 @@ class Renderer:
             pose=wp.array(pose, dtype=wp.transform, device=self.device),
             camera=camera,
             view=_camera_view(camera),
-            stage=shading.Stage(),
+            stage=shading.LitStage(),
         )
         chunk = _Chunk(self.device, job.geometry, rows)
         drawn = self._draw(job, chunk)
         height, width, lights = camera.height, camera.width, len(stage.LIGHTS) if ground else 0
-        lit = shading.Stage()
+        lit = shading.LitStage()
         lit.key = drawn.key[0]
         lit.ambient = self._zeros((height, width), wp.vec3)
         lit.direct = self._zeros((lights, height, width), wp.vec3)
@@ -309,7 +309,7 @@ class _Job:
     pose: wp.array
     camera: Camera
     view: raster.View
-    stage: shading.Stage
+    stage: shading.LitStage
     shadows: int = 0
     wanted: frozenset[str] = frozenset()
 
