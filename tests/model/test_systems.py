@@ -11,7 +11,8 @@ from flax import nnx
 
 from tests import synthetic
 from xew.config import ConfigError
-from xew.episode import find_accepted, read_record, read_states, read_video, write_episode
+from xew.dataset import find_accepted
+from xew.episode import read_record, read_states, read_video, write_episode
 from xew.model import latents, rollout, train
 from xew.model.conditions import ACTIONS
 from xew.model.experiment import create_model, load_experiment

@@ -30,18 +30,8 @@ import tyro
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.episode import (
-    HEIGHT,
-    WIDTH,
-    EpisodeError,
-    Record,
-    States,
-    complete_folder,
-    find_accepted,
-    read_states,
-    read_video,
-)
-from xew.protocol import seed_split
+from xew.dataset import read_dataset
+from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, States, complete_folder, read_states, read_video
 
 VERSION = "v3.0"
 RATE = Fraction(50, 3)
@@ -122,20 +112,14 @@ def export(args: Args) -> tuple[int, list[str]]:
 
 
 def _chosen(args: Args) -> list[tuple[Path, Record]]:
-    accepted = find_accepted(args.data)
+    dataset = read_dataset(args.data)
     for flag, asked, known in (
-        ("--robots", args.robots, {record.robot for _, record in accepted}),
-        ("--tasks", args.tasks, {record.task for _, record in accepted}),
+        ("--robots", args.robots, {record.robot for _, record in dataset.accepted}),
+        ("--tasks", args.tasks, {record.task for _, record in dataset.accepted}),
     ):
         if missing := sorted(set(asked) - known):
             raise EpisodeError(f"{flag} {', '.join(missing)}: not in {args.data}; it has {', '.join(sorted(known))}.")
-    found = [
-        (folder, record)
-        for folder, record in accepted
-        if (not args.robots or record.robot in args.robots)
-        and (not args.tasks or record.task in args.tasks)
-        and args.split in (None, seed_split(record.seed))
-    ]
+    found = dataset.select(robots=args.robots or None, tasks=args.tasks or None, split=args.split)
     if not found:
         raise EpisodeError(f"{args.data} has no episode of these robots, tasks and seeds; name fewer.")
     return found

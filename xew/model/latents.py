@@ -24,7 +24,8 @@ from safetensors.numpy import save_file
 from tqdm import tqdm
 
 from xew.config import ConfigError, digest, suggestion, user_errors
-from xew.episode import Record, complete_folder, episode_folder, find_accepted, read_states
+from xew.dataset import find_accepted
+from xew.episode import Record, complete_folder, episode_folder, read_states
 from xew.files import replacing
 from xew.model.cache.scales import Scale, fit_scales, load_run_scales, read_scales, save_scales
 from xew.model.codecs.ceiling import measure_ceiling, spread

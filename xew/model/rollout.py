@@ -24,7 +24,8 @@ from flax import nnx
 from tqdm import tqdm
 
 from xew.config import CONVERTER, ConfigError, suggestion, user_errors
-from xew.episode import EpisodeError, Record, episode_folder, find_accepted
+from xew.dataset import find_accepted
+from xew.episode import EpisodeError, Record, episode_folder
 from xew.model.cache.scales import load_run_scales
 from xew.model.codecs.codec import codec_of
 from xew.model.devices.sharding import MeshSettings, make_mesh, replicated

@@ -25,7 +25,8 @@ from flax import nnx
 from tqdm import tqdm
 
 from xew.config import ConfigError, load, pick, user_errors
-from xew.episode import find_accepted, read_video
+from xew.dataset import find_accepted
+from xew.episode import read_video
 from xew.model.codecs.ceiling import Ceiling, measure_ceiling, spread
 from xew.model.codecs.codec import WanVaeCodec, to_signed
 from xew.model.codecs.vae import VAES, LatentStatistic, VaeSize, VideoVae

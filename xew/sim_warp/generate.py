@@ -25,7 +25,8 @@ import warp as wp
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.episode import EpisodeError, Record, episode_folder, find_records, remove_left_overs
+from xew.dataset import find_records
+from xew.episode import EpisodeError, Record, episode_folder, remove_left_overs
 from xew.protocol import TEST_SEED_START, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK
 from xew.sim_warp.devices.workers import Workers, has_kernels, named_device, quiet_warp, worker_count
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
