@@ -16,7 +16,7 @@ from xew.files import cache_folder
 from xew.model.codecs.codec import TEMPORAL_FACTOR, CodecSettings, codec_of, latent_frames
 from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition
 from xew.model.devices.sharding import MeshSettings
-from xew.model.diffusion.samplers import GRIDS, SAMPLERS
+from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES
 from xew.model.network.dit import (
     MODELS,
     PATCH,
@@ -134,7 +134,7 @@ class RolloutSettings:
     sampler: str = "euler"
     """One of SAMPLERS."""
     grid: str = "flowwam"
-    """One of GRIDS: which project's noise levels."""
+    """Noise schedule: one of SCHEDULES, each by the name of the project that has it."""
     steps: int = 50
     """Evaluations of the network a chunk."""
     shift: float | None = None
@@ -256,7 +256,7 @@ def load_experiment(path: Path | str, overrides: list[str] | None = None) -> Exp
     demand_at_least(LEAST, experiment, str(path))
     codec_of(experiment.codec).check(experiment.codec)
     pick(SAMPLERS, experiment.rollout.sampler, "sampler")
-    pick(GRIDS, experiment.rollout.grid, "grid of noise levels")
+    pick(SCHEDULES, experiment.rollout.grid, "noise schedule")
     _ = experiment.size, experiment.robots
     _check_conditions(experiment, str(path))
     _check_sizes(experiment, str(path))

@@ -17,7 +17,7 @@ from xew.episode import HEIGHT, WIDTH, read_record, read_states
 from xew.model.codecs.codec import CODECS
 from xew.model.codecs.vae import VAES
 from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition, command_of
-from xew.model.diffusion.samplers import GRIDS, SAMPLERS
+from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES
 from xew.model.experiment import load_experiment
 from xew.model.network import dit
 from xew.model.network.dit import MODELS, STREAMS, WorldModel
@@ -327,7 +327,7 @@ PAGE = (ROOT / "docs" / "models.md").read_text()
 
 
 def test_the_page_names_all_that_can_be_chosen() -> None:
-    registries = (MODELS, STREAMS, ACTIONS, CONDITIONS, MECHANISMS, CODECS, VAES, SAMPLERS, GRIDS)
+    registries = (MODELS, STREAMS, ACTIONS, CONDITIONS, MECHANISMS, CODECS, VAES, SAMPLERS, SCHEDULES)
     absent = [name for registry in registries for name in registry if f"`{name}`" not in PAGE]
     assert not absent
     assert all((ROOT / path).is_file() for path in re.findall(r"configs/[\w/]+\.yaml", PAGE))

@@ -27,7 +27,7 @@ from xew.model.cache.scales import Scale, apply_scales
 from xew.model.codecs.codec import Codec, encode_pictures, to_pictures, to_signed
 from xew.model.conditions import Condition, clip_numbers
 from xew.model.devices.sharding import batch_sharding, replicated
-from xew.model.diffusion.samplers import GRIDS, SAMPLERS, Grid
+from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES, NoiseSchedule
 from xew.model.experiment import Experiment
 from xew.model.latents import Episode, stream_videos
 from xew.model.network.dit import WorldModel, compute_params
@@ -55,7 +55,7 @@ class Sampling(NamedTuple):
     """How a chunk is sampled; hashable, static in the compiled function."""
 
     sampler: str
-    grid: Grid
+    schedule: NoiseSchedule
     guidance: float
     latent_shape: tuple[int, ...]
 
@@ -120,8 +120,10 @@ class Predictor:
     @property
     def _sampling(self) -> Sampling:
         settings = self.experiment.rollout
-        grid = pick(GRIDS, settings.grid, "grid of noise levels")(settings.steps, settings.shift or self.experiment.train.shift)
-        return Sampling(settings.sampler, grid, settings.guidance, self.experiment.latent_shape)
+        schedule = pick(SCHEDULES, settings.grid, "noise schedule")(
+            settings.steps, settings.shift or self.experiment.train.shift
+        )
+        return Sampling(settings.sampler, schedule, settings.guidance, self.experiment.latent_shape)
 
     def _read(self, episode: Episode) -> Streams:
         conditions = {name: condition for name, condition in self.experiment.conditions.items() if condition.make is not None}
@@ -203,7 +205,7 @@ def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInp
     keys = jax.random.wrap_key_data(inputs.keys)
     noise = jax.vmap(lambda key: jax.random.normal(key, sampling.latent_shape, jnp.float32))(keys)
     velocity, sampler = guided_velocity(model, inputs, sampling.guidance), pick(SAMPLERS, sampling.sampler, "sampler")
-    frames = to_pictures(codec.decode_batch(sampler(velocity, reference, noise, sampling.grid)))
+    frames = to_pictures(codec.decode_batch(sampler(velocity, reference, noise, sampling.schedule)))
     return jax.lax.with_sharding_constraint(frames, PartitionSpec()) if jax.process_count() > 1 else frames
 
 
