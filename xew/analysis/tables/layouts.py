@@ -24,7 +24,8 @@ from xew.analysis.statistics.grades import (
     pooled,
 )
 from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
-from xew.model import conditions
+from xew.model.conditions import ACTIONS as REPRESENTATIONS
+from xew.model.conditions import CONDITIONS
 from xew.protocol import (
     FORGETTING_ROBOT,
     HELD_OUT_ROBOTS,
@@ -50,16 +51,16 @@ DIMENSION_TITLES = {
 SHORT_ROBOTS = {"franka_panda": "Franka", "piper": "Piper", "aloha_agilex": "Aloha", "arx_x5": "ARX", "ur5_wsg": "UR5"}
 SEEN_TITLE = "Seen pool: Aloha-AgileX, ARX-X5 and UR5"
 
-ACTIONS = {variant.action: conditions.ACTIONS[variant.action].title for variant in PARTS["actions"]}
+ACTIONS = {variant.action: REPRESENTATIONS[variant.action].title for variant in PARTS["actions"]}
 """Title of each action representation by its key."""
-LADDER = {variant.embodiment: conditions.CONDITIONS[variant.embodiment].label for variant in PARTS["ladder"]}
+LADDER = {variant.embodiment: CONDITIONS[variant.embodiment].label for variant in PARTS["ladder"]}
 """Label of each condition of the ladder by its key, from nothing to a render of every frame."""
 SYSTEMS = {
-    variant.system: "reference model" if variant.system == REFERENCE else conditions.ACTIONS[variant.action].title
+    variant.system: "reference model" if variant.system == REFERENCE else REPRESENTATIONS[variant.action].title
     for variant in PARTS["baselines"]
 }
 """Title of each world model by its key."""
-SYSTEM_ACTIONS = tuple(conditions.ACTIONS[variant.action].label for variant in PARTS["baselines"])
+SYSTEM_ACTIONS = tuple(REPRESENTATIONS[variant.action].label for variant in PARTS["baselines"])
 """What each of SYSTEMS is told of actions."""
 STILL, TRUE = "frozen first frame", "true video, graded"
 REMEDIES = {"replay": "with replay", "lora": "with LoRA"}
