@@ -158,10 +158,10 @@ def pack_frames(worlds: Sequence[World], kind: Sequence[int]) -> tuple[FrameTabl
 def pack_points(worlds: Sequence[World]) -> np.ndarray:
     """[t k 3] float64 points of all frames [m], world frame; worlds with fewer points are filled up with NaN."""
     most = max((world.points.shape[1] for world in worlds if world.points is not None), default=0)
-    rows = []
+    padded_worlds = []
     for world in worlds:
         padded = np.full((len(world.pose), most, 3), np.nan)
         if world.points is not None:
             padded[:, : world.points.shape[1]] = world.points
-        rows.append(padded)
-    return np.concatenate(rows)
+        padded_worlds.append(padded)
+    return np.concatenate(padded_worlds)
