@@ -91,7 +91,7 @@ def test_the_camera_is_the_file_s(imported: Path) -> None:
 
 
 def test_the_robot_is_found_and_rendered_where_it_stood(imported: Path) -> None:
-    kept = get_robot(ROBOT)
+    kept = get_robot(ROBOT, imported.parents[2])
     for arm, base in zip(kept.arms, made.BASES, strict=True):
         assert np.allclose(arm.root_pose[:3], base[:3], atol=1e-6) and np.allclose(arm.tool_pose, (0.12, 0, 0, 0, 0, 0, 1))
     record, states = read_record(imported), read_states(imported)

@@ -31,7 +31,7 @@ from xew.sim_warp.geometry.poses import matrix_from_pose, pose_from_matrix
 from xew.sim_warp.kinematics.forward import tool_matrix
 from xew.sim_warp.rendering.observe import Recording, keypoint_names, observe
 from xew.sim_warp.rendering.streams import command_renders, default_renderer
-from xew.sim_warp.robots import RobotSpec, get_robot, is_path, keep_robot, use_robots_of
+from xew.sim_warp.robots import RobotSpec, get_robot, is_path, keep_robot
 from xew.sim_warp.robots.user.draft import find_description, read_draft
 
 EMBODIMENTS = {
@@ -164,14 +164,13 @@ def _middle(poses: np.ndarray) -> np.ndarray:
 def _robot(path: Path, recorded: Recorded, args: Args) -> tuple[str, RobotSpec | None]:
     """The name under which the episode is stored, and the robot that it is rendered with, if it is known."""
     named = args.robot or _embodiment(path)
-    robot = get_robot(named)
+    robot = get_robot(named, args.out)
     if is_path(named) and (tool := read_draft(find_description(Path(named))).arms[0].tool_pose):
         robot = replace(robot, arms=(replace(robot.arms[0], tool_pose=tool), replace(robot.arms[1], tool_pose=tool)))
     placed = fitted(robot, recorded)
     if placed is None:
         return f"{robot.key}_robotwin", None
     key = f"{robot.key}_robotwin"
-    use_robots_of(args.out)
     placed = replace(placed, key=key)
     kept = keep_robot(placed, args.out)
     bases = [np.array([arm.root_pose for arm in spec.arms]) for spec in (placed, kept)]
@@ -219,7 +218,7 @@ def _seen(robot: RobotSpec | None, action: np.ndarray, recorded: Recorded) -> tu
     if robot is not None:
         names = keypoint_names(robot)
         keypoints = observe(default_renderer(), [Recording(robot, action)], camera)[0].keypoints
-        video = command_renders([(robot.key, action)], camera)[0]
+        video = command_renders([(robot, action)], camera)[0]
     nothing = np.full((frames, ACTION_DIM), np.nan, np.float32)
     no_pose = np.full((frames, 2, 7), np.nan)
     states = States(
@@ -257,7 +256,7 @@ def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
     if args.robot:
-        get_robot(args.robot)  # a mistake in it is told once, not for every file
+        get_robot(args.robot, args.out)  # a mistake in it is told once, not for every file
     records, refused = import_all(find_episodes(args.source), args)
     rendered = sum("robot" in record.hashes for record in records)
     print(f"{len(records)} episodes under {args.out}, {rendered} with the robot's own kinematics")

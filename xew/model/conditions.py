@@ -18,11 +18,12 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.episode import Record, States, read_video
+from xew.episode import Record, States, data_folder, read_video
 from xew.model.network.mechanisms import GROUP
 from xew.protocol import ARMS
 
 if TYPE_CHECKING:
+    from xew.sim_warp.embodiment.spec import RobotSpec
     from xew.sim_warp.geometry.camera import Camera
     from xew.sim_warp.rendering.streams import CommandStreams
 
@@ -42,6 +43,8 @@ class Command:
     """The stored robot-only video, posed by `action` on a white ground."""
     rendered: np.ndarray | None = None
     """The same [t h w 3] uint8, where it is at hand."""
+    data: Path | None = None
+    """Data set of the episode, which keeps robots of a user's own."""
 
     @cached_property
     def render(self) -> np.ndarray:
@@ -53,17 +56,21 @@ class Command:
         """Render, mask and optical flow of the commands; Warp is imported when first asked for."""
         from xew.sim_warp.rendering.streams import command_streams
 
-        return command_streams(self.robot, self.action, self.camera)
+        return command_streams(self.robot_spec, self.action, self.camera)
 
     @cached_property
     def tools(self) -> np.ndarray:
         """float64 [t 2 7], commanded world poses of the left and right tool, x y z w quaternions, by forward kinematics."""
-        from xew.sim_warp.kinematics.forward import tool_pose
+        from xew.sim_warp.kinematics.forward import tool_poses
+
+        return tool_poses(self.robot_spec, self.action)
+
+    @cached_property
+    def robot_spec(self) -> "RobotSpec":
+        """The simulator's description of the robot: of the registry, or kept beside the data."""
         from xew.sim_warp.robots import get_robot
 
-        robot = get_robot(self.robot)
-        joints = [self.action[:, arm_joints][:, : robot.arm_joint_count] for arm_joints, _ in ARMS]
-        return np.stack([tool_pose(robot, arm, arm_pos) for arm, arm_pos in enumerate(joints)], axis=1)
+        return get_robot(self.robot, self.data)
 
     @property
     def camera(self) -> "Camera":
@@ -122,7 +129,8 @@ def clip_numbers(condition: Condition, numbers: np.ndarray, start: int, frames: 
 
 def command_of(folder: Path, record: Record, states: States, rendered: np.ndarray | None = None) -> Command:
     """The part of an episode that conditions may see."""
-    return Command(record.robot, states.action, states.intrinsics, states.extrinsics, folder / "robot.mkv", rendered)
+    data = data_folder(folder)
+    return Command(record.robot, states.action, states.intrinsics, states.extrinsics, folder / "robot.mkv", rendered, data)
 
 
 def joints(command: Command) -> np.ndarray:
@@ -151,28 +159,28 @@ def ray_map(command: Command) -> np.ndarray:
     """The commanded tool frames drawn into the image."""
     from xew.sim_warp.rendering import streams
 
-    return streams.ray_map(command.robot, command.action, command.camera)
+    return streams.ray_map(command.robot_spec, command.action, command.camera)
 
 
 def reference_image(command: Command) -> np.ndarray:
     """One front view of the robot at home."""
     from xew.sim_warp.rendering import streams
 
-    return streams.reference_image(command.robot)[None]
+    return streams.reference_image(command.robot_spec)[None]
 
 
 def nine_views(command: Command) -> np.ndarray:
     """The robot at home from nine sides."""
     from xew.sim_warp.rendering import streams
 
-    return streams.nine_views(command.robot)
+    return streams.nine_views(command.robot_spec)
 
 
 def articulation_clip(command: Command) -> np.ndarray:
     """A clip of the robot that moves all its joints."""
     from xew.sim_warp.rendering import streams
 
-    return streams.articulation_clip(command.robot)
+    return streams.articulation_clip(command.robot_spec)
 
 
 POINTING_DOWN = Rotation.from_matrix([[0, -1, 0], [0, 0, 1], [-1, 0, 0]])

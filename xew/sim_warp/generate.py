@@ -193,7 +193,7 @@ def _check(args: Args) -> None:
         get_task(task)
     for robot in args.robots:
         if not is_path(robot):
-            get_robot(robot)
+            get_robot(robot, args.out)
     if not args.tasks or not args.robots or min(args.train_seeds, args.test_seeds) < 0 or args.batch < 1:
         raise EpisodeError(
             f"nothing to make of {len(args.tasks)} tasks, {len(args.robots)} robots, {args.train_seeds} training and "

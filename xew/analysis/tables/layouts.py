@@ -35,6 +35,7 @@ from xew.protocol import (
     expected_counts,
     reference,
 )
+from xew.sim_warp.robots import ROBOTS
 
 PAPER_METRICS = (
     "psnr", "ssim", "lpips", "mask_iou", "boundary_f1", "region_lpips", "pck", "keypoint_error", "ndtw", "trajectory_error",
@@ -46,7 +47,7 @@ DIMENSION_TITLES = {
     "kinematics": "Robot kinematics",
     "objects": "Object dynamics",
 }
-SHORT_ROBOTS = {"franka_panda": "Franka", "piper": "Piper", "aloha_agilex": "Aloha", "arx_x5": "ARX", "ur5_wsg": "UR5"}
+SHORT_ROBOTS = {key: robot.label for key, robot in ROBOTS.items()}
 SEEN_TITLE = "Seen pool: Aloha-AgileX, ARX-X5 and UR5"
 
 ACTIONS = {"joints": "Joint pose", "ray_map": "Ray map", "mask": "Mask", "optical_flow": "Optical flow"}

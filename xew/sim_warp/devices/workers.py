@@ -10,7 +10,6 @@ A worker ignores Ctrl-C (its parent decides) and leaves when its parent is kille
 import multiprocessing
 import os
 import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -21,6 +20,7 @@ import warp
 
 from xew.config import ConfigError
 from xew.episode import EpisodeError
+from xew.processes import leave_with_parent
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -99,11 +99,4 @@ def quiet_warp() -> None:
 def _become_worker() -> None:
     quiet_warp()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
-
-
-def _leave_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    leave_with_parent(lambda: os._exit(1))

@@ -34,7 +34,9 @@ class RobotSpec:
     """A bimanual robot: a URDF, used once with both arms in it or twice with one."""
 
     key: str
+    """Name in commands, folders and score tables."""
     title: str
+    """Name in headings of tables and pages."""
     urdf: Path
     arms: tuple[Arm, Arm]
     """Left (at -x) and right (at +x); the robot stands at -y and looks to +y."""
@@ -43,6 +45,11 @@ class RobotSpec:
     joint_upper: tuple[float, ...]
     joint_velocity: tuple[float, ...]
     """Speed limits that experts keep [rad/s]."""
+    label: str = ""
+    """Short name in columns and legends; the title where it is left out."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "label", self.label or self.title)
 
     @property
     def one_urdf_holds_both_arms(self) -> bool:

@@ -78,6 +78,12 @@ def tool_pose(robot: RobotSpec, arm: int, arm_pos: np.ndarray) -> np.ndarray:
     return pose_from_matrix(tool_matrix(robot, arm, np.asarray(arm_pos, float)))
 
 
+def tool_poses(robot: RobotSpec, action: np.ndarray) -> np.ndarray:
+    """World poses [n 2 7] of the left and right tool frame at canonical rows `action` [n 16] (joints in rad)."""
+    arms = [action[:, joints][:, : robot.arm_joint_count] for joints, _ in ARMS]
+    return np.stack([tool_pose(robot, arm, arm_pos) for arm, arm_pos in enumerate(arms)], axis=1)
+
+
 def tool_matrix(robot: RobotSpec, arm: int, arm_pos: np.ndarray) -> np.ndarray:
     """As `tool_pose`, but [n 4 4]; other joints on the way to the tool stay at 0."""
     side = robot.arms[arm]

@@ -7,11 +7,11 @@ Writes `Cell`s: first with scene, plan and joint commands (`plan_cells`), then w
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
-from xew.protocol import ARMS
-from xew.sim_warp.kinematics.forward import tool_pose
+from xew.sim_warp.kinematics.forward import tool_poses
 from xew.sim_warp.physics import Motion, World, simulate
 from xew.sim_warp.plan import ToolPath
 from xew.sim_warp.production.expert import Commands, joint_commands
@@ -74,15 +74,19 @@ class Cell:
         return scene_recording(self.robot, self.scene, motion.joint_pos, motion.object_pose, motion.object_joint)
 
 
-def plan_cells(jobs: Sequence[Job]) -> list[list[Cell]]:
-    """Scene, plan and commands of every cell, by job; the commands of all cells of a robot are solved together."""
+def plan_cells(jobs: Sequence[Job], data: Path | None = None) -> list[list[Cell]]:
+    """Scene, plan and commands of every cell, by job; the commands of all cells of a robot are solved together.
+
+    Args:
+        data: data set whose own robots count too.
+    """
     tasks = [get_task(job.task) for job in jobs]
     scenes = [task.sample(scene_rng(job.task, job.seed), job.seed) for job, task in zip(jobs, tasks, strict=True)]
     paths = [task.plan(scene).path() for task, scene in zip(tasks, scenes, strict=True)]
     seeds: list[list[Cell]] = [[] for _ in jobs]
     for name in dict.fromkeys(robot for job in jobs for robot in job.robots):
         mine = [index for index, job in enumerate(jobs) if name in job.robots]
-        robot = get_robot(name)
+        robot = get_robot(name, data)
         for index, commands in zip(mine, joint_commands(robot, [paths[index] for index in mine]), strict=True):
             seeds[index].append(Cell(jobs[index].task, tasks[index], scenes[index], paths[index], name, robot, commands))
     return seeds
@@ -102,5 +106,4 @@ def simulate_cells(seeds: list[list[Cell]], device: str | None = None, batch: in
 
 def measured_tools(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
     """[t 2 7] float32 tool poses, xyz [m] and quaternion xyzw, world, at canonical joint positions [t 16] rad."""
-    arms = [joint_pos[:, joints][:, : robot.arm_joint_count] for joints, _ in ARMS]
-    return np.stack([tool_pose(robot, side, arm) for side, arm in enumerate(arms)], 1).astype(np.float32)
+    return tool_poses(robot, joint_pos).astype(np.float32)

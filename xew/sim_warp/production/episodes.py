@@ -30,7 +30,7 @@ Pixels = tuple[Observation, np.ndarray]
 def render_cells(cells: Sequence[Cell], renderer: Renderer) -> list[Pixels]:
     """What the camera sees of each cell, and the robot alone by its commands [t h w 3] uint8."""
     views = observe(renderer, [cell.recording for cell in cells])
-    renders = command_renders([(cell.robot_name, cell.commands.action) for cell in cells], renderer=renderer)
+    renders = command_renders([(cell.robot, cell.commands.action) for cell in cells], renderer=renderer)
     return list(zip(views, renders, strict=True))
 
 

@@ -34,7 +34,7 @@ def produce(
         batch: worlds that a GPU steps together, None for all.
         videos: store them; without, an episode has all states and hashes, and `rerender.add_videos` makes its videos.
     """
-    planned = plan_cells(jobs)
+    planned = plan_cells(jobs, out)
     seeds = simulate_cells(planned, renderer.device.alias, batch)
     rejected = {(job.task, job.seed) for job in jobs if job.rejected}
     records: list[list[Record]] = []

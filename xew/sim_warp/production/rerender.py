@@ -9,12 +9,22 @@ from pathlib import Path
 
 import numpy as np
 
-from xew.episode import EpisodeError, Record, array_hash, demand_known, read_record, read_states, states_hash, write_episode
+from xew.episode import (
+    EpisodeError,
+    Record,
+    array_hash,
+    data_folder,
+    demand_known,
+    read_record,
+    read_states,
+    states_hash,
+    write_episode,
+)
 from xew.sim_warp.physics.plausibility import find_implausible
 from xew.sim_warp.rendering.observe import observe, scene_recording
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import command_renders
-from xew.sim_warp.robots import get_robot, use_robots_of
+from xew.sim_warp.robots import get_robot
 from xew.sim_warp.scene import Scene, scene_hash, scene_rng
 from xew.sim_warp.tasks import get_task
 
@@ -29,12 +39,11 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
         EpisodeError: the scene or anything rendered differs from what is recorded.
     """
     demand_known(folder, "joint_pos", "object_pose")
-    use_robots_of(folder.absolute().parents[2])
     record, states = read_record(folder), read_states(folder)
-    robot = get_robot(record.robot)
+    robot = get_robot(record.robot, data_folder(folder))
     scene = _sample_again(folder, record)
     view = observe(renderer, [scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)])[0]
-    render = command_renders([(record.robot, states.action)], renderer=renderer)[0]
+    render = command_renders([(robot, states.action)], renderer=renderer)[0]
     again = replace(states, keypoints=view.keypoints, keypoint_visible=view.keypoint_visible, robot_mask=view.robot_mask)
     found = {"states": states_hash(again), "rgb": array_hash(view.rgb), "robot": array_hash(render)}
     found["scene"] = scene_hash(scene)
@@ -52,7 +61,7 @@ def add_videos(folder: Path, renderer: Renderer) -> None:
     record = read_record(folder)
     if not record.videos:
         rgb, robot = render_again(folder, renderer)
-        write_episode(folder.parents[2], replace(record, videos=True), read_states(folder), rgb, robot)
+        write_episode(data_folder(folder), replace(record, videos=True), read_states(folder), rgb, robot)
 
 
 def demand_plausible(folder: Path) -> None:

@@ -3,8 +3,8 @@
 Reads  a URDF, a folder with robot.yaml, a RoboTwin embodiment folder, or a robot kept in a data set
 Writes <data>/robots/<key>/: robot.yaml with nothing left open, the URDF and all files that it names
 
-Episodes name their robot by its key. Whoever reads them finds the robot in the folders that `XEW_ROBOTS` lists (as PATH
-does), to which `use_robots_of(data)` adds those of a data set; workers inherit it.
+Episodes name their robot by its key. Whoever reads them finds the robot in the data set of the episode, or in the folders that
+`XEW_ROBOTS` lists (as PATH does).
 """
 
 import hashlib
@@ -223,23 +223,15 @@ def adopt_robots(names: Sequence[str], data: Path) -> tuple[str, ...]:
     Raises:
         ConfigError: a robot cannot be used, or the data set holds another of that key.
     """
-    use_robots_of(data)
     return tuple(_adopt(Path(name), data) if is_path(name) else name for name in names)
 
 
-def use_robots_of(data: Path) -> None:
-    """Let the robots that a data set holds be found by their keys, in this process and those that it starts."""
-    folder = str((Path(data) / KEPT).resolve())
-    known = [entry for entry in os.environ.get(FOLDERS, "").split(os.pathsep) if entry]
-    if folder not in known:
-        os.environ[FOLDERS] = os.pathsep.join([folder, *known])
-
-
-def kept_robot(key: str) -> RobotSpec | None:
-    """The robot of a key in the folders of `XEW_ROBOTS`, if there is one."""
-    for folder in os.environ.get(FOLDERS, "").split(os.pathsep):
-        if folder and (Path(folder) / key / OWN).is_file():
-            return load_robot(Path(folder) / key)
+def kept_robot(key: str, data: Path | None = None) -> RobotSpec | None:
+    """The robot of a key that a data set keeps, or else a folder of `XEW_ROBOTS`; None where neither has it."""
+    listed = [Path(folder) for folder in os.environ.get(FOLDERS, "").split(os.pathsep) if folder]
+    for folder in [*([] if data is None else [Path(data) / KEPT]), *listed]:
+        if (folder / key / OWN).is_file():
+            return load_robot(folder / key)
     return None
 
 

@@ -14,13 +14,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError
+from xew.protocol import ACTION_DIM, ARMS
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import load_urdf
 from xew.sim_warp.geometry.poses import matrix_from_pose
 from xew.sim_warp.kinematics.forward import link_poses
 from xew.sim_warp.kinematics.inverse import ArmSolver
+from xew.sim_warp.kinematics.reachability import GRASP_TILT, WORK_X, WORK_Y, WORK_Z, radial_yaw, reaches
 from xew.sim_warp.plan import ASIDE, HOME
-from xew.sim_warp.robots.reach import GRASP_TILT, WORK_X, WORK_Y, WORK_Z, radial_yaw, reached
 from xew.sim_warp.stage import TABLE_SIZE, TABLE_TOP
 
 DISTANCES = (0.6, 0.7, 0.8, 0.5, 0.4)
@@ -198,15 +199,16 @@ def _share(solver: ArmSolver, arm: int) -> float:
     cells = list(product(OFFSETS, product(WORK_X[::2], WORK_Y[::2], WORK_Z[::2])))
     positions = np.array([ASIDE[0].position, *(position for _, position in cells)])
     yaws = np.array([0.0, *(radial_yaw(np.array(position)) + offset for offset, position in cells)])
-    found = reached(solver, arm, positions, np.full(len(positions), float(GRASP_TILT)), yaws)
+    found = reaches(solver, arm, positions, np.full(len(positions), float(GRASP_TILT)), yaws)
     return float(found[1:].mean()) * (1.0 if found[0] else 0.25)
 
 
 def _is_clear(robot: RobotSpec, arm: int) -> bool:
     """Do all links that an arm's second joint and those after it move stay off the table and on their own side?"""
     urdf = load_urdf(robot.urdf)
-    row = np.zeros((1, 16))
-    row[0, 8 * arm : 8 * arm + robot.arm_joint_count] = robot.arms[arm].home
+    joints, _ = ARMS[arm]
+    row = np.zeros((1, ACTION_DIM))
+    row[0, joints][: robot.arm_joint_count] = robot.arms[arm].home
     frames = link_poses(robot, row)[0 if robot.one_urdf_holds_both_arms else arm]
     moved = [name for name in urdf.links if urdf.joints[robot.arms[arm].joints[1]] in urdf.chain(name)]
     for name in moved:
