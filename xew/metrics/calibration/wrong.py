@@ -102,9 +102,8 @@ def render(folder: Path, states: States) -> WrongVideo:
     quiet_warp()
     record = read_record(folder)
     scene = get_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
-    seen = scene_recording(
-        get_robot(record.robot, data_folder(folder)), scene, states.joint_pos, states.object_pose, states.object_joint
-    )
+    robot = get_robot(record.robot, data_folder(folder))
+    seen = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
     view = observe(default_renderer(), [seen])[0]
     objects, _ = project(HEAD_CAMERA, states.object_pose[..., :3].astype(np.float64))
     return WrongVideo(view.rgb, view.robot_mask, view.keypoints, objects.astype(np.float32))

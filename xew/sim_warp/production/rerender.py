@@ -61,7 +61,7 @@ def add_videos(folder: Path, renderer: Renderer) -> None:
     record = read_record(folder)
     if not record.videos:
         rgb, robot = render_again(folder, renderer)
-        write_episode(folder.parents[2], replace(record, videos=True), read_states(folder), rgb, robot)
+        write_episode(data_folder(folder), replace(record, videos=True), read_states(folder), rgb, robot)
 
 
 def demand_plausible(folder: Path) -> None:
