@@ -20,11 +20,11 @@ import numpy as np
 from xew.episode import HEIGHT, WIDTH, EpisodeError
 
 TOOL_OFFSET = 0.12
-"""RoboTwin's end pose lies this far behind the tool center point, along the approach [m], whatever the robot."""
+"""Distance of RoboTwin's end pose behind the tool center point, along the approach [m], whatever the robot."""
 RGB_MARK = b"XPL-RGB1"
 """JPEG comment of pictures that are ordinary JPEGs."""
 TABLE_CENTER = (0.0, 0.0, 0.74)
-"""What a head camera sees, world frame [m]."""
+"""Point that a head camera sees, world frame [m]."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Recorded:
     """One episode as RoboTwin recorded it, in our units, frames and orders."""
 
     layout: str
-    """"legacy" or "1.0"."""
+    """Layout of the file: "legacy" or "1.0"."""
     arms: np.ndarray
     """[t 2 d] drive targets of the left and right arm [rad]."""
     grippers: np.ndarray
@@ -46,7 +46,7 @@ class Recorded:
     extrinsics: np.ndarray
     """[4 4] world to camera."""
     instruction: str
-    """Empty where the file has none."""
+    """Instruction; empty where the file has none."""
 
 
 def read_robotwin(path: Path) -> Recorded:

@@ -48,9 +48,9 @@ RATE = Fraction(50, 3)
 """Frames a second."""
 FILES_PER_CHUNK = 1000
 LARGEST_DATA, LARGEST_VIDEO = 100, 200
-"""Size at which a file is closed and the next begun [MB]."""
+"""Sizes at which a file is closed and the next begun [MB]."""
 ENCODER = {"crf": "16", "g": "2", "bf": "0", "preset": "veryfast"}
-"""Of x264: every other frame is a key frame, so that single frames are read fast."""
+"""Options of x264: every other frame is a key frame, so that single frames are read fast."""
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 AXES = [f"{side}_{axis}" for side in ("left", "right") for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
 JOINTS = [f"{side}_{name}" for side in ("left", "right") for name in (*(f"joint{number}" for number in range(1, 8)), "gripper")]
@@ -59,7 +59,7 @@ VECTORS = {
     "observation.state": ("joint_pos", JOINTS),
     "observation.tool_pose": ("tool_pose", AXES),
 }
-"""Feature -> array of `States` and names of its numbers."""
+"""Array of `States` and names of its numbers, by feature."""
 SCALARS = {"next.done": "bool", "next.success": "bool", "timestamp": "float32"} | dict.fromkeys(
     ("frame_index", "episode_index", "index", "task_index"), "int64"
 )
@@ -73,13 +73,14 @@ class Args:
     out: Path
     """Folder of the LeRobotDataset; it must not exist."""
     robots: tuple[str, ...] = ()
-    """Default: all in the data."""
+    """Robots to export; default: all in the data."""
     tasks: tuple[str, ...] = ()
-    """Default: all in the data."""
+    """Tasks to export; default: all in the data."""
     split: Literal["train", "test"] | None = None
-    """Only training seeds, or only test seeds; default: both. Who trains on the set and grades on ours exports the first."""
+    """Training seeds or test seeds; default: both. Export the training seeds if you train on the set and grade on our test
+    seeds."""
     robot_video: bool = False
-    """Also the robot alone, as observation.images.robot."""
+    """Export the video of the robot alone too, as observation.images.robot."""
 
 
 @dataclass(frozen=True)

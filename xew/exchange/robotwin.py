@@ -43,11 +43,11 @@ EMBODIMENTS = {
 }
 """RoboTwin's names of robots, and ours."""
 TOOL_DISTANCE = {"aloha_agilex": 0.12, "arx_x5": 0.12, "ur5_wsg": 0.11, "franka_panda": 0.08, "piper": 0.12}
-"""From the link that carries the tool to RoboTwin's tool center point [m] (gripper_bias of its embodiments)."""
+"""Distance from the link that carries the tool to RoboTwin's tool center point [m] (gripper_bias of its embodiments)."""
 FIT_POSITION, FIT_ROTATION = 0.01, 0.05
-"""Median distance [m] and angle [rad] between end poses and those of a robot's joints, up to which it is that robot."""
+"""Largest median distance [m] and angle [rad] between end poses and those of a robot's joints at which it is that robot."""
 SAME_PLACE = 0.003
-"""How far the bases of two episodes of one robot may differ [m]."""
+"""Largest distance between the bases of two episodes of one robot [m]."""
 UNKNOWN = ("joint_pos", "joint_vel", "object_pose", "object_joint", "contact", "penetration", "keypoint_visible", "robot_mask")
 SOURCE = "RoboTwin HDF5"
 
@@ -57,12 +57,12 @@ class Args:
     """What to import."""
 
     source: Annotated[Path, tyro.conf.Positional]
-    """A RoboTwin episode (.hdf5), or a folder of them at any depth."""
+    """Path of a RoboTwin episode (.hdf5), or of a folder with them at any depth."""
     out: Path = Path("data")
     robot: str | None = None
-    """A key of the registry, module:NAME or the path of a robot; default: told by the names of the folders."""
+    """Registry key, module:NAME or path of a robot; default: the one that the names of the folders tell."""
     task: str | None = None
-    """Default: the name of the folder two above the one that holds the file, as RoboTwin lays them out."""
+    """Name of the task; default: that of the folder two above the one that holds the file, as RoboTwin lays them out."""
 
 
 def find_episodes(source: Path) -> list[Path]:

@@ -13,9 +13,9 @@ from xew.sim_warp.geometry import meshes
 from xew.sim_warp.geometry.meshes import Color, Mesh
 
 WALL_SEGMENTS = 6
-"""Convex wedges round the wall of a hollow object: few enough that a finger pad lies on the flat of one."""
+"""Number of convex wedges round the wall of a hollow object: few enough that a finger pad lies on the flat of one."""
 FOOT = 0.0005
-"""How far the wall's wedges end above the floor [m], so that a vessel stands on its floor alone."""
+"""Gap between the wall's wedges and the floor [m], so that a vessel stands on its floor alone."""
 
 PALETTE: dict[str, Color] = {
     "red": (200, 45, 40),

@@ -28,7 +28,7 @@ from xew.sim_warp.production.produce import Job, header, plan_cells, simulate_ce
 from xew.sim_warp.robots import ROBOTS, get_robot
 from xew.sim_warp.tasks import TASKS, Task, get_task
 
-PARTS = ("Task", "Randomisation", "Success", "After")
+PARTS = ("Task", "Randomization", "Success", "After")
 """How the paragraphs of a task's module docstring begin."""
 COMMAND = "python -m xew.sim_warp.yields"
 
@@ -135,7 +135,7 @@ def described(task: Task) -> dict[str, str]:
     """The paragraphs of a task's module docstring by how they begin: what to do, what varies, when it is done."""
     module = importlib.import_module(task.sample.__module__)
     found: dict[str, str] = {}
-    for line in inspect.cleandoc(module.__doc__ or "").splitlines():
+    for line in inspect.cleandoc(module.__doc__ or "").replace("Randomisation:", "Randomization:").splitlines():
         begun = next((part for part in PARTS if line.startswith((part + ":", part + " "))), None)
         if begun:
             found[begun] = line.removeprefix(begun + ":").strip()
@@ -148,7 +148,7 @@ def described(task: Task) -> dict[str, str]:
 def description(task: Task) -> str:
     """A task as a section of the page."""
     parts = described(task)
-    lines = [f"- **{part}**: {parts[part]}" for part in ("Task", "Randomisation", "Success") if part in parts]
+    lines = [f"- **{part}**: {parts[part]}" for part in ("Task", "Randomization", "Success") if part in parts]
     return "\n".join([f"### `{task.name}`", f"*{task.instruction}*", "", *lines, "", parts.get("After", "")]).strip()
 
 

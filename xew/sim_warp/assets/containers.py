@@ -27,14 +27,15 @@ DARK: Color = (48, 48, 52)
 AMBER: Color = (214, 120, 30)
 
 SECTIONS = 32
-"""Facets round what is turned."""
+"""Number of facets round a body of revolution."""
 SIDES = 12
-"""Flat sides of what stands."""
+"""Number of flat sides of a container that stands."""
 GRASP_BELOW_TOP = 0.014
-"""Of the tool when what stands is taken from above [m]: deeper, and the palm of a leaning hand would meet the edge."""
+"""Depth of the tool below the top when a standing container is taken from above [m]: deeper, and the palm of a leaning hand
+would meet the edge."""
 
 Outline = Sequence[tuple[float, float]]
-"""(radius, height) pairs [m] from the bottom to the top."""
+"""Pairs (radius, height) [m] from the bottom to the top."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +43,11 @@ class Band:
     """A stretch of a container's height that is painted."""
 
     low: float
-    """m."""
+    """Lower end [m]."""
     high: float
     color: Color
     front: Color | None = None
-    """Of the label's front, a third of the way round."""
+    """Color of the label's front, a third of the way round."""
 
 
 def turned(outline: Outline, color: Color, bands: Sequence[Band] = (), facing: float = 0.0) -> Mesh:

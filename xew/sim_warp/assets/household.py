@@ -21,10 +21,10 @@ from xew.sim_warp.stage import TABLE_TOP
 LOWEST_GRASP = 0.019
 """Height of the tool above the table at which a leaning pad just clears it [m]: pads reach 15 mm beyond the tool."""
 PALM = 0.020
-"""How far above the tool a long thing may reach [m]: the palm of the hand with the shortest fingers leans over its end."""
+"""Greatest reach of a long thing above the tool [m]: the palm of the hand with the shortest fingers leans over its end."""
 HALF_TURN, QUARTER_TURN = np.pi, np.pi / 2
 SKIN = 0.0006
-"""How far a printed or glued part stands out of the face that it decorates [m]."""
+"""Distance by which a printed or glued part stands out of the face that it decorates [m]."""
 
 DARK: Color = (45, 46, 50)
 STEEL: Color = (168, 172, 178)
@@ -36,7 +36,7 @@ MATS: dict[str, Color] = {name: COLORS[name] for name in ("red", "green", "blue"
     "cyan": (70, 190, 205),
     "magenta": (190, 60, 150),
 }
-"""RoboTwin's eight colors of the mats on which things are put."""
+"""Colors of the mats on which things are put, RoboTwin's eight."""
 MAT_THICKNESS = 0.001
 
 
@@ -57,17 +57,17 @@ class Thing:
     kind: str
     """Key of `THINGS`."""
     words: str
-    """What an instruction calls it, without an article: "red toy car"."""
+    """Name in an instruction, without an article: "red toy car"."""
     shape: Shape
     mass: float
-    """kg."""
+    """Mass [kg]."""
     grasp_height: float
-    """Of the tool above the object's bottom, on the object's own z axis [m]."""
+    """Height of the tool above the object's bottom, on the object's own z axis [m]."""
     width: float
-    """Between the fingers [m]."""
+    """Width between the fingers [m]."""
     symmetry: float
-    """Turning the hand by this angle about z [rad] gives an equally good grasp: pi for what is long, less for what is
-    square or round."""
+    """Angle by which the hand may turn about z for an equally good grasp [rad]: pi for what is long, less for what is square
+    or round."""
 
     def placed(self, name: str, xy: Point, yaw: float) -> SceneObject:
         """The thing upright on the table at `xy` [2] m, turned by `yaw` [rad]."""
@@ -190,13 +190,13 @@ class StaplerParts:
     words: str
     base: Shape
     arm: Shape
-    """As it stands open: the gap below it is widest at the front."""
+    """Upper arm as it stands open: the gap below it is widest at the front."""
     hinge: tuple[float, float, float]
-    """A point of the axis, which runs along x [m]."""
+    """Point of the axis, which runs along x [m]."""
     width: float
     length: float
     height: float
-    """m."""
+    """Height of the whole [m]."""
     opening: float
     """Angle by which the arm comes down until its front meets the base [rad]."""
 

@@ -17,9 +17,9 @@ from trimesh.resolvers import Resolver
 from trimesh.visual import TextureVisuals
 
 LARGEST_FILE = 200e6
-"""Bytes of a mesh file; a larger one is refused before it is read."""
+"""Largest size of a mesh file [bytes]; a larger one is refused before it is read."""
 MOST_TRIANGLES = 1_000_000
-"""Of one mesh file; a link of our own robots has some hundreds."""
+"""Largest number of triangles of a mesh file; a link of our own robots has some hundreds."""
 SAMPLES = np.array([(4, 1, 1), (1, 4, 1), (1, 1, 4), (2, 2, 2), (3, 3, 0), (0, 3, 3), (3, 0, 3)]) / 6
 """Barycentric coordinates at which a texture is read."""
 
@@ -33,7 +33,7 @@ class Part:
     """A piece of a mesh file."""
 
     shape: trimesh.Trimesh
-    """In the file's units and frame."""
+    """Mesh in the file's units and frame."""
     colors: np.ndarray | None
     """[f 3] uint8, sRGB, or None where the file gives none."""
 

@@ -20,11 +20,11 @@ from xew.sim_warp.embodiment.mesh_files import MeshError, MeshFile, Part, read_m
 from xew.sim_warp.geometry.meshes import Color, Mesh, from_trimesh, merge
 
 DEFAULT_COLOR: Color = (190, 190, 190)
-"""Of a visual that names no material."""
+"""Color of a visual that names no material."""
 HULL_POINTS = 64
-"""Corners of a collision hull; of finer ones those are kept that lie farthest out in as many directions."""
+"""Largest number of corners of a collision hull; of finer ones those are kept that lie farthest out in as many directions."""
 LARGEST_LINK = 10.0
-"""Extent of a link [m] beyond which its mesh must be in millimeters."""
+"""Largest extent of a link [m]; beyond it its mesh must be in millimeters."""
 
 
 class UrdfError(ConfigError):
@@ -36,7 +36,7 @@ class Inertial:
     """Mass properties of a link."""
 
     mass: float
-    """kg."""
+    """Mass [kg]."""
     center: np.ndarray
     """[3] center of mass in the link frame, m."""
     inertia: np.ndarray
@@ -48,7 +48,7 @@ class Collision:
     """A convex shape that a link collides with."""
 
     name: str
-    """As in the URDF; "pad" is the gripping face of a finger. Empty where the URDF names none."""
+    """Name in the URDF; "pad" is the gripping face of a finger. Empty where the URDF names none."""
     points: np.ndarray
     """[k 3] float32, corners of its convex hull in the link frame, m."""
 
@@ -57,7 +57,7 @@ class Collision:
 class Link:
     name: str
     visual: Mesh | None
-    """All visuals of the link as one mesh."""
+    """Mesh of all visuals of the link; None where it has none."""
     collisions: tuple[Collision, ...]
     inertial: Inertial | None
 
@@ -66,7 +66,7 @@ class Link:
 class Joint:
     name: str
     kind: str
-    """fixed, revolute, continuous or prismatic."""
+    """One of fixed, revolute, continuous or prismatic."""
     parent: str
     child: str
     origin: np.ndarray
@@ -92,9 +92,9 @@ class Urdf:
     links: dict[str, Link]
     joints: dict[str, Joint]
     meshes: dict[str, Path]
-    """Where each mesh is that the URDF names."""
+    """File of each mesh by the name that the URDF gives it."""
     files: tuple[Path, ...]
-    """All that was read: the URDF, meshes, their materials and textures."""
+    """Files that were read: the URDF, meshes, their materials and textures."""
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:

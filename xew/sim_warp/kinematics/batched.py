@@ -20,7 +20,7 @@ from xew.sim_warp.geometry.poses import Pose, pose_from_matrix
 from xew.sim_warp.kinematics.kernels import FIXED, SLIDING, TURNING, kinematics_kernels
 
 BLOCK = 64
-"""Threads of a block: with 65,536 configurations every multiprocessor of a large GPU has some."""
+"""Number of threads of a block: with 65,536 configurations every multiprocessor of a large GPU has some."""
 AT_ORIGIN: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -38,14 +38,14 @@ class Node:
     """A link in the order in which a thread walks."""
 
     copy: int
-    """Copy of the URDF: 0, or 1 for the right arm of a robot that uses it twice."""
+    """Number of the copy of the URDF: 0, or 1 for the right arm of a robot that uses it twice."""
     link: str
     above: int
     """Number of the parent's node, -1 for the world."""
     origin: Pose
     joint: Joint | None = None
     source: Source | None = None
-    """None where the joint does not move."""
+    """Source of the position; None where the joint does not move."""
 
 
 class BatchedKinematics:

@@ -22,14 +22,15 @@ from xew.sim_warp.kinematics.forward import tool_matrix
 
 JOINT_COUNT = 7
 POSITION_WEIGHT = 4.0
-"""A residual of 1 m counts as much as one of 4 rad: near a pose both then converge at the same pace."""
+"""Weight of a position residual: 1 m counts as much as 4 rad, so that near a pose both converge at the same pace."""
 LIMIT_WEIGHT = 2.0
 POSTURE_WEIGHT = 0.01
-"""Pull of a seven-joint arm towards the mean of its two homes, so that its elbow does not drift."""
+"""Weight of the pull of a seven-joint arm toward the mean of its two homes, so that its elbow does not drift."""
 POLISH_STEPS = 4
-"""Last steps, without that pull, so that it does not move the tool."""
+"""Number of last steps without that pull, so that it does not move the tool."""
 ANCHOR_STRIDE = 8
-"""Frames of a path between two that are solved one after the other; those between are then solved all at once."""
+"""Number of frames from one pose of a path that is solved after the one before to the next; those between are solved at once.
+"""
 
 
 @dataclass(frozen=True)

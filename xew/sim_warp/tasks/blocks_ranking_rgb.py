@@ -1,6 +1,6 @@
 """Task: put a red, a green and a blue block in a row, from left to right, one hand at a time.
 
-Randomisation: three cubes of one size (half edge 15 to 25 mm) at |x| in [.05, .28], y in [-.08, .05] (y at most 0 where
+Randomization: three cubes of one size (half edge 15 to 25 mm) at |x| in [.05, .28], y in [-.08, .05] (y at most 0 where
     |x| < .15), any yaw within 43 degrees, at least .10 apart; never in order already. The row's y and its three x.
 Success: red left of green left of blue, neighbors within 130 mm in x and 30 mm in y, both grippers open.
 After RoboTwin 2.0's blocks_ranking_rgb.
@@ -16,7 +16,7 @@ from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, arm_for, pick, pla
 
 COLORS = ("red", "green", "blue")
 GRASP_BELOW_TOP = 0.014
-"""High enough that a wide hand passes over the blocks beside [m]."""
+"""Depth of the tool below the top of a block [m]: small enough that a wide hand passes over the blocks beside."""
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:

@@ -1,6 +1,6 @@
 """Task: put three blocks in a row by size, the largest on the left, one hand at a time.
 
-Randomisation: three cubes of half edges 28 to 31, 23 to 26 and 18 to 21 mm in three colors at |x| in [.05, .28], y in
+Randomization: three cubes of half edges 28 to 31, 23 to 26 and 18 to 21 mm in three colors at |x| in [.05, .28], y in
     [-.08, .05] (y at most 0 where |x| < .15), any yaw within 43 degrees, at least .12 apart and .10 from the places of the
     row; never in order already. The row's y and its three x.
 Success: large left of medium left of small, neighbors within 130 mm in x and 30 mm in y, both grippers open.
@@ -20,7 +20,7 @@ from xew.sim_warp.tasks.task import LET_GO, NARROWEST_HAND, Moment, Task, arm_fo
 SIZES = {"large": (0.028, 0.031), "medium": (0.023, 0.026), "small": (0.018, 0.021)}
 """Half edges [m], from the left end of the row to the right."""
 ROW = ((-0.10, -0.09), (-0.005, 0.005), (0.09, 0.10))
-"""x of each size in the row [m]."""
+"""Place of each size along x in the row [m]."""
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:

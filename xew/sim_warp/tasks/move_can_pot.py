@@ -1,6 +1,6 @@
 """Task: pick up a can and put it beside a cooking pot.
 
-Randomisation: the pot (fixed to the table) in the middle, its handles within 22 degrees of x; its size, colors and lid.
+Randomization: the pot (fixed to the table) in the middle, its handles within 22 degrees of x; its size, colors and lid.
     The can at |x| in [.20, .30], y in [.05, .15], yaw within 43 degrees; size and colors. The arm is that of the can's side.
 Success: the can on the arm's side of the pot, at most 200 mm from it in x and 35 mm in y, upright within 15 degrees and on
     the table (5 mm), both grippers open.

@@ -1,6 +1,6 @@
 """Task: put one everyday thing to the left of another.
 
-Randomisation: two different things A and B out of mouse, stapler, bell, toy car, magic cube, bread, phone, playing cards,
+Randomization: two different things A and B out of mouse, stapler, bell, toy car, magic cube, bread, phone, playing cards,
     wooden block, tea box, coffee box, soap, each a random variant. A at |x| in [.02, .22], y in [-.20, 0], its long side
     within 55 degrees of the direction from its arm's shoulder, either way round. B at y in [-.20, 0], any yaw, x in
     [.18, .23] if A is on the right, else in [-.10, .10]; the two at least .10 apart in y and 35 mm free of each other.
@@ -30,9 +30,9 @@ GAP = 0.035
 OVER = 0.08
 """Height at which A is carried [m]: over all that B may be."""
 PALM_HALF_WIDTH = 0.108
-"""Of the widest hand, the Panda's, with a little room: it stands over what is lower than it alone [m]."""
+"""Half width of the widest hand, the Panda's, with a little room: it stands over what is lower than it alone [m]."""
 MARGIN = 0.02
-"""By which A is nearer than what counts [m]."""
+"""Distance by which A is put nearer than what counts [m]."""
 NEAREST, FARTHEST = 0.08, 0.2
 """Distances between the two that count [m]."""
 

@@ -1,6 +1,6 @@
 """Task: put one or two pieces of bread into a basket, each with the hand on its side.
 
-Randomisation: breads at |x| in [.15, .28], y in [-.20, .02], at least .20 from the basket's middle and .14 apart, turned up
+Randomization: breads at |x| in [.15, .28], y in [-.20, .02], at least .20 from the basket's middle and .14 apart, turned up
     to 45 degrees from the direction in which their side's arm reaches; three times in four there are two. Basket (fixed) at
     (0, -.15): round or square, yaw within 14 degrees, color; kind, size and color of the breads.
 Success: every bread within 60 mm of the basket's middle in x and y and inside it (its bottom below the rim), both grippers
@@ -42,7 +42,7 @@ from xew.sim_warp.tasks.task import (
 
 BASKET = (0.0, -0.15)
 HALF = (0.108, 0.082)
-"""Half the inner size of the square basket [m]."""
+"""Half width of the square basket inside [m]."""
 RADIUS = 0.112
 """Inner radius of the round one [m]."""
 WALL, FLOOR, RIM = 0.007, 0.007, 0.036
@@ -51,9 +51,9 @@ SLOT = 0.043
 """Distance from the middle at which each of two breads goes [m]."""
 LIFT = 0.08
 PALM = 0.028
-"""How much of a bread may be above the tool [m]: the shortest fingers reach 39 mm from palm to tool, less the lean."""
+"""Greatest height of a bread above the tool [m]: the shortest fingers reach 39 mm from palm to tool, less the lean."""
 WIDEST_TURN = np.radians(45)
-"""Of a hand that leans by `STEEP_TILT` from its radial yaw [rad]."""
+"""Largest turn of a hand that leans by `STEEP_TILT` from its radial yaw [rad]."""
 WICKER: tuple[Color, ...] = ((196, 152, 92), (158, 108, 62), (214, 184, 132))
 
 

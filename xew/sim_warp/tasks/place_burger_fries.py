@@ -1,6 +1,6 @@
 """Task: put a burger and a portion of fries on a tray, both grasped at once, set down one after the other.
 
-Randomisation: tray (fixed) in the middle at y in [-.15, -.10]; burger at x in [-.30, -.25], fries at x in [.20, .30], both at
+Randomization: tray (fixed) in the middle at y in [-.15, -.10]; burger at x in [-.30, -.25], fries at x in [.20, .30], both at
     y in [-.15, -.07]; filling and size of the burger, color and size of the carton, color of the tray.
 Success: burger within 80 mm of the middle of the tray's left half, fries of its right half, both on the tray (15 mm), both
     grippers open. (RoboTwin 2.0 does not test the height.)
@@ -25,11 +25,11 @@ SPOT = 0.073
 """Distance of the two places on the tray from its middle, in x [m]."""
 LIFT = 0.08
 SIDES = 12
-"""Flat sides of the burger, on which pads lie."""
+"""Number of flat sides of the burger, on which pads lie."""
 BURGER_GRASP, FRIES_GRASP = 0.023, 0.019
 """Heights of the tool above the bottom [m]."""
 CARTON_BACK = -0.046
-"""y of the carton's bottom end [m]; the fries stick out towards +y."""
+"""Place of the carton's bottom end along y [m]; the fries stick out toward +y."""
 CARTON_LENGTH = 0.056
 
 
@@ -98,7 +98,7 @@ def _on_crown(radius: float, height: float, angle: float) -> tuple[float, float,
 
 
 def fries(rng: np.random.Generator) -> Shape:
-    """A carton of fries on its back, open towards +y."""
+    """A carton of fries on its back, open toward +y."""
     width, height = rng.uniform([0.046, 0.031], [0.054, 0.035])
     color, stripe = [((200, 40, 36), (245, 200, 60)), ((235, 232, 226), (200, 40, 36)), ((50, 90, 180), (240, 240, 238))][
         rng.integers(3)

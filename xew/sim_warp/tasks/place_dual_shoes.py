@@ -1,7 +1,7 @@
 """Task: put a pair of shoes into their box side by side, tips to the left; both are grasped at once.
 
-Randomisation: box (fixed) at (0, -.14); left shoe at x in [-.29, -.22], right shoe at x in [.22, .29], both at y in
-    [-.15, -.07]; tips up to 75 degrees from the left, of the left shoe towards the robot, of the right shoe away from it
+Randomization: box (fixed) at (0, -.14); left shoe at x in [-.29, -.22], right shoe at x in [.22, .29], both at y in
+    [-.15, -.07]; tips up to 75 degrees from the left, of the left shoe toward the robot, of the right shoe away from it
     (and 12 degrees the other way); size, kind and colors of the shoes, color of the box.
 Success: the left shoe within 50 mm in x and y of the box's nearer place, the right one of the farther, tips to the left
     (within 15 degrees), on the box's floor (15 mm), both grippers open.
@@ -32,16 +32,17 @@ WALL, FLOOR, RIM = 0.005, 0.004, 0.034
 SLOT = 0.044
 """Distance of each shoe's place from the box's middle, in y [m]."""
 LIFT = 0.05
-"""High enough to pass over the rim, low enough for short wrists that point straight down [m]."""
+"""Height to which the shoes are lifted [m]: enough to pass over the rim, little enough for short wrists that point straight
+down."""
 TURNS = np.radians([-12, 75])
-"""Range of a shoe's turn from its place in the box: of the left one anticlockwise, of the right one clockwise [rad]."""
+"""Range of a shoe's turn from its place in the box [rad]: of the left one counterclockwise, of the right one clockwise."""
 TIP_LEFT = np.pi / 2
 """Yaw at which a shoe's tip, its y axis, points to the left [rad]."""
 SOLE = 0.012
 GRASP_HEIGHT = 0.036
-"""Of the tool above the sole's bottom [m]: the pads end above the rim of the sole."""
+"""Height of the tool above the sole's bottom [m]: the pads end above the rim of the sole."""
 GRASP_AT = -0.010
-"""y of the grasp in a shoe's frame [m]: its center of mass is there."""
+"""Place of the grasp along y in a shoe's frame [m]: its center of mass is there."""
 LEATHERS: dict[str, Color] = objects.PALETTE | {"black": (52, 53, 58), "white": (236, 236, 232), "brown": (122, 78, 46)}
 
 
@@ -162,7 +163,7 @@ def places(scene: Scene) -> dict[str, np.ndarray]:
 
 
 def _grasp(thing: SceneObject, arm: int) -> tuple[Tool, float]:
-    """The hand straight down across a shoe, and the turn [rad] that brings the tip to the left and ends a quarter outwards."""
+    """The hand straight down across a shoe, and the turn [rad] that brings the tip to the left and ends a quarter outward."""
     turn = TIP_LEFT - thing.yaw
     middle = np.array(thing.pose[:3]) + Rotation.from_euler("z", thing.yaw).apply([0, GRASP_AT, GRASP_HEIGHT])
     return tool(middle, outward(arm) * np.pi / 2 - turn), turn

@@ -1,6 +1,6 @@
 """Task: put an everyday thing on a kitchen scale.
 
-Randomisation: one of mouse, stapler, bell at |x| in [.04, .25], y in [-.20, 0], its long side within 55 degrees of the
+Randomization: one of mouse, stapler, bell at |x| in [.04, .25], y in [-.20, 0], its long side within 55 degrees of the
     direction from its arm's shoulder, either way round; scale on the same side at |x| in [.04, .25], y in [-.18, .02], its
     display turned at most 40 degrees off the robot, 20 mm free of it; variant of the thing, form (round or square pan),
     size and color of the scale, which is fixed to the table.

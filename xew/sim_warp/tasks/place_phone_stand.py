@@ -1,6 +1,6 @@
 """Task: put a phone that lies on its back on a stand, where it leans against the rest.
 
-Randomisation: phone at |x| in [.05, .25], y in [-.20, -.05], yaw within 40 degrees; stand (fixed) on the same side at |x| at
+Randomization: phone at |x| in [.05, .25], y in [-.20, -.05], yaw within 40 degrees; stand (fixed) on the same side at |x| at
     most .15, y in [.02, .12], at least .17 away, turned to the shoulder of that side's arm; size and color of the phone,
     form and color of the stand.
 Success: the middle of the phone's lower edge within 45, 40 and 40 mm of its place on the stand's ledge, in x, y and z; the
@@ -23,15 +23,15 @@ from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks.task import LET_GO, NARROWEST_HAND, Moment, Task, arm_for, pick, place, radial_yaw
 
 LEAN = np.radians(40)
-"""Of the stand's rest from level [rad]."""
+"""Lean of the stand's rest from level [rad]."""
 FOOT = np.array([0.0, -0.040, 0.030])
-"""Where the rest meets the ledge, in the stand's frame [m]; the rest rises from there away from the robot."""
+"""Point where the rest meets the ledge, in the stand's frame [m]; the rest rises from there away from the robot."""
 GRASP_HEIGHT = 0.0165
-"""Of the tool above the phone's back [m]: a hand that points straight down clears the table with it."""
+"""Height of the tool above the phone's back [m]: a hand that points straight down clears the table with it."""
 GAP = 0.0015
-"""Between phone and stand when it is let go [m]."""
+"""Distance between phone and stand when it is let go [m]."""
 WIDTH = 0.052
-"""Of rest and ledge [m]."""
+"""Width of rest and ledge [m]."""
 LEDGE = 0.022
 """Depth of the ledge [m]."""
 

@@ -1,6 +1,6 @@
 """Task: press a stapler shut twice with the closed fingers of one hand, and hold it down.
 
-Randomisation: stapler at |x| at most .20, y in [-.10, .05], any yaw (the arm on its side works); its size and color. Its
+Randomization: stapler at |x| at most .20, y in [-.10, .05], any yaw (the arm on its side works); its size and color. Its
     foot is fixed to the table, its arm stands on a sprung hinge.
 Success: arm of the stapler pressed down beyond 60 % of its way, closed fingers on it, the tool within 40 mm of the place to
     press.
@@ -18,20 +18,21 @@ from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks.task import GRIPPER_CLOSED, TURN_TILT, Moment, Task, arm_for, aside, radial_yaw
 
 PRESS_AT = 0.28
-"""y of the place to press, as a share of the stapler's length."""
+"""Place to press along y, as a share of the stapler's length."""
 PRESSED, DONE = 1.3, 0.6
-"""Shares of the arm's way to which the expert means to press it, past the stop since a robot gives way by a millimeter or two
+"""Shares of the arm's way: to which the expert means to press it, past the stop since a robot gives way by a millimeter or two
 under the spring, and from which it counts as pressed."""
 STIFFNESS, PRELOAD = 1.0, 0.15
-"""Of the spring [N m/rad], and the angle [rad] by which it is wound when the arm stands open: 2 N at the fingers, 4 N shut."""
+"""Stiffness of the spring [N m/rad], and the angle [rad] by which it is wound when the arm stands open: 2 N at the fingers, 4
+N shut."""
 BEYOND_TOOL, HALF_WIDTH = 0.015, 0.011
-"""Of every robot's pads: how far they reach ahead of the tool, and how far to its sides [m]."""
+"""Reach of every robot's pads ahead of the tool, and to its sides [m]."""
 NEAR = 0.04
-"""Farthest that the tool may be from the place to press [m]."""
+"""Largest distance of the tool from the place to press [m]."""
 STROKES = 2
-"""How often it is pressed: in between the spring lifts the arm again, at the end it is held down."""
+"""Number of strokes: in between the spring lifts the arm again, at the end it is held down."""
 STROKE_TIME = 0.72
-"""Of each way down [s]."""
+"""Time of each way down [s]."""
 CLEAR, APPROACH = 0.01, 0.06
 """Heights over the place to press between strokes, and from which the way down is straight [m]."""
 

@@ -1,9 +1,9 @@
 """Task: take a lying bottle, turn it upright and shake it.
 
-Randomisation: a bottle of one of four kinds, on its side, |x| in [.10, .15], y in [-.15, -.05], its neck away from the
+Randomization: a bottle of one of four kinds, on its side, |x| in [.10, .15], y in [-.15, -.05], its neck away from the
     robot and within 45 degrees of the direction in which its side's arm reaches; sizes and colors.
 Success: the bottle above .80.
-After RoboTwin 2.0's shake_bottle, whose bottles stand upright in the hand: here they lean 20 degrees forwards, as far up as all
+After RoboTwin 2.0's shake_bottle, whose bottles stand upright in the hand: here they lean 20 degrees forward, as far up as all
 five robots can turn them in the head camera's view. The hand shakes at one place for each arm.
 """
 
@@ -18,17 +18,17 @@ from xew.sim_warp.scene import Scene, SceneObject, draw
 from xew.sim_warp.tasks.task import Moment, Task, arm_for, grasp_across, outward, pick, radial_yaw
 
 WIDEST_TURN = np.radians(45)
-"""Of the bottle from the radial direction [rad]."""
+"""Largest turn of the bottle from the radial direction [rad]."""
 FRONT = (0.07, -0.17, 0.985)
-"""Where the right hand shakes [m], its x mirrored for the left: before the head camera, and where all wrists can roll."""
+"""Place where the right hand shakes [m], its x mirrored for the left: before the head camera, and where all wrists can roll."""
 FRONT_TILT, FRONT_YAW = np.radians(70), np.radians(18)
-"""Lean of the shaking hand, and its turn inwards [rad]."""
+"""Lean of the shaking hand, and its turn inward [rad]."""
 LIFT = 0.07
-"""Straight up, before the bottle is turned [m]."""
+"""Way straight up, before the bottle is turned [m]."""
 RAISING = 3.2
-"""s."""
+"""Time to bring the bottle up [s]."""
 STROKE, SWING, STROKE_TIME = 0.05, np.radians(22.5), 0.9
-"""Of a shake: m upwards, rad about the hand's approach direction to either side, s for one way."""
+"""Size of a shake: way up [m], turn about the hand's approach direction to either side [rad], time for one way [s]."""
 HIGH_ENOUGH = 0.80
 
 

@@ -1,6 +1,6 @@
 """Task: take a lying bottle, hold it level across and shake it.
 
-Randomisation: a bottle of one of four kinds, on its side, |x| in [.10, .15], y in [-.15, -.05], its neck away from the
+Randomization: a bottle of one of four kinds, on its side, |x| in [.10, .15], y in [-.15, -.05], its neck away from the
     robot and within 45 degrees of the direction in which its side's arm reaches; sizes and colors.
 Success: the bottle above .80.
 After RoboTwin 2.0's shake_bottle_horizontally, whose bottles all point to the left: here to the side of the other
@@ -24,7 +24,7 @@ from xew.sim_warp.tasks.shake_bottle import (
 from xew.sim_warp.tasks.task import Task, outward
 
 TURNING = 2.0
-"""s."""
+"""Time to turn the bottle level [s]."""
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:

@@ -1,6 +1,6 @@
 """Task: stack two bowls in the middle, the nearer one first, each hand serving its own side.
 
-Randomisation: two equal bowls at |x| in [.09, .30], y in [-.15, .15] (y at most 0 where |x| < .15), at least .15 apart and
+Randomization: two equal bowls at |x| in [.09, .30], y in [-.15, .15] (y at most 0 where |x| < .15), at least .15 apart and
     .15 from the place of the stack; size and colors.
 Success: centers within 40 mm in x and y, the lower bowl on the table (below .76), the upper inside it (between 10 and
     45 mm higher), both grippers open. (RoboTwin 2.0 tests only upper bounds of the heights.)

@@ -29,7 +29,7 @@ MESH_NAMES: dict[str, str] = {}
 
 
 def finger(side: int) -> tuple[Box, ...]:
-    """Pad and carriage of the finger that opens towards `side` (+1, -1) of y."""
+    """Pad and carriage of the finger that opens toward `side` (+1, -1) of y."""
     low, high = sorted((0, side * PAD_THICKNESS))
     inner, outer = sorted((side * 0.004, side * 0.026))
     return (

@@ -12,7 +12,7 @@ Part = tuple[str, trimesh.Trimesh]
 """Name of a material, and a solid in the frame of its link."""
 
 PAD_HALF_WIDTH, PAD_THICKNESS = 0.011, 0.008
-"""A gripping face reaches this far to either side of the tool center point, and outwards [m]."""
+"""Reach of a gripping face to either side of the tool center point, and outward [m]."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from xew.config import ConfigError, parse, read_yaml
 from xew.sim_warp.geometry.poses import Pose
 
 OWN, ROBOTWIN = "robot.yaml", "config.yml"
-"""The file that describes a robot in our own way, and in RoboTwin's."""
+"""Names of the file that describes a robot in our own way, and in RoboTwin's."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,11 @@ class ArmDraft:
     joints: tuple[str, ...] | None = None
     home: tuple[float, ...] | None = None
     near: tuple[float, ...] | None = None
-    """A posture to search the home from, if home is left open [rad]."""
+    """Posture to search the home from, if home is left open [rad]."""
     tool_link: str | None = None
     tool_pose: Pose | None = None
     tool_at_tips: bool = False
-    """Take only the orientation of `tool_pose`, and for its origin the place at the fingers where all our robots have it."""
+    """True takes only the orientation of `tool_pose`; the origin is the place at the fingers where all our robots have it."""
     fingers: tuple[str, str] | None = None
     finger_closed: tuple[float, float] | None = None
     finger_open: tuple[float, float] | None = None
@@ -46,15 +46,15 @@ class RobotDraft:
     """Path of the URDF, relative to the file that says so."""
     title: str | None = None
     arms: tuple[ArmDraft, ArmDraft] = (ArmDraft(), ArmDraft())
-    """Left, right. What only the left says holds for the right too, but for `root_pose` and `home`."""
+    """Left and right arm. What only the left says holds for the right too, but for `root_pose` and `home`."""
     joint_lower: tuple[float, ...] | None = None
     """Limits that experts keep [rad]; open: the URDF's."""
     joint_upper: tuple[float, ...] | None = None
     joint_velocity: tuple[float, ...] | None = None
-    """[rad/s]; open: the URDF's."""
+    """Speed limits that experts keep [rad/s]; open: the URDF's."""
     distance: float | None = None
-    """Between the bases of two equal arms [m], to either side of `root_pose`; open: the first of `placement.DISTANCES` at
-    which both arms reach home."""
+    """Distance between the bases of two equal arms [m], half to either side of `root_pose`; open: the first of
+    `placement.DISTANCES` at which both arms reach home."""
     source: str | None = None
     """SHA-256 of what a kept robot was made from; leave it out."""
 

@@ -17,13 +17,14 @@ from xew.sim_warp.kinematics.forward import link_matrices
 
 ARM_JOINTS = (6, 7)
 TIP_MARGIN = 0.015
-"""How far behind the finger tips the tool frame is put [m], as on our own robots."""
+"""Distance of the tool frame behind the finger tips [m], as on our own robots."""
 SNAP = math.cos(math.radians(20))
-"""An approach direction within 20 degrees of an axis of the hand is taken to be that axis."""
+"""Cosine of the largest angle at which an approach direction is taken to be the axis of the hand that is nearest: 20 degrees.
+"""
 LARGEST_ANGLE = 2 * math.pi
-"""Position limits beyond it are placeholders [rad]."""
+"""Largest position limit [rad]; one beyond it is a placeholder."""
 LARGEST_SPEED, DEFAULT_SPEED = 10.0, 3.0
-"""A speed limit that is absent, 0 or larger than the first [rad/s] is a placeholder; the second is used."""
+"""Largest speed limit [rad/s], and the one that is used where the URDF has none, 0 or a larger one: those are placeholders."""
 
 
 def find_fingers(urdf: Urdf) -> list[tuple[str, str]]:

@@ -29,12 +29,12 @@ from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
 from xew.sim_warp.robots.user.draft import OWN, ArmDraft, RobotDraft, find_description, read_draft
 
 FOLDERS = "XEW_ROBOTS"
-"""Environment variable: folders of robots, separated as in PATH."""
+"""Name of the environment variable that lists folders of robots, separated as in PATH."""
 KEPT = "robots"
-"""Folder of a data set that holds its robots."""
+"""Name of the folder of a data set that holds its robots."""
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 STROKE_TOLERANCE = 1e-3
-"""The two fingers of a hand move together: how far their strokes may differ [m]."""
+"""Largest difference between the strokes of the two fingers of a hand, which move together [m]."""
 
 
 def is_path(name: str) -> bool:

@@ -25,24 +25,27 @@ from xew.sim_warp.plan import ASIDE, HOME
 from xew.sim_warp.stage import TABLE_SIZE, TABLE_TOP
 
 DISTANCES = (0.6, 0.7, 0.8, 0.5, 0.4)
-"""Between the bases of two equal arms [m], in the order in which they are tried; RoboTwin calls 0.6 to 0.8 typical."""
+"""Distances between the bases of two equal arms [m], in the order in which they are tried; RoboTwin calls 0.6 to 0.8
+typical."""
 PLACE_DISTANCES, BASE_Y, BASE_Z = (0.4, 0.6, 0.7), (-0.65, -0.55, -0.45, -0.37), (0.55, 0.75)
 ROOT_Z = (0.0, 0.25, 0.5, 0.75)
-"""Tried where a robot says nothing of its place [m]: of two equal arms, and of a root that carries both."""
+"""Places that are tried where a robot names none [m]: the four before for two equal arms, this height for one root of both
+arms."""
 YAW_90 = (0.0, 0.0, 0.5**0.5, 0.5**0.5)
-"""Looking to +y, for robots that look along their x."""
+"""Quaternion x y z w of a root that looks to +y, for robots that look along their x."""
 SEEDS = 64
+"""Number of postures from which the search begins."""
 BEST, FEW = 12, 3
-"""Postures from which the search begins, and how many of what it finds are tried out: for good, or to compare places."""
+"""Numbers of postures that are tried out, of those found: for good, and to compare places."""
 OFFSETS = (-45, 0, 45)
-"""Of a grasp's yaw from the radial one [deg]."""
+"""Turns of a grasp's yaw from the radial one [deg]."""
 ENOUGH = 0.9
 """Share of the work area that makes the other turn of the tool frame not worth a try."""
 POSITION_TOLERANCE, ROTATION_TOLERANCE = 1e-3, 0.01
 LIMIT_ROOM = 0.15
-"""A home nearer to a limit than this is taken only if there is no other [rad]."""
+"""Least distance of a home from the joint limits, unless there is no other home [rad]."""
 CLEARANCE = 0.02
-"""Of all moving links from the table, with the arms at home [m]."""
+"""Least height of all moving links above the table, with the arms at home [m]."""
 
 
 def with_home(robot: RobotSpec, near: tuple[np.ndarray | None, np.ndarray | None]) -> RobotSpec:
