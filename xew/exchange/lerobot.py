@@ -93,7 +93,7 @@ class Place:
     def path(self, root: Path, ending: str) -> Path:
         return root / f"chunk-{self.chunk:03d}" / f"file-{self.file:03d}.{ending}"
 
-    def after(self) -> "Place":
+    def next_place(self) -> "Place":
         return Place(self.chunk, self.file + 1) if self.file + 1 < FILES_PER_CHUNK else Place(self.chunk + 1, 0)
 
 
@@ -105,7 +105,7 @@ def export(args: Args) -> tuple[int, list[str]]:
     """
     if args.out.exists():
         raise EpisodeError(f"{args.out} exists; choose another --out, or remove it first.")
-    chosen = _chosen(args)
+    chosen = _select_episodes(args)
     vectors = {
         feature: entry for feature, entry in VECTORS.items() if not any(entry[0] in record.unknown for _, record in chosen)
     }
@@ -122,7 +122,7 @@ def export(args: Args) -> tuple[int, list[str]]:
     return len(chosen), [feature for feature in VECTORS if feature not in vectors]
 
 
-def _chosen(args: Args) -> list[tuple[Path, Record]]:
+def _select_episodes(args: Args) -> list[tuple[Path, Record]]:
     accepted = find_accepted(args.data)
     for flag, asked, known in (
         ("--robots", args.robots, {record.robot for _, record in accepted}),
@@ -228,7 +228,7 @@ class _Tables:
         rows = _arrow(columns)
         if self.writer is not None and self.bytes + rows.nbytes > LARGEST_DATA * 1e6:
             self.writer.close()
-            self.writer, self.bytes, self.place = None, 0, self.place.after()
+            self.writer, self.bytes, self.place = None, 0, self.place.next_place()
         if self.writer is None:
             path = self.place.path(self.root, "parquet")
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -256,7 +256,7 @@ class _Films:
         """Append an episode [t h w 3] uint8 RGB; the columns that say where it is."""
         if self.container is not None and self.bytes > LARGEST_VIDEO * 1e6:
             self._close()
-            self.place = self.place.after()
+            self.place = self.place.next_place()
         if self.container is None:
             self._open(video.shape[2], video.shape[1])
         begin = self.frames

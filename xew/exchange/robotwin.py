@@ -100,7 +100,7 @@ def import_episode(path: Path, args: Args) -> Record:
                 f"{path}: {beside.parent} was simulated here; RoboTwin's seed {seed} is another scene. Import it as another "
                 "--task or into another --out."
             )
-    states, names, video = _seen(robot, action, recorded)
+    states, names, video = _build_states(robot, action, recorded)
     record = Record(
         task=task,
         seed=seed,
@@ -125,7 +125,7 @@ def canonical_action(recorded: Recorded) -> np.ndarray:
     return action
 
 
-def fitted(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
+def fit_bases(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
     """The robot with the bases and tool frames from which the recorded joints bring its tools to the recorded end poses.
 
     Targets run ahead of what is measured, so the bases are the median over the episode.
@@ -145,7 +145,7 @@ def fitted(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
         reached = tool_matrix(replace(robot, arms=(unplaced, unplaced)), 0, recorded.arms[:, side])
         measured = matrix_from_pose(recorded.tool_pose[:, side])
         bases = pose_from_matrix(measured @ np.linalg.inv(reached))
-        base = _middle(bases)
+        base = _middle_pose(bases)
         off = pose_from_matrix(np.linalg.inv(matrix_from_pose(base)) @ matrix_from_pose(bases))
         angle = 2 * np.arccos(np.clip(off[:, 6], -1, 1))
         if np.median(np.linalg.norm(off[:, :3], axis=1)) > FIT_POSITION or np.median(angle) > FIT_ROTATION:
@@ -155,7 +155,7 @@ def fitted(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
     return replace(robot, arms=(arms[0], arms[1]), title=f"{robot.title} as placed in RoboTwin")
 
 
-def _middle(poses: np.ndarray) -> np.ndarray:
+def _middle_pose(poses: np.ndarray) -> np.ndarray:
     """Of poses [t 7] the one nearest to their median, so that it is a pose."""
     aligned = np.concatenate([poses[:, :3], poses[:, 3:] * np.where(poses[:, 3:] @ poses[0, 3:] < 0, -1, 1)[:, None]], 1)
     return poses[int(np.argmin(np.linalg.norm(aligned - np.median(aligned, axis=0), axis=1)))]
@@ -167,7 +167,7 @@ def _robot(path: Path, recorded: Recorded, args: Args) -> tuple[str, RobotSpec |
     robot = get_robot(named, args.out)
     if is_path(named) and (tool := read_draft(find_description(Path(named))).arms[0].tool_pose):
         robot = replace(robot, arms=(replace(robot.arms[0], tool_pose=tool), replace(robot.arms[1], tool_pose=tool)))
-    placed = fitted(robot, recorded)
+    placed = fit_bases(robot, recorded)
     if placed is None:
         return f"{robot.key}_robotwin", None
     key = f"{robot.key}_robotwin"
@@ -209,7 +209,9 @@ def _seed(path: Path) -> int:
     return int(seeds[number]) if number < len(seeds) and seeds[number].isdigit() else number
 
 
-def _seen(robot: RobotSpec | None, action: np.ndarray, recorded: Recorded) -> tuple[States, tuple[str, ...], np.ndarray | None]:
+def _build_states(
+    robot: RobotSpec | None, action: np.ndarray, recorded: Recorded
+) -> tuple[States, tuple[str, ...], np.ndarray | None]:
     """States, names of keypoints and the robot-only video, as far as they can be known."""
     frames, height, width = recorded.rgb.shape[:3]
     camera = Camera(recorded.intrinsics, recorded.extrinsics)

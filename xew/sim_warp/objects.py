@@ -43,11 +43,11 @@ def merge(*shapes: Shape) -> Shape:
     return Shape(meshes.merge([s.mesh for s in shapes]), tuple(h for s in shapes for h in s.hulls))
 
 
-def moved(shape: Shape, xyz: tuple[float, float, float]) -> Shape:
+def move(shape: Shape, xyz: tuple[float, float, float]) -> Shape:
     return Shape(shape.mesh.transformed(xyz), tuple(h + np.array(xyz, np.float32) for h in shape.hulls))
 
 
-def darker(color: Color, share: float) -> Color:
+def darken(color: Color, share: float) -> Color:
     """A color at `share` of its brightness."""
     red, green, blue = color
     return int(share * red), int(share * green), int(share * blue)

@@ -177,11 +177,11 @@ def _sample(home: Tool, segments: list[_Segment], times: np.ndarray) -> np.ndarr
     for segment in segments:
         now = times >= segment.start_time
         progress = minimum_jerk((times[now] - segment.start_time) / (segment.end_time - segment.start_time))
-        pose[now] = _along(segment.waypoints, progress)
+        pose[now] = _interpolate_waypoints(segment.waypoints, progress)
     return pose
 
 
-def _along(waypoints: tuple[Tool, ...], progress: np.ndarray) -> np.ndarray:
+def _interpolate_waypoints(waypoints: tuple[Tool, ...], progress: np.ndarray) -> np.ndarray:
     knots = np.linspace(0, 1, len(waypoints))
     positions = np.stack([waypoint.position for waypoint in waypoints])
     position = np.stack([np.interp(progress, knots, positions[:, axis]) for axis in range(3)], -1)

@@ -118,14 +118,14 @@ def scene_hash(scene: Scene) -> str:
     """SHA-256 over everything that the scene is made of."""
     digest = hashlib.sha256(repr((scene.task, scene.seed, sorted(scene.words.items()), sorted(scene.targets.items()))).encode())
     for thing in scene.objects:
-        digest.update(repr(_numbers(thing)).encode())
+        digest.update(repr(_plain_numbers(thing)).encode())
         for shape in (thing.shape, *((thing.hinge.lid,) if thing.hinge else ())):
             mesh = shape.mesh
             digest.update(array_hash(mesh.vertices, mesh.triangles, mesh.colors, mesh.normals, *shape.hulls).encode())
     return digest.hexdigest()
 
 
-def _numbers(thing: SceneObject) -> tuple[object, ...]:
+def _plain_numbers(thing: SceneObject) -> tuple[object, ...]:
     """The numbers of an object without its shapes."""
     hinge = thing.hinge
     numbers = {f.name: None if f.name == "lid" else getattr(hinge, f.name) for f in fields(hinge)} if hinge else None

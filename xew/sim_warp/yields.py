@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from xew.config import user_errors
 from xew.episode import EpisodeError, Record
-from xew.sim_warp.devices.workers import Workers, has_kernels, named_device, quiet_warp, worker_count
+from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.production.produce import Job, header, plan_cells, simulate_cells
 from xew.sim_warp.robots import ROBOTS, get_robot
 from xew.sim_warp.tasks import TASKS, Task, get_task
@@ -72,7 +72,7 @@ def attempts(args: Args) -> Iterator[list[Record]]:
             f"nothing to try of {len(tasks)} tasks, {len(robots)} robots and {args.seeds} seeds from {args.first_seed}; name "
             "tasks and robots, --seeds from 1 and --first-seed from 0."
         )
-    device = named_device(args.device)
+    device = find_device(args.device)
     size = max(1, args.batch // len(robots)) if device.is_cuda else 1
     batches = [jobs[start : start + size] for start in range(0, len(jobs), size)]
     attempt = partial(attempt_batch, device=device.alias, batch=args.batch)

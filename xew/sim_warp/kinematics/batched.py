@@ -68,7 +68,7 @@ class BatchedKinematics:
         self.device = wp.get_device(device)
         self.dtype = dtype
         self._kernels = kinematics_kernels(dtype)
-        self._forest = _packed(forests, self._kernels, dtype, self.device)
+        self._forest = _pack(forests, self._kernels, dtype, self.device)
         self._no_robot = wp.empty(0, dtype=int, device=self.device)
         self._arrays: tuple[wp.array | None, wp.array | None, wp.array | None] = (None, None, None)
         self._launch: wp.Launch | None = None
@@ -178,7 +178,7 @@ def _pose(matrix: np.ndarray) -> Pose:
     return (x, y, z, qx, qy, qz, qw)
 
 
-def _packed(forests: Sequence[Sequence[Node]], kernels: object, dtype: type, device: wp.Device) -> object:
+def _pack(forests: Sequence[Sequence[Node]], kernels: object, dtype: type, device: wp.Device) -> object:
     """Device arrays of the links of all robots, see `kinematics_kernels`."""
     nodes = [node for forest in forests for node in forest]
     counts = np.array([len(forest) for forest in forests])

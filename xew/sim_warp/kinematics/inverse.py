@@ -100,7 +100,7 @@ class ArmSolver:
         at_anchor = np.empty((len(anchors), *start.shape))
         for index, frame in enumerate(anchors):
             start = at_anchor[index] = self._nearest(targets[frame * count : (frame + 1) * count], start)
-        seed = _interpolated(np.arange(frames), anchors, at_anchor)
+        seed = _interpolate(np.arange(frames), anchors, at_anchor)
         joint_pos = self._nearest(targets, seed.reshape(frames * count, -1))
         position, rotation = self._errors(arms, poses, joint_pos)
         return Solution(joint_pos.reshape(seed.shape), position.reshape(frames, count), rotation.reshape(frames, count))
@@ -149,7 +149,7 @@ def arm_solver(robot: RobotSpec) -> ArmSolver:
     return ArmSolver(robot)
 
 
-def _interpolated(frames: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _interpolate(frames: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Values [a n d] at anchor frames [a], linearly between them at frames [t]: [t n d]."""
     after = np.clip(np.searchsorted(anchors, frames), 1, max(1, len(anchors) - 1))
     if len(anchors) == 1:
@@ -229,8 +229,8 @@ class _Problems:
     def solve(self, target: np.ndarray, seed: np.ndarray) -> np.ndarray:
         """Joint positions [n d] for tool poses [n 7] in the arm's base frame; n may be less than the size."""
         count, joints = seed.shape
-        self.positions.assign(_padded(target[:, :3], self.positions.shape[0]))
-        self.rotations.assign(_padded(target[:, 3:], self.positions.shape[0]))
+        self.positions.assign(_pad(target[:, :3], self.positions.shape[0]))
+        self.rotations.assign(_pad(target[:, 3:], self.positions.shape[0]))
         start = np.zeros((self.positions.shape[0], JOINT_COUNT), np.float32)
         start[:count, :joints] = seed
         self.joint_pos.assign(start)
@@ -256,6 +256,6 @@ class _Problems:
             self.solver.step(self.joint_pos, self.joint_pos, iterations=iterations)
 
 
-def _padded(rows: np.ndarray, size: int) -> np.ndarray:
+def _pad(rows: np.ndarray, size: int) -> np.ndarray:
     """Rows [n ...] float32, the last one repeated up to `size` rows."""
     return np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), 0)]).astype(np.float32)

@@ -45,7 +45,7 @@ def work_reach(robot: RobotSpec, arm: int) -> np.ndarray:
     return found.reshape(len(RADIAL_OFFSETS), len(WORK_X), len(WORK_Y), len(WORK_Z))
 
 
-def markdown(robots: list[RobotSpec]) -> str:
+def format_tables(robots: list[RobotSpec]) -> str:
     """Both tables."""
     lines = ["| robot | left arm | right arm |", "|---|---|---|"]
     for robot in robots:
@@ -70,7 +70,7 @@ class Args:
 def main() -> None:
     quiet_warp()
     args = tyro.cli(Args)
-    print(markdown([get_robot(name) for name in args.robots]))
+    print(format_tables([get_robot(name) for name in args.robots]))
 
 
 if __name__ == "__main__":

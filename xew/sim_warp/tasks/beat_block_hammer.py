@@ -29,7 +29,7 @@ BLOCK = 0.05
 def hammer() -> Shape:
     """A mallet whose face is its frame's origin; the handle points along -y, light enough that it stands on its head."""
     head = objects.block(HEAD_SIZE, (95, 98, 105))
-    face = objects.moved(objects.block((0.036, 0.036, 0.004), (60, 62, 66)), (0, 0, HEAD_SIZE[2]))
+    face = objects.move(objects.block((0.036, 0.036, 0.004), (60, 62, 66)), (0, 0, HEAD_SIZE[2]))
     handle = meshes.box((0.02, HANDLE_LENGTH, 0.022), (165, 105, 55))
     handle = handle.transformed((0, -HEAD_SIZE[1] / 2 - HANDLE_LENGTH / 2, HANDLE_HEIGHT))
     return objects.merge(head, Shape(face.mesh), Shape(handle, (handle.vertices,)))

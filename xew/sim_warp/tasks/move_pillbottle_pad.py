@@ -29,7 +29,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         "move_pillbottle_pad",
         seed,
         (
-            containers.standing("bottle", shape, bottle * [side, 1], rng.uniform(-np.pi, np.pi), mass=0.08),
+            containers.place_standing("bottle", shape, bottle * [side, 1], rng.uniform(-np.pi, np.pi), mass=0.08),
             SceneObject("pad", household.mat((PAD, PAD), household.MATS[color]), upright(pad * [side, 1], TABLE_TOP)),
         ),
         words={"color": color},

@@ -30,7 +30,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         "move_stapler_pad",
         seed,
         (
-            stapler.placed("stapler", at, graspable_yaw(rng, at, np.radians(50))),
+            stapler.place_at("stapler", at, graspable_yaw(rng, at, np.radians(50))),
             SceneObject("mat", household.mat(MAT, household.MATS[color]), upright(goal * [side, 1], TABLE_TOP)),
         ),
         words={"stapler": stapler.words, "color": color},

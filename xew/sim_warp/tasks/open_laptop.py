@@ -14,7 +14,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool, tool
 from xew.sim_warp.scene import Hinge, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, aside, radial_yaw
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, aside_poses, radial_yaw
 
 BASE_HEIGHT = 0.016
 LID_THICKNESS = 0.009
@@ -34,10 +34,10 @@ WIDEST_TURN = np.radians(30)
 
 def laptop(width: float, depth: float, color: objects.Color) -> tuple[Shape, Hinge]:
     """The fixed base and the lid; the front is at -y, the hinge along the edge at +y."""
-    deck = objects.moved(objects.block((width * 0.8, depth * 0.4, 0.001), (45, 45, 48)), (0, depth * 0.12, BASE_HEIGHT))
+    deck = objects.move(objects.block((width * 0.8, depth * 0.4, 0.001), (45, 45, 48)), (0, depth * 0.12, BASE_HEIGHT))
     base = objects.merge(objects.block((width, depth, BASE_HEIGHT), color), Shape(deck.mesh))
-    screen = objects.moved(objects.block((width * 0.92, depth * 0.86, 0.001), (25, 35, 60)), (0, 0, BASE_HEIGHT + 0.001))
-    panel = objects.moved(objects.block((width, depth - 0.008, LID_THICKNESS), color), (0, -0.004, BASE_HEIGHT + 0.002))
+    screen = objects.move(objects.block((width * 0.92, depth * 0.86, 0.001), (25, 35, 60)), (0, 0, BASE_HEIGHT + 0.001))
+    panel = objects.move(objects.block((width, depth - 0.008, LID_THICKNESS), color), (0, -0.004, BASE_HEIGHT + 0.002))
     hinge = Hinge(
         lid=objects.merge(panel, Shape(screen.mesh)),
         mass=0.12,
@@ -70,7 +70,7 @@ def lid_edge(scene: Scene, fraction: float) -> np.ndarray:
     return np.array(thing.pose[:3]) + Rotation.from_euler("z", _yaw(thing)).apply(local)
 
 
-def _pushing(scene: Scene, arm: int, fraction: float, short_by: float) -> Tool:
+def _pushing_pose(scene: Scene, arm: int, fraction: float, short_by: float) -> Tool:
     """The closed hand whose far side touches the lid's edge, drawn back toward the laptop's front by `short_by` [m]."""
     edge, yaw = lid_edge(scene, fraction), _yaw(scene.object("laptop"))
     radial = radial_yaw(arm, edge)
@@ -83,11 +83,13 @@ def plan(scene: Scene) -> Timeline:
     arm = RIGHT if _yaw(scene.object("laptop")) > 0 else LEFT
     timeline = Timeline()
     timeline.grip({arm: 0.0})
-    before = _pushing(scene, arm, START, RUN_UP)
-    timeline.move(aside([arm]) | {arm: before.moved(z=0.05)})
+    before = _pushing_pose(scene, arm, START, RUN_UP)
+    timeline.move(aside_poses([arm]) | {arm: before.moved(z=0.05)})
     timeline.move({arm: before})
-    timeline.move({arm: _pushing(scene, arm, START, 0.0)})
-    timeline.follow(arm, [_pushing(scene, arm, fraction, -PRESS) for fraction in np.linspace(START, GOAL, 16)[1:]], seconds=2.4)
+    timeline.move({arm: _pushing_pose(scene, arm, START, 0.0)})
+    timeline.follow(
+        arm, [_pushing_pose(scene, arm, fraction, -PRESS) for fraction in np.linspace(START, GOAL, 16)[1:]], seconds=2.4
+    )
     timeline.wait(0.2)
     timeline.hold(arm, "laptop")
     return timeline

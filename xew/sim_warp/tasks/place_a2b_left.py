@@ -45,17 +45,17 @@ def sample_beside(rng: np.random.Generator, task: str, seed: int, side: float) -
     mirror = np.array([half, 1, -side, 1])
     # B leaves room for A between itself and the end of the arm's reach.
     near, far = (0.18, 0.23) if half == -side else (-0.1, 0.1)
-    places = draw(rng, [0.02, -0.2, near, -0.2], [0.22, 0.0, far, 0.0], lambda p: _apart(p * mirror, first, second, side))
+    places = draw(rng, [0.02, -0.2, near, -0.2], [0.22, 0.0, far, 0.0], lambda p: _are_apart(p * mirror, first, second, side))
     at, beside = np.split(places * mirror, 2)
     return Scene(
         task,
         seed,
-        (first.placed("a", at, graspable_yaw(rng, at)), second.placed("b", beside, rng.uniform(-np.pi, np.pi))),
+        (first.place_at("a", at, graspable_yaw(rng, at)), second.place_at("b", beside, rng.uniform(-np.pi, np.pi))),
         words={"a": first.words, "b": second.words},
     )
 
 
-def _apart(places: np.ndarray, first: Thing, second: Thing, side: float) -> bool:
+def _are_apart(places: np.ndarray, first: Thing, second: Thing, side: float) -> bool:
     """Are A and B, at [4] x y x y, free of each other, and is A not yet where it is to go?"""
     offset = places[2:] - places[:2]
     free = np.hypot(*offset) >= max(0.1, first.radius + second.radius + GAP) and abs(offset[1]) >= 0.1

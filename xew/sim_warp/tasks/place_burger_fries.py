@@ -16,7 +16,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, aside, pick, place, radial_yaw
+from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, aside_poses, pick, place, radial_yaw
 
 TRAY = (0.30, 0.19)
 """Outer size of the tray [m]."""
@@ -37,12 +37,11 @@ def tray(color: Color) -> Shape:
     """A low tray with a rim."""
     width, depth = TRAY
     floor = objects.block((width, depth, TRAY_FLOOR), color)
-    rim = objects.darker(color, 0.82)
+    rim = objects.darken(color, 0.82)
     edges = [
-        objects.moved(objects.block((width, 0.006, 0.009), rim), (0, side * (depth / 2 - 0.003), TRAY_FLOOR))
-        for side in (-1, 1)
+        objects.move(objects.block((width, 0.006, 0.009), rim), (0, side * (depth / 2 - 0.003), TRAY_FLOOR)) for side in (-1, 1)
     ] + [
-        objects.moved(objects.block((0.006, depth - 0.012, 0.009), rim), (side * (width / 2 - 0.003), 0, TRAY_FLOOR))
+        objects.move(objects.block((0.006, depth - 0.012, 0.009), rim), (side * (width / 2 - 0.003), 0, TRAY_FLOOR))
         for side in (-1, 1)
     ]
     paper = meshes.box((width * 0.86, depth * 0.8, 0.0006), (246, 243, 234)).transformed((0, 0, TRAY_FLOOR))
@@ -65,7 +64,7 @@ def burger(rng: np.random.Generator) -> Shape:
         height += thickness
     crown = [_ring(radius * share, height + rise) for share, rise in ((0.98, 0.0), (1.0, 0.005), (0.8, 0.014), (0.42, 0.019))]
     seeds = [
-        meshes.box((0.0035, 0.002, 0.0016), (246, 226, 178)).transformed(_on_crown(radius, height, angle), (0, 0, angle))
+        meshes.box((0.0035, 0.002, 0.0016), (246, 226, 178)).transformed(_crown_point(radius, height, angle), (0, 0, angle))
         for angle in rng.uniform(0, np.pi / 3, 6) + np.arange(6) * np.pi / 3
     ]
     mesh = meshes.merge([*layers, meshes.hull(np.concatenate(crown), bun), *seeds])
@@ -92,7 +91,7 @@ def _filling(name: str, radius: float, low: float, thickness: float) -> Mesh:
     return _layer(radius * (0.94 if name == "tomato" else 1.0), low, low + thickness, color)
 
 
-def _on_crown(radius: float, height: float, angle: float) -> tuple[float, float, float]:
+def _crown_point(radius: float, height: float, angle: float) -> tuple[float, float, float]:
     at = 0.6 * radius
     return float(at * np.cos(angle)), float(at * np.sin(angle)), height + 0.0168
 
@@ -157,7 +156,7 @@ def plan(scene: Scene) -> Timeline:
     put_burger = grasps[LEFT].carried(left, goal["burger"], turn)
     place(timeline, LEFT, "burger", put_burger, above=0.07, retreat=LIFT, release=0.95)
     put_fries = grasps[RIGHT].carried(right, goal["fries"])
-    timeline.move(aside([RIGHT]) | {RIGHT: put_fries.moved(z=0.07)})
+    timeline.move(aside_poses([RIGHT]) | {RIGHT: put_fries.moved(z=0.07)})
     place(timeline, RIGHT, "fries", put_fries, above=0.03, retreat=LIFT, release=0.9)
     return timeline
 

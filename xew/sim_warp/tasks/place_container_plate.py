@@ -53,7 +53,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     at = draw(rng, [0.20, -0.10], [0.28, 0.05], lambda p: True)
     dish = draw(rng, [0.02, -0.15], [0.08, -0.10], lambda p: np.hypot(*(p - at)) >= CLEAR)
     kind = ("bowl", "cup")[rng.integers(2)]
-    color, trim = containers.palette(rng, 2)
+    color, trim = containers.draw_color_names(rng, 2)
     shape = {"bowl": bowl, "cup": cup}[kind](rng, objects.PALETTE[color])
     return Scene(
         "place_container_plate",

@@ -22,7 +22,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool, tool
 from xew.sim_warp.scene import Grasp, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import HOVER, LET_GO, NARROWEST_HAND, Moment, Task, aside, outward, pick, place
+from xew.sim_warp.tasks.task import HOVER, LET_GO, NARROWEST_HAND, Moment, Task, aside_poses, pick, place, side_sign
 
 BOX = (0.0, -0.14)
 BOX_SIZE = (0.236, 0.214)
@@ -99,7 +99,7 @@ def _collar(grip: float, half: float, top: float, trim: Color) -> list[Mesh]:
         outline = [(x * grip * inside, (y + 0.46) * half * inside - 0.46 * half) for x, y in sides]
         return _plate(outline, lambda y: slope(y) - 0.002, lambda y: slope(y) + proud, color)
 
-    return [ring(1.0, 0.0012, objects.darker(trim, 0.85)), ring(0.84, 0.0020, (34, 31, 31))]
+    return [ring(1.0, 0.0012, objects.darken(trim, 0.85)), ring(0.84, 0.0020, (34, 31, 31))]
 
 
 def _details(kind: str, grip: float, half: float, top: float, trim: Color) -> list[Mesh]:
@@ -132,10 +132,10 @@ def _details(kind: str, grip: float, half: float, top: float, trim: Color) -> li
 def shoe_box(color: Color) -> Shape:
     """The lower part of a shoe box, with tissue paper on its floor."""
     width, depth = BOX_SIZE
-    floor = objects.block((width - WALL, depth - WALL, FLOOR), objects.darker(color, 0.9))
-    walls = [objects.moved(objects.block((width, WALL, RIM), color), (0, s * (depth - WALL) / 2, 0)) for s in (-1, 1)]
+    floor = objects.block((width - WALL, depth - WALL, FLOOR), objects.darken(color, 0.9))
+    walls = [objects.move(objects.block((width, WALL, RIM), color), (0, s * (depth - WALL) / 2, 0)) for s in (-1, 1)]
     walls += [
-        objects.moved(objects.block((WALL, depth - 2 * WALL, RIM), color), (s * (width - WALL) / 2, 0, 0)) for s in (-1, 1)
+        objects.move(objects.block((WALL, depth - 2 * WALL, RIM), color), (s * (width - WALL) / 2, 0, 0)) for s in (-1, 1)
     ]
     paper = meshes.box((width - 0.02, depth - 0.02, 0.0008), (246, 244, 240)).transformed((0, 0, FLOOR))
     label = meshes.box((0.07, 0.0012, 0.018), (246, 244, 240)).transformed((0, -depth / 2, RIM / 2))
@@ -166,7 +166,7 @@ def _grasp(thing: SceneObject, arm: int) -> tuple[Tool, float]:
     """The hand straight down across a shoe, and the turn [rad] that brings the tip to the left and ends a quarter outward."""
     turn = TIP_LEFT - thing.yaw
     middle = np.array(thing.pose[:3]) + Rotation.from_euler("z", thing.yaw).apply([0, GRASP_AT, GRASP_HEIGHT])
-    return tool(middle, outward(arm) * np.pi / 2 - turn), turn
+    return tool(middle, side_sign(arm) * np.pi / 2 - turn), turn
 
 
 def plan(scene: Scene) -> Timeline:
@@ -183,7 +183,7 @@ def plan(scene: Scene) -> Timeline:
     timeline = Timeline()
     pick(timeline, grasps, LIFT)
     place(timeline, LEFT, names[LEFT], goals[LEFT], above=LIFT, retreat=LIFT, release=release)
-    timeline.move(aside([RIGHT]) | {RIGHT: goals[RIGHT].moved(z=LIFT)})
+    timeline.move(aside_poses([RIGHT]) | {RIGHT: goals[RIGHT].moved(z=LIFT)})
     place(timeline, RIGHT, names[RIGHT], goals[RIGHT], above=0.03, retreat=LIFT, release=release)
     return timeline
 

@@ -30,7 +30,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         "place_mouse_pad",
         seed,
         (
-            mouse.placed("mouse", at, graspable_yaw(rng, at)),
+            mouse.place_at("mouse", at, graspable_yaw(rng, at)),
             SceneObject("mat", household.mat(MAT, household.MATS[color]), upright(goal, TABLE_TOP)),
         ),
         words={"mouse": mouse.words, "color": color},

@@ -66,7 +66,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         "place_object_stand",
         seed,
         (
-            thing.placed("thing", at, graspable_yaw(rng, at, np.radians(45))),
+            thing.place_at("thing", at, graspable_yaw(rng, at, np.radians(45))),
             SceneObject("stand", shape, upright(beneath, TABLE_TOP, turn), mass=STAND_MASS),
         ),
         words={"thing": thing.words, "color": color},

@@ -15,7 +15,7 @@ from xew.sim_warp.assets.household import StaplerParts
 from xew.sim_warp.plan import ASIDE_TIME, Timeline, Tool, tool
 from xew.sim_warp.scene import Hinge, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRIPPER_CLOSED, TURN_TILT, Moment, Task, arm_for, aside, radial_yaw
+from xew.sim_warp.tasks.task import GRIPPER_CLOSED, TURN_TILT, Moment, Task, arm_for, aside_poses, radial_yaw
 
 PRESS_AT = 0.28
 """Place to press along y, as a share of the stapler's length."""
@@ -37,7 +37,7 @@ CLEAR, APPROACH = 0.01, 0.06
 """Heights over the place to press between strokes, and from which the way down is straight [m]."""
 
 
-def hinged(parts: StaplerParts) -> Hinge:
+def stapler_hinge(parts: StaplerParts) -> Hinge:
     """The stapler's arm on its hinge: at 0 as it stands open, pressed down at `upper`."""
     return Hinge(
         lid=parts.arm,
@@ -61,7 +61,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     return Scene(
         "press_stapler",
         seed,
-        (SceneObject("stapler", parts.base, pose, hinge=hinged(parts)),),
+        (SceneObject("stapler", parts.base, pose, hinge=stapler_hinge(parts)),),
         words={"stapler": parts.words},
     )
 
@@ -77,7 +77,7 @@ def press_point(scene: Scene, fraction: float) -> np.ndarray:
     return np.array(thing.pose[:3]) + Rotation.from_euler("z", thing.yaw).apply(local)
 
 
-def _pressing(scene: Scene, arm: int, fraction: float) -> Tool:
+def _pressing_pose(scene: Scene, arm: int, fraction: float) -> Tool:
     """The closed hand whose lower edge touches the place to press."""
     at = press_point(scene, fraction)
     hand = tool(at, radial_yaw(arm, at), TURN_TILT)
@@ -86,13 +86,13 @@ def _pressing(scene: Scene, arm: int, fraction: float) -> Tool:
 
 def plan(scene: Scene) -> Timeline:
     arm = arm_for(scene.object("stapler").pose[0])
-    touch = _pressing(scene, arm, 0.0)
+    touch = _pressing_pose(scene, arm, 0.0)
     timeline = Timeline()
     timeline.grip({arm: 0.0})
-    timeline.move(aside([arm]) | {arm: touch.moved(z=APPROACH)}, at_least=ASIDE_TIME)
+    timeline.move(aside_poses([arm]) | {arm: touch.moved(z=APPROACH)}, at_least=ASIDE_TIME)
     for _ in range(STROKES):
         timeline.move({arm: touch.moved(z=CLEAR)})
-        timeline.follow(arm, [_pressing(scene, arm, PRESSED)], seconds=STROKE_TIME)
+        timeline.follow(arm, [_pressing_pose(scene, arm, PRESSED)], seconds=STROKE_TIME)
         timeline.wait(0.3)
     timeline.hold(arm, "stapler")
     return timeline

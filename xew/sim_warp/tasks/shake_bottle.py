@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from xew.sim_warp.assets import containers
 from xew.sim_warp.plan import Timeline, Tool, tool
 from xew.sim_warp.scene import Scene, SceneObject, draw
-from xew.sim_warp.tasks.task import Moment, Task, arm_for, grasp_across, outward, pick, radial_yaw
+from xew.sim_warp.tasks.task import Moment, Task, arm_for, grasp_across, pick, radial_yaw, side_sign
 
 WIDEST_TURN = np.radians(45)
 """Largest turn of the bottle from the radial direction [rad]."""
@@ -42,32 +42,32 @@ def lying_bottle(task: str, rng: np.random.Generator, seed: int) -> Scene:
     at = draw(rng, [0.10, -0.15], [0.15, -0.05], lambda p: True) * [side, 1]
     yaw = radial_yaw(arm_for(side), at) + rng.uniform(-WIDEST_TURN, WIDEST_TURN)
     shape, color = containers.bottle(rng)
-    return Scene(task, seed, (containers.lying("bottle", shape, at, yaw, mass=0.12),), words={"color": color})
+    return Scene(task, seed, (containers.place_lying("bottle", shape, at, yaw, mass=0.12),), words={"color": color})
 
 
-def front(arm: int) -> Tool:
+def front_pose(arm: int) -> Tool:
     """Where a hand shakes: nearly level, so that what lay under it stands nearly upright."""
     x, y, z = FRONT
-    return tool((outward(arm) * x, y, z), outward(arm) * FRONT_YAW, FRONT_TILT)
+    return tool((side_sign(arm) * x, y, z), side_sign(arm) * FRONT_YAW, FRONT_TILT)
 
 
-def rolled(hand: Tool, angle: float) -> Tool:
+def roll_hand(hand: Tool, angle: float) -> Tool:
     """Turned about its approach direction [rad]."""
     return Tool(hand.position, hand.rotation * Rotation.from_euler("x", angle))
 
 
 def raise_bottle(timeline: Timeline, bottle: SceneObject) -> int:
-    """Take a lying bottle from straight above and bring it to `front`; the arm on its side does it."""
+    """Take a lying bottle from straight above and bring it to `front_pose`; the arm on its side does it."""
     arm = arm_for(bottle.pose[0])
     pick(timeline, {arm: grasp_across(bottle, arm, tilt=0.0)}, lift=LIFT)
-    timeline.follow(arm, [front(arm)], RAISING)
+    timeline.follow(arm, [front_pose(arm)], RAISING)
     return arm
 
 
 def shake(timeline: Timeline, arm: int, start: Tool, strokes: Sequence[tuple[float, float]]) -> None:
     """From `start` through (height above it [m], roll [rad]) one after the other, and back."""
     for up, angle in strokes:
-        timeline.follow(arm, [rolled(start.moved(z=up), angle)], STROKE_TIME)
+        timeline.follow(arm, [roll_hand(start.moved(z=up), angle)], STROKE_TIME)
     timeline.follow(arm, [start], STROKE_TIME)
     timeline.hold(arm, "bottle")
 
@@ -75,7 +75,7 @@ def shake(timeline: Timeline, arm: int, start: Tool, strokes: Sequence[tuple[flo
 def plan(scene: Scene) -> Timeline:
     timeline = Timeline()
     arm = raise_bottle(timeline, scene.object("bottle"))
-    shake(timeline, arm, front(arm), [(STROKE, -SWING), (0, SWING)] * 3)
+    shake(timeline, arm, front_pose(arm), [(STROKE, -SWING), (0, SWING)] * 3)
     return timeline
 
 

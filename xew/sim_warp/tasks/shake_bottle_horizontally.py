@@ -14,14 +14,14 @@ from xew.sim_warp.scene import Scene
 from xew.sim_warp.tasks.shake_bottle import (
     STROKE,
     SWING,
-    front,
+    front_pose,
     lying_bottle,
     raise_bottle,
-    rolled,
+    roll_hand,
     shake,
     success,
 )
-from xew.sim_warp.tasks.task import Task, outward
+from xew.sim_warp.tasks.task import Task, side_sign
 
 TURNING = 2.0
 """Time to turn the bottle level [s]."""
@@ -34,7 +34,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 def plan(scene: Scene) -> Timeline:
     timeline = Timeline()
     arm = raise_bottle(timeline, scene.object("bottle"))
-    level = rolled(front(arm), -outward(arm) * np.pi / 2)
+    level = roll_hand(front_pose(arm), -side_sign(arm) * np.pi / 2)
     timeline.follow(arm, [level], TURNING)
     shake(timeline, arm, level, [(STROKE, -SWING), (0, SWING)] * 3)
     return timeline

@@ -73,7 +73,7 @@ def arm_for(x: float) -> int:
     return RIGHT if x > 0 else LEFT
 
 
-def outward(arm: int) -> float:
+def side_sign(arm: int) -> float:
     """+1 for the right arm, -1 for the left: the sign of x on its side."""
     return 1.0 if arm == RIGHT else -1.0
 
@@ -85,7 +85,7 @@ def pick(timeline: Timeline, grasps: dict[int, Tool], lift: float, opening: floa
     """
     if opening < 1.0:
         timeline.grip(dict.fromkeys(grasps, opening), seconds=0.24)
-    idle = aside(grasps)
+    idle = aside_poses(grasps)
     seconds = ASIDE_TIME if any(timeline.at[arm] is not goal for arm, goal in idle.items()) else 0.0
     timeline.move(idle | {arm: grasp.backed(PRE_GRASP) for arm, grasp in grasps.items()}, at_least=seconds)
     timeline.move(grasps)
@@ -96,7 +96,7 @@ def pick(timeline: Timeline, grasps: dict[int, Tool], lift: float, opening: floa
 def radial_yaw(arm: int, position: Point) -> float:
     """The hand's yaw [rad] at which its lean points away from the arm's shoulder: the one that all robots reach best."""
     x, y = position[:2]
-    return outward(arm) * float(np.arctan2(0.25 - outward(arm) * x, y + 0.45))
+    return side_sign(arm) * float(np.arctan2(0.25 - side_sign(arm) * x, y + 0.45))
 
 
 def symmetric_yaw(arm: int, position: Point, yaw: float, symmetry: float) -> float:
@@ -177,11 +177,11 @@ def rim_grasp(vessel: SceneObject, wall: float, depth: float) -> tuple[int, Tool
     vertices = vessel.shape.mesh.vertices
     radius = float(np.hypot(*vertices[:, :2].T).max()) - wall / 2
     yaw = radial_yaw(arm, position)
-    radial = outward(arm) * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    radial = side_sign(arm) * np.array([np.cos(yaw), np.sin(yaw), 0.0])
     return arm, tool(position + radius * radial + [0, 0, vertices[:, 2].max() - depth], yaw, GRASP_TILT)
 
 
-def aside(working: Collection[int]) -> dict[int, Tool]:
+def aside_poses(working: Collection[int]) -> dict[int, Tool]:
     """Where the arms that are not working wait."""
     return {arm: ASIDE[arm] for arm in (LEFT, RIGHT) if arm not in working}
 

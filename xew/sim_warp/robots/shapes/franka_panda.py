@@ -6,13 +6,13 @@ from xew.sim_warp.robots.shapes.solids import (
     Box,
     Part,
     Vector,
-    between,
     box_solid,
     camera,
     cylinder,
     dome,
     hull,
     loft,
+    point_between,
     rounded_box,
 )
 
@@ -69,7 +69,7 @@ COLLISIONS = {
 
 def drum(start: Vector, end: Vector, radius: float = 0.0545) -> list[Part]:
     """Half of a joint: dark at the seam where it starts, a white dome where it ends."""
-    seam = between(start, end, 0.06)
+    seam = point_between(start, end, 0.06)
     return [("gray", cylinder(start, seam, 0.96 * radius)), ("white", dome(seam, end, radius))]
 
 
