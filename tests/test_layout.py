@@ -59,10 +59,10 @@ def test_a_file_imports_only_what_its_room_may(path: Path) -> None:
     assert not found, f"{path.relative_to(ROOT)} imports {', '.join(found)}"
 
 
-def test_only_latents_asks_the_simulation_to_render() -> None:
+def test_few_files_of_model_ask_the_simulation_to_render() -> None:
     """The one door between model and simulation; it stands inside functions, so that a model loads without Warp."""
     users = {path.stem for path in FILES if room(path) == "model" and touches(imports(path), "xew.sim_warp")}
-    assert users <= {"latents", "pixels", "conditions"}
+    assert users <= {"commands", "pixels", "conditions"}
 
 
 def test_metric_functions_know_nothing_of_ours_but_metrics() -> None:

@@ -174,7 +174,7 @@ def another(episodes: Sequence[Episode], record: Record, differs: str) -> Path |
 def open_codec(run: Path) -> Callable[[np.ndarray], np.ndarray]:
     """What a run's codec leaves of a video uint8 [t h w 3]. Raises ConfigError if there is no such run."""
     # Only here: the metrics load without the model.
-    from xew.model.runs.checkpoint import load_run
+    from xew.model.runs.folder import load_run
     from xew.model.video.frames import to_camera_size, to_model_size
 
     try:
