@@ -22,6 +22,7 @@ from typing import Annotated
 import numpy as np
 import pandas as pd
 import tyro
+from markupsafe import Markup
 from tqdm import tqdm
 
 from xew.analysis.paper import read_paper
@@ -80,7 +81,7 @@ class Picture:
     name: str
     image: bytes
     """PNG."""
-    html: str
+    html: Markup
 
 
 @user_errors
@@ -141,7 +142,7 @@ def _report_scores(args: Args, scores: Scores) -> None:
         _method_section(scores, args),
     ]
     sentences = finding(held_out, seen, scores.metrics)
-    html = page.page(TITLE, sentences, [text for text in sections if text], _footer(scores.versions))
+    html = page.page(TITLE, sentences, [part for part in sections if part], _footer(scores.versions))
     notes = [*report_study.missing_note(missing), *_caution(held_out)]
     text, files = _markdown(sentences, notes, held_out, seen, scores, [*strips, *sheets], chart_files(curves))
     if len(missing):
@@ -169,7 +170,7 @@ def _expected(records: Sequence[Record], robots: Sequence[str]) -> int:
     return sum(record.robot in robots for record in tests)
 
 
-def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> str:
+def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> Markup:
     if not tables:
         return page.section("Robots never seen in training", page.note("No held-out robot has been graded yet."))
     return page.section(
@@ -192,9 +193,9 @@ def _caution(tables: Sequence[RobotTable]) -> list[str]:
     return ["Fewer than ten episodes a robot: intervals and verdicts are rough."] if few < 10 else []
 
 
-def _seen_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> str:
+def _seen_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> Markup | None:
     if not tables:
-        return ""
+        return None
     text = "The same model on robots that it was trained on, at test seeds: what is missing here is not embodiment."
     return page.section("Robots seen in training", page.paragraph(text), *(page.table(run_table(t, metrics)) for t in tables))
 
@@ -235,7 +236,7 @@ def _run_cell(row: Row, metric: MetricInfo) -> Cell:
     )
 
 
-def _strip_section(strips: Sequence[Picture]) -> str:
+def _strip_section(strips: Sequence[Picture]) -> Markup:
     if not strips:
         return page.section(
             "What it looks like", page.note("No pictures: name the data and the rollouts (--data, --rollouts).")
@@ -247,15 +248,15 @@ def _strip_section(strips: Sequence[Picture]) -> str:
     return page.section("What it looks like", page.paragraph(text), *(strip.html for strip in strips))
 
 
-def _data_section(sheets: Sequence[Picture], records: Sequence[Record]) -> str:
+def _data_section(sheets: Sequence[Picture], records: Sequence[Record]) -> Markup | None:
     if not sheets:
-        return ""
+        return None
     accepted = sum(record.success for record in records)
     text = f"{len(records)} cells were tried, {accepted} succeeded. A seed counts when every robot has mastered it."
     return page.section("The paired data", page.paragraph(text), *(sheet.html for sheet in sheets))
 
 
-def _method_section(scores: Scores, args: Args) -> str:
+def _method_section(scores: Scores, args: Args) -> Markup:
     definitions = {METRIC_TITLES.get(metric.name, metric.name): metric.reference for metric in scores.metrics}
     notes = (
         f"Every metric is a mean over the predicted frames; {FRAME_ZERO[scores.frame_zero]}. Masks in predicted video are "
@@ -297,12 +298,10 @@ def _strip(
     predicted = pictures.as_graded(read_rollout_video(rollouts[key]), observed, frame_zero)
     times = pictures.strip_times(int(row["frames"]))
     image = pictures.png(pictures.strip(observed, predicted, times))
-    caption = (
-        f"<b>{page.escape(robot_title(row['robot']))}, {page.escape(row['task'])}</b>, seed {row['seed']} · "
-        f"{page.escape(' · '.join(filter(None, key[:2])))} · {word}, LPIPS {row['value']:.3f}"
-    )
+    title = f"{robot_title(row['robot'])}, {row['task']}"
+    caption = f", seed {row['seed']} · {' · '.join(filter(None, key[:2]))} · {word}, LPIPS {row['value']:.3f}"
     columns = [f"frame {t}" for t in times]
-    html = page.labeled_picture(pictures.data_uri(image), caption, columns, ["observed", "predicted", "difference"])
+    html = page.labeled_picture(pictures.data_uri(image), caption, columns, ["observed", "predicted", "difference"], title)
     return Picture("_".join((*map(str, key[:5]), word)).replace("/", "-") + ".png", image, html)
 
 
@@ -344,7 +343,7 @@ def _footer(graded_with: Mapping[str, str]) -> str:
     packages = ("xew", "numpy", "scipy", "pandas", "opencv-python-headless")
     versions = {name: metadata.version(name) for name in packages} | dict(graded_with)
     text = " · ".join(f"{name} {version}" for name, version in versions.items())
-    return page.escape(f"{text} · Python {platform.python_version()}")
+    return f"{text} · Python {platform.python_version()}"
 
 
 def _markdown(

@@ -95,11 +95,11 @@ def panel_svg(chart: Chart, panel: Panel) -> str:
     svg = re.sub(r'<g id="[^"]*">', "<g>", svg)  # the same in every panel; nothing refers to them
     svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg))
     for color in THEME:
-        svg = svg.replace(color, themed(color))
+        svg = svg.replace(color, themed_color(color))
     return svg.replace("<svg ", '<svg aria-hidden="true" ', 1)
 
 
-def themed(color: str) -> str:
+def themed_color(color: str) -> str:
     """The page's variable that stands for a color."""
     return f"var(--{THEME[color]})"
 

@@ -12,16 +12,8 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.correlation import Correlation
-from xew.analysis.distance import Frame
-from xew.analysis.paper import (
-    AXES,
-    Cell,
-    Paper,
-    RecomputedChange,
-    mean_distance_cells,
-    rebuild,
-    recompute_changes,
-)
+from xew.analysis.distances.workspaces import Frame
+from xew.analysis.paper import AXES, Paper
 from xew.analysis.reports import page
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study import Report
@@ -46,6 +38,13 @@ from xew.analysis.tables.paper import (
     frame_table,
     percent,
     robot_table,
+)
+from xew.analysis.tables.recompute import (
+    RecomputedChange,
+    RecomputedFigure,
+    rebuild,
+    recompute_changes,
+    recompute_mean_distances,
 )
 from xew.protocol import ROBOT_NAMES
 
@@ -83,9 +82,9 @@ def build(paper: Paper, footer: str) -> Report:
 
     Args:
         paper: its figures.
-        footer: HTML, versions.
+        footer: text of the footer, versions.
     """
-    cells, means, changes = rebuild(paper), mean_distance_cells(paper), recompute_changes(paper)
+    cells, means, changes = rebuild(paper), recompute_mean_distances(paper), recompute_changes(paper)
     results = {(metric, axis): paper.correlation(metric, axis) for metric in paper.metrics for axis in AXES}
     frames = frame_distances()
     by_frame = {frame: frame_results(paper, frames[frame]) for frame in OWN_FRAMES}
@@ -110,7 +109,7 @@ def build(paper: Paper, footer: str) -> Report:
 
 
 def finding(
-    cells: Sequence[Cell],
+    cells: Sequence[RecomputedFigure],
     results: Mapping[tuple[str, str], Correlation],
     changes: Sequence[RecomputedChange],
     by_frame: Mapping[Frame, Mapping[str, Correlation]],
@@ -126,7 +125,7 @@ def finding(
     ]
 
 
-def _rebuilt_sentences(cells: Sequence[Cell], changes: Sequence[RecomputedChange]) -> Iterator[str]:
+def _rebuilt_sentences(cells: Sequence[RecomputedFigure], changes: Sequence[RecomputedChange]) -> Iterator[str]:
     outside = [f"{_name(cell.metric, cell.axis)} {cell.quantity}" for cell in cells if not cell.agrees]
     furthest = max(abs(cell.ours - cell.published) for cell in cells)
     word = f"{len(cells) - len(outside)} of {len(cells)} printed figures come out within what rounding of the inputs allows"
@@ -203,7 +202,7 @@ def _html(content: Content, paper: Paper, footer: str) -> str:
     for number, (title, shown) in enumerate(content.shown.items()):
         chart = [page.chart(content.chart)] if number == 0 else []
         sections[title] = page.section(title, *chart, *map(page.table, shown))
-    folded = [page.folded(table.title, page.table(table)) for table in content.folded]
+    folded = [page.details(table.title, page.table(table)) for table in content.folded]
     sections["The scores"] = page.section("The scores", page.paragraph(SCORES_TEXT), *folded)
     sources = {"paper": paper.title, **paper.tables, **{part: rows.source for part, rows in paper.parts.items()}}
     sources = {name.replace("_", " "): text for name, text in sources.items()}
@@ -237,7 +236,7 @@ def _files(content: Content) -> Iterator[tuple[str, bytes]]:
 
 
 def _frame(
-    cells: Sequence[Cell], changes: Sequence[RecomputedChange], by_frame: Mapping[Frame, Mapping[str, Correlation]]
+    cells: Sequence[RecomputedFigure], changes: Sequence[RecomputedChange], by_frame: Mapping[Frame, Mapping[str, Correlation]]
 ) -> pd.DataFrame:
     """Columns: row axis quantity published ours least most agrees; blank where the paper prints nothing."""
     names = ("published", "ours", "least", "most", "agrees")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
+from markupsafe import Markup
 
 from xew.analysis.paper import AXES, read_paper
 from xew.analysis.reports import page, pictures
@@ -94,7 +95,7 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
         data: the data set, for pictures.
         rollouts: trees of rollouts named after their variants, or folders that hold such trees; for pictures.
         distances: folder of the command of distances; the paper's printed ones where None.
-        footer: HTML, versions.
+        footer: text of the footer, versions.
 
     Raises:
         ConfigError: a file that was named cannot be read.
@@ -236,11 +237,11 @@ def _html(content: Content, scores: Scores, footer: str) -> str:
     sections = {"Claims": _claims_section(content)}
     sections |= {PART_TITLES[part]: text for part in SECTIONS if (text := _part_section(content, part))}
     sections["How it was measured"] = _method_section(content, scores)
-    head = page.contents(list(sections)) + "".join(map(page.note, content.lacks))
-    return page.page(TITLE, content.sentences, [head, *sections.values()], footer)
+    head = [page.contents(list(sections)), *map(page.note, content.lacks)]
+    return page.page(TITLE, content.sentences, [*head, *sections.values()], footer)
 
 
-def _claims_section(content: Content) -> str:
+def _claims_section(content: Content) -> Markup:
     text = (
         "Each claim of the paper as an inequality, asked of this study and of the paper's own printed figures. It holds where "
         "every number lies on its side with its whole 95 % interval over scenes (for the paper: with all that prints the "
@@ -250,25 +251,25 @@ def _claims_section(content: Content) -> str:
     return page.section("Claims", page.paragraph(text), page.claims(content.findings, content.printed))
 
 
-def _part_section(content: Content, part: str) -> str:
+def _part_section(content: Content, part: str) -> Markup | None:
     charts, shown, folded = SECTIONS[part]
     if not any(name in content.tables for name in shown):
-        return ""
+        return None
     parts = [page.chart(content.charts[name]) for name in charts if name in content.charts]
     parts += [page.table(content.tables[name]) for name in shown if name in content.tables]
     if part in content.strips:
         strip = content.strips[part]
         source = pictures.data_uri(strip.image)
-        parts.append(page.labeled_picture(source, page.escape(strip.caption), strip.columns, strip.rows))
+        parts.append(page.labeled_picture(source, strip.caption, strip.columns, strip.rows))
     if FRAME_CHARTS.get(part) in content.charts:
         parts.append(page.chart(content.charts[FRAME_CHARTS[part]]))
     hidden = [content.tables[name] for name in folded if name in content.tables]
     if hidden:
-        parts.append(page.folded("; ".join(table.title for table in hidden), *map(page.table, hidden)))
+        parts.append(page.details("; ".join(table.title for table in hidden), *map(page.table, hidden)))
     return page.section(PART_TITLES[part], *parts)
 
 
-def _method_section(content: Content, scores: Scores) -> str:
+def _method_section(content: Content, scores: Scores) -> Markup:
     made = {"scenes graded": str(len(scores.rows[["task", "seed"]].drop_duplicates())), **scores.measured_by}
     definitions = {METRIC_TITLES.get(metric.name, metric.name): metric.reference for metric in scores.metrics}
     return page.section(

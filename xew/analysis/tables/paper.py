@@ -7,14 +7,16 @@ from functools import cache
 import numpy as np
 
 from xew.analysis.correlation import Correlation, loeo_correlation
-from xew.analysis.distance import Frame, chamfer_floor, mean_distances, measure
-from xew.analysis.paper import AXES, Cell, Paper, PublishedChange, RecomputedChange
+from xew.analysis.distances.matrices import mean_distances
+from xew.analysis.distances.workspaces import Frame, chamfer_floor, measure
+from xew.analysis.paper import AXES, Paper, PublishedChange
 from xew.analysis.statistics.grades import PaperGrades
 from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
 from xew.analysis.tables import layouts as tables
 from xew.analysis.tables.distances import signed
 from xew.analysis.tables.findings import Finding
 from xew.analysis.tables.layouts import ACTIONS, LADDER, SYSTEMS, Block, Builder, Column, Row, Table
+from xew.analysis.tables.recompute import RecomputedChange, RecomputedFigure
 from xew.protocol import ROBOT_NAMES
 from xew.sim_warp.robots import ROBOTS
 
@@ -101,7 +103,7 @@ def claims_table(claims: Sequence[Finding]) -> Table:
     )
 
 
-def correlation_table(paper: Paper, cells: Sequence[Cell]) -> Table:
+def correlation_table(paper: Paper, cells: Sequence[RecomputedFigure]) -> Table:
     """The paper's layout: r and leave-one-out range for each axis, then r with the number of joints."""
     found = {(cell.metric, cell.axis, cell.quantity): cell for cell in cells}
     layout = [(axis, names) for axis in AXES for names in (("r",), ("low", "high"))] + [("dof", ("r",))]
@@ -115,7 +117,7 @@ def correlation_table(paper: Paper, cells: Sequence[Cell]) -> Table:
     )
 
 
-def _compared(cells: Sequence[Cell]) -> tables.Cell:
+def _compared(cells: Sequence[RecomputedFigure]) -> tables.Cell:
     """One figure, or the two ends of a range."""
     ours = " to ".join(signed(cell.ours) for cell in cells)
     published = " to ".join(signed(cell.published) for cell in cells)
@@ -124,7 +126,7 @@ def _compared(cells: Sequence[Cell]) -> tables.Cell:
     return tables.Cell(ours, published=published, agrees=agrees, value=value, printed=printed)
 
 
-def certainty_table(paper: Paper, cells: Sequence[Cell], results: Mapping[tuple[str, str], Correlation]) -> Table:
+def certainty_table(paper: Paper, cells: Sequence[RecomputedFigure], results: Mapping[tuple[str, str], Correlation]) -> Table:
     printed = {(cell.metric, cell.axis): cell for cell in cells if cell.quantity == "p_value"}
 
     def row(metric: str) -> Row:
@@ -247,7 +249,7 @@ def percent(value: float, digits: int = 1) -> str:
     return f"{value:+z.{digits}f} %".replace("-", "−")
 
 
-def robot_table(paper: Paper, means: Sequence[Cell]) -> Table:
+def robot_table(paper: Paper, means: Sequence[RecomputedFigure]) -> Table:
     found = {(cell.metric, cell.axis): cell for cell in means}
 
     def row(name: str) -> Row:
@@ -262,7 +264,7 @@ def robot_table(paper: Paper, means: Sequence[Cell]) -> Table:
     return _table("robots", "Distances and features", ROBOT_TEXT, "robot", columns, [row(name) for name in paper.robots])
 
 
-def _mean(cell: Cell) -> tables.Cell:
+def _mean(cell: RecomputedFigure) -> tables.Cell:
     printed = f"{cell.published:.3f}"
     return tables.Cell(f"{cell.ours:.3f}", published=printed, agrees=cell.agrees, value=cell.ours, printed=cell.published)
 
