@@ -6,7 +6,7 @@ import pytest
 
 from xew.analysis.scores import MetricInfo
 from xew.analysis.statistics.summary import Interval, RobotTable, Row, finding, mean_interval, progress, verdict
-from xew.analysis.tables.layouts import number
+from xew.analysis.tables.table import format_number
 
 rng = np.random.default_rng(0)
 
@@ -99,6 +99,6 @@ def test_the_finding_says_better_worse_and_how_far() -> None:
 
 
 def test_numbers_have_the_digits_that_mean_something() -> None:
-    assert number(21.23456, info("psnr", "dB")) == "21.23"
-    assert number(3.14159, info("keypoint_error", "px")) == "3.1"
-    assert number(0.123456, info("lpips")) == "0.123"
+    assert format_number(21.23456, info("psnr", "dB")) == "21.23"
+    assert format_number(3.14159, info("keypoint_error", "px")) == "3.1"
+    assert format_number(0.123456, info("lpips")) == "0.123"

@@ -1,4 +1,4 @@
-"""Stage 11 of 11: the report's charts. A chart is panels beside one another, and the numbers that they draw.
+"""The report's charts. A chart is panels beside one another, and the numbers that they draw.
 
 On the page each panel is an SVG of its own, so that they stand one below the other on a narrow screen, and takes its colors
 from the page, light or dark. For Markdown and LaTeX all panels are one PNG and one PDF.

@@ -13,7 +13,7 @@ from markupsafe import Markup, escape
 
 from xew.analysis.reports.charts import Chart, panel_svg, themed_color
 from xew.analysis.tables.findings import Finding
-from xew.analysis.tables.layouts import Row, Table
+from xew.analysis.tables.table import Table, TableRow
 
 __all__ = [
     "Markup", "anchor", "chart", "claims", "contents", "definitions", "details", "escape", "labeled_picture", "note", "page",
@@ -72,7 +72,7 @@ def table(table: Table) -> Markup:
     """A table with its caption."""
     grouped = groupby(table.columns, key=lambda column: column.group)
     groups = [(title, len(list(members))) for title, members in grouped]
-    sections = [(one, [(row, _labels(one.rows, i)) for i, row in enumerate(one.rows)]) for one in table.blocks]
+    sections = [(one, [(row, _labels(one.rows, i)) for i, row in enumerate(one.rows)]) for one in table.sections]
     return _render("table.html", "table", table, groups if any(title for title, _ in groups) else (), sections)
 
 
@@ -87,7 +87,7 @@ class _Label:
     """Number of rows that it stands for; 0 for a label that belongs to its row alone."""
 
 
-def _labels(rows: Sequence[Row], index: int) -> Iterator[_Label]:
+def _labels(rows: Sequence[TableRow], index: int) -> Iterator[_Label]:
     """The labels that stand in a row; all but the last stand once for all following rows that share them."""
     labels = rows[index].labels
     for place, label in enumerate(labels):

@@ -1,4 +1,4 @@
-"""Stage 11 of 11: the report of a study, from a score table with the column `variant`; `report` reads and writes files.
+"""The report of a study, from a score table with the column `variant`; `report` reads and writes files.
 
 What came out stands first, then the claims with their verdicts, then a section for each question of the paper: chart, the
 main table, what it looks like, and all metrics folded away.
@@ -16,23 +16,26 @@ from xew.analysis.reports import page, pictures
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study_charts import study_charts
 from xew.analysis.reports.study_strips import Strip, study_strips
-from xew.analysis.scores import Scores, describe_cells, missing_cells
+from xew.analysis.scores import Scores, describe_scores, find_missing_scores
 from xew.analysis.statistics.grades import SEEN, Grades, PaperGrades, StudyGrades, better, interval
 from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
 from xew.analysis.tables import formats
+from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import (
     Distances,
     certainty_table,
     correlate,
     correlation_table,
     distance_tables,
+    format_signed,
     own_correlation_tables,
     printed_distances,
     read_distances,
-    signed,
 )
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask, findings_frame
-from xew.analysis.tables.layouts import ACTIONS, LADDER, MARKS, SHORT_ROBOTS, Builder, Table, build_tables, count_table
+from xew.analysis.tables.labels import ACTIONS, LADDER, SHORT_ROBOTS
+from xew.analysis.tables.layouts import build_tables, count_table
+from xew.analysis.tables.table import MARKS, Table
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
 
 TITLE = "Can the model render a robot that it has never seen?"
@@ -108,11 +111,11 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
     planned = scores.attributes.get("study", {}).get("variants", {})
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
     tables = [*build_tables(builder), count_table(builder), *distance_tables(known)]
-    if builder.present("loeo"):
+    if builder.has_results("loeo"):
         tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
         tables.append(certainty_table(grades, known, paper))
     findings = ask(grades)
-    missing = missing_cells(scores.rows)
+    missing = find_missing_scores(scores.rows)
     content = Content(
         _sentences(grades, known, findings),
         findings,
@@ -120,11 +123,11 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
         {table.name: table for table in tables},
         study_charts(builder, known, scores.curves),
         strips,
-        [*_lacks(builder, scores), *missing_note(missing)],
+        [*_missing_notes(builder, scores), *missing_note(missing)],
         missing,
     )
-    html = _html(content, scores, footer)
-    return Report(html, _markdown(content), formats.tables_frame(tables), dict(_files(content)))
+    html = _write_html(content, scores, footer)
+    return Report(html, _write_markdown(content), formats.tables_frame(tables), dict(_files(content)))
 
 
 def _sentences(grades: Grades, distances: Distances, findings: Sequence[Finding]) -> list[str]:
@@ -135,12 +138,12 @@ def _sentences(grades: Grades, distances: Distances, findings: Sequence[Finding]
         *_adaptation_sentences(grades),
         *_distance_sentence(grades, distances),
     ]
-    return [_verdict_sentence(findings), *asked]
+    return [_answer_sentence(findings), *asked]
 
 
-def _verdict_sentence(findings: Sequence[Finding]) -> str:
+def _answer_sentence(findings: Sequence[Finding]) -> str:
     claims = [finding for finding in findings if finding.claim.where != "ours"]
-    counts = {word: sum(finding.verdict == word for finding in claims) for word in (HOLDS, FAILS, UNRESOLVED, UNMEASURED)}
+    counts = {word: sum(finding.answer == word for finding in claims) for word in (HOLDS, FAILS, UNRESOLVED, UNMEASURED)}
     measured = len(claims) - counts[UNMEASURED]
     if not measured:
         return f"None of {len(claims)} claims of the paper could be asked of what was graded here."
@@ -148,7 +151,7 @@ def _verdict_sentence(findings: Sequence[Finding]) -> str:
     verbs = {HOLDS: ("holds", "hold"), FAILS: ("fails", "fail"), UNRESOLVED: ("is unresolved", "are unresolved")}
     parts = [f"{counts[word] or 'none'} {verbs[word][counts[word] > 1]}" for word in verbs]
     text = f"Of {len(claims)} claims of the paper {asked} could be asked here: {', '.join(parts)}."
-    failed = [finding.claim.says.strip("… ").rstrip(".") for finding in claims if finding.verdict == FAILS]
+    failed = [finding.claim.says.strip("… ").rstrip(".") for finding in claims if finding.answer == FAILS]
     return text + (f" What fails: {'; '.join(failed)}." if failed else "")
 
 
@@ -160,7 +163,9 @@ def _gap_sentence(grades: Grades) -> Iterator[str]:
         if mean and seen:
             worse = -better(mean, seen, grades.metrics["lpips"])
             low, high = interval(worse, grades.level)
-            parts.append(f"{_change(worse[0])} on {ROBOT_TITLES[robot]} ({_change(low)} to {_change(high)})")
+            parts.append(
+                f"{_format_change(worse[0])} on {ROBOT_TITLES[robot]} ({_format_change(low)} to {_format_change(high)})"
+            )
     if parts and seen:
         yield f"Told optical flow only, LPIPS is {seen.value:.3f} on robots seen in training; {' and '.join(parts)}."
 
@@ -174,7 +179,9 @@ def _best_sentences(grades: Grades) -> Iterator[str]:
             known = {row: gain for row, gain in gains.items() if gain is not None}
             if known:
                 best = max(known, key=lambda row: known[row])
-                found.append(f"{labels[best].removeprefix('+ ').lower()} on {SHORT_ROBOTS[robot]} ({_change(known[best])})")
+                found.append(
+                    f"{labels[best].removeprefix('+ ').lower()} on {SHORT_ROBOTS[robot]} ({_format_change(known[best])})"
+                )
         if found:
             yield f"Against {labels[base].lower()}, LPIPS improves most with {' and '.join(found)}."
 
@@ -185,15 +192,15 @@ def _adaptation_sentences(grades: Grades) -> Iterator[str]:
         loss = _gain(grades, "forgetting", f"{robot}-1", "none", FORGETTING_ROBOT)
         if gain is not None and loss is not None:
             yield (
-                f"One demonstration of each task changes LPIPS by {_change(-gain)} on {ROBOT_TITLES[robot]}, and by "
-                f"{_change(-loss)} on {ROBOT_TITLES[FORGETTING_ROBOT]}, which the model had been trained on."
+                f"One demonstration of each task changes LPIPS by {_format_change(-gain)} on {ROBOT_TITLES[robot]}, and by "
+                f"{_format_change(-loss)} on {ROBOT_TITLES[FORGETTING_ROBOT]}, which the model had been trained on."
             )
 
 
 def _distance_sentence(grades: Grades, distances: Distances) -> Iterator[str]:
     found = correlate(grades, distances)
     parts = [
-        f"r = {signed(found['lpips', axis].r)} with {axis} distance (p = {found['lpips', axis].p_value:.3f}, "
+        f"r = {format_signed(found['lpips', axis].r)} with {axis} distance (p = {found['lpips', axis].p_value:.3f}, "
         f"{'stable' if found['lpips', axis].stable else 'unstable'} sign)"
         for axis in AXES
         if ("lpips", axis) in found
@@ -202,7 +209,7 @@ def _distance_sentence(grades: Grades, distances: Distances) -> Iterator[str]:
         yield f"Over the five robots, each held out in turn, LPIPS goes with distance: {'; '.join(parts)}."
 
 
-def _change(share: float) -> str:
+def _format_change(share: float) -> str:
     return f"{100 * share:+z.0f}\u00a0%".replace("-", "−")
 
 
@@ -213,8 +220,8 @@ def _gain(grades: Grades, part: str, row: str, base: str, robot: str) -> float |
     return float(better(after, before, grades.metrics["lpips"])[0]) if after and before else None
 
 
-def _lacks(builder: Builder, scores: Scores) -> Iterator[str]:
-    absent = [part.replace("_", " ") for part in PAPER_PARTS if not builder.present(part)]
+def _missing_notes(builder: Builder, scores: Scores) -> Iterator[str]:
+    absent = [part.replace("_", " ") for part in PAPER_PARTS if not builder.has_results(part)]
     if absent:
         yield f"Not run in this study: {', '.join(absent)}."
     unknown = set(scores.rows["variant"]) - {variant.name for variants in PARTS.values() for variant in variants} - {""}
@@ -228,11 +235,11 @@ def missing_note(missing: pd.DataFrame) -> list[str]:
         return []
     return [
         f"{len(missing)} scores are missing that other models have; comparisons leave these cells out for all. They are in "
-        f"missing.csv: {describe_cells(missing, 3)}."
+        f"missing.csv: {describe_scores(missing, 3)}."
     ]
 
 
-def _html(content: Content, scores: Scores, footer: str) -> str:
+def _write_html(content: Content, scores: Scores, footer: str) -> str:
     """The page."""
     sections = {"Claims": _claims_section(content)}
     sections |= {PART_TITLES[part]: text for part in SECTIONS if (text := _part_section(content, part))}
@@ -287,7 +294,7 @@ def _method_section(content: Content, scores: Scores) -> Markup:
     )
 
 
-def _markdown(content: Content) -> str:
+def _write_markdown(content: Content) -> str:
     lines = [
         f"# {TITLE}",
         "",
@@ -318,7 +325,7 @@ def _files(content: Content) -> Iterator[tuple[str, bytes]]:
     """Tables as LaTeX and CSV, charts as PNG, PDF and CSV, strips as PNG, findings as CSV and LaTeX."""
     for name, table in content.tables.items():
         yield f"tables/{name}.tex", formats.latex(table).encode()
-        yield f"tables/{name}.csv", formats.frame(table).to_csv(index=False).encode()
+        yield f"tables/{name}.csv", formats.table_frame(table).to_csv(index=False).encode()
     for chart in content.charts.values():
         for name, data in chart_files(chart).items():
             yield f"figures/{name}", data
