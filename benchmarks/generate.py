@@ -116,7 +116,7 @@ def stages(jobs: list[Job], renderer: Renderer, out: Path, clock: Clock) -> int:
     with clock.stage("scene render"):
         views = observe(renderer, [cell.recording for cell in cells])
     with clock.stage("robot-only render"):
-        renders = command_renders([(cell.robot_name, cell.commands.action) for cell in cells], renderer=renderer)
+        renders = command_renders([(cell.robot, cell.commands.action) for cell in cells], renderer=renderer)
     with clock.stage("writing"), ThreadPoolExecutor(1 if device.is_cpu else os.cpu_count()) as pool:
         pixels = zip(views, renders, strict=True)
         list(pool.map(lambda cell, seen: write_cell(cell, seen, out, device), cells, pixels))

@@ -115,6 +115,11 @@ def episode_folder(data: Path, task: str, seed: int, robot: str) -> Path:
     return Path(data) / task / f"{seed:07d}" / robot
 
 
+def data_folder(episode: Path) -> Path:
+    """The folder of the data set that the folder of an episode lies in."""
+    return episode.absolute().parents[2]
+
+
 def array_hash(*arrays: np.ndarray) -> str:
     """SHA-256 over dtype, shape and bytes of arrays, in order."""
     digest = hashlib.sha256()

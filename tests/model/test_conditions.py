@@ -31,7 +31,7 @@ from xew.model.conditions import (
 )
 from xew.model.latents import episode_command
 from xew.protocol import ACTION_DIM, ROBOT_NAMES
-from xew.sim_warp.robots.user.own import FOLDERS
+from xew.sim_warp.robots import ROBOTS, keep_robot
 
 STORED = [condition for condition in (ACTIONS["joints"], CONDITIONS["robot_render"]) if isinstance(condition, Condition)]
 SYSTEMS = {name: entry for name, entry in ACTIONS.items() if isinstance(entry, System) and entry.conditions}
@@ -45,17 +45,17 @@ def episode(tmp_path: Path) -> Path:
 
 def test_a_command_holds_nothing_measured() -> None:
     """`rendered` is the video at `render_path`, at hand or rendered anew from the commands (pixels.py)."""
-    named = {"robot", "action", "intrinsics", "extrinsics", "render_path", "rendered"}
+    named = {"robot", "action", "intrinsics", "extrinsics", "render_path", "rendered", "data"}
     assert {field.name for field in fields(Command)} == named
 
 
-def test_robots_of_ones_own_are_those_of_the_data_set_of_the_episode(
-    episode: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_robots_of_ones_own_are_those_of_the_data_set_of_the_episode(episode: Path, tmp_path: Path) -> None:
     """A rollout's data need not be those of its run."""
-    monkeypatch.setenv(FOLDERS, "")
-    episode_command(episode, read_record(episode))
-    assert os.environ[FOLDERS].split(os.pathsep)[0] == str((tmp_path / "robots").resolve())
+    before = dict(os.environ)
+    keep_robot(replace(ROBOTS["piper"], key="my_arm", title="My arm"), tmp_path)
+    command = episode_command(episode, replace(read_record(episode), robot="my_arm"))
+    assert command.data == tmp_path.absolute() and command.robot_spec.title == "My arm"
+    assert command.robot_spec.urdf.is_relative_to((tmp_path / "robots").resolve()) and dict(os.environ) == before
 
 
 @pytest.mark.parametrize("condition", [*STORED, *NUMBERS], ids=lambda condition: condition.name)
@@ -127,7 +127,7 @@ def wandering(frames: int = 12) -> np.ndarray:
 def test_tool_poses_are_forward_kinematics_of_commands(tmp_path: Path, robot: str) -> None:
     from xew.sim_warp.geometry.poses import matrix_from_pose
     from xew.sim_warp.kinematics import joint_positions, link_matrices
-    from xew.sim_warp.robots import ROBOTS, load_urdf
+    from xew.sim_warp.robots import load_urdf
 
     folder = synthetic.write_cell(tmp_path, "place_empty_cup", 0, robot, frames=5)
     states = read_states(folder)
@@ -154,7 +154,6 @@ def test_a_tool_that_points_down_has_no_angles() -> None:
 def test_no_angle_is_near_a_jump_where_tools_rest(tmp_path: Path, robot: str) -> None:
     """Angles wrap at pi and are ambiguous at a pitch of pi / 2."""
     from xew.sim_warp.rendering.streams import home_action
-    from xew.sim_warp.robots import ROBOTS
 
     home = home_action(ROBOTS[robot])[None].astype(np.float32)
     poses = tool_poses(Command(robot, home, np.eye(3), np.eye(4), tmp_path))[0]

@@ -20,11 +20,12 @@ import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
-from xew.episode import Record, States, read_video
+from xew.episode import Record, States, data_folder, read_video
 from xew.model.video.frames import TEMPORAL_FACTOR
 from xew.protocol import ARMS
 
 if TYPE_CHECKING:
+    import xew.sim_warp.embodiment.spec
     import xew.sim_warp.geometry.camera
     import xew.sim_warp.rendering.streams
 
@@ -48,6 +49,8 @@ class Command:
     """Path of the stored robot-only video, posed by `action` on a white ground."""
     rendered: Video | None = None
     """The same video [t h w 3] uint8, where it is in memory."""
+    data: Path | None = None
+    """Data set of the episode, which keeps robots of a user's own."""
 
     @cached_property
     def render(self) -> Video:
@@ -59,17 +62,21 @@ class Command:
         """Render, mask and optical flow of the commands; Warp is imported when first asked for."""
         from xew.sim_warp.rendering.streams import command_streams
 
-        return command_streams(self.robot, self.action, self.camera)
+        return command_streams(self.robot_spec, self.action, self.camera)
 
     @cached_property
     def tools(self) -> Float[np.ndarray, "t 2 7"]:
         """Commanded poses [t 2 7] float64 of the left and right tool in the world: position [m], quaternion x y z w."""
-        from xew.sim_warp.kinematics.forward import tool_pose
+        from xew.sim_warp.kinematics.forward import tool_poses
+
+        return tool_poses(self.robot_spec, self.action)
+
+    @cached_property
+    def robot_spec(self) -> "xew.sim_warp.embodiment.spec.RobotSpec":
+        """The simulator's description of the robot: of the registry, or kept beside the data."""
         from xew.sim_warp.robots import get_robot
 
-        robot = get_robot(self.robot)
-        joints = [self.action[:, arm_joints][:, : robot.arm_joint_count] for arm_joints, _ in ARMS]
-        return np.stack([tool_pose(robot, arm, arm_pos) for arm, arm_pos in enumerate(joints)], axis=1)
+        return get_robot(self.robot, self.data)
 
     @property
     def camera(self) -> "xew.sim_warp.geometry.camera.Camera":
@@ -171,7 +178,8 @@ def make_command(folder: Path, record: Record, states: States, rendered: Video |
         states: its arrays.
         rendered: its robot-only video [t h w 3] uint8, where it is in memory.
     """
-    return Command(record.robot, states.action, states.intrinsics, states.extrinsics, folder / "robot.mkv", rendered)
+    data = data_folder(folder)
+    return Command(record.robot, states.action, states.intrinsics, states.extrinsics, folder / "robot.mkv", rendered, data)
 
 
 def joints(command: Command) -> Float[np.ndarray, "t 16"]:
@@ -200,28 +208,28 @@ def ray_map(command: Command) -> Video:
     """The commanded tool frames drawn into the image: [t h w 3] uint8."""
     from xew.sim_warp.rendering import streams
 
-    return streams.ray_map(command.robot, command.action, command.camera)
+    return streams.ray_map(command.robot_spec, command.action, command.camera)
 
 
 def reference_image(command: Command) -> Video:
     """One front view of the robot at home: [1 h w 3] uint8."""
     from xew.sim_warp.rendering import streams
 
-    return streams.reference_image(command.robot)[None]
+    return streams.reference_image(command.robot_spec)[None]
 
 
 def nine_views(command: Command) -> Video:
     """The robot at home from nine sides: [9 h w 3] uint8."""
     from xew.sim_warp.rendering import streams
 
-    return streams.nine_views(command.robot)
+    return streams.nine_views(command.robot_spec)
 
 
 def articulation_clip(command: Command) -> Video:
     """A clip of the robot that moves all its joints: [17 h w 3] uint8."""
     from xew.sim_warp.rendering import streams
 
-    return streams.articulation_clip(command.robot)
+    return streams.articulation_clip(command.robot_spec)
 
 
 POINTING_DOWN = Rotation.from_matrix([[0, -1, 0], [0, 0, 1], [-1, 0, 0]])

@@ -191,9 +191,6 @@ def stream_videos(
 
 def episode_command(folder: Path, record: Record, rendered: np.ndarray | None = None) -> Command:
     """What conditions may be made from, of an episode of a data set."""
-    from xew.sim_warp.robots import use_robots_of
-
-    use_robots_of(folder.absolute().parents[2])  # a robot of a user's own is kept beside its data
     return make_command(folder, record, read_states(folder), rendered)
 
 

@@ -27,7 +27,7 @@ from tqdm import tqdm
 from xew.config import user_errors
 from xew.episode import EpisodeError, Record, episode_folder, find_records, remove_left_overs
 from xew.protocol import TEST_SEED_START, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK
-from xew.sim_warp.devices.workers import Workers, has_kernels, named_device, quiet_warp, worker_count
+from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.produce import Job, produce
 from xew.sim_warp.rendering.render import Renderer
@@ -127,7 +127,7 @@ Made = tuple[list[Record], float]
 @contextmanager
 def maker(args: Args) -> Iterator[Callable[[Sequence[Job]], Iterator[Made]]]:
     """What runs jobs on the device at hand: in worker processes, one job at a time on a CPU, in large batches on a GPU."""
-    device = named_device(args.device)
+    device = find_device(args.device)
     size = max(1, args.batch // len(args.robots)) if device.is_cuda else 1
     make = partial(_make, out=args.out, device=device.alias, batch=args.batch, videos=not args.states_only)
     with Workers(args.workers or worker_count(device), first_alone=not has_kernels(device)) as workers:
@@ -192,7 +192,7 @@ def _check(args: Args) -> None:
         get_task(task)
     for robot in args.robots:
         if not is_path(robot):
-            get_robot(robot)
+            get_robot(robot, args.out)
     if not args.tasks or not args.robots or min(args.train_seeds, args.test_seeds) < 0 or args.batch < 1:
         raise EpisodeError(
             f"nothing to make of {len(args.tasks)} tasks, {len(args.robots)} robots, {args.train_seeds} training and "
@@ -275,7 +275,7 @@ def _demand_enough(families: Sequence[Family]) -> None:
 
 def _tell_device(name: str | None) -> None:
     """On what it runs, and why the first run seems to stand still."""
-    device = named_device(name)
+    device = find_device(name)
     print(f"device: {device.name}")
     if not has_kernels(device):
         wait = "five minutes" if device.is_cuda else "a minute"

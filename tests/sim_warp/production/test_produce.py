@@ -79,8 +79,8 @@ def test_the_same_bytes_alone_among_others_and_in_groups(
 def shortened(plan_cells: object) -> object:
     """Only the first frames of a real task: company for the others, not an episode."""
 
-    def first_frames(jobs: list[Job]) -> list[list[stage.Cell]]:
-        return [[cut(cell) for cell in cells] for cells in plan_cells(jobs)]  # type: ignore[operator]
+    def first_frames(jobs: list[Job], out: Path) -> list[list[stage.Cell]]:
+        return [[cut(cell) for cell in cells] for cells in plan_cells(jobs, out)]  # type: ignore[operator]
 
     def cut(cell: stage.Cell) -> stage.Cell:
         return replace(cell, commands=replace(cell.commands, action=cell.commands.action[:12]))

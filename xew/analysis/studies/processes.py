@@ -14,13 +14,14 @@ import runpy
 import signal
 import subprocess
 import sys
-import threading
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Literal
+
+from xew.processes import leave_with_parent
 
 PRELOADED = ("xew.model.train", "xew.model.rollout", "xew.metrics.evaluate")
 """Modules that the fork server imports. None of them may start a thread or a JAX backend at import, which no fork survives."""
@@ -77,7 +78,7 @@ def _run(command: tuple[str, ...], log: Path, environment: dict[str, str], launc
     """Run a module as `python -m` would, or the launcher's process; called in the new process."""
     os.environ.update(environment)
     os.setpgrp()  # Ctrl-C reaches the study only, which asks its steps to stop
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    leave_with_parent(lambda: os.kill(os.getpid(), signal.SIGTERM))
     with log.open("a", buffering=1) as file, _hold_lock(log.with_suffix(".lock")):
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
@@ -126,11 +127,3 @@ def _hold_lock(path: Path) -> Iterator[None]:
     with path.open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
-
-
-def _leave_with_parent() -> None:
-    """End this process when the process that started it ends."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os.kill(os.getpid(), signal.SIGTERM)

@@ -24,6 +24,7 @@ from xew.episode import (
     Record,
     States,
     array_hash,
+    data_folder,
     demand_known,
     read_record,
     read_states,
@@ -32,7 +33,7 @@ from xew.episode import (
 )
 from xew.protocol import ARMS
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
-from xew.sim_warp.kinematics.forward import tool_pose
+from xew.sim_warp.kinematics.forward import tool_poses
 from xew.sim_warp.physics import Motion, World, simulate
 from xew.sim_warp.physics.plausibility import implausible
 from xew.sim_warp.plan import ToolPath
@@ -40,7 +41,7 @@ from xew.sim_warp.production.expert import Commands, joint_commands
 from xew.sim_warp.rendering.observe import Observation, Recording, keypoint_names, observe, scene_things
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import command_renders
-from xew.sim_warp.robots import RobotSpec, get_robot, use_robots_of
+from xew.sim_warp.robots import RobotSpec, get_robot
 from xew.sim_warp.scene import Scene, scene_hash, scene_rng
 from xew.sim_warp.tasks import Moment, Task, get_task
 
@@ -115,7 +116,7 @@ def produce(
         batch: worlds that a GPU steps together, None for all.
         videos: store them; without, an episode has all states and hashes, and `add_videos` makes its videos.
     """
-    seeds = simulate_cells(plan_cells(jobs), renderer.device.alias, batch)
+    seeds = simulate_cells(plan_cells(jobs, out), renderer.device.alias, batch)
     rejected = {(job.task, job.seed) for job in jobs if job.rejected}
     records: list[list[Record]] = []
     writing: list[list[Future[Record]]] = []
@@ -147,15 +148,19 @@ def _groups(seeds: list[list[Cell]]) -> Iterator[list[list[Cell]]]:
         yield group
 
 
-def plan_cells(jobs: Sequence[Job]) -> list[list[Cell]]:
-    """Scene, plan and commands of every cell; the commands of all cells of a robot are solved together."""
+def plan_cells(jobs: Sequence[Job], data: Path | None = None) -> list[list[Cell]]:
+    """Scene, plan and commands of every cell; the commands of all cells of a robot are solved together.
+
+    Args:
+        data: data set whose own robots count too.
+    """
     tasks = [get_task(job.task) for job in jobs]
     scenes = [task.sample(scene_rng(job.task, job.seed), job.seed) for job, task in zip(jobs, tasks, strict=True)]
     paths = [task.plan(scene).path() for task, scene in zip(tasks, scenes, strict=True)]
     seeds: list[list[Cell]] = [[] for _ in jobs]
     for name in dict.fromkeys(robot for job in jobs for robot in job.robots):
         mine = [index for index, job in enumerate(jobs) if name in job.robots]
-        robot = get_robot(name)
+        robot = get_robot(name, data)
         for index, commands in zip(mine, joint_commands(robot, [paths[index] for index in mine]), strict=True):
             seeds[index].append(Cell(jobs[index].task, tasks[index], scenes[index], paths[index], name, robot, commands))
     return seeds
@@ -172,14 +177,13 @@ def simulate_cells(seeds: list[list[Cell]], device: str | None = None, batch: in
 def render_cells(cells: Sequence[Cell], renderer: Renderer) -> list[Pixels]:
     """What the camera sees of each cell, and the robot alone by its commands."""
     views = observe(renderer, [cell.recording for cell in cells])
-    renders = command_renders([(cell.robot_name, cell.commands.action) for cell in cells], renderer=renderer)
+    renders = command_renders([(cell.robot, cell.commands.action) for cell in cells], renderer=renderer)
     return list(zip(views, renders, strict=True))
 
 
 def measured_tools(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
     """[t 2 7] tool poses at canonical joint positions [t 16], world."""
-    arms = [joint_pos[:, joints][:, : robot.arm_joint_count] for joints, _ in ARMS]
-    return np.stack([tool_pose(robot, side, arm) for side, arm in enumerate(arms)], 1).astype(np.float32)
+    return tool_poses(robot, joint_pos).astype(np.float32)
 
 
 def moment(action: np.ndarray, motion: Motion, tools: np.ndarray, frame: int) -> Moment:
@@ -332,12 +336,11 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
         EpisodeError: the scene or anything rendered differs from what is recorded.
     """
     demand_known(folder, "joint_pos", "object_pose")
-    use_robots_of(folder.absolute().parents[2])
     record, states = read_record(folder), read_states(folder)
-    robot = get_robot(record.robot)
+    robot = get_robot(record.robot, data_folder(folder))
     scene = _scene_again(folder, record)
     view = observe(renderer, [recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)])[0]
-    render = command_renders([(record.robot, states.action)], renderer=renderer)[0]
+    render = command_renders([(robot, states.action)], renderer=renderer)[0]
     again = replace(states, keypoints=view.keypoints, keypoint_visible=view.keypoint_visible, robot_mask=view.robot_mask)
     found = {"states": states_hash(again), "rgb": array_hash(view.rgb), "robot": array_hash(render)}
     found["scene"] = scene_hash(scene)

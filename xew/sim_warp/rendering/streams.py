@@ -1,8 +1,8 @@
 """Stage 4b: what a model may know in advance: images that follow from a robot and its commands alone.
 
-Reads  a robot's key and canonical commands [t 16]; never a recorded state, so that no condition sees the future
+Reads  a robot, or its name, and canonical commands [t 16]; never a recorded state, so that no condition sees the future
 Writes the robot-only render with mask and exact optical flow, ray map, and task-independent views of the robot
-To add one, write a pure function of (robot_key, action, camera) here.
+To add one, write a pure function of (robot, action, camera) here.
 """
 
 from collections.abc import Sequence
@@ -61,34 +61,34 @@ def default_renderer() -> Renderer:
     return Renderer()
 
 
-def command_streams(robot_key: str, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> CommandStreams:
+def command_streams(robot: str | RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> CommandStreams:
     """Render, mask and exact optical flow of commands [t 16].
 
     Raises:
         ConfigError: there is no such robot.
         ValueError: the action does not have 16 columns.
     """
-    return command_streams_batch([(robot_key, action)], camera)[0]
+    return command_streams_batch([(robot, action)], camera)[0]
 
 
 def command_streams_batch(
-    commands: Sequence[tuple[str, np.ndarray]], camera: Camera = HEAD_CAMERA, renderer: Renderer | None = None
+    commands: Sequence[tuple[str | RobotSpec, np.ndarray]], camera: Camera = HEAD_CAMERA, renderer: Renderer | None = None
 ) -> list[CommandStreams]:
-    """`command_streams` of many (robot_key, action [t 16]) at once; each does not depend on the others."""
+    """`command_streams` of many (robot, action [t 16]) at once; each does not depend on the others."""
     batch = (renderer or default_renderer()).render_batch(_worlds(commands), camera, ground=False, optical_flow=True)
     return [CommandStreams(frames.rgb, frames.robot_mask, frames.optical_flow) for frames in batch]
 
 
 def command_renders(
-    commands: Sequence[tuple[str, np.ndarray]], camera: Camera = HEAD_CAMERA, renderer: Renderer | None = None
+    commands: Sequence[tuple[str | RobotSpec, np.ndarray]], camera: Camera = HEAD_CAMERA, renderer: Renderer | None = None
 ) -> list[np.ndarray]:
     """Only the renders [t h w 3] uint8 of `command_streams_batch`, of which an episode keeps a video."""
     batch = (renderer or default_renderer()).render_batch(_worlds(commands), camera, ground=False)
     return [frames.rgb for frames in batch]
 
 
-def _worlds(commands: Sequence[tuple[str, np.ndarray]]) -> list[World]:
-    robots = [get_robot(robot_key) for robot_key, _ in commands]
+def _worlds(commands: Sequence[tuple[str | RobotSpec, np.ndarray]]) -> list[World]:
+    robots = [get_robot(robot) for robot, _ in commands]
     return [
         World(robot_bodies(robot), robot_pose(robot, _checked(action)))
         for robot, (_, action) in zip(robots, commands, strict=True)
@@ -126,7 +126,7 @@ def color_wheel() -> np.ndarray:
     return cv2.cvtColor(np.stack([hue, saturation, np.full_like(hue, 255)], -1), cv2.COLOR_HSV2RGB)
 
 
-def ray_map(robot_key: str, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> np.ndarray:
+def ray_map(robot: str | RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> np.ndarray:
     """The commanded tool frames drawn into the image: [t h w 3] uint8.
 
     On gray, each tool has a base marker, a disc at the origin of its frame whose color goes with the gripper, and over it
@@ -134,7 +134,7 @@ def ray_map(robot_key: str, action: np.ndarray, camera: Camera = HEAD_CAMERA) ->
     EnerVerse-AC's trajectory maps. A tool that is nearer covers one that is farther; a tool that is not in front of the
     camera is left out.
     """
-    robot = get_robot(robot_key)
+    robot = get_robot(robot)
     action = _checked(action)
     canvas = np.full((len(action), camera.height, camera.width, 3), RAY_MAP_GROUND, np.uint8)
     tools = [_tool_points(robot, arm, action) for arm in range(len(ARMS))]
@@ -167,23 +167,23 @@ def _draw_tool(image: np.ndarray, pixels: np.ndarray, arm: int, gripper: float) 
         cv2.line(image, origin, end, axis_color, round(width * AXIS_WIDTH), cv2.LINE_AA, 4)
 
 
-def reference_image(robot_key: str) -> np.ndarray:
+def reference_image(robot: str | RobotSpec) -> np.ndarray:
     """The robot at home, seen from the front, [h w 3] uint8: the first of its nine views."""
-    return nine_views(robot_key)[0]
+    return nine_views(robot)[0]
 
 
-def nine_views(robot_key: str) -> np.ndarray:
+def nine_views(robot: str | RobotSpec) -> np.ndarray:
     """The robot at home from nine azimuths 40 degrees apart, [9 h w 3] uint8, the first from the front."""
-    robot = get_robot(robot_key)
+    robot = get_robot(robot)
     bodies, pose = robot_bodies(robot), robot_pose(robot, home_action(robot)[None])
     cameras = _fitted_cameras(bodies, pose, [index * 360 / VIEW_COUNT for index in range(VIEW_COUNT)])
     return np.concatenate([default_renderer().render(bodies, pose, camera, ground=False).rgb for camera in cameras])
 
 
-def articulation_clip(robot_key: str) -> np.ndarray:
+def articulation_clip(robot: str | RobotSpec) -> np.ndarray:
     """A clip of the robot, seen from the front, that sweeps every joint and both grippers (`articulation_action`): [17 h w 3]
     uint8."""
-    robot = get_robot(robot_key)
+    robot = get_robot(robot)
     bodies, pose = robot_bodies(robot), robot_pose(robot, articulation_action(robot))
     camera = _fitted_cameras(bodies, pose, [0.0])[0]
     return default_renderer().render(bodies, pose, camera, ground=False).rgb
