@@ -15,6 +15,7 @@ from xew.analysis.correlation import Correlation
 from xew.analysis.distance import Frame
 from xew.analysis.paper import (
     AXES,
+    PAPER_TITLES,
     Cell,
     Paper,
     RecomputedChange,
@@ -27,7 +28,6 @@ from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study import Report
 from xew.analysis.reports.study_charts import distance_chart
 from xew.analysis.statistics.grades import PaperGrades
-from xew.analysis.statistics.summary import METRIC_TITLES
 from xew.analysis.tables import formats
 from xew.analysis.tables import layouts as tables
 from xew.analysis.tables.distances import Distances, distance_tables, printed_distances, signed
@@ -154,9 +154,9 @@ def _frame_sentences(
     }
     for frame, start in starts.items():
         found = by_frame[frame]
-        turned = [METRIC_TITLES[name] for name, one in found.items() if one.r * results[name, "kinematic"].r < 0]
+        turned = [PAPER_TITLES[name] for name, one in found.items() if one.r * results[name, "kinematic"].r < 0]
         yield (
-            f"{start}, {METRIC_TITLES[PRIMARY]} has r = {signed(found[PRIMARY].r)}, p = {found[PRIMARY].p_value:.3f}; its sign "
+            f"{start}, {PAPER_TITLES[PRIMARY]} has r = {signed(found[PRIMARY].r)}, p = {found[PRIMARY].p_value:.3f}; its sign "
             f"{_survives(found[PRIMARY])}. Against the printed figures r turns its sign for {', '.join(turned) or 'no metric'}."
         )
 
@@ -175,7 +175,7 @@ def _verdicts(claims: Sequence[Finding]) -> str:
 
 def _sentence(axis: str, result: Correlation) -> str:
     return (
-        f"{METRIC_TITLES[PRIMARY]} against {axis} distance: r = {signed(result.r)}, p = {result.p_value:.3f}; its sign "
+        f"{PAPER_TITLES[PRIMARY]} against {axis} distance: r = {signed(result.r)}, p = {result.p_value:.3f}; its sign "
         f"{_survives(result)}."
     )
 
@@ -186,7 +186,7 @@ def _survives(result: Correlation) -> str:
 
 
 def _name(metric: str, axis: str) -> str:
-    return f"{METRIC_TITLES[metric]} by {axis}"
+    return f"{PAPER_TITLES[metric]} by {axis}"
 
 
 def _with_own_frames(distances: Distances, frames: Mapping[Frame, np.ndarray]) -> Distances:

@@ -16,8 +16,8 @@ from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study_charts import study_charts
 from xew.analysis.reports.study_strips import Strip, study_strips
 from xew.analysis.scores import Scores, describe_cells, missing_cells
-from xew.analysis.statistics.grades import SEEN, Grades, PaperGrades, StudyGrades, better, interval
-from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.analysis.statistics.grades import SEEN, Grades, PaperGrades, StudyGrades, relative_gain
+from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables import formats
 from xew.analysis.tables.distances import (
     Distances,
@@ -33,6 +33,7 @@ from xew.analysis.tables.distances import (
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask, findings_frame
 from xew.analysis.tables.layouts import ACTIONS, LADDER, MARKS, SHORT_ROBOTS, Builder, Table, build_tables, count_table
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
+from xew.statistics import interval
 
 TITLE = "Can the model render a robot that it has never seen?"
 PART_TITLES = {
@@ -157,7 +158,7 @@ def _gap_sentence(grades: Grades) -> Iterator[str]:
     for robot in HELD_OUT_ROBOTS:
         mean = grades.mean("fixed", "fixed", robot, "lpips") if seen else None
         if mean and seen:
-            worse = -better(mean, seen, grades.metrics["lpips"])
+            worse = -relative_gain(mean, seen, grades.metrics["lpips"]).values
             low, high = interval(worse, grades.level)
             parts.append(f"{_change(worse[0])} on {ROBOT_TITLES[robot]} ({_change(low)} to {_change(high)})")
     if parts and seen:
@@ -209,7 +210,7 @@ def _gain(grades: Grades, part: str, row: str, base: str, robot: str) -> float |
     if "lpips" not in grades.metrics:
         return None
     after, before = (grades.mean(part, key, robot, "lpips", shared=True) for key in (row, base))
-    return float(better(after, before, grades.metrics["lpips"])[0]) if after and before else None
+    return relative_gain(after, before, grades.metrics["lpips"]).value if after and before else None
 
 
 def _lacks(builder: Builder, scores: Scores) -> Iterator[str]:
@@ -270,7 +271,7 @@ def _part_section(content: Content, part: str) -> str:
 
 def _method_section(content: Content, scores: Scores) -> str:
     made = {"scenes graded": str(len(scores.rows[["task", "seed"]].drop_duplicates())), **scores.measured_by}
-    definitions = {METRIC_TITLES.get(metric.name, metric.name): metric.reference for metric in scores.metrics}
+    definitions = {metric.title: metric.reference for metric in scores.metrics}
     return page.section(
         "How it was measured",
         page.paragraph(

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.correlation import Correlation, dof_correlation, loeo_correlation
-from xew.analysis.paper import AXES, Paper
+from xew.analysis.paper import AXES, PAPER_TITLES, Paper
 from xew.analysis.statistics.grades import Grades
-from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables.layouts import PAPER_METRICS, SHORT_ROBOTS, Block, Cell, Column, Row, Table
 from xew.config import ConfigError
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES
@@ -144,7 +144,7 @@ def correlation_table(grades: Grades, distances: Distances, paper: Paper) -> Tab
         scores = _loeo_scores(grades, metric)
         dof = [dof_correlation(distances.of("dof").tolist(), scores, grades.metrics[metric].higher_is_better)] if scores else []
         cells.append(_signed_cell(dof, [paper.metrics[metric].dof_r]))
-        return Row((METRIC_TITLES[metric],), tuple(cells))
+        return Row((PAPER_TITLES[metric],), tuple(cells))
 
     columns = [Column(title, AXIS_TITLES[axis]) for axis in AXES for title in ("Pearson r", "leave one out")]
     shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
@@ -175,7 +175,7 @@ def own_correlation_tables(grades: Grades, distances: Distances) -> list[Table]:
                 _signed_cell([result.low, result.high] if result else [], []),
                 p,
             ]
-        return Row((METRIC_TITLES[metric],), tuple(cells))
+        return Row((PAPER_TITLES[metric],), tuple(cells))
 
     table = Table(
         "correlations_own",
@@ -207,7 +207,7 @@ def certainty_table(grades: Grades, distances: Distances, paper: Paper) -> Table
                 Cell(spread, value=result.r, low=result.bootstrap_low, high=result.bootstrap_high),
                 Cell("stable" if result.stable else "unstable", value=float(result.stable)),
             ]
-        return Row((METRIC_TITLES[metric],), tuple(cells))
+        return Row((PAPER_TITLES[metric],), tuple(cells))
 
     shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
     heads = ("exact p", "Spearman ρ", "bootstrap of r", "sign")

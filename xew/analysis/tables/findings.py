@@ -16,10 +16,11 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.correlation import leave_one_out, pearson, permutation_p
-from xew.analysis.statistics.grades import MIN_SCENES, REFERENCE, SEEN, Grades, Mean, StudyGrades, better, interval
-from xew.analysis.statistics.summary import METRIC_TITLES
+from xew.analysis.paper import PAPER_TITLES
+from xew.analysis.statistics.grades import REFERENCE, SEEN, Grades, relative_gain
 from xew.analysis.tables.layouts import PAPER_METRICS, SHORT_ROBOTS, SYSTEMS
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS
+from xew.statistics import MIN_SCENES, Mean, interval
 
 FRANKA, PIPER = HELD_OUT_ROBOTS
 HOLDS, FAILS, UNRESOLVED, UNMEASURED = "holds", "fails", "unresolved", "not measured"
@@ -100,7 +101,7 @@ class Reader:
         mean = self.grades.mean(part, row, robots, metric, shared=True) if metric in self.grades.metrics else None
         if mean is None:
             name = SHORT_ROBOTS.get(robots, "seen robots")
-            raise NotMeasuredError(f"{METRIC_TITLES[metric]} of {row.replace('_', ' ')} ({part.replace('_', ' ')}) on {name}")
+            raise NotMeasuredError(f"{PAPER_TITLES[metric]} of {row.replace('_', ' ')} ({part.replace('_', ' ')}) on {name}")
         return mean
 
     def gain(
@@ -108,18 +109,18 @@ class Reader:
     ) -> Comparison:
         """By which share of the value before one row is better than another."""
         new, old = self.mean(part, after, robots, metric), self.mean(part, before, robots, metric)
-        label = f"{SHORT_ROBOTS.get(robots, 'seen')} {METRIC_TITLES[metric]}"
+        label = f"{SHORT_ROBOTS.get(robots, 'seen')} {PAPER_TITLES[metric]}"
         # Where a bound from above is asked for, smallness is the claim, and the floor does not speak against it.
         doubt = self._doubt((new, old), robots, metric) if above > -np.inf else self._few((new, old))
-        return Comparison(label, better(new, old, self.grades.metrics[metric]), above, below, doubt=doubt)
+        return Comparison(label, relative_gain(new, old, self.grades.metrics[metric]).values, above, below, doubt=doubt)
 
     def worse_than_seen(
         self, part: str, row: str, robots: str, metric: str, above: float = 0, below: float = np.inf
     ) -> Comparison:
         """By which share of its score on seen robots a row is worse on another robot."""
         new, old = self.mean(part, row, robots, metric), self.mean(part, row, SEEN, metric)
-        label = f"{SHORT_ROBOTS[robots]} {METRIC_TITLES[metric]}"
-        values = -better(new, old, self.grades.metrics[metric])
+        label = f"{SHORT_ROBOTS[robots]} {PAPER_TITLES[metric]}"
+        values = -relative_gain(new, old, self.grades.metrics[metric]).values
         return Comparison(label, values, above, below, doubt=self._doubt((new, old), robots, metric))
 
     def share(self, start: Mean, after: Mean, end: Mean, metric: str) -> tuple[np.ndarray, str]:
@@ -150,13 +151,14 @@ class Reader:
         return self._few((self.mean(part, row, robots, metric),))
 
     def _few(self, means: Sequence[Mean]) -> str:
-        few = isinstance(self.grades, StudyGrades) and min(mean.scenes for mean in means) < MIN_SCENES
+        few = any(mean.scenes is not None and mean.scenes < MIN_SCENES for mean in means)
         return f"fewer than {MIN_SCENES} scenes" if few else ""
 
     def _doubt(self, means: tuple[Mean, Mean], robots: str, metric: str) -> str:
         floor = self.grades.floor(robots, metric)
         inside = floor > 0 and abs(means[0].value - means[1].value) <= floor
-        return self._few(means) or (f"inside the noise floor of {floor:.3g}" if inside else "")
+        unknown = "no noise floor: the true video was not graded" if np.isnan(floor) else ""
+        return self._few(means) or unknown or (f"inside the noise floor of {floor:.3g}" if inside else "")
 
 
 def ask(grades: Grades, claims: Sequence[Claim] | None = None) -> list[Finding]:
@@ -358,7 +360,7 @@ def _appearance_first_always(reader: Reader) -> Iterator[Comparison]:
 def _appearance_everywhere(reader: Reader) -> Iterator[Comparison]:
     for metric in PAPER_METRICS:
         r = pearson(reader.grades.axis("appearance"), reader.loeo(metric))
-        yield Comparison(METRIC_TITLES[metric], r, above=0, percent=False, doubt=_loeo_few(reader, metric))
+        yield Comparison(PAPER_TITLES[metric], r, above=0, percent=False, doubt=_loeo_few(reader, metric))
 
 
 def _appearance_significant(reader: Reader) -> Iterator[Comparison]:

@@ -9,22 +9,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from xew import statistics
+from xew.analysis.paper import PAPER_TITLES
 from xew.analysis.scores import COPY, TRUTH, MetricInfo
-from xew.analysis.statistics.grades import (
-    MIN_SCENES,
-    REFERENCE,
-    SEEN,
-    Grades,
-    Mean,
-    PaperGrades,
-    StudyGrades,
-    better,
-    find_variant,
-    interval,
-    pooled,
-)
-from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.analysis.statistics.grades import REFERENCE, SEEN, Grades, PaperGrades, StudyGrades, find_variant, pooled
+from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.protocol import (
+    DIMENSION_TITLES,
     FORGETTING_ROBOT,
     HELD_OUT_ROBOTS,
     PAPER_PARTS,
@@ -35,17 +26,10 @@ from xew.protocol import (
     expected_counts,
     reference,
 )
+from xew.statistics import MIN_SCENES, Mean
 
-PAPER_METRICS = (
-    "psnr", "ssim", "lpips", "mask_iou", "boundary_f1", "region_lpips", "pck", "keypoint_error", "ndtw", "trajectory_error",
-)  # fmt: skip
+PAPER_METRICS = tuple(PAPER_TITLES)
 """The paper's suite in its order."""
-DIMENSION_TITLES = {
-    "visual": "Visual quality",
-    "morphology": "Robot morphology",
-    "kinematics": "Robot kinematics",
-    "objects": "Object dynamics",
-}
 SHORT_ROBOTS = {"franka_panda": "Franka", "piper": "Piper", "aloha_agilex": "Aloha", "arx_x5": "ARX", "ur5_wsg": "UR5"}
 SEEN_TITLE = "Seen pool: Aloha-AgileX, ARX-X5 and UR5"
 
@@ -64,7 +48,7 @@ REMEDIES = {"replay": "with replay", "lora": "with LoRA"}
 
 MARKS = (
     "▲ better, ▼ worse, ≈ not resolved: the interval of the paired difference holds 0, the difference is inside the noise "
-    f"floor, or there are fewer than {MIN_SCENES} scenes"
+    f"floor or the floor is not known, or there are fewer than {MIN_SCENES} scenes"
 )
 """What stands behind values; captions name the row that they are compared with."""
 
@@ -152,6 +136,11 @@ class Builder:
     def any_metric(self) -> str:
         """The first metric, for counts."""
         return next(iter(self.ours.metrics))
+
+    @property
+    def reported(self) -> tuple[str, ...]:
+        """Metrics of the full tables: the paper's suite, and whatever else the scores ask to be shown."""
+        return tuple(name for name, info in self.ours.metrics.items() if name in PAPER_METRICS or info.reported)
 
     def present(self, part: str) -> bool:
         """Was anything measured that only this part asks for? The models that comparisons start from do not count."""
@@ -245,15 +234,11 @@ def _graded(rows: Sequence[Row]) -> list[Row]:
 
 def verdict(grades: Grades, part: str, row: str, base: str, robots: str, metric: str) -> str:
     """Is a row better than another of its part, on the cells that all rows of the part have?"""
-    after, before = (grades.mean(part, key, robots, metric, shared=True) for key in (row, base))
-    if after is None or before is None:
+    difference = grades.difference(part, row, base, robots, metric)
+    if difference is None:
         return ""
-    if isinstance(grades, StudyGrades) and min(after.scenes, before.scenes) < MIN_SCENES:
-        return "unresolved"
-    low, high = interval(better(after, before, grades.metrics[metric]), grades.level)
-    if not low <= 0 <= high and abs(after.value - before.value) > grades.floor(robots, metric):
-        return "better" if low > 0 else "worse"
-    return "unresolved"
+    floor, info = grades.floor(robots, metric), grades.metrics[metric]
+    return statistics.verdict(difference.value, difference.interval(grades.level), floor, info.higher_is_better)
 
 
 def number(value: float, metric: MetricInfo) -> str:
@@ -264,7 +249,7 @@ def number(value: float, metric: MetricInfo) -> str:
 def metric_title(metric: MetricInfo) -> str:
     """Such as 'PSNR [dB] ↑': the arrow points to better."""
     unit = f" [{metric.unit}]" if metric.unit else ""
-    return f"{METRIC_TITLES.get(metric.name, metric.name)}{unit} {'↑' if metric.higher_is_better else '↓'}"
+    return f"{metric.title}{unit} {'↑' if metric.higher_is_better else '↓'}"
 
 
 def metric_columns(metrics: Mapping[str, MetricInfo], names: Sequence[str]) -> tuple[Column, ...]:
@@ -370,7 +355,7 @@ def few_shot_table(builder: Builder) -> Table:
 
 def recovery_full(builder: Builder) -> Table:
     """The appendix's complete table of few-shot recovery."""
-    metrics = _measured(builder, PAPER_METRICS)
+    metrics = builder.reported
     seen = builder.row("few_shot", REFERENCE, SEEN, metrics, (REFERENCE,))
     blocks = [Block("Seen pool, before adaptation", (seen,), builder.note("few_shot", [(REFERENCE, SEEN, REFERENCE)]))]
     for robot in HELD_OUT_ROBOTS:
@@ -384,7 +369,7 @@ def recovery_full(builder: Builder) -> Table:
 
 def forgetting_full(builder: Builder) -> Table:
     """The appendix's complete table of forgetting, and with it the remedies, which the paper does not have."""
-    metrics = _measured(builder, PAPER_METRICS)
+    metrics = builder.reported
     keys = {"none": "none (before)"}
     keys |= {f"{robot}-{shots}": f"{SHORT_ROBOTS[robot]}, M = {shots}" for robot in HELD_OUT_ROBOTS for shots in SHOTS}
     if builder.present("remedies") and builder.paper:
@@ -442,7 +427,7 @@ def baseline_table(builder: Builder) -> Table:
 
 def loeo_full(builder: Builder) -> Table:
     """The appendix's absolute scores of the five folds; each row is another model."""
-    metrics = _measured(builder, PAPER_METRICS)
+    metrics = builder.reported
     rows = [builder.row("loeo", f"loeo_{robot}", robot, metrics, (ROBOT_TITLES[robot],)) for robot in ROBOT_NAMES]
     floors = [row for r in ROBOT_NAMES for row in builder.truth((ROBOT_TITLES[r],), [((r,), metric) for metric in metrics])]
     note = builder.note("loeo", ((f"loeo_{robot}", robot, ROBOT_TITLES[robot]) for robot in ROBOT_NAMES))
@@ -493,7 +478,7 @@ def _count_cell(builder: Builder, part: str, place: int, printed: int) -> Cell:
 
 def _full(builder: Builder, name: str, title: str, part: str, stub: str, keys: dict[str, str], base: str) -> Table:
     """Ten metrics; the seen pool and each held-out robot a block."""
-    metrics = _measured(builder, PAPER_METRICS)
+    metrics = builder.reported
     groups = {SEEN: SEEN_TITLE, **{robot: f"Held-out {ROBOT_TITLES[robot]}" for robot in HELD_OUT_ROBOTS}}
     blocks = tuple(_block(builder, text, part, keys, robots, metrics, base) for robots, text in groups.items())
     caption = f"Marks: against {keys[base].lower()}." if base else ""
@@ -533,7 +518,7 @@ def _best(rows: Sequence[Row], higher_is_better: Sequence[bool]) -> list[Row]:
 
 def _ends(mean: Mean, level: float) -> tuple[float, float]:
     """NaN where there are too few scenes for an interval, or where none is known (the paper)."""
-    return interval(mean.values, level) if mean.scenes >= MIN_SCENES else (np.nan, np.nan)
+    return mean.interval(level) if mean.scenes is not None else (np.nan, np.nan)
 
 
 def interval_text(ends: tuple[float, float], metric: MetricInfo) -> str:

@@ -8,9 +8,9 @@ import numpy as np
 
 from xew.analysis.correlation import Correlation, loeo_correlation
 from xew.analysis.distance import Frame, chamfer_floor, mean_distances, measure
-from xew.analysis.paper import AXES, Cell, Paper, PublishedChange, RecomputedChange
+from xew.analysis.paper import AXES, PAPER_TITLES, Cell, Paper, PublishedChange, RecomputedChange
 from xew.analysis.statistics.grades import PaperGrades
-from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables import layouts as tables
 from xew.analysis.tables.distances import signed
 from xew.analysis.tables.findings import Finding
@@ -106,7 +106,7 @@ def correlation_table(paper: Paper, cells: Sequence[Cell]) -> Table:
     found = {(cell.metric, cell.axis, cell.quantity): cell for cell in cells}
     layout = [(axis, names) for axis in AXES for names in (("r",), ("low", "high"))] + [("dof", ("r",))]
     rows = [
-        Row((METRIC_TITLES[metric],), tuple(_compared([found[metric, axis, q] for q in names]) for axis, names in layout))
+        Row((PAPER_TITLES[metric],), tuple(_compared([found[metric, axis, q] for q in names]) for axis, names in layout))
         for metric in paper.metrics
     ]
     columns = [Column(title, AXIS_TITLES[axis]) for axis in AXES for title in ("Pearson r", "leave one out")]
@@ -136,7 +136,7 @@ def certainty_table(paper: Paper, cells: Sequence[Cell], results: Mapping[tuple[
             if p:
                 compared = replace(compared, published=f"{p.published:.3f}", agrees=p.agrees, printed=p.published)
             columns += [compared, *_own_certainty(result)]
-        return Row((METRIC_TITLES[metric],), tuple(columns))
+        return Row((PAPER_TITLES[metric],), tuple(columns))
 
     heads = ("p", "Spearman ρ", "bootstrap of r", "sign")
     columns = [Column(head, AXIS_TITLES[axis]) for axis in AXES for head in heads]
@@ -169,7 +169,7 @@ def frame_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
             result = results[metric]
             p = tables.Cell(f"{result.p_value:.3f}", value=result.p_value)
             cells += [_signed(result.r), *((_range(result.low, result.high), p) if frame != "root" else ())]
-        return Row((METRIC_TITLES[metric],), tuple(cells))
+        return Row((PAPER_TITLES[metric],), tuple(cells))
 
     columns = [Column(head, "As printed") for head in ("r", "leave one out")]
     columns += [
@@ -233,7 +233,7 @@ def compared_places(change: PublishedChange) -> str:
     else:
         subject, first, second = SYSTEMS[after], *(ROBOT_TITLES.get(robot, "seen robots") for robot in (start, end))
     gap = ", share of the gap to seen robots" if change.toward else ""
-    return f"{METRIC_TITLES[change.metric]}, {subject}: {first} to {second}{gap}"
+    return f"{PAPER_TITLES[change.metric]}, {subject}: {first} to {second}{gap}"
 
 
 def _row_title(part: str, key: str, robot: str) -> str:
