@@ -4,7 +4,7 @@ The figures lie in `paper.json` with the table that each is from:
 
     robots      robot -> dof, links, reach, volume and the mean distances to the other four
     distances   axis -> symmetric matrix in the order of `robots`
-    metrics     metric -> dimension, unit, direction and the printed correlations with distance
+    metrics     metric -> title, dimension, unit, direction and the printed correlations with distance
     parts       part -> rows: key -> robot -> metric -> value, where `robot` may be 'seen', the pooled training robots
         actions     by action representation: joints, ray_map, mask, optical_flow
         ladder      by condition: none, reference_image, nine_views, articulation_clip, robot_render
@@ -65,6 +65,8 @@ class PublishedCorrelation:
 class PublishedMetric:
     """A metric and how its scores in the leave-one-embodiment-out study go with distance."""
 
+    title: str
+    """As the paper's tables name it."""
     dimension: str
     unit: str
     higher_is_better: bool
@@ -122,7 +124,7 @@ class Paper:
     def infos(self) -> tuple[MetricInfo, ...]:
         """The metrics as a score table describes them, in the paper's order."""
         return tuple(
-            MetricInfo(name, metric.dimension, metric.unit, metric.higher_is_better, None, None, self.title)
+            MetricInfo(name, metric.dimension, metric.unit, metric.higher_is_better, None, None, self.title, metric.title)
             for name, metric in self.metrics.items()
         )
 
@@ -152,3 +154,7 @@ class Paper:
 def read_paper() -> Paper:
     """The figures that come with the package."""
     return parse(Paper, json.loads(PAPER.read_text()), str(PAPER))
+
+
+PAPER_TITLES = {name: metric.title for name, metric in read_paper().metrics.items()}
+"""Titles of the paper's metrics, in its order."""

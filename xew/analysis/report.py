@@ -32,14 +32,14 @@ from xew.analysis.reports import study as report_study
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study_charts import run_chart
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, find_missing_scores, read_scores
-from xew.analysis.statistics.grades import MIN_SCENES
-from xew.analysis.statistics.summary import METRIC_TITLES, RobotTable, Row, finding, flat_summary, robot_table, robot_title
+from xew.analysis.statistics.summary import RobotTable, Row, finding, flat_summary, robot_table, robot_title
 from xew.analysis.tables import formats
 from xew.analysis.tables.table import Table, TableCell, TableRow, TableSection, format_interval, format_number, metric_columns
 from xew.config import ConfigError, user_errors
 from xew.episode import Record, episode_folder, find_records, read_video
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
+from xew.statistics import MIN_SCENES
 
 TITLE = "Can the model render a robot that it has never seen?"
 STRIP_METRIC = "lpips"
@@ -258,7 +258,7 @@ def _data_section(sheets: Sequence[Picture], records: Sequence[Record]) -> Marku
 
 
 def _method_section(scores: Scores, args: Args) -> Markup:
-    definitions = {METRIC_TITLES.get(metric.name, metric.name): metric.reference for metric in scores.metrics}
+    definitions = {metric.title: metric.reference for metric in scores.metrics}
     notes = (
         f"Every metric is a mean over the predicted frames; {FRAME_ZERO[scores.frame_zero]}. Masks in predicted video are "
         "estimated with the help of the true episode, by the same estimator for every row."

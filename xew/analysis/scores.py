@@ -4,6 +4,7 @@ A study's table is several runs' tables as one: `merge_scores` adds the column `
 each row (xew.protocol.Variant) and is empty for the two baselines, which belong to no model.
 """
 
+import operator
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -14,7 +15,7 @@ import pandas as pd
 
 from xew.config import ConfigError
 from xew.files import replacing
-from xew.protocol import ROBOT_NAMES
+from xew.protocol import BASELINES, ROBOT_NAMES
 
 VARIANT = "variant"
 EPISODE = ["task", "seed", "robot"]
@@ -22,10 +23,12 @@ KEY = ["model", "condition", *EPISODE]
 NAMES = [VARIANT, "model", "condition", "task", "robot", "metric"]
 """Columns of text."""
 COLUMNS = [*KEY, "metric", "value", "frames", "exact_frames"]
-COPY, TRUTH = "copy_first_frame", "ground_truth"
+COPY, TRUTH = BASELINES
 """The two models that every other is read against: a score of nothing, and the ceiling."""
 COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero")
 """What a table says of how it was graded; tables that differ in it do not compare."""
+DEFINITION = ("dimension", "unit", "higher_is_better", "low", "high", "reference")
+"""What a table says of each metric, and has always said."""
 LISTED = 20
 """Cells that an error names of each kind; it counts the others."""
 
@@ -43,6 +46,21 @@ class MetricInfo:
     low: float | None
     high: float | None
     reference: str
+    title: str = ""
+    """What tables and charts call it; its name where the table does not say."""
+    estimated: bool = False
+    """Does it need an estimator, so that even the true video does not get the best score?"""
+    reported: bool = False
+    """Does a study's full table show it, beside the metrics of the paper?"""
+
+    def __post_init__(self) -> None:
+        if not self.title:
+            object.__setattr__(self, "title", self.name)
+
+    @property
+    def best(self) -> float | None:
+        """The best score; None where there is none, as of PSNR."""
+        return self.high if self.higher_is_better else self.low
 
 
 @dataclass(frozen=True)
@@ -207,11 +225,28 @@ def _read(path: Path, command: str) -> pd.DataFrame:
 
 def _read_metric_infos(path: Path, described: Mapping[str, Mapping[str, Any]]) -> tuple[MetricInfo, ...]:
     """What a table says of its metrics; more than is asked for here is left alone."""
-    names = [field.name for field in fields(MetricInfo) if field.name != "name"]
     for metric, info in described.items():
-        if missing := [name for name in names if name not in info]:
+        if missing := [name for name in DEFINITION if name not in info]:
             raise ConfigError(f"{path} does not say the {', '.join(missing)} of {metric}; it is no score table of this xew.")
-    return tuple(MetricInfo(name=metric, **{name: info[name] for name in names}) for metric, info in described.items())
+    known = {field.name for field in fields(MetricInfo)}
+    return tuple(
+        MetricInfo(name=metric, **{"estimated": _was_estimated(metric, info)} | {k: v for k, v in info.items() if k in known})
+        for metric, info in described.items()
+    )
+
+
+def _was_estimated(metric: str, info: Mapping[str, Any]) -> bool:
+    """Of tables that were written before they said so: of whole pictures nothing was estimated."""
+    return info["dimension"] != "visual" and metric != "region_lpips"
+
+
+def _have_same_metrics(one: Mapping[str, Mapping[str, Any]], other: Mapping[str, Mapping[str, Any]]) -> bool:
+    """Do two tables define their metrics alike? Titles and the like do not count, which older tables do not have."""
+
+    def definitions(described: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+        return {metric: {name: info.get(name) for name in DEFINITION} for metric, info in described.items()}
+
+    return definitions(one) == definitions(other)
 
 
 def _find_wrong_rows(rows: pd.DataFrame, metrics: Sequence[MetricInfo], robots: set[str]) -> dict[str, pd.DataFrame]:
@@ -243,7 +278,8 @@ def _merge_attributes(tables: Sequence[tuple[Path, Mapping[Hashable, Any]]]) -> 
     """Attributes that all tables share; versions of packages may differ and are all named."""
     first = tables[0][1]
     for key in COMPARABLE:
-        if any(attributes.get(key) != first.get(key) for _, attributes in tables):
+        same = _have_same_metrics if key == "metrics" else operator.eq
+        if not all(same(attributes.get(key, {}), first.get(key, {})) for _, attributes in tables):
             found = "\n".join(f"  {path}: {attributes.get(key)}" for path, attributes in tables)
             raise ConfigError(
                 f"the score tables differ in {key}, so their numbers do not compare:\n{found}\n"

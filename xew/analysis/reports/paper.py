@@ -13,13 +13,16 @@ import pandas as pd
 
 from xew.analysis.correlation import Correlation
 from xew.analysis.distances.workspaces import Frame
-from xew.analysis.paper import AXES, Paper
+from xew.analysis.paper import (
+    AXES,
+    PAPER_TITLES,
+    Paper,
+)
 from xew.analysis.reports import page
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study import Report
 from xew.analysis.reports.study_charts import distance_chart
 from xew.analysis.statistics.grades import PaperGrades
-from xew.analysis.statistics.summary import METRIC_TITLES
 from xew.analysis.tables import formats
 from xew.analysis.tables.distances import Distances, distance_tables, format_signed, printed_distances
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask, findings_frame
@@ -154,9 +157,9 @@ def _frame_sentences(
     }
     for frame, start in starts.items():
         found, primary = by_frame[frame], by_frame[frame][PRIMARY]
-        turned = [METRIC_TITLES[name] for name, one in found.items() if one.r * results[name, "kinematic"].r < 0]
+        turned = [PAPER_TITLES[name] for name, one in found.items() if one.r * results[name, "kinematic"].r < 0]
         yield (
-            f"{start}, {METRIC_TITLES[PRIMARY]} has r = {format_signed(primary.r)}, p = {primary.p_value:.3f}; its sign "
+            f"{start}, {PAPER_TITLES[PRIMARY]} has r = {format_signed(primary.r)}, p = {primary.p_value:.3f}; its sign "
             f"{_stability_phrase(primary)}. Against the printed figures r turns its sign for "
             f"{', '.join(turned) or 'no metric'}."
         )
@@ -176,7 +179,7 @@ def _count_answers(claims: Sequence[Finding]) -> str:
 
 def _correlation_sentence(axis: str, result: Correlation) -> str:
     return (
-        f"{METRIC_TITLES[PRIMARY]} against {axis} distance: r = {format_signed(result.r)}, p = {result.p_value:.3f}; its sign "
+        f"{PAPER_TITLES[PRIMARY]} against {axis} distance: r = {format_signed(result.r)}, p = {result.p_value:.3f}; its sign "
         f"{_stability_phrase(result)}."
     )
 
@@ -187,7 +190,7 @@ def _stability_phrase(result: Correlation) -> str:
 
 
 def _name_correlation(metric: str, axis: str) -> str:
-    return f"{METRIC_TITLES[metric]} by {axis}"
+    return f"{PAPER_TITLES[metric]} by {axis}"
 
 
 def _with_own_frames(distances: Distances, frames: Mapping[Frame, np.ndarray]) -> Distances:

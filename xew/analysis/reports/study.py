@@ -17,8 +17,8 @@ from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study_charts import study_charts
 from xew.analysis.reports.study_strips import Strip, study_strips
 from xew.analysis.scores import Scores, describe_scores, find_missing_scores
-from xew.analysis.statistics.grades import SEEN, Grades, PaperGrades, StudyGrades, better, interval
-from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.analysis.statistics.grades import SEEN, Grades, PaperGrades, StudyGrades, relative_gain
+from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables import formats
 from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import (
@@ -37,6 +37,7 @@ from xew.analysis.tables.labels import ACTIONS, LADDER, SHORT_ROBOTS
 from xew.analysis.tables.layouts import build_tables, count_table
 from xew.analysis.tables.table import MARKS, Table
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
+from xew.statistics import interval
 
 TITLE = "Can the model render a robot that it has never seen?"
 PART_TITLES = {
@@ -161,11 +162,10 @@ def _gap_sentence(grades: Grades) -> Iterator[str]:
     for robot in HELD_OUT_ROBOTS:
         mean = grades.mean("fixed", "fixed", robot, "lpips") if seen else None
         if mean and seen:
-            worse = -better(mean, seen, grades.metrics["lpips"])
+            worse = -relative_gain(mean, seen, grades.metrics["lpips"]).values
             low, high = interval(worse, grades.level)
-            parts.append(
-                f"{_format_change(worse[0])} on {ROBOT_TITLES[robot]} ({_format_change(low)} to {_format_change(high)})"
-            )
+            ends = f"{_format_change(low)} to {_format_change(high)}"
+            parts.append(f"{_format_change(worse[0])} on {ROBOT_TITLES[robot]} ({ends})")
     if parts and seen:
         yield f"Told optical flow only, LPIPS is {seen.value:.3f} on robots seen in training; {' and '.join(parts)}."
 
@@ -179,9 +179,8 @@ def _best_sentences(grades: Grades) -> Iterator[str]:
             known = {row: gain for row, gain in gains.items() if gain is not None}
             if known:
                 best = max(known, key=lambda row: known[row])
-                found.append(
-                    f"{labels[best].removeprefix('+ ').lower()} on {SHORT_ROBOTS[robot]} ({_format_change(known[best])})"
-                )
+                label = labels[best].removeprefix("+ ").lower()
+                found.append(f"{label} on {SHORT_ROBOTS[robot]} ({_format_change(known[best])})")
         if found:
             yield f"Against {labels[base].lower()}, LPIPS improves most with {' and '.join(found)}."
 
@@ -217,7 +216,7 @@ def _gain(grades: Grades, part: str, row: str, base: str, robot: str) -> float |
     if "lpips" not in grades.metrics:
         return None
     after, before = (grades.mean(part, key, robot, "lpips", shared=True) for key in (row, base))
-    return float(better(after, before, grades.metrics["lpips"])[0]) if after and before else None
+    return relative_gain(after, before, grades.metrics["lpips"]).value if after and before else None
 
 
 def _missing_notes(builder: Builder, scores: Scores) -> Iterator[str]:
@@ -278,7 +277,7 @@ def _part_section(content: Content, part: str) -> Markup | None:
 
 def _method_section(content: Content, scores: Scores) -> Markup:
     made = {"scenes graded": str(len(scores.rows[["task", "seed"]].drop_duplicates())), **scores.measured_by}
-    definitions = {METRIC_TITLES.get(metric.name, metric.name): metric.reference for metric in scores.metrics}
+    definitions = {metric.title: metric.reference for metric in scores.metrics}
     return page.section(
         "How it was measured",
         page.paragraph(

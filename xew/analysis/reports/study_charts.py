@@ -12,13 +12,14 @@ from matplotlib.axes import Axes
 from xew.analysis.reports import charts
 from xew.analysis.reports.charts import SERIES, SOFT, Chart, Panel, Series
 from xew.analysis.scores import COPY, TRUTH, VARIANT, MetricInfo
-from xew.analysis.statistics.grades import MIN_SCENES, Grades, Mean, PaperGrades, better, find_variant, interval
-from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.analysis.statistics.grades import Grades, PaperGrades, find_variant, relative_gain
+from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import AXIS_TITLES, Distances
 from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, SHORT_ROBOTS
 from xew.analysis.tables.table import metric_title
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS
+from xew.statistics import Mean
 
 BAR_METRICS = ("lpips", "region_lpips", "mask_iou", "pck")
 CURVE_METRIC = "lpips"
@@ -43,10 +44,8 @@ def _leave_out(base: str, labels: Mapping[str, str]) -> dict[str, str]:
 
 
 GAIN_ROWS = (
-    GainRows(
-        "actions", "against joint pose", lambda _: "joints", lambda _: {k: v for k, v in ACTIONS.items() if k != "joints"}
-    ),
-    GainRows("ladder", "against flow only", lambda _: "none", lambda _: {k: v for k, v in LADDER.items() if k != "none"}),
+    GainRows("actions", "against joint pose", lambda _: "joints", lambda _: _leave_out("joints", ACTIONS)),
+    GainRows("ladder", "against flow only", lambda _: "none", lambda _: _leave_out("none", LADDER)),
     GainRows("few_shot", "against M = 0", lambda r: f"{r}-0", lambda r: {f"{r}-{shots}": f"M = {shots}" for shots in SHOTS}),
 )
 
@@ -84,7 +83,7 @@ def gain_chart(builder: Builder, gain: GainRows) -> Chart:
         charts.bars(axes, labels, groups, f"better by [%], {gain.title}")
 
     height = 1.0 + 0.42 * len(gain.rows(HELD_OUT_ROBOTS[0]))
-    panels = [Panel(METRIC_TITLES[metric], partial(draw, metric=metric), height) for metric in metrics]
+    panels = [Panel(builder.ours.metrics[metric].title, partial(draw, metric=metric), height) for metric in metrics]
     legend = [Series(ROBOT_TITLES[robot], ROBOT_COLORS[robot]) for robot in HELD_OUT_ROBOTS]
     caption = f"Relative improvement {gain.title}; to the right is better. Lines: 95 % intervals, paired by scene."
     if builder.paper:
@@ -259,13 +258,11 @@ def _relative_gain(grades: Grades | PaperGrades, part: str, row: str, base: str,
     after, before = (grades.mean(part, key, robot, metric, shared=True) for key in (row, base))
     if after is None or before is None:
         return np.full(3, np.nan)
-    values = better(after, before, grades.metrics[metric])
-    ends = interval(values, grades.level) if min(after.scenes, before.scenes) >= MIN_SCENES else (np.nan, np.nan)
-    return 100 * np.array([values[0], *ends])
+    gain = relative_gain(after, before, grades.metrics[metric])
+    return 100 * np.array([gain.value, *gain.interval(grades.level)])
 
 
 def _mean_and_ends(mean: Mean | None, level: float) -> tuple[float, float, float]:
     if mean is None:
         return np.nan, np.nan, np.nan
-    ends = interval(mean.values, level) if mean.scenes >= MIN_SCENES else (np.nan, np.nan)
-    return mean.value, *ends
+    return mean.value, *(mean.interval(level) if mean.scenes is not None else (np.nan, np.nan))

@@ -5,19 +5,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from xew import statistics
 from xew.analysis.scores import COPY, TRUTH
-from xew.analysis.statistics.grades import (
-    MIN_SCENES,
-    Grades,
-    Mean,
-    PaperGrades,
-    StudyGrades,
-    better,
-    find_variant,
-    interval,
-    pooled,
-)
-from xew.analysis.tables.labels import STILL, TRUE
+from xew.analysis.statistics.grades import Grades, PaperGrades, StudyGrades, find_variant, pooled
+from xew.analysis.tables.labels import PAPER_METRICS, STILL, TRUE
 from xew.analysis.tables.table import TableCell, TableRow, format_interval, format_number
 from xew.protocol import (
     PAPER_PARTS,
@@ -25,6 +16,7 @@ from xew.protocol import (
     expected_counts,
     reference,
 )
+from xew.statistics import Mean
 
 
 @dataclass(frozen=True)
@@ -45,6 +37,11 @@ class Builder:
     def any_metric(self) -> str:
         """The first metric, for counts."""
         return next(iter(self.ours.metrics))
+
+    @property
+    def reported(self) -> tuple[str, ...]:
+        """Metrics of the full tables: the paper's suite, and whatever else the scores ask to be shown."""
+        return tuple(name for name, info in self.ours.metrics.items() if name in PAPER_METRICS or info.reported)
 
     def has_results(self, part: str) -> bool:
         """Was anything measured that only this part asks for? The models that comparisons start from do not count."""
@@ -138,17 +135,13 @@ def _keep_graded(rows: Sequence[TableRow]) -> list[TableRow]:
 
 def paired_verdict(grades: Grades, part: str, row: str, base: str, robots: str, metric: str) -> str:
     """Is a row better than another of its part, on the cells that all rows of the part have?"""
-    after, before = (grades.mean(part, key, robots, metric, shared=True) for key in (row, base))
-    if after is None or before is None:
+    difference = grades.difference(part, row, base, robots, metric)
+    if difference is None:
         return ""
-    if isinstance(grades, StudyGrades) and min(after.scenes, before.scenes) < MIN_SCENES:
-        return "unresolved"
-    low, high = interval(better(after, before, grades.metrics[metric]), grades.level)
-    if not low <= 0 <= high and abs(after.value - before.value) > grades.floor(robots, metric):
-        return "better" if low > 0 else "worse"
-    return "unresolved"
+    floor, info = grades.floor(robots, metric), grades.metrics[metric]
+    return statistics.verdict(difference.value, difference.interval(grades.level), floor, info.higher_is_better)
 
 
 def _interval_ends(mean: Mean, level: float) -> tuple[float, float]:
     """NaN where there are too few scenes for an interval, or where none is known (the paper)."""
-    return interval(mean.values, level) if mean.scenes >= MIN_SCENES else (np.nan, np.nan)
+    return mean.interval(level) if mean.scenes is not None else (np.nan, np.nan)

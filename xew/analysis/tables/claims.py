@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from xew.analysis.correlation import leave_one_out, pearson, permutation_p
+from xew.analysis.paper import PAPER_TITLES
 from xew.analysis.statistics.grades import REFERENCE
-from xew.analysis.statistics.summary import METRIC_TITLES
 from xew.analysis.tables.comparisons import Claim, Comparison, NotMeasuredError, Reader
 from xew.analysis.tables.labels import PAPER_METRICS, SHORT_ROBOTS, SYSTEMS
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS
@@ -168,7 +168,7 @@ def _appearance_first_always(reader: Reader) -> Iterator[Comparison]:
 def _appearance_everywhere(reader: Reader) -> Iterator[Comparison]:
     for metric in PAPER_METRICS:
         r = pearson(reader.grades.axis("appearance"), reader.loeo(metric))
-        yield Comparison(METRIC_TITLES[metric], r, above=0, percent=False, doubt=_loeo_few(reader, metric))
+        yield Comparison(PAPER_TITLES[metric], r, above=0, percent=False, doubt=_loeo_few(reader, metric))
 
 
 def _appearance_significant(reader: Reader) -> Iterator[Comparison]:

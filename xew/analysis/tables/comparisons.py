@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from xew.analysis.statistics.grades import MIN_SCENES, SEEN, Grades, Mean, StudyGrades, better, interval
-from xew.analysis.statistics.summary import METRIC_TITLES
+from xew.analysis.paper import PAPER_TITLES
+from xew.analysis.statistics.grades import SEEN, Grades, relative_gain
 from xew.analysis.tables.labels import SHORT_ROBOTS
 from xew.protocol import ROBOT_NAMES
+from xew.statistics import MIN_SCENES, Mean, interval
 
 
 class NotMeasuredError(Exception):
@@ -52,7 +53,7 @@ class Reader:
         mean = self.grades.mean(part, row, robots, metric, shared=True) if metric in self.grades.metrics else None
         if mean is None:
             name = SHORT_ROBOTS.get(robots, "seen robots")
-            raise NotMeasuredError(f"{METRIC_TITLES[metric]} of {row.replace('_', ' ')} ({part.replace('_', ' ')}) on {name}")
+            raise NotMeasuredError(f"{PAPER_TITLES[metric]} of {row.replace('_', ' ')} ({part.replace('_', ' ')}) on {name}")
         return mean
 
     def gain(
@@ -60,18 +61,18 @@ class Reader:
     ) -> Comparison:
         """By which share of the value before one row is better than another."""
         new, old = self.mean(part, after, robots, metric), self.mean(part, before, robots, metric)
-        label = f"{SHORT_ROBOTS.get(robots, 'seen')} {METRIC_TITLES[metric]}"
+        label = f"{SHORT_ROBOTS.get(robots, 'seen')} {PAPER_TITLES[metric]}"
         # Where a bound from above is asked for, smallness is the claim, and the floor does not speak against it.
         doubt = self._doubt((new, old), robots, metric) if above > -np.inf else self._doubt_of_few((new, old))
-        return Comparison(label, better(new, old, self.grades.metrics[metric]), above, below, doubt=doubt)
+        return Comparison(label, relative_gain(new, old, self.grades.metrics[metric]).values, above, below, doubt=doubt)
 
     def worse_than_seen(
         self, part: str, row: str, robots: str, metric: str, above: float = 0, below: float = np.inf
     ) -> Comparison:
         """By which share of its score on seen robots a row is worse on another robot."""
         new, old = self.mean(part, row, robots, metric), self.mean(part, row, SEEN, metric)
-        label = f"{SHORT_ROBOTS[robots]} {METRIC_TITLES[metric]}"
-        values = -better(new, old, self.grades.metrics[metric])
+        label = f"{SHORT_ROBOTS[robots]} {PAPER_TITLES[metric]}"
+        values = -relative_gain(new, old, self.grades.metrics[metric]).values
         return Comparison(label, values, above, below, doubt=self._doubt((new, old), robots, metric))
 
     def share(self, start: Mean, after: Mean, end: Mean, metric: str) -> tuple[np.ndarray, str]:
@@ -102,10 +103,11 @@ class Reader:
         return self._doubt_of_few((self.mean(part, row, robots, metric),))
 
     def _doubt_of_few(self, means: Sequence[Mean]) -> str:
-        few = isinstance(self.grades, StudyGrades) and min(mean.scenes for mean in means) < MIN_SCENES
+        few = any(mean.scenes is not None and mean.scenes < MIN_SCENES for mean in means)
         return f"fewer than {MIN_SCENES} scenes" if few else ""
 
     def _doubt(self, means: tuple[Mean, Mean], robots: str, metric: str) -> str:
         floor = self.grades.floor(robots, metric)
         inside = floor > 0 and abs(means[0].value - means[1].value) <= floor
-        return self._doubt_of_few(means) or (f"inside the noise floor of {floor:.3g}" if inside else "")
+        unknown = "no noise floor: the true video was not graded" if np.isnan(floor) else ""
+        return self._doubt_of_few(means) or unknown or (f"inside the noise floor of {floor:.3g}" if inside else "")

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.correlation import Correlation, dof_correlation, loeo_correlation
-from xew.analysis.paper import AXES, Paper
+from xew.analysis.paper import AXES, PAPER_TITLES, Paper
 from xew.analysis.statistics.grades import Grades
-from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables.labels import PAPER_METRICS, SHORT_ROBOTS
 from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection
 from xew.config import ConfigError
@@ -145,7 +145,7 @@ def correlation_table(grades: Grades, distances: Distances, paper: Paper) -> Tab
         scores = _loeo_scores(grades, metric)
         dof = [dof_correlation(distances.of("dof").tolist(), scores, grades.metrics[metric].higher_is_better)] if scores else []
         cells.append(_signed_cell(dof, [paper.metrics[metric].dof_r]))
-        return TableRow((METRIC_TITLES[metric],), tuple(cells))
+        return TableRow((PAPER_TITLES[metric],), tuple(cells))
 
     columns = [Column(title, AXIS_TITLES[axis]) for axis in AXES for title in ("Pearson r", "leave one out")]
     shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
@@ -177,7 +177,7 @@ def own_correlation_tables(grades: Grades, distances: Distances) -> list[Table]:
                 _signed_cell([result.low, result.high] if result else [], []),
                 p,
             ]
-        return TableRow((METRIC_TITLES[metric],), tuple(cells))
+        return TableRow((PAPER_TITLES[metric],), tuple(cells))
 
     table = Table(
         "correlations_own",
@@ -209,7 +209,7 @@ def certainty_table(grades: Grades, distances: Distances, paper: Paper) -> Table
                 TableCell(spread, value=result.r, low=result.bootstrap_low, high=result.bootstrap_high),
                 TableCell("stable" if result.stable else "unstable", value=float(result.stable)),
             ]
-        return TableRow((METRIC_TITLES[metric],), tuple(cells))
+        return TableRow((PAPER_TITLES[metric],), tuple(cells))
 
     shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
     heads = ("exact p", "Spearman ρ", "bootstrap of r", "sign")
@@ -264,9 +264,8 @@ def _robot_table(distances: Distances, name: str, title: str, caption: str, feat
     records = {(row["robot"], row["feature"]): row for row in distances.robots.to_dict("records")}
 
     def row(robot: str) -> TableRow:
-        return TableRow(
-            (ROBOT_TITLES[robot],), tuple(_distance_cell(records.get((robot, feature)), feature) for feature in features)
-        )
+        cells = (_distance_cell(records.get((robot, feature)), feature) for feature in features)
+        return TableRow((ROBOT_TITLES[robot],), tuple(cells))
 
     seen = tuple(row(robot) for robot in ROBOT_NAMES if robot not in HELD_OUT_ROBOTS)
     held_out = tuple(row(robot) for robot in HELD_OUT_ROBOTS)

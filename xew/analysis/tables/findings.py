@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from xew.analysis.statistics.grades import Grades, interval
+from xew.analysis.statistics.grades import Grades
 from xew.analysis.tables.claims import CLAIMS
 from xew.analysis.tables.comparisons import Claim, Comparison, NotMeasuredError, Reader
+from xew.statistics import interval
 
 HOLDS, FAILS, UNRESOLVED, UNMEASURED = "holds", "fails", "unresolved", "not measured"
 

@@ -3,15 +3,14 @@
 They live on the entries of the registries. What a registry does not hold is shown under its key.
 """
 
+from xew.analysis.paper import PAPER_TITLES
 from xew.analysis.statistics.grades import REFERENCE
 from xew.model.conditions import ACTIONS as REPRESENTATIONS
 from xew.model.conditions import CONDITIONS
 from xew.protocol import PARTS, SEEN_ROBOTS
 from xew.sim_warp.robots import ROBOTS
 
-PAPER_METRICS = (
-    "psnr", "ssim", "lpips", "mask_iou", "boundary_f1", "region_lpips", "pck", "keypoint_error", "ndtw", "trajectory_error",
-)  # fmt: skip
+PAPER_METRICS = tuple(PAPER_TITLES)
 """Metrics of the paper's suite, in its order."""
 SHORT_ROBOTS = {key: robot.label for key, robot in ROBOTS.items()}
 """Label of each robot by its key."""

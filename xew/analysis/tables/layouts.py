@@ -10,26 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from xew.analysis.scores import TRUTH
-from xew.analysis.statistics.grades import (
-    REFERENCE,
-    SEEN,
-    StudyGrades,
-    find_variant,
-    pooled,
-)
+from xew.analysis.statistics.grades import REFERENCE, SEEN, StudyGrades, find_variant, pooled
 from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables.builder import Builder
-from xew.analysis.tables.labels import (
-    ACTIONS,
-    LADDER,
-    PAPER_METRICS,
-    REMEDIES,
-    SEEN_TITLE,
-    SHORT_ROBOTS,
-    SYSTEM_ACTIONS,
-    SYSTEMS,
-    TRUE,
-)
+from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, SEEN_TITLE, SHORT_ROBOTS, SYSTEM_ACTIONS, SYSTEMS, TRUE
 from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, metric_columns, metric_title
 from xew.protocol import (
     FORGETTING_ROBOT,
@@ -140,7 +124,7 @@ def few_shot_table(builder: Builder) -> Table:
 
 def recovery_full(builder: Builder) -> Table:
     """The appendix's complete table of few-shot recovery."""
-    metrics = _keep_measured(builder, PAPER_METRICS)
+    metrics = builder.reported
     seen = builder.row("few_shot", REFERENCE, SEEN, metrics, (REFERENCE,))
     sections = [TableSection("Seen pool, before adaptation", (seen,), builder.note("few_shot", [(REFERENCE, SEEN, REFERENCE)]))]
     for robot in HELD_OUT_ROBOTS:
@@ -156,7 +140,7 @@ def recovery_full(builder: Builder) -> Table:
 
 def forgetting_full(builder: Builder) -> Table:
     """The appendix's complete table of forgetting, and with it the remedies, which the paper does not have."""
-    metrics = _keep_measured(builder, PAPER_METRICS)
+    metrics = builder.reported
     keys = {"none": "none (before)"}
     keys |= {f"{robot}-{shots}": f"{SHORT_ROBOTS[robot]}, M = {shots}" for robot in HELD_OUT_ROBOTS for shots in SHOTS}
     if builder.has_results("remedies") and builder.paper:
@@ -214,7 +198,7 @@ def baseline_table(builder: Builder) -> Table:
 
 def loeo_full(builder: Builder) -> Table:
     """The appendix's absolute scores of the five folds; each row is another model."""
-    metrics = _keep_measured(builder, PAPER_METRICS)
+    metrics = builder.reported
     rows = [builder.row("loeo", f"loeo_{robot}", robot, metrics, (ROBOT_TITLES[robot],)) for robot in ROBOT_NAMES]
     floors = [row for r in ROBOT_NAMES for row in builder.truth((ROBOT_TITLES[r],), [((r,), metric) for metric in metrics])]
     note = builder.note("loeo", ((f"loeo_{robot}", robot, ROBOT_TITLES[robot]) for robot in ROBOT_NAMES))
@@ -265,7 +249,7 @@ def _count_cell(builder: Builder, part: str, place: int, printed: int) -> TableC
 
 def _full(builder: Builder, name: str, title: str, part: str, stub: str, keys: dict[str, str], base: str) -> Table:
     """Ten metrics; the seen pool and each held-out robot a section."""
-    metrics = _keep_measured(builder, PAPER_METRICS)
+    metrics = builder.reported
     groups = {SEEN: SEEN_TITLE, **{robot: f"Held-out {ROBOT_TITLES[robot]}" for robot in HELD_OUT_ROBOTS}}
     sections = tuple(_build_section(builder, text, part, keys, robots, metrics, base) for robots, text in groups.items())
     caption = f"Marks: against {keys[base].lower()}." if base else ""

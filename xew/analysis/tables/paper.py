@@ -9,9 +9,9 @@ import numpy as np
 from xew.analysis.correlation import Correlation, loeo_correlation
 from xew.analysis.distances.matrices import mean_distances
 from xew.analysis.distances.workspaces import Frame, chamfer_floor, measure
-from xew.analysis.paper import AXES, Paper, PublishedChange
+from xew.analysis.paper import AXES, PAPER_TITLES, Paper, PublishedChange
 from xew.analysis.statistics.grades import PaperGrades
-from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import format_signed
 from xew.analysis.tables.findings import Finding
@@ -110,7 +110,7 @@ def correlation_table(paper: Paper, cells: Sequence[RecomputedFigure]) -> Table:
     layout = [(axis, names) for axis in AXES for names in (("r",), ("low", "high"))] + [("dof", ("r",))]
     rows = [
         TableRow(
-            (METRIC_TITLES[metric],), tuple(_compared_cell([found[metric, axis, q] for q in names]) for axis, names in layout)
+            (PAPER_TITLES[metric],), tuple(_compared_cell([found[metric, axis, q] for q in names]) for axis, names in layout)
         )
         for metric in paper.metrics
     ]
@@ -141,7 +141,7 @@ def certainty_table(paper: Paper, cells: Sequence[RecomputedFigure], results: Ma
             if p:
                 compared = replace(compared, published=f"{p.published:.3f}", agrees=p.agrees, printed=p.published)
             columns += [compared, *_own_certainty(result)]
-        return TableRow((METRIC_TITLES[metric],), tuple(columns))
+        return TableRow((PAPER_TITLES[metric],), tuple(columns))
 
     heads = ("p", "Spearman ρ", "bootstrap of r", "sign")
     columns = [Column(head, AXIS_TITLES[axis]) for axis in AXES for head in heads]
@@ -174,7 +174,7 @@ def frame_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
             result = results[metric]
             p = TableCell(f"{result.p_value:.3f}", value=result.p_value)
             cells += [_signed_cell(result.r), *((_range_cell(result.low, result.high), p) if frame != "root" else ())]
-        return TableRow((METRIC_TITLES[metric],), tuple(cells))
+        return TableRow((PAPER_TITLES[metric],), tuple(cells))
 
     columns = [Column(head, "As printed") for head in ("r", "leave one out")]
     columns += [
@@ -238,7 +238,7 @@ def describe_change(change: PublishedChange) -> str:
     else:
         subject, first, second = SYSTEMS[after], *(ROBOT_TITLES.get(robot, "seen robots") for robot in (start, end))
     gap = ", share of the gap to seen robots" if change.toward else ""
-    return f"{METRIC_TITLES[change.metric]}, {subject}: {first} to {second}{gap}"
+    return f"{PAPER_TITLES[change.metric]}, {subject}: {first} to {second}{gap}"
 
 
 def _row_title(part: str, key: str, robot: str) -> str:

@@ -6,20 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from xew.analysis.scores import MetricInfo
-from xew.analysis.statistics.grades import (
-    MIN_SCENES,
+from xew.protocol import (
+    DIMENSION_TITLES,
 )
-from xew.analysis.statistics.summary import METRIC_TITLES
+from xew.statistics import MIN_SCENES
 
-DIMENSION_TITLES = {
-    "visual": "Visual quality",
-    "morphology": "Robot morphology",
-    "kinematics": "Robot kinematics",
-    "objects": "Object dynamics",
-}
 MARKS = (
     "▲ better, ▼ worse, ≈ not resolved: the interval of the paired difference holds 0, the difference is inside the noise "
-    f"floor, or there are fewer than {MIN_SCENES} scenes"
+    f"floor or the floor is not known, or there are fewer than {MIN_SCENES} scenes"
 )
 """What stands behind values; captions name the row that they are compared with."""
 
@@ -97,7 +91,7 @@ def format_number(value: float, metric: MetricInfo) -> str:
 def metric_title(metric: MetricInfo) -> str:
     """Such as 'PSNR [dB] ↑': the arrow points to better."""
     unit = f" [{metric.unit}]" if metric.unit else ""
-    return f"{METRIC_TITLES.get(metric.name, metric.name)}{unit} {'↑' if metric.higher_is_better else '↓'}"
+    return f"{metric.title}{unit} {'↑' if metric.higher_is_better else '↓'}"
 
 
 def metric_columns(metrics: Mapping[str, MetricInfo], names: Sequence[str]) -> tuple[Column, ...]:
