@@ -6,12 +6,14 @@ float32 and results agree with a float64 reference to about 1e-7. Floating input
 
 import functools
 import math
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from xew.metrics.mergeable.sums import Mean, Mergeable, empty_mean, mean_of, merge_means, to_float
 from xew.metrics.metric import check_videos, map_frames
 
 SSIM_WINDOW = 7
@@ -137,3 +139,58 @@ def _window_sum(image: jax.Array) -> jax.Array:
     for window, dilation in (((SSIM_WINDOW, 1), (1, 1)), ((1, SSIM_WINDOW), (1, 3))):
         image = lax.reduce_window(image, zero, lax.add, window, (1, 1), "valid", window_dilation=dilation)
     return image
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class CappedMean:
+    """The mean of PSNR: exact frames count as the largest finite value, which is not known before all parts are there."""
+
+    finite: Mean
+    """Mean of the finite values, in dB."""
+    exact: jax.Array
+    """int32, number of exact frames."""
+    largest: jax.Array
+    """float32 [dB], the largest finite value; -inf where there is none."""
+    attainable: jax.Array
+    """float32 [dB], what exact frames count as where no frame is inexact."""
+
+    @property
+    def value(self) -> jax.Array:
+        """float32 [dB], as the mean of `psnr` over all frames of the video."""
+        cap = jnp.where(self.finite.count > 0, self.largest, self.attainable)
+        finite = jnp.where(self.finite.count > 0, to_float(self.finite.total), 0)
+        return (finite + jnp.where(self.exact > 0, self.exact * cap, 0)) / (self.finite.count + self.exact)
+
+
+def _empty_capped() -> CappedMean:
+    nothing = jnp.float32(-jnp.inf)
+    return CappedMean(empty_mean(), jnp.int32(0), nothing, nothing)
+
+
+def _update_capped(state: CappedMean, prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) -> CappedMean:
+    check_videos(prediction, target)
+    error = mean_squared_error(prediction, target, chunk)
+    values = finite_psnr(error)
+    return _merge_capped(
+        state,
+        CappedMean(
+            finite=mean_of(values, error > 0),
+            exact=jnp.sum(error == 0, dtype=jnp.int32),
+            largest=jnp.max(jnp.where(error > 0, values, -jnp.inf)),
+            attainable=attainable_psnr(np.shape(target)),
+        ),
+    )
+
+
+def _merge_capped(a: CappedMean, b: CappedMean) -> CappedMean:
+    return CappedMean(
+        finite=merge_means(a.finite, b.finite),
+        exact=a.exact + b.exact,
+        largest=jnp.maximum(a.largest, b.largest),
+        attainable=jnp.maximum(a.attainable, b.attainable),
+    )
+
+
+PSNR_STATE = Mergeable(_empty_capped, _update_capped, _merge_capped, lambda state: state.value)
+"""States of `psnr`."""

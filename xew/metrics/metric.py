@@ -1,4 +1,4 @@
-"""Metrics, ground: what a metric is, what all of them share: checks on arrays, frames by the chunk. Imports nothing of ours."""
+"""What a metric is, and what all metrics share: checks on arrays, and frames by the chunk."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,32 +9,56 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-INPUTS = ("video", "mask", "region", "track")
-"""video: two [t h w 3]. mask: two [t h w]. region: two videos and the target's mask. track: two [t k 2], valid [t k]."""
+from xew.metrics.mergeable.sums import Mergeable
 
+INPUTS = ("video", "mask", "region", "track")
+"""Kinds of what a metric compares. video: two [t h w 3]. mask: two [t h w]. region: two videos and the target's mask.
+track: two [t k 2], valid [t k]."""
+ESTIMATED_INPUTS = ("mask", "track")
+"""Inputs that have to be estimated in a prediction."""
 
 ACCELERATOR_CHUNK = 64
-"""Frames computed at once on a GPU or TPU; one is fastest on a CPU, where a frame's intermediates then stay in its cache."""
+"""Number of frames computed at once on a GPU or TPU; one is fastest on a CPU, where a frame's intermediates then stay in its
+cache."""
 
 
 @dataclass(frozen=True)
 class Metric:
-    """One entry of the registry `METRICS`: all that a table or a figure needs to know of a metric."""
+    """One entry of the registry `METRICS`: all that grading, a table or a figure needs to know of a metric."""
 
     function: Callable[..., jax.Array]
-    """Pure and jitted, as users call it."""
+    """Metric as users call it: pure and jitted."""
     curve: Callable[..., jax.Array] | None
-    """The same before the mean over frames, [t]; None where a frame has no value of its own."""
+    """Function of the same inputs before the mean over frames, [t]; None for metrics of tracks, whose frames are graded by
+    `function`."""
     dimension: str
-    """visual, morphology, kinematics or objects: reported side by side, never collapsed."""
+    """Group of metrics, a key of `xew.protocol.DIMENSION_TITLES` or one of your own: reported side by side, never collapsed."""
     unit: str
-    """'' where the number has none."""
+    """Unit of the number, '' where it has none."""
     range: tuple[float, float]
+    """Least and largest value."""
     higher_is_better: bool
+    """Direction of the metric."""
     inputs: str
-    """What the functions compare, one of `INPUTS`."""
+    """Kind of what the functions compare, one of `INPUTS`."""
     reference: str
-    """Where the definition comes from."""
+    """Source of the definition, as the report prints it."""
+    title: str = ""
+    """Short title in tables and charts; the registry's key where left out."""
+    reported: bool = True
+    """Whether a study's full tables show it; False for companions of other metrics."""
+    whole: bool = False
+    """Whether its values by frame need the whole video, so that frames are never graded in blocks (PSNR, by its cap); of a
+    metric of tracks, whether a frame has no value of its own (nDTW)."""
+    parts: Callable[..., tuple[jax.Array, jax.Array]] | None = None
+    """Function of the same inputs to the values that the metric is the mean of, and which of them count."""
+    state: Mergeable | None = None
+    """Mergeable states; left out, they are the mean of `parts`, or else of the values by frame."""
+
+    @property
+    def estimated(self) -> bool:
+        """Does it need an estimator, so that even the true video does not get the best score?"""
+        return self.inputs in ESTIMATED_INPUTS
 
 
 def check_videos(prediction: jax.Array, target: jax.Array, smallest_side: int = 1) -> None:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from xew.metrics.mergeable.sums import Mean, Mergeable, empty_mean, mean_of, merge_means
 from xew.metrics.metric import check_contacts, check_tracks
 
 
@@ -217,3 +218,16 @@ def _norm(vector: jax.Array) -> jax.Array:
 def _masked_mean(values: jax.Array, keep: jax.Array, axis: int | None = None) -> jax.Array:
     """Mean of the kept values; NaN where none is."""
     return jnp.sum(jnp.where(keep, values, 0), axis=axis) / jnp.sum(keep, axis=axis).astype(jnp.float32)
+
+
+def _update_objects(state: Mean, prediction: jax.Array, target: jax.Array, valid: jax.Array) -> Mean:
+    return merge_means(state, mean_of(*distances(prediction, target, valid)))
+
+
+def _mean_over_objects(state: Mean) -> jax.Array:
+    seen = state.count > 0
+    return jnp.sum(jnp.where(seen, state.value, 0)) / jnp.sum(seen)
+
+
+TRAJECTORY_STATE = Mergeable(lambda objects: empty_mean((objects,)), _update_objects, merge_means, _mean_over_objects)
+"""States of `trajectory_error`: one mean for each object."""
