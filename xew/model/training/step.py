@@ -236,7 +236,8 @@ def chunk_weights(batch: Batch) -> Array:
     """[b k] each chunk's share in its sample's loss: equal over those that show the episode beyond their first frame."""
     if batch.following is None:
         return jnp.ones((len(batch.latents), 1), jnp.float32)
-    there = jnp.stack([jnp.ones(len(batch.latents)), batch.following.shown[:, 1:].any(axis=1)], axis=1).astype(jnp.float32)
+    later = batch.following.shown[:, 1:].any(axis=1).astype(jnp.float32)
+    there = jnp.stack([jnp.ones(len(later)), later], axis=1)
     return there / there.sum(axis=1, keepdims=True)
 
 

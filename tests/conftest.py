@@ -1,0 +1,79 @@
+"""The session that all tests share: strict arrays, checked shapes, few threads, and programs that are compiled once.
+
+Strictness is the default. What needs an exception asks for it by name and with its reason:
+`pytestmark = pytest.mark.loose_types("Flax adds float32 and int32 in ...")`, or a line of `filterwarnings` in pyproject.toml.
+"""
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+XEW = Path(__file__).parents[1] / "xew"
+CHECKED_ROOMS = ("metrics", "model")
+"""Rooms whose annotated modules are checked at run time."""
+CHECK_SHAPES = os.environ.get("XEW_CHECK_SHAPES", "1") != "0"
+"""Whether shapes and types of arrays are checked at every call; benchmarks of tests turn it off by XEW_CHECK_SHAPES=0."""
+LOOSE = (("loose_types", "jax_numpy_dtype_promotion", "standard"), ("loose_ranks", "jax_numpy_rank_promotion", "allow"))
+"""Mark, option of JAX, and its value under the mark."""
+CACHE_DAYS = 14
+"""Number of days for which a compiled program that no session has written again is kept."""
+
+
+def annotated_modules() -> list[str]:
+    """Modules of the checked rooms that import jaxtyping, by their full names."""
+    files = (path for room in CHECKED_ROOMS for path in sorted((XEW / room).rglob("*.py")))
+    names = (".".join(path.relative_to(XEW.parent).with_suffix("").parts) for path in files if "jaxtyping" in path.read_text())
+    return [name.removesuffix(".__init__") for name in names]
+
+
+for pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(pool, "1")  # before NumPy loads: two workers with a pool of threads each only wait for one another
+if CHECK_SHAPES:
+    install_import_hook(annotated_modules(), "beartype.beartype")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Name the marks, and share one folder of compiled programs between workers, subprocesses and sessions."""
+    config.addinivalue_line("markers", "loose_types(reason): arrays of different types may meet; says whose code needs that")
+    config.addinivalue_line("markers", "loose_ranks(reason): arrays of different rank may meet; says whose code needs that")
+    folder = Path(os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(config.rootpath / ".pytest_cache" / "jax")))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+    if not hasattr(config, "workerinput"):
+        remove_old_files(folder)
+
+
+def remove_old_files(folder: Path) -> None:
+    """Remove the files of a folder that are older than CACHE_DAYS."""
+    for path in folder.glob("*"):
+        if path.is_file() and time.time() - path.stat().st_mtime > CACHE_DAYS * 86_400:
+            path.unlink(missing_ok=True)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def strict_arrays() -> None:
+    """JAX neither converts types nor adds axes silently, in fixtures of any scope and in threads too."""
+    import jax
+
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+    jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture(autouse=True)
+def named_exceptions(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Tests marked loose_types or loose_ranks run as JAX does by default; the mark gives the reason."""
+    import jax
+
+    loosened = {}
+    for mark, option, loose in LOOSE:
+        found = request.node.get_closest_marker(mark)
+        if found is not None:
+            assert found.args and isinstance(found.args[0], str), f"@pytest.mark.{mark} needs a reason"
+            loosened[option] = getattr(jax.config, option)
+            jax.config.update(option, loose)
+    yield
+    for option, strict in loosened.items():
+        jax.config.update(option, strict)
