@@ -25,10 +25,12 @@ import numpy as np
 import tyro
 import warp as wp
 
-from xew.episode import Record, find_accepted, find_records, verify_episode
+from xew.dataset import find_accepted, find_records
+from xew.episode import Record, verify_episode
 from xew.sim_warp import generate
 from xew.sim_warp.devices.workers import has_kernels, worker_count
-from xew.sim_warp.production.produce import Cell, Job, plan_cells, simulate_cells, write_cell
+from xew.sim_warp.production.cells import Cell, Job, plan_cells, simulate_cells
+from xew.sim_warp.production.episodes import write_cell
 from xew.sim_warp.rendering.observe import observe
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import command_renders
@@ -116,7 +118,7 @@ def stages(jobs: list[Job], renderer: Renderer, out: Path, clock: Clock) -> int:
     with clock.stage("scene render"):
         views = observe(renderer, [cell.recording for cell in cells])
     with clock.stage("robot-only render"):
-        renders = command_renders([(cell.robot_name, cell.commands.action) for cell in cells], renderer=renderer)
+        renders = command_renders([(cell.robot, cell.commands.action) for cell in cells], renderer=renderer)
     with clock.stage("writing"), ThreadPoolExecutor(1 if device.is_cpu else os.cpu_count()) as pool:
         pixels = zip(views, renders, strict=True)
         list(pool.map(lambda cell, seen: write_cell(cell, seen, out, device), cells, pixels))

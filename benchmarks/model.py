@@ -222,13 +222,13 @@ def xew_denoise(args: Args) -> Iterator[dict[str, Any]]:
     from flax import nnx
 
     from xew.model.experiment import create_model
-    from xew.model.network.dit import compute_params
+    from xew.model.network.dit import cast_params
     from xew.model.training.data import fake_batch
 
     for streams, visibility in itertools.product(args.streams, ("joint", "one_way")):
         experiment = experiment_of(args, streams, 1, "none", "bfloat16", f"--model.visibility={visibility}")
         graph = nnx.split(nnx.eval_shape(functools.partial(create_model, experiment)), nnx.Param)[0]
-        params = jax.jit(lambda e=experiment, g=graph: compute_params(g, nnx.state(create_model(e), nnx.Param)))()
+        params = jax.jit(lambda e=experiment, g=graph: cast_params(g, nnx.state(create_model(e), nnx.Param)))()
         fill = jax.jit(lambda p, b, g=graph: nnx.merge(g, p).condition_cache(b.conditions, b.text))
         step = jax.jit(lambda p, b, c, s, g=graph: nnx.merge(g, p)(b.latents, b.conditions, s, b.text, c))
         for samples in args.batches:

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from tests import synthetic
-from xew.episode import HEIGHT, WIDTH, find_records, read_video
+from xew.dataset import find_records
+from xew.episode import HEIGHT, WIDTH, read_video
 from xew.model import latents, rollout, train
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.latents import LatentCache, clip_starts, load_codec, training_episodes

@@ -168,12 +168,12 @@ sys.path[:0] = {path!r}
 import jax, numpy as np
 from pathlib import Path
 from tests.model.test_rollout import FRAMES, ROBOT_NAMES, load_experiment, make_predictor, latents
-from xew.model.devices.sharding import MeshSettings, make_mesh, replicated
+from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
 from dataclasses import replace
 assert len(jax.devices()) == 2
 predictor = make_predictor(load_experiment({config!r}))
 mesh = make_mesh(MeshSettings())
-predictor = replace(predictor, params=jax.device_put(predictor.params, replicated(mesh)))
+predictor = replace(predictor, params=jax.device_put(predictor.params, replicated_sharding(mesh)))
 episodes = latents.test_episodes(predictor.experiment.data, ROBOT_NAMES)[:3]
 begun = predictor.begin(episodes, FRAMES)
 assert len(begun.chunks[0].sharding.device_set) == 2 and begun.chunks[0].shape[0] == 4

@@ -11,9 +11,10 @@ from flax import nnx
 
 from tests import synthetic
 from xew.config import ConfigError
-from xew.episode import find_accepted, read_record, read_states, read_video, write_episode
+from xew.dataset import find_accepted
+from xew.episode import read_record, read_states, read_video, write_episode
 from xew.model import latents, rollout, train
-from xew.model.conditions import ACTIONS
+from xew.model.conditions import ACTIONS, System
 from xew.model.experiment import create_model, load_experiment
 from xew.model.latents import LatentCache, load_codec, load_scales, scales_path, training_episodes
 from xew.model.sampling.predict import Predictor
@@ -23,7 +24,7 @@ from xew.rollout import find_rollouts
 pytestmark = pytest.mark.usefixtures("quick_compile")
 FRAMES = 9
 ROBOTS = ("aloha_agilex", "arx_x5", "piper")
-SYSTEMS = [name for name, entry in ACTIONS.items() if isinstance(entry, tuple)]
+SYSTEMS = [name for name, entry in ACTIONS.items() if isinstance(entry, System) and entry.conditions]
 BASELINES = Path(__file__).parents[2] / "configs" / "baselines"
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from tests import synthetic
-from xew.episode import EpisodeError, find_accepted, read_video
+from xew.dataset import find_accepted
+from xew.episode import EpisodeError, read_video
 from xew.model import latents, train_vae
 from xew.model.codecs.codec import CodecSettings, WanVaeCodec
 from xew.model.experiment import load_experiment

@@ -31,7 +31,7 @@ from xew.sim_warp.geometry.poses import matrix_from_pose, pose_from_matrix
 from xew.sim_warp.kinematics.forward import tool_matrix
 from xew.sim_warp.rendering.observe import Recording, keypoint_names, observe
 from xew.sim_warp.rendering.streams import command_renders, default_renderer
-from xew.sim_warp.robots import RobotSpec, get_robot, is_path, keep_robot, use_robots_of
+from xew.sim_warp.robots import RobotSpec, get_robot, is_path, keep_robot
 from xew.sim_warp.robots.user.draft import find_description, read_draft
 
 EMBODIMENTS = {
@@ -43,11 +43,11 @@ EMBODIMENTS = {
 }
 """RoboTwin's names of robots, and ours."""
 TOOL_DISTANCE = {"aloha_agilex": 0.12, "arx_x5": 0.12, "ur5_wsg": 0.11, "franka_panda": 0.08, "piper": 0.12}
-"""From the link that carries the tool to RoboTwin's tool center point [m] (gripper_bias of its embodiments)."""
+"""Distance from the link that carries the tool to RoboTwin's tool center point [m] (gripper_bias of its embodiments)."""
 FIT_POSITION, FIT_ROTATION = 0.01, 0.05
-"""Median distance [m] and angle [rad] between end poses and those of a robot's joints, up to which it is that robot."""
+"""Largest median distance [m] and angle [rad] between end poses and those of a robot's joints at which it is that robot."""
 SAME_PLACE = 0.003
-"""How far the bases of two episodes of one robot may differ [m]."""
+"""Largest distance between the bases of two episodes of one robot [m]."""
 UNKNOWN = ("joint_pos", "joint_vel", "object_pose", "object_joint", "contact", "penetration", "keypoint_visible", "robot_mask")
 SOURCE = "RoboTwin HDF5"
 
@@ -57,12 +57,12 @@ class Args:
     """What to import."""
 
     source: Annotated[Path, tyro.conf.Positional]
-    """A RoboTwin episode (.hdf5), or a folder of them at any depth."""
+    """Path of a RoboTwin episode (.hdf5), or of a folder with them at any depth."""
     out: Path = Path("data")
     robot: str | None = None
-    """A key of the registry, module:NAME or the path of a robot; default: told by the names of the folders."""
+    """Registry key, module:NAME or path of a robot; default: the one that the names of the folders tell."""
     task: str | None = None
-    """Default: the name of the folder two above the one that holds the file, as RoboTwin lays them out."""
+    """Name of the task; default: that of the folder two above the one that holds the file, as RoboTwin lays them out."""
 
 
 def find_episodes(source: Path) -> list[Path]:
@@ -100,7 +100,7 @@ def import_episode(path: Path, args: Args) -> Record:
                 f"{path}: {beside.parent} was simulated here; RoboTwin's seed {seed} is another scene. Import it as another "
                 "--task or into another --out."
             )
-    states, names, video = _seen(robot, action, recorded)
+    states, names, video = _build_states(robot, action, recorded)
     record = Record(
         task=task,
         seed=seed,
@@ -125,7 +125,7 @@ def canonical_action(recorded: Recorded) -> np.ndarray:
     return action
 
 
-def fitted(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
+def fit_bases(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
     """The robot with the bases and tool frames from which the recorded joints bring its tools to the recorded end poses.
 
     Targets run ahead of what is measured, so the bases are the median over the episode.
@@ -145,7 +145,7 @@ def fitted(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
         reached = tool_matrix(replace(robot, arms=(unplaced, unplaced)), 0, recorded.arms[:, side])
         measured = matrix_from_pose(recorded.tool_pose[:, side])
         bases = pose_from_matrix(measured @ np.linalg.inv(reached))
-        base = _middle(bases)
+        base = _middle_pose(bases)
         off = pose_from_matrix(np.linalg.inv(matrix_from_pose(base)) @ matrix_from_pose(bases))
         angle = 2 * np.arccos(np.clip(off[:, 6], -1, 1))
         if np.median(np.linalg.norm(off[:, :3], axis=1)) > FIT_POSITION or np.median(angle) > FIT_ROTATION:
@@ -155,7 +155,7 @@ def fitted(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
     return replace(robot, arms=(arms[0], arms[1]), title=f"{robot.title} as placed in RoboTwin")
 
 
-def _middle(poses: np.ndarray) -> np.ndarray:
+def _middle_pose(poses: np.ndarray) -> np.ndarray:
     """Of poses [t 7] the one nearest to their median, so that it is a pose."""
     aligned = np.concatenate([poses[:, :3], poses[:, 3:] * np.where(poses[:, 3:] @ poses[0, 3:] < 0, -1, 1)[:, None]], 1)
     return poses[int(np.argmin(np.linalg.norm(aligned - np.median(aligned, axis=0), axis=1)))]
@@ -164,14 +164,13 @@ def _middle(poses: np.ndarray) -> np.ndarray:
 def _robot(path: Path, recorded: Recorded, args: Args) -> tuple[str, RobotSpec | None]:
     """The name under which the episode is stored, and the robot that it is rendered with, if it is known."""
     named = args.robot or _embodiment(path)
-    robot = get_robot(named)
+    robot = get_robot(named, args.out)
     if is_path(named) and (tool := read_draft(find_description(Path(named))).arms[0].tool_pose):
         robot = replace(robot, arms=(replace(robot.arms[0], tool_pose=tool), replace(robot.arms[1], tool_pose=tool)))
-    placed = fitted(robot, recorded)
+    placed = fit_bases(robot, recorded)
     if placed is None:
         return f"{robot.key}_robotwin", None
     key = f"{robot.key}_robotwin"
-    use_robots_of(args.out)
     placed = replace(placed, key=key)
     kept = keep_robot(placed, args.out)
     bases = [np.array([arm.root_pose for arm in spec.arms]) for spec in (placed, kept)]
@@ -210,7 +209,9 @@ def _seed(path: Path) -> int:
     return int(seeds[number]) if number < len(seeds) and seeds[number].isdigit() else number
 
 
-def _seen(robot: RobotSpec | None, action: np.ndarray, recorded: Recorded) -> tuple[States, tuple[str, ...], np.ndarray | None]:
+def _build_states(
+    robot: RobotSpec | None, action: np.ndarray, recorded: Recorded
+) -> tuple[States, tuple[str, ...], np.ndarray | None]:
     """States, names of keypoints and the robot-only video, as far as they can be known."""
     frames, height, width = recorded.rgb.shape[:3]
     camera = Camera(recorded.intrinsics, recorded.extrinsics)
@@ -219,7 +220,7 @@ def _seen(robot: RobotSpec | None, action: np.ndarray, recorded: Recorded) -> tu
     if robot is not None:
         names = keypoint_names(robot)
         keypoints = observe(default_renderer(), [Recording(robot, action)], camera)[0].keypoints
-        video = command_renders([(robot.key, action)], camera)[0]
+        video = command_renders([(robot, action)], camera)[0]
     nothing = np.full((frames, ACTION_DIM), np.nan, np.float32)
     no_pose = np.full((frames, 2, 7), np.nan)
     states = States(
@@ -257,7 +258,7 @@ def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
     if args.robot:
-        get_robot(args.robot)  # a mistake in it is told once, not for every file
+        get_robot(args.robot, args.out)  # a mistake in it is told once, not for every file
     records, refused = import_all(find_episodes(args.source), args)
     rendered = sum("robot" in record.hashes for record in records)
     print(f"{len(records)} episodes under {args.out}, {rendered} with the robot's own kinematics")

@@ -24,7 +24,8 @@ from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from xew.config import ConfigError, user_errors
-from xew.episode import EpisodeError, Record, find_accepted, read_video
+from xew.dataset import find_accepted
+from xew.episode import EpisodeError, Record, read_video
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
 from xew.metrics.calibration.wrong import WrongVideo, wrong_videos

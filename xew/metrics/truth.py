@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from xew.episode import EpisodeError, demand_known, read_states, read_video
+from xew.projection import project
 
 NEEDS = {
     "video": (),
@@ -70,7 +71,8 @@ def read_truth(folder: Path, frames: int, compared: Collection[str]) -> Truth:
     if rgb.shape[:3] != states.robot_mask.shape:
         raise EpisodeError(f"{folder}: video {rgb.shape[:3]} and masks {states.robot_mask.shape} differ; generate it anew.")
     objects, hands = (
-        project(pose[..., :3], states.intrinsics, states.extrinsics) for pose in (states.object_pose, states.tool_pose)
+        project(pose[..., :3], states.intrinsics, states.extrinsics)[0].astype(np.float32)
+        for pose in (states.object_pose, states.tool_pose)
     )
     return Truth(
         rgb=rgb[:frames],
@@ -82,13 +84,6 @@ def read_truth(folder: Path, frames: int, compared: Collection[str]) -> Truth:
         hands=hands[:frames],
         contact=states.contact[:frames],
     )
-
-
-def project(points: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) -> np.ndarray:
-    """Pixels [... 2] float32 of world points [... 3] m; NaN where a point is not before the camera."""
-    seen = points @ extrinsics[:3, :3].T + extrinsics[:3, 3]
-    depth = np.where(seen[..., 2:] > 0, seen[..., 2:], np.nan)
-    return ((seen / depth) @ intrinsics[:2].T).astype(np.float32)
 
 
 def _visible(points: np.ndarray, rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -13,10 +13,10 @@ from flax import nnx
 
 from xew.config import ConfigError, load, pick
 from xew.files import cache_folder
-from xew.model.codecs.codec import TEMPORAL_FACTOR, CodecSettings, codec_of, latent_frames
-from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition
+from xew.model.codecs.codec import CodecSettings, codec_class, latent_frames
+from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition, list_conditions
 from xew.model.devices.sharding import MeshSettings
-from xew.model.diffusion.samplers import GRIDS, SAMPLERS
+from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES
 from xew.model.network.dit import (
     MODELS,
     PATCH,
@@ -30,6 +30,7 @@ from xew.model.network.dit import (
 )
 from xew.model.network.mechanisms import MECHANISMS
 from xew.model.text.instructions import TEXT_ENCODERS, VOCABULARY, TextEncoder, TextSource, encode_instructions
+from xew.model.video.frames import TEMPORAL_FACTOR
 from xew.protocol import ACTION_DIM, SPLITS, Split
 
 
@@ -134,7 +135,7 @@ class RolloutSettings:
     sampler: str = "euler"
     """One of SAMPLERS."""
     grid: str = "flowwam"
-    """One of GRIDS: which project's noise levels."""
+    """Noise schedule: one of SCHEDULES, each by the name of the project that has it."""
     steps: int = 50
     """Evaluations of the network a chunk."""
     shift: float | None = None
@@ -221,10 +222,8 @@ def beside(data: Path, ending: str) -> Path:
 
 def chosen_conditions(settings: ModelSettings) -> list[Condition]:
     """The action's, the embodiment's and the history's. Raises ConfigError for a name that does not exist."""
-    action = pick(ACTIONS, settings.action, "action")
-    system = action if isinstance(action, tuple) else (action,)
-    chosen = (*system, pick(CONDITIONS, settings.embodiment, "embodiment"), HISTORY if settings.history else None)
-    return [condition for condition in chosen if condition is not None]
+    action, embodiment = pick(ACTIONS, settings.action, "action"), pick(CONDITIONS, settings.embodiment, "embodiment")
+    return [*list_conditions(action), *list_conditions(embodiment), *([HISTORY] if settings.history else [])]
 
 
 LEAST = {
@@ -254,9 +253,9 @@ def load_experiment(path: Path | str, overrides: list[str] | None = None) -> Exp
     """Read and check a config. Raises ConfigError with every choice that does not exist or does not fit."""
     experiment = load(Experiment, path, overrides or [])
     demand_at_least(LEAST, experiment, str(path))
-    codec_of(experiment.codec).check(experiment.codec)
+    codec_class(experiment.codec).check(experiment.codec)
     pick(SAMPLERS, experiment.rollout.sampler, "sampler")
-    pick(GRIDS, experiment.rollout.grid, "grid of noise levels")
+    pick(SCHEDULES, experiment.rollout.grid, "noise schedule")
     _ = experiment.size, experiment.robots
     _check_conditions(experiment, str(path))
     _check_sizes(experiment, str(path))

@@ -24,12 +24,13 @@ from safetensors.numpy import save_file
 from tqdm import tqdm
 
 from xew.config import ConfigError, digest, suggestion, user_errors
-from xew.episode import Record, complete_folder, episode_folder, find_accepted, read_states
+from xew.dataset import find_accepted
+from xew.episode import Record, complete_folder, episode_folder, read_states
 from xew.files import replacing
 from xew.model.cache.scales import Scale, fit_scales, load_run_scales, read_scales, save_scales
-from xew.model.codecs.ceiling import measure_ceiling, spread
-from xew.model.codecs.codec import Codec, check_clip_shape, codec_of, encode_pictures
-from xew.model.conditions import Command, Condition, clip_numbers, command_of, robot_render
+from xew.model.codecs.ceiling import choose_evenly, measure_ceiling
+from xew.model.codecs.codec import Codec, check_clip_shape, codec_class, encode_pictures
+from xew.model.conditions import Command, Condition, clip_numbers, make_command, robot_render
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.checkpoint import load_run
 from xew.model.video.frames import to_model_size
@@ -191,10 +192,7 @@ def stream_videos(
 
 def episode_command(folder: Path, record: Record, rendered: np.ndarray | None = None) -> Command:
     """What conditions may be made from, of an episode of a data set."""
-    from xew.sim_warp.robots import use_robots_of
-
-    use_robots_of(folder.absolute().parents[2])  # a robot of a user's own is kept beside its data
-    return command_of(folder, record, read_states(folder), rendered)
+    return make_command(folder, record, read_states(folder), rendered)
 
 
 def cut_clip(
@@ -295,7 +293,7 @@ def load_codec(experiment: Experiment, episodes: Sequence[Episode]) -> Codec:
     """
     if experiment.adapt.start_from is not None:
         return load_run(experiment.adapt.start_from)[1]
-    kind = codec_of(experiment.codec)
+    kind = codec_class(experiment.codec)
     if not kind.fitted:
         return kind.prepare(experiment.codec, list)
     path = codec_path(experiment, episodes)
@@ -335,7 +333,7 @@ def keep_scales(experiment: Experiment, episodes: Sequence[Episode]) -> None:
 
 def fit_codec(experiment: Experiment, episodes: Sequence[Episode], source: PixelSource = stored_pixels) -> Codec:
     """Fit the codec on clips of training episodes, and keep it."""
-    codec = codec_of(experiment.codec).prepare(experiment.codec, lambda: _clips_to_fit(experiment, episodes, source))
+    codec = codec_class(experiment.codec).prepare(experiment.codec, lambda: _clips_to_fit(experiment, episodes, source))
     path = codec_path(experiment, episodes)
     with complete_folder(path) as unfinished:
         codec.save(unfinished)
@@ -361,7 +359,7 @@ def _clips_to_fit(experiment: Experiment, episodes: Sequence[Episode], source: P
 def ceiling(experiment: Experiment, codec: Codec, episodes: Sequence[Episode], source: PixelSource) -> dict[str, Any]:
     """The codec's reconstruction of clips of held-out robots and test seeds, or of training data where there are none."""
     held_out = test_episodes(experiment.data, experiment.robots.held_out_robots)
-    chosen = spread(held_out or episodes, CEILING_CLIPS)
+    chosen = choose_evenly(held_out or episodes, CEILING_CLIPS)
     videos = (source(folder, record, ("rgb",))["rgb"] for folder, record in chosen)
     measured = measure_ceiling(codec, videos, **asdict(experiment.clip))
     on = "held-out robots" if held_out else "training episodes, for there are none of held-out robots"
@@ -390,7 +388,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     episodes = training_episodes(experiment)
     source = rendered_pixels() if args.from_states else stored_pixels
     adapts = experiment.adapt.start_from is not None
-    to_fit = codec_of(experiment.codec).fitted and not adapts and not codec_path(experiment, episodes).exists()
+    to_fit = codec_class(experiment.codec).fitted and not adapts and not codec_path(experiment, episodes).exists()
     codec = fit_codec(experiment, episodes, source) if to_fit else load_codec(experiment, episodes)
     keep_scales(experiment, episodes)
     experiment.encode_instructions((record.instruction for _, record in find_accepted(experiment.data)))

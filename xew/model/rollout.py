@@ -24,13 +24,14 @@ from flax import nnx
 from tqdm import tqdm
 
 from xew.config import CONVERTER, ConfigError, suggestion, user_errors
-from xew.episode import EpisodeError, Record, episode_folder, find_accepted
+from xew.dataset import find_accepted
+from xew.episode import EpisodeError, Record, episode_folder
 from xew.model.cache.scales import load_run_scales
-from xew.model.codecs.codec import codec_of
-from xew.model.devices.sharding import MeshSettings, make_mesh, replicated
+from xew.model.codecs.codec import codec_class
+from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
 from xew.model.experiment import Experiment, compile_cache, create_model, load_experiment
 from xew.model.latents import Episode, load_codec, training_episodes
-from xew.model.network.dit import compute_params
+from xew.model.network.dit import cast_params
 from xew.model.network.dit_layouts import load_dit_params
 from xew.model.runs.checkpoint import load_run, restore_params, saved_at
 from xew.model.sampling.predict import Prediction, Predictor
@@ -65,10 +66,10 @@ def load_predictor(run: Path, step: int | None = None, overrides: Sequence[str] 
     chosen = load_experiment(run / "config.yaml", list(overrides)).rollout
     mesh = make_mesh(MeshSettings())
     graph, shapes = nnx.split(nnx.eval_shape(lambda: create_model(experiment)), nnx.Param)
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=replicated(mesh)), shapes)
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=replicated_sharding(mesh)), shapes)
     params, step = restore_params(run, like, step)
-    params = jax.jit(compute_params, static_argnums=0)(graph, params)
-    codec = jax.device_put(codec, replicated(mesh))
+    params = jax.jit(cast_params, static_argnums=0)(graph, params)
+    codec = jax.device_put(codec, replicated_sharding(mesh))
     return Predictor(replace(experiment, rollout=chosen), codec, graph, params, load_run_scales(experiment, run)), step
 
 
@@ -97,11 +98,11 @@ def load_published(experiment: Experiment, source: Path) -> Predictor:
     mesh = make_mesh(MeshSettings())
     graph, params = random_params(experiment, mesh)
     params = load_dit_params(graph, params, experiment.model.weights)
-    kind = codec_of(experiment.codec)
+    kind = codec_class(experiment.codec)
     fitted = kind.fitted
     codec = load_codec(experiment, training_episodes(experiment)) if fitted else kind.prepare(experiment.codec, list)
-    params = jax.jit(compute_params, static_argnums=0)(graph, params)
-    return Predictor(experiment, jax.device_put(codec, replicated(mesh)), graph, params)
+    params = jax.jit(cast_params, static_argnums=0)(graph, params)
+    return Predictor(experiment, jax.device_put(codec, replicated_sharding(mesh)), graph, params)
 
 
 def _check_overrides(overrides: Sequence[str]) -> None:

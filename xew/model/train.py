@@ -33,7 +33,7 @@ from xew.model.devices.sharding import (
     make_mesh,
     mesh_shape,
     place_batch,
-    process_rows,
+    process_samples,
     start_processes,
     state_shardings,
 )
@@ -41,7 +41,7 @@ from xew.model.experiment import Experiment, compile_cache, create_model, load_e
 from xew.model.latents import LatentCache, load_codec, replay_episodes, training_episodes
 from xew.model.network.blocks import choose_attention
 from xew.model.network.dit_layouts import check_dit, load_dit_params
-from xew.model.network.lora import corrected
+from xew.model.network.lora import apply_lora
 from xew.model.runs.checkpoint import (
     START,
     TrainState,
@@ -201,7 +201,7 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
 
     # State: step 0, or where the run was left.
     settings = experiment.train
-    rows = process_rows(mesh, settings.batch)
+    rows = process_samples(mesh, settings.batch)
     batches = iter(make_dataset(source, settings.batch, settings.seed, experiment.adapt.replay, rows))
     with open_checkpoints(experiment.out, settings.keep_checkpoints) as checkpoints:  # what is being written is finished
         if checkpoints.latest_step() is None:
@@ -340,7 +340,7 @@ def left_state(experiment: Experiment, mesh: Mesh, checkpoints: Any) -> tuple[nn
 def draw_samples(log: RunLog | None, experiment: Experiment, run: Run, state: TrainState, step: int) -> None:
     """Predict clips of seen and unseen robots beside the truth."""
     with jax.set_mesh(run.mesh):
-        params = jax.jit(corrected)(state.base, state.params if state.ema is None else state.ema)
+        params = jax.jit(apply_lora)(state.base, state.params if state.ema is None else state.ema)
     scales = load_run_scales(experiment, experiment.out)
     log_samples(log, Predictor(experiment, run.codec, run.graph, params, scales), step)
 

@@ -25,8 +25,9 @@ from flax import nnx
 from tqdm import tqdm
 
 from xew.config import ConfigError, load, pick, user_errors
-from xew.episode import find_accepted, read_video
-from xew.model.codecs.ceiling import Ceiling, measure_ceiling, spread
+from xew.dataset import find_accepted
+from xew.episode import read_video
+from xew.model.codecs.ceiling import Ceiling, choose_evenly, measure_ceiling
 from xew.model.codecs.codec import WanVaeCodec, to_signed
 from xew.model.codecs.vae import VAES, LatentStatistic, VaeSize, VideoVae
 from xew.model.codecs.vae_layouts import save_vae
@@ -292,7 +293,7 @@ def train_vae(experiment: VaeExperiment, *, resume: bool = False, overwrite: boo
         if saves:
             save_state(checkpoints, state, batches.get_state())
         if settings.sample_every and (number % settings.sample_every == 0 or last):
-            codec = WanVaeCodec.of(nnx.merge(graph, state.ema, statistics))
+            codec = WanVaeCodec.from_vae(nnx.merge(graph, state.ema, statistics))
             log.image(number, "sample/unseen", strip(sample, codec.decode(codec.encode(sample))))
         if stop.received and not last:
             progress.write(f"stopped at step {number} of {settings.steps} and saved; continue with --resume", file=sys.stderr)
@@ -349,7 +350,7 @@ def report_episodes(experiment: VaeExperiment) -> dict[str, list[Episode]]:
         "unseen": test_episodes(experiment.data, robots.held_out_robots),
         "seen": test_episodes(experiment.data, robots.train_robots),
     }
-    return {name: spread(episodes, CEILING_CLIPS) for name, episodes in found.items() if episodes}
+    return {name: choose_evenly(episodes, CEILING_CLIPS) for name, episodes in found.items() if episodes}
 
 
 def sample_clip(experiment: VaeExperiment, episodes: Sequence[Episode]) -> np.ndarray:
@@ -364,7 +365,7 @@ def finish(experiment: VaeExperiment, vae: VideoVae, files: Sequence[tuple[Path,
     vae.latents_mean.set_value(mean)
     vae.latents_std.set_value(std)
     save_vae(vae, experiment.out / "vae.safetensors")
-    codec = WanVaeCodec.of(vae)
+    codec = WanVaeCodec.from_vae(vae)
     ceilings = {name: ceiling_of(experiment, codec, chosen) for name, chosen in report_episodes(experiment).items()}
     for name, ceiling in ceilings.items():
         print(f"{name} robots, test seeds: {ceiling}")
@@ -402,7 +403,7 @@ def latent_statistics(
     """Mean and standard deviation [c] of the latents' means over whole clips of all training streams."""
     moments = jax.jit(lambda vae, pictures: vae.moments(to_signed(pictures), chunk=8)[0])
     rng, total, squares, count = np.random.default_rng(0), 0.0, 0.0, 0
-    for path, frame_count in tqdm(spread(files, experiment.train.statistics_clips), desc="statistics", unit="clip"):
+    for path, frame_count in tqdm(choose_evenly(files, experiment.train.statistics_clips), desc="statistics", unit="clip"):
         clip = random_clips(path, frame_count, experiment.cut(whole=True), rng)
         latents = np.asarray(moments(vae, clip), np.float64).reshape(-1, experiment.size.channels)
         total, squares, count = total + latents.sum(0), squares + np.square(latents).sum(0), count + len(latents)

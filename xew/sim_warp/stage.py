@@ -16,7 +16,7 @@ TABLE_SIZE = (1.2, 0.7, 0.05)
 """Full size of the table's plate [m]; its center is over the world's origin."""
 LEG_SIZE = 0.05
 LEG_XY = (0.55, 0.30)
-"""A leg stands at every (+-x, +-y) [m]."""
+"""Distances of the four legs from the table's middle along x and y [m]."""
 WALL_CENTER = (0.0, 1.0, 1.5)
 WALL_SIZE = (6.0, 1.2, 3.0)
 GROUND_SIZE = 12.0
@@ -32,7 +32,7 @@ SKY_SHARE = 0.35
 EXPOSURE = 0.5
 """Factor from light to linear image value: it puts the lit white table at 0.8, below the white of the image."""
 KNEE, CEILING = 0.7, 0.95
-"""Linear image values above the knee bend towards the ceiling, so that what is lit never reaches white."""
+"""Linear image values: above the knee they bend toward the ceiling, so that what is lit never reaches white."""
 SPECULAR = 0.12
 """Strength of the highlight that all surfaces share."""
 
@@ -43,9 +43,9 @@ class Light:
 
     intensity: float
     direction: tuple[float, float, float]
-    """Where it shines; for a point light the axis of its shadow map."""
+    """Direction in which it shines; for a point light the axis of its shadow map."""
     position: tuple[float, float, float] | None = None
-    """World frame [m]."""
+    """Position in the world frame [m]; None makes the light directional."""
 
 
 LIGHTS = (
@@ -56,11 +56,11 @@ LIGHTS = (
 SKY = (1.0, 1.0, 1.0)
 """Linear color where there is nothing, and of the ground of a render without the stage."""
 SHADOW_CENTER = (0.0, -0.1, 0.85)
-"""Middle of what the directional light's shadow map holds [m]."""
+"""Middle of the volume that the directional light's shadow map covers [m]."""
 SHADOW_WIDTH = 1.8
 """Side of the square that the directional light's shadow map covers [m]."""
 SHADOW_DISTANCE = 4.0
-"""How far from that middle the directional light's shadow map begins [m]."""
+"""Distance from that middle at which the directional light's shadow map begins [m]."""
 SHADOW_ANGLE = 80.0
 """Full angle of a point light's shadow map [deg]."""
 

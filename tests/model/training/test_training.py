@@ -20,7 +20,7 @@ from xew.model.devices.sharding import make_mesh, place_batch
 from xew.model.diffusion.flow_matching import sample_losses
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.latents import LatentCache, first_of_each, load_codec, replay_episodes, training_episodes
-from xew.model.network.lora import corrected, init_corrections
+from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs import checkpoint
 from xew.model.runs.checkpoint import TrainState
 from xew.model.training import data, memory
@@ -478,7 +478,7 @@ def test_corrections_change_nothing_at_first_and_only_they_are_learned(experimen
     start = jax.tree.map(lambda leaf: leaf + 0.1, full.params)  # the head's own start is zero and gives no gradient
     base = jax.device_get(start)
     graph, state = init_train_state(low_rank, mesh, start)
-    jax.tree.map(np.testing.assert_array_equal, corrected(state.base, state.params), base)
+    jax.tree.map(np.testing.assert_array_equal, apply_lora(state.base, state.params), base)
     assert len(state.params["blocks"]) == 10, "q, k, v, o of both attentions and both layers of the feed-forward"
     moments = sum(leaf.size for leaf in jax.tree.leaves(state.optimizer))
     assert moments < 2.1 * sum(leaf.size for leaf in jax.tree.leaves(state.params))
@@ -492,9 +492,9 @@ def test_corrections_change_nothing_at_first_and_only_they_are_learned(experimen
 def test_corrections_have_the_gradient_of_the_whole_matrix(experiment: Experiment) -> None:
     """W + A B: with dL/dW known, dL/dB is A transposed times it."""
     params = {"blocks": {"ffn": {"first": {"kernel": jax.random.normal(jax.random.key(0), (2, 3, 4))}}}}
-    learned = init_corrections(params, 2, jax.random.key(1))
+    learned = init_lora(params, 2, jax.random.key(1))
     weight = jax.random.normal(jax.random.key(2), (2, 3, 4))
-    gradient = jax.grad(lambda c: (corrected(params, c)["blocks"]["ffn"]["first"]["kernel"] * weight).sum())(learned)
+    gradient = jax.grad(lambda c: (apply_lora(params, c)["blocks"]["ffn"]["first"]["kernel"] * weight).sum())(learned)
     a = learned["blocks"]["ffn.first.kernel"]["a"]
     np.testing.assert_allclose(gradient["blocks"]["ffn.first.kernel"]["b"], a.swapaxes(1, 2) @ weight, rtol=1e-5)
 

@@ -3,7 +3,7 @@
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,28 +15,24 @@ import yaml
 from tests.sim_warp.robots.own_robot import STRIPES, robotwin_config, write_embodiment, write_urdf
 from tests.sim_warp.small import TASK
 from xew.config import ConfigError
-from xew.episode import array_hash, find_accepted
+from xew.dataset import find_accepted
+from xew.episode import array_hash
 from xew.sim_warp import generate as command
 from xew.sim_warp.embodiment import mesh_files
 from xew.sim_warp.generate import Args, generate
 from xew.sim_warp.kinematics import tool_pose
 from xew.sim_warp.plan import HOME
-from xew.sim_warp.production.produce import render_again
+from xew.sim_warp.production.rerender import render_again
 from xew.sim_warp.rendering.render import Renderer
-from xew.sim_warp.robots import RobotSpec, adopt_robots, get_robot, load_robot, load_urdf, use_robots_of
+from xew.sim_warp.robots import RobotSpec, adopt_robots, get_robot, load_robot, load_urdf
 from xew.sim_warp.robots.user.own import FOLDERS
 
 PLACED: dict[str, Any] = {"root_pose": [0, -0.37, 0.75, 0, 0, 0.5**0.5, 0.5**0.5]}
 
 
 @pytest.fixture(autouse=True)
-def forgotten() -> Iterator[None]:
-    """Robots of data sets are known to a process; every test begins without."""
-    before = os.environ.pop(FOLDERS, None)
-    yield
-    os.environ.pop(FOLDERS, None)
-    if before is not None:
-        os.environ[FOLDERS] = before
+def no_listed_folders(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(FOLDERS, raising=False)
 
 
 @pytest.fixture(scope="module")
@@ -130,17 +126,17 @@ def test_data_keep_their_robot(embodiment: Path, tmp_path: Path) -> None:
     assert [family.accepted for family in generate(args)] == [1, 0], "again, with what is kept"
     shutil.rmtree(source)
     moved = data.rename(tmp_path / "moved")
-    os.environ.pop(FOLDERS)
     with pytest.raises(ConfigError, match=r"unknown robot 'my-arm'.*a data set keeps its own in <data>/robots, list that in"):
         get_robot("my-arm")
     folder, record = find_accepted(moved)[0]
     assert array_hash(render_again(folder, Renderer("cpu"))[0]) == record.hashes["rgb"]
-    assert get_robot("my-arm").urdf.is_relative_to(moved.resolve())
+    assert get_robot("my-arm", moved).urdf.is_relative_to(moved.resolve())
+    assert FOLDERS not in os.environ, "folders are passed, the environment is the user's"
 
 
 def test_what_is_kept_is_the_same_robot(embodiment: Path, tmp_path: Path) -> None:
     assert adopt_robots([str(embodiment), "piper"], tmp_path) == ("my-arm", "piper")
-    ours, kept = load_robot(embodiment), get_robot("my-arm")
+    ours, kept = load_robot(embodiment), get_robot("my-arm", tmp_path)
     assert kept.arms == ours.arms and (kept.joint_lower, kept.joint_upper) == (ours.joint_lower, ours.joint_upper)
     for name, link in load_urdf(ours.urdf).links.items():
         other = load_urdf(kept.urdf).links[name].visual
@@ -163,7 +159,7 @@ def test_meshes_anywhere_are_kept(tmp_path: Path) -> None:
     (key,) = adopt_robots([f"{folder}/"], tmp_path / "data")
     for gone in (far, tmp_path / "description", tmp_path / "textures"):
         shutil.rmtree(gone)
-    kept = load_urdf(get_robot(key).urdf).links["link3"].visual
+    kept = load_urdf(get_robot(key, tmp_path / "data").urdf).links["link3"].visual
     assert kept is not None and set(map(tuple, kept.colors)) == set(STRIPES)
 
 
@@ -174,11 +170,23 @@ def test_another_robot_of_the_same_name_is_told(embodiment: Path, tmp_path: Path
         adopt_robots([str(other)], tmp_path / "data")
 
 
-def test_robots_are_found_in_the_folders_of_the_environment(embodiment: Path, tmp_path: Path) -> None:
+def test_robots_are_found_in_the_folders_of_the_environment(
+    embodiment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     adopt_robots([str(embodiment)], tmp_path / "one")
-    use_robots_of(tmp_path / "two")
-    assert os.environ[FOLDERS].split(os.pathsep) == [str(tmp_path / name / "robots") for name in ("two", "one")]
-    assert get_robot("my-arm").key == "my-arm"
+    monkeypatch.setenv(FOLDERS, os.pathsep.join(str(tmp_path / name / "robots") for name in ("two", "one")))
+    assert get_robot("my-arm").urdf.is_relative_to((tmp_path / "one").resolve())
+
+
+def test_a_data_set_s_robot_goes_before_those_of_the_environment(
+    embodiment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("one", "two"):
+        adopt_robots([str(embodiment)], tmp_path / name)
+    monkeypatch.setenv(FOLDERS, str(tmp_path / "one" / "robots"))
+    assert get_robot("my-arm", tmp_path / "two").urdf.is_relative_to((tmp_path / "two").resolve())
+    assert get_robot("my-arm", tmp_path / "none").urdf.is_relative_to((tmp_path / "one").resolve())
+    assert get_robot(get_robot("my-arm")) == get_robot("my-arm"), "a robot itself is a name of it too"
 
 
 # --- What is told of bad robots.

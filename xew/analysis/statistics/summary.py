@@ -8,14 +8,9 @@ import pandas as pd
 
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores
 from xew.analysis.statistics.grades import LEVEL, MIN_SCENES, interval, resample
+from xew.sim_warp.robots import ROBOTS
 
-ROBOT_TITLES = {
-    "aloha_agilex": "Aloha-AgileX",
-    "arx_x5": "ARX-X5",
-    "ur5_wsg": "UR5 with WSG-50",
-    "franka_panda": "Franka Panda",
-    "piper": "Piper",
-}
+ROBOT_TITLES = {key: robot.title for key, robot in ROBOTS.items()}
 METRIC_TITLES = {
     "psnr": "PSNR",
     "ssim": "SSIM",

@@ -14,13 +14,14 @@ import runpy
 import signal
 import subprocess
 import sys
-import threading
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Literal
+
+from xew.processes import leave_with_parent
 
 PRELOADED = ("xew.model.train", "xew.model.rollout", "xew.metrics.evaluate")
 """What the fork server imports. None of them may start a thread or a JAX backend at import, which forks would not survive."""
@@ -77,7 +78,7 @@ def _run(command: tuple[str, ...], log: Path, environment: dict[str, str], launc
     """In the new process: the module as `__main__`, as `python -m` would run it, or the launcher's process."""
     os.environ.update(environment)
     os.setpgrp()  # Ctrl-C reaches the study only, which asks its cells to stop
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    leave_with_parent(lambda: os.kill(os.getpid(), signal.SIGTERM))
     with log.open("a", buffering=1) as file, _alone(log.with_suffix(".lock")):
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
@@ -126,10 +127,3 @@ def _alone(path: Path) -> Iterator[None]:
     with path.open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
-
-
-def _leave_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os.kill(os.getpid(), signal.SIGTERM)

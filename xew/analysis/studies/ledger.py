@@ -17,7 +17,8 @@ from typing import Any
 
 from xew.analysis.studies.plan import Cell, key_of
 from xew.config import ConfigError
-from xew.episode import EpisodeError, find_accepted
+from xew.dataset import find_accepted
+from xew.episode import EpisodeError
 from xew.files import replacing
 
 

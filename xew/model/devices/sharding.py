@@ -123,12 +123,12 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, PartitionSpec(AXES))
 
 
-def replicated(mesh: Mesh) -> NamedSharding:
+def replicated_sharding(mesh: Mesh) -> NamedSharding:
     """A copy on every device."""
     return NamedSharding(mesh, PartitionSpec())
 
 
-def process_rows(mesh: Mesh, batch: int) -> np.ndarray:
+def process_samples(mesh: Mesh, batch: int) -> np.ndarray:
     """Which samples of the whole batch this process loads, in order."""
     slices = batch_sharding(mesh).addressable_devices_indices_map((batch,)).values()
     return np.unique(np.concatenate([np.arange(batch)[index] for index in slices]))
@@ -140,7 +140,7 @@ def place_batch(batch: Any, mesh: Mesh) -> Any:
     return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, leaf), batch)
 
 
-def cut_over_batch(values: jax.Array) -> jax.Array:
+def shard_over_batch(values: jax.Array) -> jax.Array:
     """Tell the compiler that activations [b ...] stay cut over the batch alone, where a mesh is set; else nothing.
 
     Left to itself it may cut their features where it has cut the parameters', which cuDNN's attention cannot take.
@@ -151,7 +151,7 @@ def cut_over_batch(values: jax.Array) -> jax.Array:
     return jax.lax.with_sharding_constraint(values, PartitionSpec(axes)) if even else values
 
 
-def gathered(parameters: Any, *, layer: bool = False) -> Any:
+def gather_parameters(parameters: Any, *, layer: bool = False) -> Any:
     """Parameters that are cut along `fsdp`, whole on every device; their gradients are summed and cut again.
 
     Left to itself the compiler moves activations instead wherever they are the smaller, many times a layer. Nothing is done

@@ -22,7 +22,7 @@ from jax import Array
 from jax.ad_checkpoint import checkpoint_name
 
 from xew.config import ConfigError
-from xew.model.devices.sharding import cut_over_batch
+from xew.model.devices.sharding import shard_over_batch
 from xew.model.network.mechanisms import FramedContext
 from xew.model.network.tokens import WAVELENGTH_BASE
 
@@ -92,7 +92,7 @@ class Block(nnx.Module):
         attended = self.self_attn(modulate(tokens, shift_sa, scale_sa, self.dtype), rotary=rotary, alone=alone, cache=cache)
         tokens = add(tokens, attended, gate_sa)
         asked = self.norm3(tokens).astype(self.dtype)
-        read = self.cross_attn.by_frame(asked, text) if isinstance(text, FramedContext) else self.cross_attn(asked, text)
+        read = self.cross_attn.attend_by_frame(asked, text) if isinstance(text, FramedContext) else self.cross_attn(asked, text)
         tokens = add(tokens, read)
         return add(tokens, self.ffn(modulate(tokens, shift_ffn, scale_ffn, self.dtype)), gate_ffn)
 
@@ -104,7 +104,7 @@ class Block(nnx.Module):
     def _chunks(self, modulation: Array, rows: np.ndarray) -> list[Array]:
         """Six [b s d]: shift, scale and gate of self-attention, then of the feed-forward; never formed at once."""
         chunks = self.modulation[...][None] + modulation
-        return [take_rows(chunks[:, :, i], rows) for i in range(6)]
+        return [select_levels(chunks[:, :, i], rows) for i in range(6)]
 
 
 class Attention(nnx.Module):
@@ -139,7 +139,7 @@ class Attention(nnx.Module):
             attended = jnp.concatenate(parts, axis=1)
         return self.o(attended.reshape(tokens.shape))
 
-    def by_frame(self, tokens: Array, context: FramedContext) -> Array:
+    def attend_by_frame(self, tokens: Array, context: FramedContext) -> Array:
         """tokens [b s d] attend to the shared context; those of the first frames to their own frame's beside it."""
         batch, frames, own, width = context.framed.shape
         shared = self.keys_values(context.shared, None)
@@ -163,7 +163,7 @@ class Attention(nnx.Module):
 
     def _heads(self, values: Array, rotary: Rotary | None) -> Array:
         values = values.reshape(*values.shape[:2], self.heads, -1)
-        return cut_over_batch((values if rotary is None else rotate(values, rotary)).astype(self.dtype))
+        return shard_over_batch((values if rotary is None else rotate(values, rotary)).astype(self.dtype))
 
     def _attend(self, q: Array, k: Array, v: Array) -> Array:
         chosen = choose_attention(self.implementation, q.shape[-1], self.dtype)
@@ -181,7 +181,7 @@ class Head(nnx.Module):
     def __call__(self, tokens: Array, time: Array, rows: np.ndarray) -> Array:
         """Features [b s pt*ph*pw*c] of tokens [b s d]; time [b r d]."""
         chunks = self.modulation[...][None] + time[:, :, None]
-        return self.head(modulate(tokens, take_rows(chunks[:, :, 0], rows), take_rows(chunks[:, :, 1], rows)))
+        return self.head(modulate(tokens, select_levels(chunks[:, :, 0], rows), select_levels(chunks[:, :, 1], rows)))
 
 
 class TwoLayer(nnx.Module):
@@ -219,7 +219,7 @@ def add(tokens: Array, change: Array, gate: Array | None = None) -> Array:
     return (tokens.astype(jnp.float32) + (change if gate is None else change * gate)).astype(tokens.dtype)
 
 
-def take_rows(values: Array, rows: np.ndarray) -> Array:
+def select_levels(values: Array, rows: np.ndarray) -> Array:
     """values[:, rows] [b s d] of [b r d] float32, in forms whose gradient is no scatter (slow on every device).
 
     Two rows are a choice, which fuses into what uses it and whose gradient is a masked sum. More (a row for each latent
@@ -228,24 +228,24 @@ def take_rows(values: Array, rows: np.ndarray) -> Array:
     count = values.shape[1]
     if count <= 2:
         return jnp.where((rows == 0)[None, :, None], values[:, :1], values[:, count - 1 :])
-    return _gather_rows(values, tuple(rows.tolist()))
+    return _gather_levels(values, tuple(rows.tolist()))
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
-def _gather_rows(values: Array, rows: tuple[int, ...]) -> Array:
+def _gather_levels(values: Array, rows: tuple[int, ...]) -> Array:
     return values[:, np.asarray(rows)]
 
 
-def _gather_rows_forward(values: Array, rows: tuple[int, ...]) -> tuple[Array, int]:
-    return _gather_rows(values, rows), values.shape[1]
+def _gather_levels_forward(values: Array, rows: tuple[int, ...]) -> tuple[Array, int]:
+    return _gather_levels(values, rows), values.shape[1]
 
 
-def _gather_rows_backward(rows: tuple[int, ...], count: int, gradient: Array) -> tuple[Array]:
+def _gather_levels_backward(rows: tuple[int, ...], count: int, gradient: Array) -> tuple[Array]:
     has_row = jnp.asarray(np.equal(rows, np.arange(count)[:, None]), gradient.dtype)
     return (jnp.einsum("rs,bsd->brd", has_row, gradient, precision=jax.lax.Precision.HIGHEST),)
 
 
-_gather_rows.defvjp(_gather_rows_forward, _gather_rows_backward)
+_gather_levels.defvjp(_gather_levels_forward, _gather_levels_backward)
 
 
 def rotate(values: Array, rotary: Rotary) -> Array:
@@ -288,13 +288,13 @@ def choose_attention(asked: AttentionName, head_dim: int, dtype: jnp.dtype) -> L
     """
     if asked == "xla":
         return "xla"
-    reason = _cudnn_lacks(head_dim, jnp.dtype(dtype))
+    reason = _reason_against_cudnn(head_dim, jnp.dtype(dtype))
     if reason and asked == "cudnn":
         raise ConfigError(f"attention: cudnn cannot be used: {reason}; set model.attention to auto or xla.")
     return "xla" if reason else "cudnn"
 
 
-def _cudnn_lacks(head_dim: int, dtype: np.dtype) -> str:
+def _reason_against_cudnn(head_dim: int, dtype: np.dtype) -> str:
     """Why cuDNN's attention cannot be used here; empty if it can."""
     device = jax.devices()[0]
     if device.platform != "gpu" or "cuda" not in device.client.platform_version:

@@ -20,7 +20,7 @@ import numpy as np
 from flax import nnx
 from jax import Array
 
-from xew.model.devices.sharding import cut_over_batch, gathered
+from xew.model.devices.sharding import gather_parameters, shard_over_batch
 from xew.model.network.blocks import (
     REMAT,
     AttentionName,
@@ -33,8 +33,8 @@ from xew.model.network.blocks import (
     gelu,
     linear,
     scaled_normal,
+    select_levels,
     stacked_blocks,
-    take_rows,
 )
 from xew.model.network.mechanisms import MECHANISMS, FramedContext, create_mechanism, ray_maps
 from xew.model.network.tokens import (
@@ -172,7 +172,7 @@ class WorldModel(nnx.Module):
         """
         rgb = np.prod(token_grid(latents.shape)).item()
         tokens, rows, rotary = self.embed_streams(latents, conditions, cached=cache is not None)
-        time, rows = self.tell_frames(self.embed_time(sigma), rows, latents.shape, conditions)
+        time, rows = self.add_frame_vectors(self.embed_time(sigma), rows, latents.shape, conditions)
         context = self.framed_context(text, latents.shape, conditions)
         tokens = self.apply_blocks(tokens, self.modulation(time), rows, rotary, context, rgb, cache)
         return unpatchify(self.head(tokens[:, :rgb].astype(jnp.float32), time, rows[:rgb]), latents.shape)
@@ -191,7 +191,7 @@ class WorldModel(nnx.Module):
         graph, layers = nnx.split(self.blocks)
 
         def block(carry: Array, layer: nnx.State) -> tuple[Array, ConditionCache]:
-            module, carry = nnx.merge(graph, gathered(layer, layer=True)), cut_over_batch(carry)
+            module, carry = nnx.merge(graph, gather_parameters(layer, layer=True)), shard_over_batch(carry)
             read = ConditionCache(*module.keys_values(carry, modulation, rows, rotary))
             return module(carry, modulation, rows, rotary, context), read
 
@@ -214,7 +214,7 @@ class WorldModel(nnx.Module):
     def _join(self, inputs: Mapping[str, Array]) -> tuple[Array, np.ndarray, Rotary]:
         grids = {name: token_grid(array.shape) for name, array in inputs.items()}
         tokens = jnp.concatenate([self._embed(name, array) for name, array in inputs.items()], axis=1)
-        rows = np.concatenate([token_rows(self._stream(name), grid) for name, grid in grids.items()])
+        rows = np.concatenate([token_levels(self._stream(name), grid) for name, grid in grids.items()])
         head_dim, base, times = self.size.head_dim, self.size.rotary_base, {"history": self.history}
         angles = np.concatenate([rotary_angles(grid, head_dim, base, times.get(name)) for name, grid in grids.items()])
         rotary = jnp.asarray(np.cos(angles), jnp.float32), jnp.asarray(np.sin(angles), jnp.float32)
@@ -241,7 +241,7 @@ class WorldModel(nnx.Module):
         """The model's mechanisms that enter the network at one place."""
         return [name for name in self.mechanisms if MECHANISMS[name].enters == place]
 
-    def tell_frames(
+    def add_frame_vectors(
         self, time: Array, rows: np.ndarray, shape: Sequence[int], conditions: Mapping[str, Array]
     ) -> tuple[Array, np.ndarray]:
         """Time embeddings [b r d] and rows [s] in which each frame of RGB latents of `shape` has a row of its own.
@@ -253,8 +253,8 @@ class WorldModel(nnx.Module):
         if not names:
             return time, rows
         frames, height, width = token_grid(shape)
-        levels = token_rows(STREAMS["rgb"], (frames, 1, 1))
-        told = sum((self.mechanisms[name](conditions[name]) for name in names), take_rows(time, levels))
+        levels = token_levels(STREAMS["rgb"], (frames, 1, 1))
+        told = sum((self.mechanisms[name](conditions[name]) for name in names), select_levels(time, levels))
         own = np.repeat(time.shape[1] + np.arange(frames), height * width)
         return jnp.concatenate([time, told], axis=1), np.concatenate([own, rows[len(own) :]])
 
@@ -306,8 +306,8 @@ class WorldModel(nnx.Module):
 
         def block(carry: Array, xs: tuple[nnx.State, ConditionCache | None]) -> tuple[Array, None]:
             layer, read = xs
-            module = nnx.merge(graph, gathered(layer, layer=True))
-            return module(cut_over_batch(carry), modulation, rows, rotary, text, alone=alone, cache=read), None
+            module = nnx.merge(graph, gather_parameters(layer, layer=True))
+            return module(shard_over_batch(carry), modulation, rows, rotary, text, alone=alone, cache=read), None
 
         if self.remat != "none":
             # The loop already keeps recomputation apart from the forward pass; only without a loop must it be forced.
@@ -315,7 +315,7 @@ class WorldModel(nnx.Module):
         return jax.lax.scan(block, tokens, (layers, cache), unroll=self.unroll)[0]
 
 
-def token_rows(stream: Stream, grid: tuple[int, int, int]) -> np.ndarray:
+def token_levels(stream: Stream, grid: tuple[int, int, int]) -> np.ndarray:
     """Which noise level each token is told [s]: row 0 is clean, row 1 the sample's own."""
     frames = np.zeros(grid[0], int) if stream.timestep == "clean" else np.minimum(np.arange(grid[0]), 1)
     return np.repeat(frames, grid[1] * grid[2])
@@ -358,7 +358,7 @@ def flops(
     return 2.0 * batch * (size.depth * (of_block + of_text) + of_ends)
 
 
-def compute_params(graph: nnx.GraphDef, params: Any) -> Any:
+def cast_params(graph: nnx.GraphDef, params: Any) -> Any:
     """Parameters with every matrix in the type in which its product is computed; the others stay as they are.
 
     With it the rounding is done once, before the loop over blocks (and over the steps of a sampler), instead of in every

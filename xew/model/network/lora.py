@@ -15,11 +15,11 @@ from jax import Array
 
 from xew.model.devices.sharding import LAYERS, path_names
 
-CORRECTED = ("q", "k", "v", "o", "first", "second")
+LORA_LAYERS = ("q", "k", "v", "o", "first", "second")
 """Linear layers of the blocks that are corrected: both attentions' and the feed-forward's."""
 
 
-def init_corrections(params: Any, rank: int, key: Array) -> dict[str, dict[str, dict[str, Array]]]:
+def init_lora(params: Any, rank: int, key: Array) -> dict[str, dict[str, dict[str, Array]]]:
     """Corrections of the blocks' matrices, all zero in effect: A is normal over the root of its inputs, B is zero.
 
     Returns:
@@ -28,7 +28,7 @@ def init_corrections(params: Any, rank: int, key: Array) -> dict[str, dict[str, 
     corrections = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         names = path_names(path)
-        if is_corrected(names):
+        if is_lora_layer(names):
             key, own = jax.random.split(key)
             layers, inputs, outputs = leaf.shape
             a = jax.random.normal(own, (layers, inputs, rank), jnp.float32) / np.sqrt(inputs).astype(np.float32)
@@ -36,12 +36,12 @@ def init_corrections(params: Any, rank: int, key: Array) -> dict[str, dict[str, 
     return {LAYERS: corrections}
 
 
-def is_corrected(names: Sequence[str]) -> bool:
+def is_lora_layer(names: Sequence[str]) -> bool:
     """Whether the parameter of this path is a matrix that LoRA corrects."""
-    return names[0] == LAYERS and names[-1] == "kernel" and names[-2] in CORRECTED
+    return names[0] == LAYERS and names[-1] == "kernel" and names[-2] in LORA_LAYERS
 
 
-def corrected(base: Any, learned: Any) -> Any:
+def apply_lora(base: Any, learned: Any) -> Any:
     """The network's parameters: `base` plus its corrections, or without a base what was learned itself."""
     if base is None:
         return learned

@@ -24,10 +24,8 @@ from flax import nnx
 from jax import Array
 
 from xew.episode import HEIGHT, WIDTH
-from xew.model.video.frames import padding_to
+from xew.model.video.frames import TEMPORAL_FACTOR, padding_to
 
-GROUP = 4
-"""Frames of video in a latent frame; latent frame 0 holds one, which counts as four equal ones."""
 TOOLS = 14
 """Position, roll-pitch-yaw and gripper of two tools."""
 CAMERA = 16
@@ -80,7 +78,7 @@ class ClipTokens(nnx.Module):
     """Two layers from the tool pose of each frame of video to a context token of all (BWM)."""
 
     def __init__(self, dim: int, numbers: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
-        self.first, self.second = _linear(numbers // GROUP, dim, dtype, rngs), _linear(dim, dim, dtype, rngs)
+        self.first, self.second = _linear(numbers // TEMPORAL_FACTOR, dim, dtype, rngs), _linear(dim, dim, dtype, rngs)
 
     def __call__(self, numbers: Array) -> Array:
         """[b t 4*n] -> [b k d], k the frames of video."""
@@ -91,7 +89,7 @@ class PooledTokens(nnx.Module):
     """A fixed number of learned queries that attend to the actions of all frames of video (EnerVerse-AC's resampler)."""
 
     def __init__(self, dim: int, heads: int, numbers: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
-        self.first = _linear(numbers // GROUP, dim, dtype, rngs)
+        self.first = _linear(numbers // TEMPORAL_FACTOR, dim, dtype, rngs)
         self.queries = nnx.Param(0.02 * jax.random.normal(rngs.params(), (POOLED_TOKENS, dim), jnp.float32))
         self.layers = nnx.List([PoolingLayer(dim, heads, dtype, rngs) for _ in range(POOLING_LAYERS)])
 
@@ -149,27 +147,27 @@ class Mechanism:
 
 
 def _frame_vector(activation: Activation, null: bool) -> Callable[[Any, int, jnp.dtype, nnx.Rngs], nnx.Module]:
-    return lambda size, _, dtype, rngs: FrameVector(size.dim, GROUP * TOOLS, activation, null, rngs)
+    return lambda size, _, dtype, rngs: FrameVector(size.dim, TEMPORAL_FACTOR * TOOLS, activation, null, rngs)
 
 
 MECHANISMS = {
-    "relative_time": Mechanism("time", "numbers", _frame_vector(nnx.gelu, null=True), width=GROUP * TOOLS),
-    "pose_time": Mechanism("time", "numbers", _frame_vector(nnx.silu, null=False), width=GROUP * TOOLS),
+    "relative_time": Mechanism("time", "numbers", _frame_vector(nnx.gelu, null=True), width=TEMPORAL_FACTOR * TOOLS),
+    "pose_time": Mechanism("time", "numbers", _frame_vector(nnx.silu, null=False), width=TEMPORAL_FACTOR * TOOLS),
     "pose_frame": Mechanism(
         "frame", "numbers", lambda size, _, dtype, rngs: FrameTokens(size.dim, TOOLS, dtype, rngs), width=TOOLS
     ),
     "pose_context": Mechanism(
         "context",
         "numbers",
-        lambda size, _, dtype, rngs: ClipTokens(size.dim, GROUP * TOOLS, dtype, rngs),
-        width=GROUP * TOOLS,
+        lambda size, _, dtype, rngs: ClipTokens(size.dim, TEMPORAL_FACTOR * TOOLS, dtype, rngs),
+        width=TEMPORAL_FACTOR * TOOLS,
         replaces_text=True,
     ),
     "pooled_context": Mechanism(
         "context",
         "numbers",
-        lambda size, _, dtype, rngs: PooledTokens(size.dim, size.heads, GROUP * TOOLS, dtype, rngs),
-        width=GROUP * TOOLS,
+        lambda size, _, dtype, rngs: PooledTokens(size.dim, size.heads, TEMPORAL_FACTOR * TOOLS, dtype, rngs),
+        width=TEMPORAL_FACTOR * TOOLS,
     ),
     "map_channels": Mechanism(
         "channels", "latents", lambda size, features, dtype, rngs: Channels(size.dim, features, dtype, rngs)
@@ -199,8 +197,8 @@ def create_mechanism(name: str, size: Any, features: int, dtype: jnp.dtype, rngs
 
 def frames_of_groups(numbers: Array) -> Array:
     """[b t 4*n] of latent frames -> [b 4*(t-1)+1 n] of frames of video: the first group is one frame, four times."""
-    frames = numbers.reshape(len(numbers), GROUP * numbers.shape[1], -1)
-    return frames[:, GROUP - 1 :]
+    frames = numbers.reshape(len(numbers), TEMPORAL_FACTOR * numbers.shape[1], -1)
+    return frames[:, TEMPORAL_FACTOR - 1 :]
 
 
 def ray_maps(camera: Array, shape: Sequence[int]) -> Array:

@@ -21,10 +21,10 @@ from jax.sharding import Mesh, NamedSharding
 
 from xew import config
 from xew.config import ConfigError
-from xew.model.codecs.codec import Codec, codec_of
+from xew.model.codecs.codec import Codec, codec_class
 from xew.model.devices.sharding import state_shardings
 from xew.model.experiment import Experiment, load_experiment
-from xew.model.network.lora import corrected, init_corrections
+from xew.model.network.lora import apply_lora, init_lora
 
 T = TypeVar("T")
 
@@ -184,9 +184,9 @@ def restore_params(out: Path, like: Any, step: int | None = None) -> tuple[Any, 
     if not experiment.adapt.lora_rank:
         return _restore_kept(out, like, step)
     base = restore_start(dataclasses.replace(experiment, out=out), like)  # a run may have been moved
-    shapes = jax.eval_shape(lambda: init_corrections(like, experiment.adapt.lora_rank, jax.random.key(0)))
+    shapes = jax.eval_shape(lambda: init_lora(like, experiment.adapt.lora_rank, jax.random.key(0)))
     corrections, step = _restore_kept(out, _placed_beside(shapes, like), step)
-    return jax.jit(corrected)(base, corrections), step
+    return jax.jit(apply_lora)(base, corrections), step
 
 
 def _restore_kept(out: Path, like: Any, step: int | None) -> tuple[Any, int]:
@@ -274,7 +274,7 @@ def load_run(out: Path) -> tuple[Experiment, Codec]:
     """Config and codec of a run. Raises ConfigError if the folder lacks them."""
     experiment = load_run_config(out)
     try:
-        return experiment, codec_of(experiment.codec).load(out / "codec")
+        return experiment, codec_class(experiment.codec).load(out / "codec")
     except FileNotFoundError as error:
         raise ConfigError(f"{out} lacks its codec ({error.filename}); copy the whole run, or train again.") from error
 

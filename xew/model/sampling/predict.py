@@ -26,11 +26,11 @@ from xew.config import pick
 from xew.model.cache.scales import Scale, apply_scales
 from xew.model.codecs.codec import Codec, encode_pictures, to_pictures, to_signed
 from xew.model.conditions import Condition, clip_numbers
-from xew.model.devices.sharding import batch_sharding, replicated
-from xew.model.diffusion.samplers import GRIDS, SAMPLERS, Grid
+from xew.model.devices.sharding import batch_sharding, replicated_sharding
+from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES, NoiseSchedule
 from xew.model.experiment import Experiment
 from xew.model.latents import Episode, stream_videos
-from xew.model.network.dit import WorldModel, compute_params
+from xew.model.network.dit import WorldModel, cast_params
 
 Streams = dict[str, np.ndarray]
 """Of one whole episode, by stream: uint8 [t h w 3] or float32 [t n]."""
@@ -55,7 +55,7 @@ class Sampling(NamedTuple):
     """How a chunk is sampled; hashable, static in the compiled function."""
 
     sampler: str
-    grid: Grid
+    schedule: NoiseSchedule
     guidance: float
     latent_shape: tuple[int, ...]
 
@@ -120,8 +120,10 @@ class Predictor:
     @property
     def _sampling(self) -> Sampling:
         settings = self.experiment.rollout
-        grid = pick(GRIDS, settings.grid, "grid of noise levels")(settings.steps, settings.shift or self.experiment.train.shift)
-        return Sampling(settings.sampler, grid, settings.guidance, self.experiment.latent_shape)
+        schedule = pick(SCHEDULES, settings.grid, "noise schedule")(
+            settings.steps, settings.shift or self.experiment.train.shift
+        )
+        return Sampling(settings.sampler, schedule, settings.guidance, self.experiment.latent_shape)
 
     def _read(self, episode: Episode) -> Streams:
         conditions = {name: condition for name, condition in self.experiment.conditions.items() if condition.make is not None}
@@ -192,18 +194,18 @@ class Predictor:
         """An array [b ...] over the devices."""
         if self._mesh is None:
             return jnp.asarray(array)
-        return jax.device_put(array, batch_sharding(self._mesh) if self._devices > 1 else replicated(self._mesh))
+        return jax.device_put(array, batch_sharding(self._mesh) if self._devices > 1 else replicated_sharding(self._mesh))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 4))
 def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInputs, sampling: Sampling) -> Array:
     """One chunk of every episode of a batch, from its reference on: uint8 [b t h w 3]."""
-    model = nnx.merge(graph, compute_params(graph, params))
+    model = nnx.merge(graph, cast_params(graph, params))
     reference = codec.encode_batch(to_signed(inputs.reference))
     keys = jax.random.wrap_key_data(inputs.keys)
     noise = jax.vmap(lambda key: jax.random.normal(key, sampling.latent_shape, jnp.float32))(keys)
     velocity, sampler = guided_velocity(model, inputs, sampling.guidance), pick(SAMPLERS, sampling.sampler, "sampler")
-    frames = to_pictures(codec.decode_batch(sampler(velocity, reference, noise, sampling.grid)))
+    frames = to_pictures(codec.decode_batch(sampler(velocity, reference, noise, sampling.schedule)))
     return jax.lax.with_sharding_constraint(frames, PartitionSpec()) if jax.process_count() > 1 else frames
 
 

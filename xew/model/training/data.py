@@ -14,10 +14,11 @@ import numpy as np
 
 from xew.episode import Record
 from xew.model.cache.scales import apply_scales
-from xew.model.codecs.codec import TEMPORAL_FACTOR, latent_frames
+from xew.model.codecs.codec import latent_frames
 from xew.model.experiment import Experiment, replayed
 from xew.model.latents import Episode, LatentCache, load_scales, sample_starts
 from xew.model.text.instructions import VOCABULARY
+from xew.model.video.frames import TEMPORAL_FACTOR
 
 
 @jax.tree_util.register_dataclass

@@ -16,13 +16,14 @@ import jax.numpy as jnp
 from flax import nnx
 
 from xew.config import ConfigError, pick
-from xew.model.codecs.codec import TEMPORAL_FACTOR, latent_frames
+from xew.model.codecs.codec import latent_frames
 from xew.model.codecs.vae import VAES, abstract_vae
 from xew.model.devices.sharding import parameter_spec, path_names
 from xew.model.experiment import Experiment
 from xew.model.network.dit import STREAMS, ModelSize, RematName, flops, token_grid
 from xew.model.training.data import fake_batch
 from xew.model.training.step import abstract_state
+from xew.model.video.frames import TEMPORAL_FACTOR
 
 MARGIN = 1.1
 """Room for what the estimate does not see."""

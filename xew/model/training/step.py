@@ -20,11 +20,11 @@ from jax import Array
 from jax.sharding import Mesh
 
 from xew.model.codecs.codec import Codec
-from xew.model.devices.sharding import gathered, replicated, state_shardings
+from xew.model.devices.sharding import gather_parameters, replicated_sharding, state_shardings
 from xew.model.diffusion.flow_matching import TrainingPair, sample_losses, training_pair
 from xew.model.experiment import Experiment, create_model
-from xew.model.network.dit import compute_params
-from xew.model.network.lora import corrected, init_corrections
+from xew.model.network.dit import cast_params
+from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs.checkpoint import TrainState
 from xew.model.training.data import Batch
 from xew.model.training.optimizer import make_optimizer
@@ -60,7 +60,7 @@ def _init(experiment: Experiment, start: Any) -> TrainState:
     base, learned = None, params
     if experiment.adapt.lora_rank:
         base = params
-        learned = init_corrections(params, experiment.adapt.lora_rank, jax.random.key(experiment.train.seed))
+        learned = init_lora(params, experiment.adapt.lora_rank, jax.random.key(experiment.train.seed))
     ema = jax.tree.map(jnp.copy, learned) if experiment.train.ema_decay else None
     return TrainState(jnp.int32(0), learned, make_optimizer(experiment.train).init(learned), ema, base)
 
@@ -115,7 +115,7 @@ def make_train_step(experiment: Experiment, graph: nnx.GraphDef, mesh: Mesh, cod
         key = jax.random.fold_in(jax.random.key(settings.seed), state.step)
         rows = Rows(batch, chunk_weights(batch), jax.random.split(key, len(batch.latents)))
         params, back = jax.vjp(
-            lambda learned: objective.place(compute_params(graph, corrected(state.base, learned))), state.params
+            lambda learned: objective.place(cast_params(graph, apply_lora(state.base, learned))), state.params
         )
         gradients, losses, sigma = objective.gradients(params, rows, codec)
         (gradients,) = back(jax.tree.map(lambda total, like: total.astype(like.dtype), gradients, params))
@@ -128,8 +128,8 @@ def make_train_step(experiment: Experiment, graph: nnx.GraphDef, mesh: Mesh, cod
         return TrainState(state.step + 1, learned, moments, ema, state.base), result
 
     shardings = state_shardings(abstract_state(experiment)[1], mesh)
-    jitted = jax.jit(step, donate_argnums=0, out_shardings=(shardings, replicated(mesh)))
-    everywhere = jax.device_put(jax.tree.map(np.asarray, codec), replicated(mesh)) if settings.chunks == 2 else None
+    jitted = jax.jit(step, donate_argnums=0, out_shardings=(shardings, replicated_sharding(mesh)))
+    everywhere = jax.device_put(jax.tree.map(np.asarray, codec), replicated_sharding(mesh)) if settings.chunks == 2 else None
     return TrainStep(jitted, mesh, everywhere)
 
 
@@ -197,7 +197,7 @@ class Objective:
         """Gradients, losses [b] and prediction of one chunk, whose samples have these shares in the loss [b]."""
 
         def loss(params: Any) -> tuple[Array, tuple[Array, Array]]:
-            predicted = nnx.merge(self.graph, gathered(params))(pair.noisy, chunk.conditions, pair.sigma, chunk.text)
+            predicted = nnx.merge(self.graph, gather_parameters(params))(pair.noisy, chunk.conditions, pair.sigma, chunk.text)
             losses = sample_losses(predicted, pair, chunk.shown)
             return (shares * losses).sum(), (losses, predicted)
 

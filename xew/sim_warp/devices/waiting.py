@@ -5,7 +5,7 @@ import time
 import warp as wp
 
 PAUSE = 0.0005
-"""Between two looks [s]."""
+"""Time between two looks [s]."""
 
 
 def wait_for(device: wp.Device) -> None:

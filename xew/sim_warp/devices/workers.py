@@ -10,7 +10,6 @@ A worker ignores Ctrl-C (its parent decides) and leaves when its parent is kille
 import multiprocessing
 import os
 import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -21,16 +20,17 @@ import warp
 
 from xew.config import ConfigError
 from xew.episode import EpisodeError
+from xew.processes import leave_with_parent
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
 MEMORY_PER_WORKER = 9e9
-"""Of a GPU [bytes]: a batch of 256 worlds, 512 frames in flight and what CUDA itself takes."""
+"""Memory of a GPU that a worker takes [bytes]: a batch of 256 worlds, 512 frames in flight and what CUDA itself takes."""
 
 
-def named_device(name: str | None) -> warp.Device:
+def find_device(name: str | None) -> warp.Device:
     """The device that a command's --device names, or the one that Warp prefers. Raises ConfigError if it is not there."""
     try:
         return warp.get_device(name)
@@ -99,11 +99,4 @@ def quiet_warp() -> None:
 def _become_worker() -> None:
     quiet_warp()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
-
-
-def _leave_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    leave_with_parent(lambda: os._exit(1))

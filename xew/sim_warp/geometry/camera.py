@@ -1,13 +1,11 @@
-"""Pinhole cameras: where a point of the world lands in the image. NumPy only.
-
-Pixels: x right, y down, (0, 0) is the center of the upper left pixel. Camera frame: x right, y down, z forward.
-"""
+"""Cameras as objects: where they stand and what they show, by the convention of `xew.projection`. NumPy only."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from xew import projection
 from xew.episode import HEIGHT, WIDTH
 
 
@@ -36,7 +34,7 @@ def look_at(
     width: int = WIDTH,
     height: int = HEIGHT,
 ) -> Camera:
-    """A centered camera at `position` [m] that looks at `target` [m], `up` upwards in the image.
+    """A centered camera at `position` [m] that looks at `target` [m], `up` upward in the image.
 
     Args:
         vertical_fov: full vertical angle of view [deg].
@@ -60,15 +58,11 @@ def look_at(
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World points [... 3] in meters -> (pixels [... 2], depth along the optical axis [...] in meters).
+    """Pixels [... 2] and depths along the optical axis [...] m of world points [... 3] m: `projection.project` by a camera.
 
     Points at or behind the camera (depth <= 0) have no image; their pixels are NaN.
     """
-    in_camera = points @ camera.extrinsics[:3, :3].T + camera.extrinsics[:3, 3]
-    depth = in_camera[..., 2]
-    focal = camera.intrinsics[[0, 1], [0, 1]]
-    front = np.where(depth > 0, depth, np.nan)
-    return focal * in_camera[..., :2] / front[..., None] + camera.intrinsics[:2, 2], depth
+    return projection.project(points, camera.intrinsics, camera.extrinsics)
 
 
 HEAD_CAMERA = look_at(position=(-0.032, -0.45, 1.35), target=(-0.032, 0.15, 0.55))

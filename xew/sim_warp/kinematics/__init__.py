@@ -13,6 +13,7 @@ from xew.sim_warp.kinematics.forward import (
     link_poses,
     tool_matrix,
     tool_pose,
+    tool_poses,
 )
 
 __all__ = [
@@ -24,4 +25,5 @@ __all__ = [
     "link_poses",
     "tool_matrix",
     "tool_pose",
+    "tool_poses",
 ]

@@ -32,14 +32,14 @@ def forward_kinematics(robot: RobotSpec | Urdf, joint_pos: np.ndarray) -> dict[s
     from xew.sim_warp.kinematics.batched import BatchedKinematics
 
     urdf = robot if isinstance(robot, Urdf) else load_urdf(robot.urdf)
-    rows = _checked(urdf, joint_pos)
+    rows = _check_rows(urdf, joint_pos)
     batched = BatchedKinematics.of_urdf(urdf, dtype=wp.float64)
     poses = batched.poses(wp.array(rows, dtype=wp.float64, device=batched.device)).numpy()
     found = {link: poses[:, number] for number, (_, link) in enumerate(batched.links[0])}
     return {name: np.ascontiguousarray(found[name]) for name in urdf.links}
 
 
-def _checked(urdf: Urdf, joint_pos: np.ndarray) -> np.ndarray:
+def _check_rows(urdf: Urdf, joint_pos: np.ndarray) -> np.ndarray:
     """joint_pos as float64 [n j]."""
     joint_pos = np.asarray(joint_pos, float)
     if joint_pos.ndim != 2 or joint_pos.shape[1] != len(urdf.joint_names):
@@ -52,7 +52,7 @@ def _checked(urdf: Urdf, joint_pos: np.ndarray) -> np.ndarray:
 
 def link_matrices(urdf: Urdf, joint_pos: np.ndarray) -> dict[str, np.ndarray]:
     """As `forward_kinematics`, but in NumPy and as homogeneous transforms [n 4 4]."""
-    joint_pos = _checked(urdf, joint_pos)
+    joint_pos = _check_rows(urdf, joint_pos)
     column = {name: index for index, name in enumerate(urdf.joint_names)}
     frames = {urdf.root: np.tile(np.eye(4), (len(joint_pos), 1, 1))}
     for joint in urdf.tree:
@@ -76,6 +76,12 @@ def joint_motion(joint: Joint, position: np.ndarray) -> np.ndarray:
 def tool_pose(robot: RobotSpec, arm: int, arm_pos: np.ndarray) -> np.ndarray:
     """World poses [n 7] of the tool frame of arm 0 (left) or 1 (right) at its joint positions `arm_pos` [n d], rad."""
     return pose_from_matrix(tool_matrix(robot, arm, np.asarray(arm_pos, float)))
+
+
+def tool_poses(robot: RobotSpec, action: np.ndarray) -> np.ndarray:
+    """World poses [n 2 7] of the left and right tool frame at canonical rows `action` [n 16] (joints in rad)."""
+    arms = [action[:, joints][:, : robot.arm_joint_count] for joints, _ in ARMS]
+    return np.stack([tool_pose(robot, arm, arm_pos) for arm, arm_pos in enumerate(arms)], axis=1)
 
 
 def tool_matrix(robot: RobotSpec, arm: int, arm_pos: np.ndarray) -> np.ndarray:

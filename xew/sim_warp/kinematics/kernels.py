@@ -1,4 +1,4 @@
-"""Forward kinematics on a device: one thread a configuration walks the tree of joints from the root outwards.
+"""Forward kinematics on a device: one thread a configuration walks the tree of joints from the root outward.
 
 A pose is that of a link, `above` its parent: pose = pose[above] * origin * motion(gain * joint_pos[column] + bias).
 """
@@ -13,13 +13,16 @@ from typing import Any
 import warp as wp
 
 FIXED, TURNING, SLIDING = 0, 1, 2
-"""How the joint above a link moves it."""
+"""Kinds of joint above a link."""
 TYPES = {wp.float32: (wp.vec3f, wp.quatf, wp.transformf), wp.float64: (wp.vec3d, wp.quatd, wp.transformd)}
 
 
 @wp.func
-def tidied(turn: Any):
-    """Of unit length, which rounding has moved by little, so that a step of Newton's for 1/sqrt does; and w >= 0."""
+def normalize_rotation(
+    # In
+    turn: Any,  # quaternion x y z w, float32 or float64, within rounding of unit length
+):
+    """The quaternion at unit length with w >= 0. Rounding moves the length by little: one Newton step for 1/sqrt is enough."""
     scale = turn.dtype(1.5) - turn.dtype(0.5) * wp.dot(turn, turn)
     return turn * wp.where(turn[3] < turn.dtype(0.0), -scale, scale)
 
@@ -33,24 +36,25 @@ def kinematics_kernels(scalar: type) -> SimpleNamespace:
     class Forest:
         """The links of several robots end to end, each robot's parents before their children."""
 
-        links: wp.array(dtype=wp.vec2i)  # [r] first link and number of links
-        above: wp.array(dtype=int)  # [l] the link above, counted within the robot; -1 for the world
-        kind: wp.array(dtype=int)  # [l] FIXED, TURNING or SLIDING
-        origin: wp.array(dtype=frame)  # [l] the link in the one above at joint position 0
-        axis: wp.array(dtype=vector)  # [l] unit, in the frame of the link
-        column: wp.array(dtype=int)  # [l] of joint_pos
-        gain: wp.array(dtype=scalar)  # [l]
+        links: wp.array(dtype=wp.vec2i)  # [r] int32, first link and number of links of a robot
+        above: wp.array(dtype=int)  # [l] int32, the link above, counted within the robot; -1 for the world
+        kind: wp.array(dtype=int)  # [l] int32, FIXED, TURNING or SLIDING
+        origin: wp.array(dtype=frame)  # [l] m and quaternion x y z w, the link in the one above at joint position 0
+        axis: wp.array(dtype=vector)  # [l] unit vector in the frame of the link
+        column: wp.array(dtype=int)  # [l] int32, of joint_pos
+        gain: wp.array(dtype=scalar)  # [l] rad or m for 1 of joint_pos
         bias: wp.array(dtype=scalar)  # [l] rad or m
 
     @wp.kernel(module="unique")
     def forward_kinematics(
-        # In:
-        forest: Forest,
-        robot: wp.array(dtype=int),  # [n], or no elements where there is one robot
-        joint_pos: wp.array2d(dtype=scalar),  # [n j]
-        # Out:
-        pose_out: wp.array3d(dtype=scalar),  # [l 7 n], so that neighboring threads write neighboring numbers
+        # In
+        forest: Forest,  # links of all robots
+        robot: wp.array(dtype=int),  # [n] int32, number of the row's robot; [0] where there is one robot
+        joint_pos: wp.array2d(dtype=scalar),  # [n j] float32 or float64, rad or m, or canonical rows
+        # Out
+        pose_out: wp.array3d(dtype=scalar),  # [l 7 n] as joint_pos, m and quaternion x y z w; threads write side by side
     ):
+        """Walk the links of one configuration from the root outward; one thread a row."""
         row = wp.tid()
         which = 0
         if robot.shape[0] > 0:
@@ -77,7 +81,7 @@ def kinematics_kernels(scalar: type) -> SimpleNamespace:
                     turn = turn * wp.quat_from_axis_angle(forest.axis[link], position)
                 else:
                     place += wp.quat_rotate(turn, forest.axis[link] * position)
-            turn = tidied(turn)
+            turn = normalize_rotation(turn)
             for i in range(3):
                 pose_out[local, i, row] = place[i]
             for i in range(4):

@@ -5,11 +5,13 @@ anywhere importable and name it `module:SPEC` wherever a robot is asked for, or 
 embodiment (docs/add_a_robot.md).
 """
 
+from pathlib import Path
+
 from xew.config import ConfigError, pick
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, UrdfError, load_urdf
 from xew.sim_warp.robots import aloha_agilex, arx_x5, franka_panda, piper, ur5_wsg
-from xew.sim_warp.robots.user.own import FOLDERS, adopt_robots, is_path, keep_robot, kept_robot, load_robot, use_robots_of
+from xew.sim_warp.robots.user.own import FOLDERS, adopt_robots, is_path, keep_robot, kept_robot, load_robot
 
 __all__ = [
     "ROBOTS",
@@ -23,7 +25,6 @@ __all__ = [
     "keep_robot",
     "load_robot",
     "load_urdf",
-    "use_robots_of",
 ]
 
 ROBOTS: dict[str, RobotSpec] = {
@@ -35,18 +36,24 @@ ROBOTS: dict[str, RobotSpec] = {
 }
 
 
-def get_robot(name: str) -> RobotSpec:
+def get_robot(name: str | RobotSpec, data: Path | None = None) -> RobotSpec:
     """The robot of a registry key, of an import path `module:NAME`, at a path, or kept beside data.
 
+    Args:
+        name: of the robot; a robot itself is returned as it is.
+        data: data set whose own robots are looked through, before those in the folders of `XEW_ROBOTS`.
+
     Raises:
-        ConfigError: there is none, or it cannot be used.
+        ConfigError: there is no such robot, or it cannot be used.
     """
+    if isinstance(name, RobotSpec):
+        return name
     if name not in ROBOTS and is_path(name):
         return load_robot(name)
     try:
         return pick(ROBOTS, name, "robot")
     except ConfigError as error:
-        if ":" not in name and (robot := kept_robot(name)):
+        if ":" not in name and (robot := kept_robot(name, data)):
             return robot
         if ":" in name:
             raise

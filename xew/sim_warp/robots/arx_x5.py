@@ -26,7 +26,8 @@ RIGHT = replace(
 
 SPEC = RobotSpec(
     key="arx_x5",
-    title="ARX X5",
+    title="ARX-X5",
+    label="ARX",
     urdf=Path(__file__).parent / "descriptions" / "arx_x5.urdf",
     arms=(LEFT, RIGHT),
     joint_lower=(-3.14, -0.05, -0.1, -1.6, -1.57, -2.0),

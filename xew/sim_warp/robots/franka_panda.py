@@ -26,7 +26,8 @@ RIGHT = replace(
 
 SPEC = RobotSpec(
     key="franka_panda",
-    title="Franka Emika Panda",
+    title="Franka Panda",
+    label="Franka",
     urdf=Path(__file__).parent / "descriptions" / "franka_panda.urdf",
     arms=(LEFT, RIGHT),
     joint_lower=(-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973),

@@ -27,7 +27,8 @@ RIGHT = replace(
 
 SPEC = RobotSpec(
     key="piper",
-    title="AgileX PiPER",
+    title="Piper",
+    label="Piper",
     urdf=Path(__file__).parent / "descriptions" / "piper.urdf",
     arms=(LEFT, RIGHT),
     joint_lower=(-2.6179, 0.0, -2.697, -1.745, -1.22, -2.09439),

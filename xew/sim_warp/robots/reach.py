@@ -9,59 +9,18 @@ from itertools import product
 
 import numpy as np
 import tyro
-from scipy.spatial.transform import Rotation, Slerp
 
 from xew.config import user_errors
 from xew.sim_warp.devices.workers import quiet_warp
-from xew.sim_warp.kinematics.forward import tool_pose
 from xew.sim_warp.kinematics.inverse import ArmSolver
-from xew.sim_warp.plan import tool
+from xew.sim_warp.kinematics.reachability import GRASP_TILT, WORK_X, WORK_Y, WORK_Z, radial_yaw, reaches
 from xew.sim_warp.robots import ROBOTS, RobotSpec, get_robot
 
 X, Y, Z = np.linspace(-0.32, 0.10, 6), np.linspace(-0.25, 0.15, 5), np.array([0.76, 0.85, 0.95])
-"""The work volume of the left arm [m]; the right arm's is its mirror image."""
-WORK_X, WORK_Y, WORK_Z = np.linspace(-0.30, 0.10, 5), np.linspace(-0.20, 0.12, 5), np.array([0.765, 0.80, 0.88])
-"""The part of it where tasks grasp and place."""
+"""Grid over the work volume of the left arm [m]; the right arm's is its mirror image."""
 TILTS, YAWS = (0, 15, 30, 45, 60), (-90, -60, -30, 0, 30, 60, 90)
-"""Degrees; a negative yaw of the left hand turns it inwards. The right arm is given the mirrored yaw."""
-GRASP_TILT = 30
+"""Leans and turns of the left hand [deg]; a negative yaw turns it inward. The right arm is given the mirrored yaw."""
 RADIAL_OFFSETS = (-45, -22.5, 0, 22.5, 45)
-FRAMES = 8
-POSITION_TOLERANCE, ROTATION_TOLERANCE = 2e-3, 0.02
-
-
-def radial_yaw(position: np.ndarray) -> float:
-    """The yaw [degrees] of the left hand at which it points away from its shoulder, a spot common to all robots."""
-    return -float(np.degrees(np.arctan2(position[0] + 0.25, position[1] + 0.45)))
-
-
-def reached(solver: ArmSolver, arm: int, positions: np.ndarray, tilts: np.ndarray, yaws: np.ndarray) -> np.ndarray:
-    """Whether an arm reaches tool poses from home.
-
-    Args:
-        solver: of the robot.
-        arm: 0 (left) or 1 (right), for which positions and yaws are mirrored.
-        positions: [n 3] m, as for the left arm.
-        tilts, yaws: [n] degrees.
-
-    Returns:
-        [n] bool.
-    """
-    mirror = 1 - 2 * arm
-    goals = [
-        tool(p * [mirror, 1, 1], np.radians(mirror * yaw), np.radians(tilt))
-        for p, tilt, yaw in zip(positions, tilts, yaws, strict=True)
-    ]
-    joint_pos = np.tile(solver.robot.arms[arm].home, (len(goals), 1))
-    home = tool_pose(solver.robot, arm, joint_pos[:1])[0]
-    turns = [Slerp([0, 1], Rotation.concatenate([Rotation.from_quat(home[3:]), goal.rotation])) for goal in goals]
-    ends = np.array([goal.position for goal in goals])
-    for share in np.linspace(1 / FRAMES, 1, FRAMES):
-        rotation = np.array([turn(share).as_quat() for turn in turns])
-        pose = np.concatenate([home[:3] + share * (ends - home[:3]), rotation], 1)
-        solution = solver.solve(arm, pose, joint_pos)
-        joint_pos = solution.joint_pos
-    return (solution.position_error < POSITION_TOLERANCE) & (solution.rotation_error < ROTATION_TOLERANCE)
 
 
 def reach_table(robot: RobotSpec) -> np.ndarray:
@@ -69,7 +28,7 @@ def reach_table(robot: RobotSpec) -> np.ndarray:
     solver = ArmSolver(robot)
     cells = list(product(TILTS, YAWS, product(X, Y, Z)))
     tilts, yaws, positions = (np.array(column, float) for column in zip(*cells, strict=True))
-    both = [reached(solver, arm, positions, tilts, yaws).reshape(len(TILTS), len(YAWS), -1).mean(-1) for arm in (0, 1)]
+    both = [reaches(solver, arm, positions, tilts, yaws).reshape(len(TILTS), len(YAWS), -1).mean(-1) for arm in (0, 1)]
     return np.minimum(*both)
 
 
@@ -82,11 +41,11 @@ def work_reach(robot: RobotSpec, arm: int) -> np.ndarray:
     cells = list(product(RADIAL_OFFSETS, product(WORK_X, WORK_Y, WORK_Z)))
     positions = np.array([position for _, position in cells])
     yaws = np.array([radial_yaw(np.array(position)) + offset for offset, position in cells])
-    found = reached(ArmSolver(robot), arm, positions, np.full(len(cells), GRASP_TILT), yaws)
+    found = reaches(ArmSolver(robot), arm, positions, np.full(len(cells), GRASP_TILT), yaws)
     return found.reshape(len(RADIAL_OFFSETS), len(WORK_X), len(WORK_Y), len(WORK_Z))
 
 
-def markdown(robots: list[RobotSpec]) -> str:
+def format_tables(robots: list[RobotSpec]) -> str:
     """Both tables."""
     lines = ["| robot | left arm | right arm |", "|---|---|---|"]
     for robot in robots:
@@ -111,7 +70,7 @@ class Args:
 def main() -> None:
     quiet_warp()
     args = tyro.cli(Args)
-    print(markdown([get_robot(name) for name in args.robots]))
+    print(format_tables([get_robot(name) for name in args.robots]))
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ RIGHT = replace(
 SPEC = RobotSpec(
     key="ur5_wsg",
     title="UR5 with WSG-50",
+    label="UR5",
     urdf=Path(__file__).parent / "descriptions" / "ur5_wsg.urdf",
     arms=(LEFT, RIGHT),
     joint_lower=(-3.1415, -3.1415, -3.1415, -1.75, -3.1415, -3.1415),

@@ -3,8 +3,8 @@
 Reads  a URDF, a folder with robot.yaml, a RoboTwin embodiment folder, or a robot kept in a data set
 Writes <data>/robots/<key>/: robot.yaml with nothing left open, the URDF and all files that it names
 
-Episodes name their robot by its key. Whoever reads them finds the robot in the folders that `XEW_ROBOTS` lists (as PATH
-does), to which `use_robots_of(data)` adds those of a data set; workers inherit it.
+Episodes name their robot by its key. Whoever reads them finds the robot in the data set of the episode, or in the folders that
+`XEW_ROBOTS` lists (as PATH does).
 """
 
 import hashlib
@@ -29,12 +29,12 @@ from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
 from xew.sim_warp.robots.user.draft import OWN, ArmDraft, RobotDraft, find_description, read_draft
 
 FOLDERS = "XEW_ROBOTS"
-"""Environment variable: folders of robots, separated as in PATH."""
+"""Name of the environment variable that lists folders of robots, separated as in PATH."""
 KEPT = "robots"
-"""Folder of a data set that holds its robots."""
+"""Name of the folder of a data set that holds its robots."""
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 STROKE_TOLERANCE = 1e-3
-"""The two fingers of a hand move together: how far their strokes may differ [m]."""
+"""Largest difference between the strokes of the two fingers of a hand, which move together [m]."""
 
 
 def is_path(name: str) -> bool:
@@ -58,7 +58,7 @@ def load_robot(path: Path | str) -> RobotSpec:
 @lru_cache(maxsize=16)
 def _load(description: Path, modified: int) -> RobotSpec:
     draft = read_draft(description)
-    return completed(draft, load_urdf(description.parent / draft.urdf), robot_key(description), str(description))
+    return complete_draft(draft, load_urdf(description.parent / draft.urdf), robot_key(description), str(description))
 
 
 def robot_key(description: Path) -> str:
@@ -73,7 +73,7 @@ def robot_key(description: Path) -> str:
 # --- What a draft leaves open.
 
 
-def completed(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> RobotSpec:
+def complete_draft(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> RobotSpec:
     """A RobotSpec of a draft and its URDF; `source` names the draft in errors."""
     arms = _arms(draft, urdf, source)
     counts = [len(arm.joints) for arm in arms]
@@ -89,26 +89,26 @@ def completed(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> RobotSpec
         joint_upper=tuple(upper.tolist()),
         joint_velocity=tuple(speed.tolist()),
     )
-    return _settled(draft, robot, source)
+    return _settle(draft, robot, source)
 
 
 def _arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]:
-    from xew.sim_warp.robots.user.infer import arm_joints, at_tips, find_fingers, finger_ends, hand_link, tool_frame
+    from xew.sim_warp.robots.user.infer import arm_joints, find_fingers, finger_ends, hand_link, tool_at_tips, tool_frame
 
-    told = _alike(draft.arms)
+    told = _fill_right_arm(draft.arms)
     found = [] if all(arm.fingers for arm in told) else find_fingers(urdf)
     arms: list[Arm] = []
     for side, given in enumerate(told):
         fingers = given.fingers or found[min(side, len(found) - 1)]
-        _demand_joints(urdf, fingers, source)
+        _check_joints(urdf, fingers, source)
         joints = given.joints or arm_joints(urdf, fingers)
-        _demand_joints(urdf, joints, source)
+        _check_joints(urdf, joints, source)
         ends = finger_ends(urdf, fingers)
         closed, opened = given.finger_closed or ends[0], given.finger_open or ends[1]
-        link = _link_named(urdf, given.tool_link, source) if given.tool_link else hand_link(urdf, fingers)
+        link = _find_link(urdf, given.tool_link, source) if given.tool_link else hand_link(urdf, fingers)
         tool = given.tool_pose or tool_frame(urdf, joints, fingers, ends[0])
         if given.tool_pose and given.tool_at_tips:
-            tool = at_tips(urdf, link, Rotation.from_quat(given.tool_pose[3:]).as_matrix(), fingers, ends[0])
+            tool = tool_at_tips(urdf, link, Rotation.from_quat(given.tool_pose[3:]).as_matrix(), fingers, ends[0])
         arms.append(
             Arm(
                 root_pose=given.root_pose or IDENTITY,
@@ -117,28 +117,28 @@ def _arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]:
                 tool_link=link,
                 tool_pose=tool,
                 fingers=fingers,
-                finger_closed=_inside(urdf, fingers, closed),
-                finger_open=_inside(urdf, fingers, opened),
+                finger_closed=_clip_fingers(urdf, fingers, closed),
+                finger_open=_clip_fingers(urdf, fingers, opened),
             )
         )
         _check_arm(urdf, arms[-1], source)
     return arms[0], arms[1]
 
 
-def _alike(arms: tuple[ArmDraft, ArmDraft]) -> tuple[ArmDraft, ArmDraft]:
+def _fill_right_arm(arms: tuple[ArmDraft, ArmDraft]) -> tuple[ArmDraft, ArmDraft]:
     """Where the right arm is left open it is told as the left, but for its home."""
     left, right = arms
     return (left, replace(left, home=None)) if right == ArmDraft() else (left, right)
 
 
-def _demand_joints(urdf: Urdf, names: Sequence[str], source: str) -> None:
+def _check_joints(urdf: Urdf, names: Sequence[str], source: str) -> None:
     if missing := [name for name in names if name not in urdf.joints]:
         raise ConfigError(
             f"{source}: {urdf.path.name} has no joint {', '.join(missing)}; it has {', '.join(urdf.joint_names)}."
         )
 
 
-def _link_named(urdf: Urdf, name: str, source: str) -> str:
+def _find_link(urdf: Urdf, name: str, source: str) -> str:
     """A link, or the child link of a joint, as RoboTwin names it."""
     if name in urdf.links:
         return name
@@ -147,7 +147,7 @@ def _link_named(urdf: Urdf, name: str, source: str) -> str:
     raise ConfigError(f"{source}: {urdf.path.name} has no link or joint {name}; name the one that carries the tool.")
 
 
-def _inside(urdf: Urdf, fingers: tuple[str, str], positions: tuple[float, float]) -> tuple[float, float]:
+def _clip_fingers(urdf: Urdf, fingers: tuple[str, str], positions: tuple[float, float]) -> tuple[float, float]:
     """Finger positions within the URDF's limits: RoboTwin's scales reach beyond them, to press."""
     first, second = (
         min(max(position, urdf.joints[name].lower), urdf.joints[name].upper)
@@ -186,11 +186,11 @@ def _limits(draft: RobotDraft, urdf: Urdf, arms: tuple[Arm, Arm], source: str) -
     return lower, upper, speed
 
 
-def _settled(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
+def _settle(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
     """The robot with bases and homes, given or found."""
     from xew.sim_warp.robots.user import placement
 
-    left, right = _alike(draft.arms)
+    left, right = _fill_right_arm(draft.arms)
     if left.root_pose is not None and left.home is not None and right.home is not None:
         return robot
     bases = robot.arms[0].root_pose, robot.arms[1].root_pose
@@ -198,12 +198,12 @@ def _settled(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
 
     def settle(robot: RobotSpec) -> RobotSpec:
         if left.root_pose is None:
-            return placement.with_place(robot, near)
+            return placement.find_place(robot, near)
         if not robot.one_urdf_holds_both_arms and bases[0][0] == bases[1][0]:
-            return placement.with_distance(robot, near, draft.distance)
-        return placement.with_home(robot, near)
+            return placement.find_distance(robot, near, draft.distance)
+        return placement.find_homes(robot, near)
 
-    return settle(robot) if left.tool_pose else placement.better_turned(robot, settle)
+    return settle(robot) if left.tool_pose else placement.try_turned_tools(robot, settle)
 
 
 def _posture(arm: ArmDraft, robot: RobotSpec, source: str) -> np.ndarray | None:
@@ -223,23 +223,15 @@ def adopt_robots(names: Sequence[str], data: Path) -> tuple[str, ...]:
     Raises:
         ConfigError: a robot cannot be used, or the data set holds another of that key.
     """
-    use_robots_of(data)
     return tuple(_adopt(Path(name), data) if is_path(name) else name for name in names)
 
 
-def use_robots_of(data: Path) -> None:
-    """Let the robots that a data set holds be found by their keys, in this process and those that it starts."""
-    folder = str((Path(data) / KEPT).resolve())
-    known = [entry for entry in os.environ.get(FOLDERS, "").split(os.pathsep) if entry]
-    if folder not in known:
-        os.environ[FOLDERS] = os.pathsep.join([folder, *known])
-
-
-def kept_robot(key: str) -> RobotSpec | None:
-    """The robot of a key in the folders of `XEW_ROBOTS`, if there is one."""
-    for folder in os.environ.get(FOLDERS, "").split(os.pathsep):
-        if folder and (Path(folder) / key / OWN).is_file():
-            return load_robot(Path(folder) / key)
+def kept_robot(key: str, data: Path | None = None) -> RobotSpec | None:
+    """The robot of a key that a data set keeps, or else a folder of `XEW_ROBOTS`; None where neither has it."""
+    listed = [Path(folder) for folder in os.environ.get(FOLDERS, "").split(os.pathsep) if folder]
+    for folder in [*([] if data is None else [Path(data) / KEPT]), *listed]:
+        if (folder / key / OWN).is_file():
+            return load_robot(folder / key)
     return None
 
 
@@ -292,7 +284,7 @@ def _write(robot: RobotSpec, digest: str, folder: Path) -> None:
         inside = urdf.path.relative_to(top)
         (temporary / inside).parent.mkdir(parents=True, exist_ok=True)
         (temporary / inside).write_bytes(_with_relative_meshes(urdf))
-        content = _described(robot, str(inside), digest)
+        content = _robot_yaml(robot, str(inside), digest)
         (temporary / OWN).write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 
 
@@ -305,11 +297,11 @@ def _with_relative_meshes(urdf: Urdf) -> bytes:
     return ElementTree.tostring(tree.getroot(), encoding="utf-8", xml_declaration=True)
 
 
-def _described(robot: RobotSpec, urdf: str, digest: str) -> dict[str, object]:
+def _robot_yaml(robot: RobotSpec, urdf: str, digest: str) -> dict[str, object]:
     """A robot.yaml that leaves nothing open."""
     limits = {name: list(getattr(robot, name)) for name in ("joint_lower", "joint_upper", "joint_velocity")}
-    return {"urdf": urdf, "title": robot.title, "arms": [_plain(arm) for arm in robot.arms], **limits, "source": digest}
+    return {"urdf": urdf, "title": robot.title, "arms": [_plain_arm(arm) for arm in robot.arms], **limits, "source": digest}
 
 
-def _plain(arm: Arm) -> dict[str, object]:
+def _plain_arm(arm: Arm) -> dict[str, object]:
     return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(arm).items()}
