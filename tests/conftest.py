@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from jaxtyping import install_import_hook
@@ -19,6 +20,46 @@ CHECK_SHAPES = os.environ.get("XEW_CHECK_SHAPES", "1") != "0"
 """Whether shapes and types of arrays are checked at every call; benchmarks of tests turn it off by XEW_CHECK_SHAPES=0."""
 LOOSE = (("loose_types", "jax_numpy_dtype_promotion", "standard"), ("loose_ranks", "jax_numpy_rank_promotion", "allow"))
 """Mark, option of JAX, and its value under the mark."""
+SLOW = (
+    "tests/analysis/reports/",
+    "tests/analysis/studies/test_study_debug.py",
+    "tests/analysis/test_report.py",
+    "tests/analysis/test_study.py::test_cells_run_as_tasks_on_a_ray_cluster",
+    "tests/analysis/test_study.py::test_steps_run_as_tasks_on_a_ray_cluster",
+    "tests/legacy/",
+    "tests/metrics/estimators/test_sam2.py",
+    "tests/metrics/grading/test_resume.py",
+    "tests/metrics/test_calibrate.py",
+    "tests/metrics/test_evaluate.py",
+    "tests/metrics/test_page.py::test_examples_print_what_they_say",
+    "tests/metrics/test_perceptual.py",
+    "tests/metrics/test_states.py",
+    "tests/model/codecs/",
+    "tests/model/devices/test_many_devices.py",
+    "tests/model/network/test_dit.py",
+    "tests/model/network/test_dit_parity.py",
+    "tests/model/network/test_mechanisms.py",
+    "tests/model/test_export.py",
+    "tests/model/test_latents.py::test_latents_from_states_are_those_from_video",
+    "tests/model/test_latents.py::test_only_what_is_needed_is_read",
+    "tests/model/test_pipeline.py",
+    "tests/model/test_rollout.py",
+    "tests/model/test_systems.py",
+    "tests/model/test_train_vae.py",
+    "tests/model/text/",
+    "tests/model/training/test_training.py",
+    "tests/sim_warp/assets/",
+    "tests/sim_warp/production/test_produce.py",
+    "tests/sim_warp/tasks/",
+    "tests/sim_warp/test_benchmarks.py",
+    "tests/sim_warp/test_generate.py",
+    "tests/sim_warp/test_kill.py::test_kills_change_no_byte",
+    "tests/sim_warp/test_scene.py",
+    "tests/test_adding.py",
+    "tests/test_docs.py::test_a_page_does_what_it_says",
+)
+"""Beginnings of the names of tests that make test-fast leaves out: whole commands, trainings, simulations, and parity with
+other people's networks. Taken from --durations; a test is slow, too, when it bears the mark."""
 CACHE_DAYS = 14
 """Number of days for which a compiled program that no session has written again is kept."""
 
@@ -42,6 +83,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "loose_ranks(reason): arrays of different rank may meet; says whose code needs that")
     folder = Path(os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(config.rootpath / ".pytest_cache" / "jax")))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # most of the time is compiling, and little is computed
     if not hasattr(config, "workerinput"):
         remove_old_files(folder)
 
@@ -53,13 +95,31 @@ def remove_old_files(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the slow tests; files that have some go first, so that no worker is left with a long file at the end."""
+    for item in items:
+        if item.nodeid.startswith(SLOW):
+            item.add_marker(pytest.mark.slow)
+    slow_files = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow_files)
+
+
 @pytest.fixture(scope="session", autouse=True)
-def strict_arrays() -> None:
+def strict_arrays() -> Iterator[None]:
     """JAX neither converts types nor adds axes silently, in fixtures of any scope and in threads too."""
     import jax
 
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_numpy_rank_promotion", "raise")
+    packbits = jax.numpy.packbits
+
+    def packbits_with_promotion(*arguments: Any, **named: Any) -> jax.Array:
+        with jax.numpy_rank_promotion("allow"):  # JAX's own code shifts [... 8 n] by [8 1]
+            return packbits(*arguments, **named)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax.numpy, "packbits", packbits_with_promotion)
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -50,6 +50,8 @@ FORBIDDEN = {
 """Libraries that a room does not import, inside functions neither."""
 WITH_TORCH = ("xew.model.weights.tensors",)
 """Modules of `model` that may import PyTorch inside functions: files of weights that only it can read."""
+REGISTRIES = {"analysis": "xew.model.conditions"}
+"""Registry of another room that a room may read at once, for titles; it loads without JAX and Warp."""
 STATISTICS_STANDS_ON = ("xew.statistics", "xew.protocol", "xew.config")
 METRIC_READERS = {"evaluate", "backends", "grade", "truth", "calibrate"}
 """Files at the root of `metrics` that may touch the disk or anything of ours outside the room; the others are pure."""
@@ -76,6 +78,7 @@ def room_failures(sources: Sources) -> list[str]:
             {"torch"} if source.module in WITH_TORCH and not touches(at_once, "torch") else set()
         )
         failures += [f"{source.name} imports {name}" for name in sorted(libraries) if touches(names, name)]
+        names = {name for name in names if not touches([name], REGISTRIES.get(source.room, "none"))}
         for other in sorted(MAY_IMPORT.keys() - {"", "statistics", source.room}):
             if not touches(names, f"{package}.{other}"):
                 continue
