@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Bool, Float32
 
 from xew.metrics.mergeable.sums import Mean, Mergeable, empty_mean, mean_of, merge_means
-from xew.metrics.metric import ByFrame, Contacts, Scalar, Tracks, Valid, check_contacts, check_first, check_tracks
+from xew.metrics.metric import AnyArray, ByFrame, Contacts, Scalar, Tracks, Valid, check_contacts, check_first, check_tracks
 
 PointValues: TypeAlias = Float32[jax.Array, "t k"]
 
@@ -119,7 +119,7 @@ def contact_f1(prediction: Contacts, target: Contacts, tolerance: int = 0) -> Sc
     return jnp.where(counts[0] + counts[1] > 0, score, 1).astype(jnp.float32)
 
 
-def _widened(contact: jax.Array, frames: int) -> jax.Array:
+def _widened(contact: AnyArray, frames: int) -> jax.Array:
     """[t c] true within so many frames of a true one."""
     shifted = jnp.pad(contact, ((frames, frames), (0, 0)))
     return functools.reduce(jnp.logical_or, (shifted[i : i + len(contact)] for i in range(2 * frames + 1)))
@@ -190,7 +190,7 @@ def box_diagonal(points: Tracks, valid: Valid) -> ByFrame:
     return _norm(extent)
 
 
-def _path_cost(prediction: jax.Array, target: jax.Array, tracked: jax.Array) -> jax.Array:
+def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray) -> jax.Array:
     """DTW cost of two paths [t 2] over the tracked frames.
 
     Tracked frames come first, in order, so that the cost of the paths is the cell (n - 1, n - 1) of the whole table,
@@ -218,13 +218,13 @@ def _path_cost(prediction: jax.Array, target: jax.Array, tracked: jax.Array) -> 
     return table[2 * end, end]
 
 
-def _distance(prediction: jax.Array, target: jax.Array) -> jax.Array:
+def _distance(prediction: AnyArray, target: AnyArray) -> jax.Array:
     """[t k] Euclidean distance; infinite where the prediction has no point."""
     found = _found(prediction)
     return jnp.where(found, _norm(jnp.where(found[..., None], prediction, target) - target), jnp.inf)
 
 
-def _found(points: jax.Array) -> jax.Array:
+def _found(points: AnyArray) -> jax.Array:
     return jnp.all(jnp.isfinite(points), axis=-1)
 
 
@@ -234,7 +234,7 @@ def _norm(vector: jax.Array) -> jax.Array:
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0).astype(jnp.float32)
 
 
-def _masked_mean(values: jax.Array, keep: jax.Array, axis: int | None = None) -> jax.Array:
+def _masked_mean(values: jax.Array, keep: AnyArray, axis: int | None = None) -> jax.Array:
     """Mean of the kept values; NaN where none is."""
     return jnp.sum(jnp.where(keep, values, 0), axis=axis) / jnp.sum(keep, axis=axis).astype(jnp.float32)
 
