@@ -55,7 +55,7 @@ def test_arrays_have_the_types_that_the_renderer_packs(name: str) -> None:
     assert (mesh.vertices.dtype, mesh.triangles.dtype) == (np.float32, np.int32)
     assert (mesh.colors.dtype, mesh.normals.dtype) == (np.uint8, np.float32)
     assert mesh.colors.shape == mesh.triangles.shape and (mesh.colors == RED).all()
-    assert 0 <= mesh.triangles.min() and mesh.triangles.max() < len(mesh.vertices)
+    assert mesh.triangles.min() >= 0 and mesh.triangles.max() < len(mesh.vertices)
 
 
 def test_edges_of_a_box_are_sharp_and_a_ball_is_smooth() -> None:
