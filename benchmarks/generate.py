@@ -25,7 +25,8 @@ import numpy as np
 import tyro
 import warp as wp
 
-from xew.episode import Record, find_accepted, find_records, verify_episode
+from xew.dataset import find_accepted, find_records
+from xew.episode import Record, verify_episode
 from xew.sim_warp import generate
 from xew.sim_warp.devices.workers import has_kernels, worker_count
 from xew.sim_warp.production.cells import Cell, Job, plan_cells, simulate_cells

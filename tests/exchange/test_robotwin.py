@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from tests.exchange import robotwin_file as made
+from xew.dataset import find_accepted
 from xew.episode import (
     HEIGHT,
     WIDTH,
     EpisodeError,
     Record,
     demand_known,
-    find_accepted,
     read_record,
     read_states,
     read_video,
@@ -24,7 +24,7 @@ from xew.episode import (
 )
 from xew.exchange import robotwin
 from xew.exchange.hdf5 import decode_picture, read_robotwin, tool_center
-from xew.exchange.robotwin import Args, find_episodes, fitted, import_all, main
+from xew.exchange.robotwin import Args, find_episodes, fit_bases, import_all, main
 from xew.protocol import LEFT_ARM, LEFT_GRIPPER, RIGHT_ARM, RIGHT_GRIPPER
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
 from xew.sim_warp.robots import ROBOTS, get_robot
@@ -151,8 +151,8 @@ def test_files_may_be_named_from_their_own_folder(tmp_path: Path, monkeypatch: p
 
 def test_another_robot_is_not_taken_for_it(tmp_path: Path) -> None:
     recorded = read_robotwin(made.write_legacy(tmp_path / LEGACY))
-    assert fitted(ROBOTS["arx_x5"], recorded) is not None
-    assert fitted(ROBOTS["piper"], recorded) is None and fitted(ROBOTS["franka_panda"], recorded) is None
+    assert fit_bases(ROBOTS["arx_x5"], recorded) is not None
+    assert fit_bases(ROBOTS["piper"], recorded) is None and fit_bases(ROBOTS["franka_panda"], recorded) is None
     records, refused = import_all([tmp_path / LEGACY], Args(tmp_path, tmp_path / "out", robot="piper"))
     assert not refused and set(records[0].hashes) == {"states", "rgb"} and records[0].keypoint_names == ()
 

@@ -12,7 +12,8 @@ import pytest
 from tests.sim_warp.small import TASK
 from tests.synthetic import write_synthetic_data
 from xew.config import ConfigError
-from xew.episode import find_accepted, read_record, read_states, read_video
+from xew.dataset import find_accepted
+from xew.episode import read_record, read_states, read_video
 from xew.metrics import METRICS
 from xew.metrics.calibrate import (
     ESTIMATED,

@@ -1,6 +1,8 @@
 """Conditions are made of commands alone, by structure and by trial."""
 
 import os
+import subprocess
+import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -18,19 +20,21 @@ from xew.model.conditions import (
     POINTING_DOWN,
     Command,
     Condition,
+    System,
     camera,
     clip_numbers,
-    command_of,
+    list_conditions,
+    make_command,
     relative_tool_poses,
     tool_deltas,
     tool_poses,
 )
-from xew.model.latents import episode_command
+from xew.model.episodes.commands import episode_command
 from xew.protocol import ACTION_DIM, ROBOT_NAMES
 from xew.sim_warp.robots import ROBOTS, keep_robot
 
 STORED = [condition for condition in (ACTIONS["joints"], CONDITIONS["robot_render"]) if isinstance(condition, Condition)]
-SYSTEMS = {name: entry for name, entry in ACTIONS.items() if isinstance(entry, tuple)}
+SYSTEMS = {name: entry for name, entry in ACTIONS.items() if isinstance(entry, System) and entry.conditions}
 NUMBERS = [condition for system in SYSTEMS.values() for condition in system if condition.make in (tool_poses, camera)]
 
 
@@ -58,7 +62,7 @@ def test_robots_of_ones_own_are_those_of_the_data_set_of_the_episode(episode: Pa
 def test_no_condition_sees_the_recorded_future(episode: Path, condition: object) -> None:
     """Turn everything that was recorded from frame 1 on upside down: the condition stays as it was."""
     record, states = read_record(episode), read_states(episode)
-    before = condition.make(command_of(episode, record, states))
+    before = condition.make(make_command(episode, record, states))
     changed = replace(
         states,
         joint_pos=states.joint_pos[::-1] + 1,
@@ -70,25 +74,43 @@ def test_no_condition_sees_the_recorded_future(episode: Path, condition: object)
         robot_mask=~states.robot_mask,
     )
     write_episode(episode.parents[2], record, changed, 255 - read_video(episode / "rgb.mkv"), read_video(episode / "robot.mkv"))
-    after = condition.make(command_of(episode, read_record(episode), read_states(episode)))
+    after = condition.make(make_command(episode, read_record(episode), read_states(episode)))
     np.testing.assert_array_equal(before, after)
 
 
 def test_joints_are_the_commands(episode: Path) -> None:
     states = read_states(episode)
-    joints = ACTIONS["joints"].make(command_of(episode, read_record(episode), states))
+    joints = ACTIONS["joints"].make(make_command(episode, read_record(episode), states))
     assert joints.shape == (5, ACTION_DIM)
     np.testing.assert_array_equal(joints, states.action)
 
 
 def test_registries_name_what_feeds_each_stream() -> None:
     for registry in (ACTIONS, CONDITIONS):
-        assert registry["none"] is None
+        assert list_conditions(registry["none"]) == ()
         assert all(entry.name == name for name, entry in registry.items() if isinstance(entry, Condition))
-    assert {condition.stream for condition in CONDITIONS.values() if condition} == {"embodiment"}
+        assert all(entry.title and entry.label for entry in registry.values())
+        assert (
+            len({entry.title for entry in registry.values()})
+            == len({entry.label for entry in registry.values()})
+            == len(registry)
+        )
+    assert {condition.stream for entry in CONDITIONS.values() for condition in list_conditions(entry)} == {"embodiment"}
     assert {entry.stream for entry in ACTIONS.values() if isinstance(entry, Condition)} == {"action", "joints"}
     for system in SYSTEMS.values():
-        assert len({condition.stream for condition in system}) == len(system)
+        assert len({condition.stream for condition in system}) == len(system.conditions)
+
+
+def test_what_a_user_gives_in_the_place_of_an_entry_is_taken() -> None:
+    """A condition, a tuple of them as in docs/models.md, or a system."""
+    joints = ACTIONS["joints"]
+    assert list_conditions(joints) == list_conditions((joints,)) == list_conditions(System((joints,), "", "")) == (joints,)
+
+
+def test_the_registries_load_without_jax_and_warp() -> None:
+    """Tables take their titles from here, and a report is written where neither is wanted."""
+    script = "import sys, xew.model.conditions; assert not {'jax', 'flax', 'warp', 'newton'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", script], check=True)
 
 
 def wandering(frames: int = 12) -> np.ndarray:
@@ -109,7 +131,7 @@ def test_tool_poses_are_forward_kinematics_of_commands(tmp_path: Path, robot: st
 
     folder = synthetic.write_cell(tmp_path, "place_empty_cup", 0, robot, frames=5)
     states = read_states(folder)
-    poses = tool_poses(command_of(folder, read_record(folder), states))
+    poses = tool_poses(make_command(folder, read_record(folder), states))
     assert poses.shape == (5, 14) and poses.dtype == np.float32
     spec = ROBOTS[robot]
     copies = joint_positions(spec, states.action.astype(float))
@@ -191,7 +213,7 @@ def test_numbers_of_a_clip() -> None:
 
 def test_scales_of_training_numbers_come_back_from_disk(tmp_path: Path) -> None:
     folders = [synthetic.write_cell(tmp_path, "place_empty_cup", seed, "piper", frames=9) for seed in range(3)]
-    commands = [command_of(folder, read_record(folder), read_states(folder)) for folder in folders]
+    commands = [make_command(folder, read_record(folder), read_states(folder)) for folder in folders]
     conditions = {condition.stream: condition for condition in (*SYSTEMS["ctrl_world"], *SYSTEMS["enerverse_ac"])}
     scales = fit_scales(conditions.values(), commands)
     assert set(scales) == {"tool_poses", "tool_deltas"}

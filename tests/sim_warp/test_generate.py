@@ -13,7 +13,8 @@ import pytest
 
 from tests.sim_warp.small import SLOW, TASK
 from xew.config import ConfigError
-from xew.episode import EpisodeError, Record, episode_folder, find_accepted, find_records, verify_episode, write_episode
+from xew.dataset import find_accepted, find_records
+from xew.episode import EpisodeError, Record, episode_folder, verify_episode, write_episode
 from xew.protocol import TEST_SEED_START
 from xew.sim_warp import generate as command
 from xew.sim_warp.devices.workers import Workers

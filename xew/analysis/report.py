@@ -37,7 +37,8 @@ from xew.analysis.tables import formats
 from xew.analysis.tables.layouts import Block, Cell, Table, interval_text, metric_columns, number
 from xew.analysis.tables.layouts import Row as TableRow
 from xew.config import ConfigError, user_errors
-from xew.episode import Record, episode_folder, find_records, read_video
+from xew.dataset import find_records
+from xew.episode import Record, episode_folder, read_video
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
 

@@ -30,7 +30,7 @@ from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import Machines, gpus_of, open_machines
 from xew.analysis.studies.plan import STAGES, Cell, in_order, plan, write_configs
 from xew.config import ConfigError, save, user_errors
-from xew.episode import find_accepted
+from xew.dataset import find_accepted
 from xew.protocol import seed_split
 
 CHECK_CONFIGS = """

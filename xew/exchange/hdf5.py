@@ -1,4 +1,4 @@
-"""What one RoboTwin HDF5 file holds, in our conventions: `read_robotwin(path)`.
+"""Reader of RoboTwin's HDF5 files: `read_robotwin(path)` gives one episode in our conventions.
 
 Reads  the legacy layout (observation/, joint_action/, endpose/) and that of version 1.0 (vision/, state/)
 Writes `Recorded`
@@ -20,11 +20,11 @@ import numpy as np
 from xew.episode import HEIGHT, WIDTH, EpisodeError
 
 TOOL_OFFSET = 0.12
-"""RoboTwin's end pose lies this far behind the tool center point, along the approach [m], whatever the robot."""
+"""Distance of RoboTwin's end pose behind the tool center point, along the approach [m], whatever the robot."""
 RGB_MARK = b"XPL-RGB1"
 """JPEG comment of pictures that are ordinary JPEGs."""
 TABLE_CENTER = (0.0, 0.0, 0.74)
-"""What a head camera sees, world frame [m]."""
+"""Point that a head camera sees, world frame [m]."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Recorded:
     """One episode as RoboTwin recorded it, in our units, frames and orders."""
 
     layout: str
-    """"legacy" or "1.0"."""
+    """Layout of the file: "legacy" or "1.0"."""
     arms: np.ndarray
     """[t 2 d] drive targets of the left and right arm [rad]."""
     grippers: np.ndarray
@@ -46,7 +46,7 @@ class Recorded:
     extrinsics: np.ndarray
     """[4 4] world to camera."""
     instruction: str
-    """Empty where the file has none."""
+    """Instruction; empty where the file has none."""
 
 
 def read_robotwin(path: Path) -> Recorded:
@@ -58,31 +58,31 @@ def read_robotwin(path: Path) -> Recorded:
     try:
         with h5py.File(path, "r") as file:
             reader = _Reader(path, file)
-            return _modern(reader) if "state" in file else _legacy(reader)
+            return _read_modern(reader) if "state" in file else _read_legacy(reader)
     except EpisodeError:
         raise
     except Exception as error:  # h5py has OSError, RuntimeError and others for damaged files
         raise EpisodeError(f"{path} cannot be read as HDF5 ({' '.join(str(error).split())}); copy it again.") from error
 
 
-def _legacy(reader: "_Reader") -> Recorded:
+def _read_legacy(reader: "_Reader") -> Recorded:
     arms = [reader.numbers(f"joint_action/{side}_arm", 2) for side in ("left", "right")]
     grippers = [reader.numbers(f"joint_action/{side}_gripper", 1) for side in ("left", "right")]
     ends = [f"endpose/{side}_endpose" for side in ("left", "right")]
     camera = "observation/head_camera"
-    return _recorded(
+    return _assemble(
         reader, "legacy", arms, grippers, ends, f"{camera}/rgb", f"{camera}/intrinsic_cv", f"{camera}/extrinsic_cv"
     )
 
 
-def _modern(reader: "_Reader") -> Recorded:
+def _read_modern(reader: "_Reader") -> Recorded:
     """Version 1.0: `state` is what was in force at a frame; its `action` is the state of the next one and adds nothing."""
     arms = [reader.numbers(f"state/{side}_arm_joint_states", 2) for side in ("left", "right")]
     grippers = [reader.column(f"state/{side}_ee_joint_states") for side in ("left", "right")]
     ends = [f"state/{side}_ee_poses" for side in ("left", "right")]
     camera = "vision/cam_head"
     extrinsics = next((n for n in ("extrinsics_matrix", "extrinsic_matrix") if f"{camera}/{n}" in reader.file), "")
-    return _recorded(
+    return _assemble(
         reader,
         "1.0",
         arms,
@@ -94,7 +94,7 @@ def _modern(reader: "_Reader") -> Recorded:
     )
 
 
-def _recorded(
+def _assemble(
     reader: "_Reader",
     layout: str,
     arms: list[np.ndarray],
@@ -108,22 +108,22 @@ def _recorded(
     poses = [reader.numbers(name, 2) for name in ends] if all(name in reader.file for name in ends) else []
     if not frames or any(len(array) != frames for array in (*arms, *grippers, *poses)):
         counts = ", ".join(str(len(array)) for array in (*arms, *grippers, *poses))
-        raise reader.wrong(f"arms, grippers and end poses have {counts} frames", "as many of each, at least one")
+        raise reader.error(f"arms, grippers and end poses have {counts} frames", "as many of each, at least one")
     if arms[0].shape != arms[1].shape or arms[0].shape[1] not in (6, 7):
-        raise reader.wrong(f"the arms have {arms[0].shape[1]} and {arms[1].shape[1]} joints", "six or seven each")
+        raise reader.error(f"the arms have {arms[0].shape[1]} and {arms[1].shape[1]} joints", "six or seven each")
     if any(pose.shape[1] != 7 for pose in poses):
-        raise reader.wrong("the end poses have another shape", "[frames 7]")
+        raise reader.error("the end poses have another shape", "[frames 7]")
     rgb = reader.pictures(pictures, frames)
     if any(np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1).max() > 0.01 for pose in poses):
-        raise reader.wrong("the end poses hold quaternions that are not of length 1", "x y z and a unit quaternion w x y z")
+        raise reader.error("the end poses hold quaternions that are not of length 1", "x y z and a unit quaternion w x y z")
     scale = rgb.shape[2] / WIDTH
     return Recorded(
         layout,
         np.stack(arms, 1),
         np.stack(grippers, 1),
         np.stack([tool_center(pose) for pose in poses], 1) if poses else None,
-        np.stack([_resized(image) for image in rgb]) if scale != 1 else rgb,
-        _pixels(reader.constant(intrinsics, (3, 3)), scale),
+        np.stack([_resize(image) for image in rgb]) if scale != 1 else rgb,
+        _center_pixels(reader.constant(intrinsics, (3, 3)), scale),
         _world_to_camera(reader, extrinsics),
         reader.instruction(),
     )
@@ -145,12 +145,12 @@ def decode_picture(encoded: bytes) -> np.ndarray | None:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if is_ordinary else image
 
 
-def _resized(image: np.ndarray) -> np.ndarray:
+def _resize(image: np.ndarray) -> np.ndarray:
     return cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
 
 
-def _pixels(intrinsics: np.ndarray, scale: float) -> np.ndarray:
-    """RoboTwin counts pixels from the upper left corner of the first, we from its center."""
+def _center_pixels(intrinsics: np.ndarray, scale: float) -> np.ndarray:
+    """K [3 3] of pixels that count from the center of the first, as ours do; RoboTwin counts from its upper left corner."""
     found = intrinsics.copy()
     found[:2] /= scale
     found[:2, 2] -= 0.5
@@ -158,22 +158,25 @@ def _pixels(intrinsics: np.ndarray, scale: float) -> np.ndarray:
 
 
 def _world_to_camera(reader: "_Reader", name: str) -> np.ndarray:
-    """[4 4], from either direction: of a matrix and its inverse the one under which the camera hangs over the table, sees it
-    and looks as the robot does, to +y. (The head camera's inverse sees the table too, from the other side.)"""
+    """World to camera [4 4] m, of a matrix that is stored in either direction.
+
+    Of the matrix and its inverse it is the one under which the camera hangs over the table, sees it and looks as the robot
+    does, to +y. (The head camera's inverse sees the table too, from the other side.)
+    """
     stored = reader.constant(name, None)
     if stored.shape not in ((3, 4), (4, 4)):
-        raise reader.wrong(f"{name} has shape {stored.shape}", "[3 4] or [4 4]")
+        raise reader.error(f"{name} has shape {stored.shape}", "[3 4] or [4 4]")
     matrix = np.eye(4)
     matrix[:3] = stored[:3]
     if not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-3):
-        raise reader.wrong(f"{name} holds no rotation", "a rigid transform between world and camera (z forward)")
+        raise reader.error(f"{name} holds no rotation", "a rigid transform between world and camera (z forward)")
     for candidate in (matrix, np.linalg.inv(matrix)):
         x, y, z, _ = candidate @ [*TABLE_CENTER, 1]
         height = -candidate[:3, 2] @ candidate[:3, 3]
         looks_ahead = candidate[2, 1] > 0
         if height > TABLE_CENTER[2] and looks_ahead and z > 0 and max(abs(x), abs(y)) < z:
             return candidate
-    raise reader.wrong(
+    raise reader.error(
         f"{name} looks away from the table", "the head camera in OpenCV's convention (x right, y down, z forward)"
     )
 
@@ -195,55 +198,57 @@ class _Reader:
         return found
 
     def numbers(self, name: str, dimensions: int) -> np.ndarray:
+        """Finite numbers [...] float64 in so many dimensions."""
         stored = self.dataset(name)
         if stored.ndim != dimensions or stored.dtype.kind not in "fiu":
-            raise self.wrong(f"{name} is {stored.dtype} of shape {stored.shape}", f"numbers in {dimensions} dimensions")
+            raise self.error(f"{name} is {stored.dtype} of shape {stored.shape}", f"numbers in {dimensions} dimensions")
         array = np.asarray(stored[()], np.float64)
         if not np.isfinite(array).all():
-            raise self.wrong(f"{name} holds numbers that are not finite", "finite ones")
+            raise self.error(f"{name} holds numbers that are not finite", "finite ones")
         return array
 
     def column(self, name: str) -> np.ndarray:
-        """[t] from [t] or [t 1]."""
+        """Numbers [t] that are stored as [t] or [t 1]."""
         array = self.numbers(name, self.dataset(name).ndim)
         if array.ndim != 1 and array.shape[1:] != (1,):
-            raise self.wrong(f"{name} has shape {array.shape}", "[frames 1]: a gripper of one number")
+            raise self.error(f"{name} has shape {array.shape}", "[frames 1]: a gripper of one number")
         return array.reshape(len(array))
 
     def constant(self, name: str, shape: tuple[int, ...] | None) -> np.ndarray:
-        """A matrix that is stored once or, the same, for every frame."""
+        """A matrix [r c] that is stored once or, the same, for every frame."""
         stored = self.numbers(name, self.dataset(name).ndim)
         first = stored[0] if stored.ndim == 3 else stored
         if stored.ndim not in (2, 3) or (shape is not None and first.shape != shape):
-            raise self.wrong(f"{name} has shape {stored.shape}", f"a matrix {list(shape or (4, 4))}, or one a frame")
+            raise self.error(f"{name} has shape {stored.shape}", f"a matrix {list(shape or (4, 4))}, or one a frame")
         if stored.ndim == 3 and not np.allclose(stored, first, atol=1e-4):
-            raise self.wrong(f"{name} changes during the episode", "a camera that stands still")
+            raise self.error(f"{name} changes during the episode", "a camera that stands still")
         return first
 
     def pictures(self, name: str, frames: int) -> np.ndarray:
+        """Decoded pictures [t h w 3] uint8 RGB."""
         stored = self.dataset(name)
         if len(stored) != frames:
-            raise self.wrong(f"{name} has {len(stored)} pictures", f"one for each of {frames} frames")
+            raise self.error(f"{name} has {len(stored)} pictures", f"one for each of {frames} frames")
         decoded = []
         for frame, entry in enumerate(stored[()]):
             encoded = entry.tobytes() if isinstance(entry, np.ndarray) else bytes(entry)
             image = decode_picture(encoded)
             if image is None:
-                raise self.wrong(f"{name}, frame {frame}, cannot be decoded", "a JPEG picture")
+                raise self.error(f"{name}, frame {frame}, cannot be decoded", "a JPEG picture")
             decoded.append(image)
         sizes = {image.shape[:2] for image in decoded}
         if len(sizes) > 1 or next(iter(sizes))[1] * HEIGHT != next(iter(sizes))[0] * WIDTH:
-            raise self.wrong(f"{name} holds pictures of (height, width) {sorted(sizes)}", f"one size, {WIDTH}:{HEIGHT}")
+            raise self.error(f"{name} holds pictures of (height, width) {sorted(sizes)}", f"one size, {WIDTH}:{HEIGHT}")
         return np.stack(decoded)
 
     def instruction(self) -> str:
         """The first instruction in the file, or in the file of instructions beside it."""
         found = self.file.get("instructions")
         if isinstance(found, h5py.Dataset):
-            return _first_instruction(_text(found[()]))
+            return _first_instruction(_as_text(found[()]))
         return _first_instruction(text_beside(self.path, f"instructions/{self.path.stem}.json"))
 
-    def wrong(self, found: str, expected: str) -> EpisodeError:
+    def error(self, found: str, expected: str) -> EpisodeError:
         return EpisodeError(f"{self.path}: {found}; expected {expected}.")
 
 
@@ -256,14 +261,14 @@ def text_beside(episode: Path, name: str) -> str:
         raise EpisodeError(f"{path} cannot be read as text ({error}); copy it again, or remove it.") from error
 
 
-def _text(value: object) -> str:
+def _as_text(value: object) -> str:
     if isinstance(value, np.ndarray):
         value = value.reshape(-1)[0] if value.size else ""
     return value.decode() if isinstance(value, bytes) else str(value)
 
 
 def _first_instruction(text: str) -> str:
-    """Of a JSON list, of RoboTwin's {"seen": […], "unseen": […]}, or plain text."""
+    """The first entry of a JSON list, of RoboTwin's {"seen": […], "unseen": […]}, or plain text."""
     try:
         content = json.loads(text)
     except ValueError:

@@ -30,27 +30,17 @@ import tyro
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.episode import (
-    HEIGHT,
-    WIDTH,
-    EpisodeError,
-    Record,
-    States,
-    complete_folder,
-    find_accepted,
-    read_states,
-    read_video,
-)
-from xew.protocol import seed_split
+from xew.dataset import read_dataset
+from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, States, complete_folder, read_states, read_video
 
 VERSION = "v3.0"
 RATE = Fraction(50, 3)
 """Frames a second."""
 FILES_PER_CHUNK = 1000
 LARGEST_DATA, LARGEST_VIDEO = 100, 200
-"""Size at which a file is closed and the next begun [MB]."""
+"""Sizes at which a file is closed and the next begun [MB]."""
 ENCODER = {"crf": "16", "g": "2", "bf": "0", "preset": "veryfast"}
-"""Of x264: every other frame is a key frame, so that single frames are read fast."""
+"""Options of x264: every other frame is a key frame, so that single frames are read fast."""
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 AXES = [f"{side}_{axis}" for side in ("left", "right") for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
 JOINTS = [f"{side}_{name}" for side in ("left", "right") for name in (*(f"joint{number}" for number in range(1, 8)), "gripper")]
@@ -59,7 +49,7 @@ VECTORS = {
     "observation.state": ("joint_pos", JOINTS),
     "observation.tool_pose": ("tool_pose", AXES),
 }
-"""Feature -> array of `States` and names of its numbers."""
+"""Array of `States` and names of its numbers, by feature."""
 SCALARS = {"next.done": "bool", "next.success": "bool", "timestamp": "float32"} | dict.fromkeys(
     ("frame_index", "episode_index", "index", "task_index"), "int64"
 )
@@ -73,18 +63,19 @@ class Args:
     out: Path
     """Folder of the LeRobotDataset; it must not exist."""
     robots: tuple[str, ...] = ()
-    """Default: all in the data."""
+    """Robots to export; default: all in the data."""
     tasks: tuple[str, ...] = ()
-    """Default: all in the data."""
+    """Tasks to export; default: all in the data."""
     split: Literal["train", "test"] | None = None
-    """Only training seeds, or only test seeds; default: both. Who trains on the set and grades on ours exports the first."""
+    """Training seeds or test seeds; default: both. Export the training seeds if you train on the set and grade on our test
+    seeds."""
     robot_video: bool = False
-    """Also the robot alone, as observation.images.robot."""
+    """Export the video of the robot alone too, as observation.images.robot."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """A file of a kind, as LeRobot numbers them."""
+    """Number of a file of its kind, as LeRobot counts chunks and files."""
 
     chunk: int = 0
     file: int = 0
@@ -92,7 +83,7 @@ class Place:
     def path(self, root: Path, ending: str) -> Path:
         return root / f"chunk-{self.chunk:03d}" / f"file-{self.file:03d}.{ending}"
 
-    def after(self) -> "Place":
+    def next_place(self) -> "Place":
         return Place(self.chunk, self.file + 1) if self.file + 1 < FILES_PER_CHUNK else Place(self.chunk + 1, 0)
 
 
@@ -104,7 +95,7 @@ def export(args: Args) -> tuple[int, list[str]]:
     """
     if args.out.exists():
         raise EpisodeError(f"{args.out} exists; choose another --out, or remove it first.")
-    chosen = _chosen(args)
+    chosen = _select_episodes(args)
     vectors = {
         feature: entry for feature, entry in VECTORS.items() if not any(entry[0] in record.unknown for _, record in chosen)
     }
@@ -121,21 +112,15 @@ def export(args: Args) -> tuple[int, list[str]]:
     return len(chosen), [feature for feature in VECTORS if feature not in vectors]
 
 
-def _chosen(args: Args) -> list[tuple[Path, Record]]:
-    accepted = find_accepted(args.data)
+def _select_episodes(args: Args) -> list[tuple[Path, Record]]:
+    dataset = read_dataset(args.data)
     for flag, asked, known in (
-        ("--robots", args.robots, {record.robot for _, record in accepted}),
-        ("--tasks", args.tasks, {record.task for _, record in accepted}),
+        ("--robots", args.robots, {record.robot for _, record in dataset.accepted}),
+        ("--tasks", args.tasks, {record.task for _, record in dataset.accepted}),
     ):
         if missing := sorted(set(asked) - known):
             raise EpisodeError(f"{flag} {', '.join(missing)}: not in {args.data}; it has {', '.join(sorted(known))}.")
-    found = [
-        (folder, record)
-        for folder, record in accepted
-        if (not args.robots or record.robot in args.robots)
-        and (not args.tasks or record.task in args.tasks)
-        and args.split in (None, seed_split(record.seed))
-    ]
+    found = dataset.select(robots=args.robots or None, tasks=args.tasks or None, split=args.split)
     if not found:
         raise EpisodeError(f"{args.data} has no episode of these robots, tasks and seeds; name fewer.")
     return found
@@ -223,11 +208,11 @@ class _Tables:
             self.writer.close()
 
     def add(self, columns: dict[str, np.ndarray]) -> Place:
-        """Append an episode; where it is."""
+        """Append the rows of an episode, arrays [t n] or [t] by feature; returns the file that has them."""
         rows = _arrow(columns)
         if self.writer is not None and self.bytes + rows.nbytes > LARGEST_DATA * 1e6:
             self.writer.close()
-            self.writer, self.bytes, self.place = None, 0, self.place.after()
+            self.writer, self.bytes, self.place = None, 0, self.place.next_place()
         if self.writer is None:
             path = self.place.path(self.root, "parquet")
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -252,10 +237,10 @@ class _Films:
         self._close()
 
     def add(self, video: np.ndarray) -> dict[str, Any]:
-        """Append an episode [t h w 3] uint8 RGB; the columns that say where it is."""
+        """Append the video of an episode [t h w 3] uint8 RGB; returns the columns that say where it is."""
         if self.container is not None and self.bytes > LARGEST_VIDEO * 1e6:
             self._close()
-            self.place = self.place.after()
+            self.place = self.place.next_place()
         if self.container is None:
             self._open(video.shape[2], video.shape[1])
         begin = self.frames
@@ -308,11 +293,13 @@ class _Totals:
     frames: int = 0
 
     def add(self, columns: dict[str, np.ndarray]) -> None:
+        """Take in the numbers of an episode, [t n] or [t] by feature."""
         for name, values in columns.items():
             self.columns.setdefault(name, []).append(values)
         self.frames += len(columns["index"])
 
     def add_colors(self, key: str, counts: np.ndarray) -> None:
+        """Take in how often each value occurs in a video [3 256]."""
         self.colors[key] = self.colors.get(key, 0) + counts
 
     def statistics(self) -> dict[str, dict[str, Any]]:
@@ -321,7 +308,7 @@ class _Totals:
 
 
 def _statistics(values: np.ndarray) -> dict[str, list[Any]]:
-    """Of [t n] or [t] over the frames: lists of n numbers."""
+    """Statistics over the frames of numbers [t n] or [t], as lists of n numbers."""
     rows = values.reshape(len(values), -1).astype(np.float64)
     found = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
     found |= {name: np.quantile(rows, share, axis=0) for name, share in QUANTILES.items()}

@@ -43,11 +43,11 @@ EMBODIMENTS = {
 }
 """RoboTwin's names of robots, and ours."""
 TOOL_DISTANCE = {"aloha_agilex": 0.12, "arx_x5": 0.12, "ur5_wsg": 0.11, "franka_panda": 0.08, "piper": 0.12}
-"""From the link that carries the tool to RoboTwin's tool center point [m] (gripper_bias of its embodiments)."""
+"""Distance from the link that carries the tool to RoboTwin's tool center point [m] (gripper_bias of its embodiments)."""
 FIT_POSITION, FIT_ROTATION = 0.01, 0.05
-"""Median distance [m] and angle [rad] between end poses and those of a robot's joints, up to which it is that robot."""
+"""Largest median distance [m] and angle [rad] between end poses and those of a robot's joints at which it is that robot."""
 SAME_PLACE = 0.003
-"""How far the bases of two episodes of one robot may differ [m]."""
+"""Largest distance between the bases of two episodes of one robot [m]."""
 UNKNOWN = ("joint_pos", "joint_vel", "object_pose", "object_joint", "contact", "penetration", "keypoint_visible", "robot_mask")
 SOURCE = "RoboTwin HDF5"
 
@@ -57,12 +57,12 @@ class Args:
     """What to import."""
 
     source: Annotated[Path, tyro.conf.Positional]
-    """A RoboTwin episode (.hdf5), or a folder of them at any depth."""
+    """Path of a RoboTwin episode (.hdf5), or of a folder with them at any depth."""
     out: Path = Path("data")
     robot: str | None = None
-    """A key of the registry, module:NAME or the path of a robot; default: told by the names of the folders."""
+    """Registry key, module:NAME or path of a robot; default: the one that the names of the folders tell."""
     task: str | None = None
-    """Default: the name of the folder two above the one that holds the file, as RoboTwin lays them out."""
+    """Name of the task; default: that of the folder two above the one that holds the file, as RoboTwin lays them out."""
 
 
 def find_episodes(source: Path) -> list[Path]:
@@ -100,7 +100,7 @@ def import_episode(path: Path, args: Args) -> Record:
                 f"{path}: {beside.parent} was simulated here; RoboTwin's seed {seed} is another scene. Import it as another "
                 "--task or into another --out."
             )
-    states, names, video = _seen(robot, action, recorded)
+    states, names, video = _build_states(robot, action, recorded)
     record = Record(
         task=task,
         seed=seed,
@@ -125,7 +125,7 @@ def canonical_action(recorded: Recorded) -> np.ndarray:
     return action
 
 
-def fitted(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
+def fit_bases(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
     """The robot with the bases and tool frames from which the recorded joints bring its tools to the recorded end poses.
 
     Targets run ahead of what is measured, so the bases are the median over the episode.
@@ -145,7 +145,7 @@ def fitted(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
         reached = tool_matrix(replace(robot, arms=(unplaced, unplaced)), 0, recorded.arms[:, side])
         measured = matrix_from_pose(recorded.tool_pose[:, side])
         bases = pose_from_matrix(measured @ np.linalg.inv(reached))
-        base = _middle(bases)
+        base = _middle_pose(bases)
         off = pose_from_matrix(np.linalg.inv(matrix_from_pose(base)) @ matrix_from_pose(bases))
         angle = 2 * np.arccos(np.clip(off[:, 6], -1, 1))
         if np.median(np.linalg.norm(off[:, :3], axis=1)) > FIT_POSITION or np.median(angle) > FIT_ROTATION:
@@ -155,8 +155,8 @@ def fitted(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
     return replace(robot, arms=(arms[0], arms[1]), title=f"{robot.title} as placed in RoboTwin")
 
 
-def _middle(poses: np.ndarray) -> np.ndarray:
-    """Of poses [t 7] the one nearest to their median, so that it is a pose."""
+def _middle_pose(poses: np.ndarray) -> np.ndarray:
+    """The pose [7] of poses [t 7] that is nearest to their median."""
     aligned = np.concatenate([poses[:, :3], poses[:, 3:] * np.where(poses[:, 3:] @ poses[0, 3:] < 0, -1, 1)[:, None]], 1)
     return poses[int(np.argmin(np.linalg.norm(aligned - np.median(aligned, axis=0), axis=1)))]
 
@@ -167,7 +167,7 @@ def _robot(path: Path, recorded: Recorded, args: Args) -> tuple[str, RobotSpec |
     robot = get_robot(named, args.out)
     if is_path(named) and (tool := read_draft(find_description(Path(named))).arms[0].tool_pose):
         robot = replace(robot, arms=(replace(robot.arms[0], tool_pose=tool), replace(robot.arms[1], tool_pose=tool)))
-    placed = fitted(robot, recorded)
+    placed = fit_bases(robot, recorded)
     if placed is None:
         return f"{robot.key}_robotwin", None
     key = f"{robot.key}_robotwin"
@@ -183,7 +183,7 @@ def _robot(path: Path, recorded: Recorded, args: Args) -> tuple[str, RobotSpec |
 
 
 def _embodiment(path: Path) -> str:
-    """Our key of the robot that the names of the folders tell."""
+    """Our key of the robot that a folder above the file is named after."""
     for part in reversed(path.absolute().parts[:-1]):
         for theirs, ours in EMBODIMENTS.items():
             if theirs.lower().replace("-", "_") in part.lower().replace("-", "_"):
@@ -209,8 +209,10 @@ def _seed(path: Path) -> int:
     return int(seeds[number]) if number < len(seeds) and seeds[number].isdigit() else number
 
 
-def _seen(robot: RobotSpec | None, action: np.ndarray, recorded: Recorded) -> tuple[States, tuple[str, ...], np.ndarray | None]:
-    """States, names of keypoints and the robot-only video, as far as they can be known."""
+def _build_states(
+    robot: RobotSpec | None, action: np.ndarray, recorded: Recorded
+) -> tuple[States, tuple[str, ...], np.ndarray | None]:
+    """States, names of keypoints and the robot-only video [t h w 3] of commands [t 16], as far as they can be known."""
     frames, height, width = recorded.rgb.shape[:3]
     camera = Camera(recorded.intrinsics, recorded.extrinsics)
     names: tuple[str, ...] = ()

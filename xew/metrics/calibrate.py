@@ -24,7 +24,8 @@ from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from xew.config import ConfigError, user_errors
-from xew.episode import EpisodeError, Record, find_accepted, read_video
+from xew.dataset import find_accepted
+from xew.episode import EpisodeError, Record, read_video
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
 from xew.metrics.calibration.wrong import WrongVideo, wrong_videos
@@ -173,7 +174,7 @@ def another(episodes: Sequence[Episode], record: Record, differs: str) -> Path |
 def open_codec(run: Path) -> Callable[[np.ndarray], np.ndarray]:
     """What a run's codec leaves of a video uint8 [t h w 3]. Raises ConfigError if there is no such run."""
     # Only here: the metrics load without the model.
-    from xew.model.runs.checkpoint import load_run
+    from xew.model.runs.folder import load_run
     from xew.model.video.frames import to_camera_size, to_model_size
 
     try:

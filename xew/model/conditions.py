@@ -3,85 +3,91 @@
 Reads  a `Command`: which robot, its commanded joints, the camera, and the robot-only render of those commands
 Writes uint8 [t h w 3] pictures for the codec, or float32 [t n] numbers
 To add one: a function of a Command and one line in ACTIONS or CONDITIONS; from outside the repo, `module:NAME` of a
-`Condition`, or of a tuple of them. The last entries of ACTIONS are the paper's other systems: each is a combination of
-mechanisms (mechanisms.py) in the same network.
+`Condition`, or of a tuple of them. Titles and labels stand here too, and tables and figures take them from here, so this
+file imports neither JAX nor Warp when it is loaded. The last entries of ACTIONS are the paper's other systems: each is a
+combination of mechanisms (network/mechanisms.py) in the same network.
 
 A Command holds nothing that was measured or seen in the scene, so that no condition can show the future.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from jaxtyping import Float, Float32, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
 from xew.episode import Record, States, data_folder, read_video
-from xew.model.network.mechanisms import GROUP
+from xew.model.video.frames import TEMPORAL_FACTOR
 from xew.protocol import ARMS
 
 if TYPE_CHECKING:
-    from xew.sim_warp.embodiment.spec import RobotSpec
-    from xew.sim_warp.geometry.camera import Camera
-    from xew.sim_warp.rendering.streams import CommandStreams
+    import xew.sim_warp.embodiment.spec
+    import xew.sim_warp.geometry.camera
+    import xew.sim_warp.rendering.streams
+
+Video = UInt8[np.ndarray, "t h w 3"]
+Poses = Float[np.ndarray, "t 14"]
+"""Position [m, world], roll, pitch, yaw [rad] and gripper of the left tool, then of the right."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """Everything a condition may be made from."""
+    """Everything that a condition may be made from."""
 
     robot: str
-    action: np.ndarray
-    """[t 16] float32, commanded joints."""
-    intrinsics: np.ndarray
-    """[3 3] head camera's K."""
-    extrinsics: np.ndarray
-    """[4 4] world to camera."""
+    action: Float[np.ndarray, "t 16"]
+    """Commanded joints [t 16] float32, in the canonical layout."""
+    intrinsics: Float[np.ndarray, "3 3"]
+    """Matrix K [3 3] of the head camera [pixels]."""
+    extrinsics: Float[np.ndarray, "4 4"]
+    """Matrix [4 4] from the world to the head camera's frame."""
     render_path: Path
-    """The stored robot-only video, posed by `action` on a white ground."""
-    rendered: np.ndarray | None = None
-    """The same [t h w 3] uint8, where it is at hand."""
+    """Path of the stored robot-only video, posed by `action` on a white ground."""
+    rendered: Video | None = None
+    """The same video [t h w 3] uint8, where it is in memory."""
     data: Path | None = None
     """Data set of the episode, which keeps robots of a user's own."""
 
     @cached_property
-    def render(self) -> np.ndarray:
-        """uint8 [t h w 3], the robot-only video."""
+    def render(self) -> Video:
+        """The robot-only video [t h w 3] uint8."""
         return read_video(self.render_path) if self.rendered is None else self.rendered
 
     @cached_property
-    def streams(self) -> "CommandStreams":
+    def streams(self) -> "xew.sim_warp.rendering.streams.CommandStreams":
         """Render, mask and optical flow of the commands; Warp is imported when first asked for."""
         from xew.sim_warp.rendering.streams import command_streams
 
         return command_streams(self.robot_spec, self.action, self.camera)
 
     @cached_property
-    def tools(self) -> np.ndarray:
-        """float64 [t 2 7], commanded world poses of the left and right tool, x y z w quaternions, by forward kinematics."""
+    def tools(self) -> Float[np.ndarray, "t 2 7"]:
+        """Commanded poses [t 2 7] float64 of the left and right tool in the world: position [m], quaternion x y z w."""
         from xew.sim_warp.kinematics.forward import tool_poses
 
         return tool_poses(self.robot_spec, self.action)
 
     @cached_property
-    def robot_spec(self) -> "RobotSpec":
+    def robot_spec(self) -> "xew.sim_warp.embodiment.spec.RobotSpec":
         """The simulator's description of the robot: of the registry, or kept beside the data."""
         from xew.sim_warp.robots import get_robot
 
         return get_robot(self.robot, self.data)
 
     @property
-    def camera(self) -> "Camera":
+    def camera(self) -> "xew.sim_warp.geometry.camera.Camera":
         """The simulator's own camera object."""
         from xew.sim_warp.geometry.camera import Camera
 
         return Camera(self.intrinsics, self.extrinsics)
 
 
-def unchanged(numbers: np.ndarray) -> np.ndarray:
-    """Numbers as they are."""
+def keep_numbers(numbers: Shaped[np.ndarray, "t n"]) -> Shaped[np.ndarray, "t n"]:
+    """Numbers [t n] as they are."""
     return numbers
 
 
@@ -90,106 +96,149 @@ class Condition:
     """One kind of condition and where it enters the network."""
 
     name: str
-    """Also its name in the latent cache."""
+    """Name in the latent cache; another content needs another name."""
     stream: str
     """A stream of the network (`dit.STREAMS`) or a mechanism (`mechanisms.MECHANISMS`)."""
     make: Callable[[Command], np.ndarray] | None
-    """uint8 [t h w 3], or float32 [t n]. None is the scene's own earlier frames, which no command knows."""
+    """Function that makes uint8 [t h w 3] or float32 [t n]. None stands for the scene's own earlier frames, which no command
+    knows."""
     aligned: bool = True
-    """One frame for each frame of the episode; else a short description (4 k + 1 frames) that every chunk reuses."""
-    change: Callable[[np.ndarray], np.ndarray] = unchanged
-    """Numbers of the frames of a clip [t n] -> what is told of them [t n], in which later frames change nothing."""
+    """Whether it has one frame for each frame of the episode. Else it is a short description of 4 k + 1 frames, which every
+    chunk reuses."""
+    change: Callable[[np.ndarray], np.ndarray] = keep_numbers
+    """Function from the numbers of a clip's frames [t n] to what the network is told of them [t n]; a later frame changes
+    nothing of an earlier one."""
     group: bool = False
-    """A latent frame is told the numbers of its four frames [t' 4*n], else those of its last [t' n]."""
+    """Whether a latent frame is told the numbers of its four frames [t' 4*n], or those of its last [t' n]."""
     scale: Literal["none", "percentiles", "standard"] = "none"
-    """How numbers are brought to a common size by those of the training episodes (scales.py)."""
+    """Normalization of numbers by those of the training episodes (cache/scales.py)."""
     with_history: bool = False
-    """Earlier frames (`model.history`) are told theirs too, before the clip's."""
+    """Whether earlier frames (`model.history`) are told theirs too, before the clip's."""
+    title: str = ""
+    """Name at the head of a table's row or a figure."""
+    label: str = ""
+    """What the network is told, in a few words."""
 
 
-def clip_numbers(condition: Condition, numbers: np.ndarray, start: int, frames: int, history: Sequence[int] = ()) -> np.ndarray:
-    """What is told of one clip: float32 [rows n].
+@dataclass(frozen=True)
+class System:
+    """Conditions that belong together, at most one for each stream or mechanism."""
+
+    conditions: tuple[Condition, ...]
+    title: str
+    """Name at the head of a table's row or a figure."""
+    label: str
+    """What the network is told, in a few words."""
+
+    def __iter__(self) -> Iterator[Condition]:
+        return iter(self.conditions)
+
+
+def list_conditions(entry: Condition | System | Sequence[Condition]) -> tuple[Condition, ...]:
+    """The conditions of a registry's entry, or of what a user gives in its place."""
+    return (entry,) if isinstance(entry, Condition) else tuple(entry)
+
+
+def clip_numbers(
+    condition: Condition, numbers: Shaped[np.ndarray, "t n"], start: int, frames: int, history: Sequence[int] = ()
+) -> Float32[np.ndarray, "latent_frames told"]:
+    """What the network is told of one clip by a condition of numbers.
 
     Args:
-        numbers: of the whole episode [t n]; before its start and past its end the nearest frame counts.
-        start, frames: of the clip.
+        condition: how frames are grouped, and whether earlier ones count.
+        numbers: [t n] of the whole episode; before its start and past its end the nearest frame counts.
+        start: first frame of the clip.
+        frames: number of its frames, 4 k + 1.
         history: earlier frames, counted from the clip's first.
+
+    Returns:
+        [t' n], or [t' 4*n] where four frames are grouped, float32: a row for each latent frame, after one for each earlier
+        frame where these count.
     """
 
-    def told(frames: np.ndarray) -> np.ndarray:
+    def take_frames(frames: np.ndarray) -> np.ndarray:
         return condition.change(numbers[np.clip(frames, 0, len(numbers) - 1)]).astype(np.float32)
 
-    rows = told(np.arange(start, start + frames))
+    told = take_frames(np.arange(start, start + frames))
     if condition.group:
-        rows = np.concatenate([rows[:1].repeat(GROUP - 1, 0), rows]).reshape(-1, GROUP * rows.shape[1])
+        told = np.concatenate([told[:1].repeat(TEMPORAL_FACTOR - 1, 0), told]).reshape(-1, TEMPORAL_FACTOR * told.shape[1])
     else:
-        rows = rows[::GROUP]
-    return np.concatenate([told(start + np.asarray(history)), rows]) if condition.with_history and len(history) else rows
+        told = told[::TEMPORAL_FACTOR]
+    if not condition.with_history or not len(history):
+        return told
+    return np.concatenate([take_frames(start + np.asarray(history)), told])
 
 
-def command_of(folder: Path, record: Record, states: States, rendered: np.ndarray | None = None) -> Command:
-    """The part of an episode that conditions may see."""
+def make_command(folder: Path, record: Record, states: States, rendered: Video | None = None) -> Command:
+    """The part of an episode that conditions may see.
+
+    Args:
+        folder: of the episode.
+        record: its header.
+        states: its arrays.
+        rendered: its robot-only video [t h w 3] uint8, where it is in memory.
+    """
     data = data_folder(folder)
     return Command(record.robot, states.action, states.intrinsics, states.extrinsics, folder / "robot.mkv", rendered, data)
 
 
-def joints(command: Command) -> np.ndarray:
-    """The canonical 16 commanded joint positions and grippers of every frame."""
+def joints(command: Command) -> Float[np.ndarray, "t 16"]:
+    """Commanded joint positions [rad or m] and grippers of every frame, in the canonical layout: [t 16] float32."""
     return command.action
 
 
-def robot_render(command: Command) -> np.ndarray:
-    """The robot alone at every frame."""
+def robot_render(command: Command) -> Video:
+    """The robot alone at every frame: [t h w 3] uint8."""
     return command.render
 
 
-def robot_mask(command: Command) -> np.ndarray:
-    """The robot's silhouette at every frame, white on black."""
+def robot_mask(command: Command) -> Video:
+    """The robot's silhouette at every frame, white on black: [t h w 3] uint8."""
     return np.repeat(command.streams.mask[..., None], 3, axis=-1).astype(np.uint8) * 255
 
 
-def optical_flow(command: Command) -> np.ndarray:
-    """The robot's exact motion as a color wheel; white where nothing moves."""
+def optical_flow(command: Command) -> Video:
+    """The robot's exact motion as a color wheel, white where nothing moves: [t h w 3] uint8."""
     from xew.sim_warp.rendering.streams import flow_to_rgb
 
     return flow_to_rgb(command.streams.optical_flow)
 
 
-def ray_map(command: Command) -> np.ndarray:
-    """The commanded tool frames drawn into the image."""
+def ray_map(command: Command) -> Video:
+    """The commanded tool frames drawn into the image: [t h w 3] uint8."""
     from xew.sim_warp.rendering import streams
 
     return streams.ray_map(command.robot_spec, command.action, command.camera)
 
 
-def reference_image(command: Command) -> np.ndarray:
-    """One front view of the robot at home."""
+def reference_image(command: Command) -> Video:
+    """One front view of the robot at home: [1 h w 3] uint8."""
     from xew.sim_warp.rendering import streams
 
     return streams.reference_image(command.robot_spec)[None]
 
 
-def nine_views(command: Command) -> np.ndarray:
-    """The robot at home from nine sides."""
+def nine_views(command: Command) -> Video:
+    """The robot at home from nine sides: [9 h w 3] uint8."""
     from xew.sim_warp.rendering import streams
 
     return streams.nine_views(command.robot_spec)
 
 
-def articulation_clip(command: Command) -> np.ndarray:
-    """A clip of the robot that moves all its joints."""
+def articulation_clip(command: Command) -> Video:
+    """A clip of the robot that moves all its joints: [17 h w 3] uint8."""
     from xew.sim_warp.rendering import streams
 
     return streams.articulation_clip(command.robot_spec)
 
 
 POINTING_DOWN = Rotation.from_matrix([[0, -1, 0], [0, 0, 1], [-1, 0, 0]])
-"""A tool frame whose approach (x) points to the ground and whose y axis points to the left, as at home: its z axis points
+"""Tool frame whose approach (x) points to the ground and whose y axis points to the left, as at home: its z axis points
 away from the robot, so that yaw is the heading."""
 
 
-def tool_poses(command: Command) -> np.ndarray:
-    """Commanded position [m], roll, pitch, yaw [rad] and gripper of both tools, world frame: float32 [t 14].
+def tool_poses(command: Command) -> Poses:
+    """Commanded position [m], roll, pitch, yaw [rad] and gripper of both tools, in the world: [t 14] float32.
 
     The angles are those of the turn from `POINTING_DOWN`, where tools mostly are: there none of them jumps.
     """
@@ -200,21 +249,27 @@ def tool_poses(command: Command) -> np.ndarray:
     return np.concatenate(sides, axis=1).astype(np.float32)
 
 
-def camera(command: Command) -> np.ndarray:
-    """The camera's 16 numbers (`mechanisms.CAMERA`) at every frame: float32 [t 16]."""
+def camera(command: Command) -> Float[np.ndarray, "t 16"]:
+    """The camera's 16 numbers (`mechanisms.CAMERA`) at every frame: [t 16] float32."""
     k, rotation, offset = command.intrinsics, command.extrinsics[:3, :3], command.extrinsics[:3, 3]
     numbers = np.concatenate([[k[0, 0], k[1, 1], k[0, 2], k[1, 2]], rotation.ravel(), -rotation.T @ offset])
     return np.tile(numbers.astype(np.float32), (len(command.action), 1))
 
 
 RELATIVE_SCALE = 20.0
-"""IRASim's factor on relative positions [m] and angles [rad]."""
+"""Factor of IRASim on relative positions [m] and angles [rad]."""
 
 
-def relative_tool_poses(poses: np.ndarray) -> np.ndarray:
-    """IRASim's actions [t 14] of tool poses [t 14]: the motion since the frame before, in that frame's tool frame, times 20.
+def relative_tool_poses(poses: Poses) -> Poses:
+    """IRASim's actions: the motion since the frame before, in that frame's tool frame, times 20.
 
     Grippers stay as they are. The first frame has no motion.
+
+    Args:
+        poses: [t 14], see `Poses`.
+
+    Returns:
+        [t 14], positions [m / 20] and angles [rad / 20].
     """
     before, sides = np.concatenate([poses[:1], poses[:-1]]), []
     for side in (slice(0, 7), slice(7, 14)):
@@ -226,8 +281,15 @@ def relative_tool_poses(poses: np.ndarray) -> np.ndarray:
     return np.concatenate(sides, axis=1)
 
 
-def tool_deltas(poses: np.ndarray) -> np.ndarray:
-    """EnerVerse-AC's actions [t 14] of tool poses [t 14]: the change of position and angles in the world, and the gripper."""
+def tool_deltas(poses: Poses) -> Poses:
+    """EnerVerse-AC's actions: the change of position and angles in the world since the frame before, and the gripper.
+
+    Args:
+        poses: [t 14], see `Poses`.
+
+    Returns:
+        [t 14], positions [m] and angles [rad].
+    """
     delta = np.diff(poses, axis=0, prepend=poses[:1])
     angles = [column for side in (0, 7) for column in range(side + 3, side + 6)]
     delta[:, angles] = (delta[:, angles] + np.pi) % (2 * np.pi) - np.pi
@@ -235,33 +297,61 @@ def tool_deltas(poses: np.ndarray) -> np.ndarray:
     return delta
 
 
-System = tuple[Condition, ...]
-"""Conditions that belong together."""
-ACTIONS: dict[str, Condition | System | None] = {
-    "none": None,
-    "optical_flow": Condition("optical_flow", "action", optical_flow),
-    "mask": Condition("mask", "action", robot_mask),
-    "ray_map": Condition("ray_map", "action", ray_map),
-    "joints": Condition("joints", "joints", joints),
-    "irasim": (Condition("relative_tool_poses", "relative_time", tool_poses, change=relative_tool_poses, group=True),),
-    "ctrl_world": (Condition("tool_poses", "pose_frame", tool_poses, scale="percentiles", with_history=True),),
-    "enerverse_ac": (
-        Condition("ray_map", "map_channels", ray_map),
-        Condition("camera", "ray_channels", camera),
-        Condition("tool_deltas", "pooled_context", tool_poses, change=tool_deltas, group=True, scale="standard"),
+ACTIONS: dict[str, Condition | System] = {
+    "none": System((), title="No action", label="nothing"),
+    "optical_flow": Condition("optical_flow", "action", optical_flow, title="Optical flow", label="optical flow"),
+    "mask": Condition("mask", "action", robot_mask, title="Mask", label="mask"),
+    "ray_map": Condition("ray_map", "action", ray_map, title="Ray map", label="ray map"),
+    "joints": Condition("joints", "joints", joints, title="Joint pose", label="joint pose"),
+    "irasim": System(
+        (Condition("relative_tool_poses", "relative_time", tool_poses, change=relative_tool_poses, group=True),),
+        title="IRASim",
+        label="relative tool poses",
     ),
-    "bwm": (
-        Condition("grouped_tool_poses", "pose_time", tool_poses, group=True, scale="percentiles"),
-        Condition("grouped_tool_poses", "pose_context", tool_poses, group=True, scale="percentiles"),
+    "ctrl_world": System(
+        (Condition("tool_poses", "pose_frame", tool_poses, scale="percentiles", with_history=True),),
+        title="Ctrl-World",
+        label="absolute tool poses",
+    ),
+    "enerverse_ac": System(
+        (
+            Condition("ray_map", "map_channels", ray_map),
+            Condition("camera", "ray_channels", camera),
+            Condition("tool_deltas", "pooled_context", tool_poses, change=tool_deltas, group=True, scale="standard"),
+        ),
+        title="EnerVerse-AC",
+        label="tool poses + ray maps",
+    ),
+    "bwm": System(
+        (
+            Condition("grouped_tool_poses", "pose_time", tool_poses, group=True, scale="percentiles"),
+            Condition("grouped_tool_poses", "pose_context", tool_poses, group=True, scale="percentiles"),
+        ),
+        title="BWM",
+        label="tool poses",
     ),
 }
-CONDITIONS: dict[str, Condition | None] = {
-    "none": None,
-    "reference_image": Condition("reference_image", "embodiment", reference_image, aligned=False),
-    "nine_views": Condition("nine_views", "embodiment", nine_views, aligned=False),
-    "articulation_clip": Condition("articulation_clip", "embodiment", articulation_clip, aligned=False),
-    "robot_render": Condition("robot_render", "embodiment", robot_render),
+CONDITIONS: dict[str, Condition | System] = {
+    "none": System((), title="No description", label="flow only"),
+    "reference_image": Condition(
+        "reference_image",
+        "embodiment",
+        reference_image,
+        aligned=False,
+        title="Reference image",
+        label="+ reference image",
+    ),
+    "nine_views": Condition("nine_views", "embodiment", nine_views, aligned=False, title="Nine views", label="+ nine views"),
+    "articulation_clip": Condition(
+        "articulation_clip",
+        "embodiment",
+        articulation_clip,
+        aligned=False,
+        title="Articulation clip",
+        label="+ articulation clip",
+    ),
+    "robot_render": Condition("robot_render", "embodiment", robot_render, title="Per-frame render", label="per-frame render"),
 }
-HISTORY = Condition("history", "history", None)
-"""Earlier frames of the scene, sparse, each encoded alone (`model.history`): recorded ones in training, predicted ones in a
-rollout."""
+HISTORY = Condition("history", "history", None, title="Earlier frames", label="earlier frames")
+"""Condition of earlier frames of the scene, sparse, each encoded alone (`model.history`): recorded ones in training,
+predicted ones in a rollout."""

@@ -25,9 +25,10 @@ import warp as wp
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.episode import EpisodeError, Record, episode_folder, find_records, remove_left_overs
+from xew.dataset import find_records
+from xew.episode import EpisodeError, Record, episode_folder, remove_left_overs
 from xew.protocol import TEST_SEED_START, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK
-from xew.sim_warp.devices.workers import Workers, has_kernels, named_device, quiet_warp, worker_count
+from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import produce
@@ -128,7 +129,7 @@ Made = tuple[list[Record], float]
 @contextmanager
 def start_workers(args: Args) -> Iterator[Callable[[Sequence[Job]], Iterator[Made]]]:
     """Start worker processes; what is given runs jobs in them, one at a time on a CPU, in large batches on a GPU."""
-    device = named_device(args.device)
+    device = find_device(args.device)
     size = max(1, args.batch // len(args.robots)) if device.is_cuda else 1
     make = partial(_make, out=args.out, device=device.alias, batch=args.batch, videos=not args.states_only)
     with Workers(args.workers or worker_count(device), first_alone=not has_kernels(device)) as workers:
@@ -276,7 +277,7 @@ def _demand_enough(families: Sequence[Family]) -> None:
 
 def _print_device(name: str | None) -> None:
     """Print which device does the work, and why the first run takes a while to begin."""
-    device = named_device(name)
+    device = find_device(name)
     print(f"device: {device.name}")
     if not has_kernels(device):
         wait = "five minutes" if device.is_cuda else "a minute"

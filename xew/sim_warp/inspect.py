@@ -21,18 +21,8 @@ from PIL import Image
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.episode import (
-    HEIGHT,
-    WIDTH,
-    EpisodeError,
-    Record,
-    find_folders,
-    none_under,
-    read_record,
-    read_states,
-    read_video,
-    verify_episode,
-)
+from xew.dataset import explain_missing, read_dataset
+from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, read_record, read_states, read_video, verify_episode
 from xew.sim_warp.devices.workers import Workers, quiet_warp
 from xew.sim_warp.generate import yield_table
 from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
@@ -100,15 +90,10 @@ def main() -> None:
 
 def read_headers(data: Path) -> tuple[list[tuple[Path, Record]], list[str]]:
     """All cells whose headers can be read, and what is wrong with the others. Raises EpisodeError if there is no cell."""
-    cells: list[tuple[Path, Record]] = []
     damaged: list[str] = []
-    for folder in find_folders(data):
-        try:
-            cells.append((folder, read_record(folder)))
-        except EpisodeError as error:
-            damaged.append(str(error))
+    cells = list(read_dataset(data, damaged).cells)
     if not cells and not damaged:
-        raise none_under(data)
+        raise explain_missing(data)
     return cells, damaged
 
 

@@ -21,7 +21,8 @@ import cattrs
 import tyro
 
 from xew.config import user_errors
-from xew.episode import EpisodeError, Record, find_records, none_under
+from xew.dataset import explain_missing, find_records
+from xew.episode import EpisodeError, Record
 from xew.files import replacing
 from xew.protocol import TEST_SEED_START
 
@@ -160,7 +161,7 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     manifest = manifest_of([record for _, record in find_records(args.data)])
     if not manifest.tasks:
-        raise none_under(args.data)
+        raise explain_missing(args.data)
     try:
         with replacing(args.out) as file:
             file.write_text(to_json(manifest))

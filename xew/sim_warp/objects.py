@@ -13,9 +13,9 @@ from xew.sim_warp.geometry import meshes
 from xew.sim_warp.geometry.meshes import Color, Mesh
 
 WALL_SEGMENTS = 6
-"""Convex wedges round the wall of a hollow object: few enough that a finger pad lies on the flat of one."""
+"""Number of convex wedges round the wall of a hollow object: few enough that a finger pad lies on the flat of one."""
 FOOT = 0.0005
-"""How far the wall's wedges end above the floor [m], so that a vessel stands on its floor alone."""
+"""Gap between the wall's wedges and the floor [m], so that a vessel stands on its floor alone."""
 
 PALETTE: dict[str, Color] = {
     "red": (200, 45, 40),
@@ -43,12 +43,13 @@ def merge(*shapes: Shape) -> Shape:
     return Shape(meshes.merge([s.mesh for s in shapes]), tuple(h for s in shapes for h in s.hulls))
 
 
-def moved(shape: Shape, xyz: tuple[float, float, float]) -> Shape:
+def move(shape: Shape, xyz: tuple[float, float, float]) -> Shape:
+    """The shape moved by `xyz` [m]."""
     return Shape(shape.mesh.transformed(xyz), tuple(h + np.array(xyz, np.float32) for h in shape.hulls))
 
 
-def darker(color: Color, share: float) -> Color:
-    """A color at `share` of its brightness."""
+def darken(color: Color, share: float) -> Color:
+    """The color at `share` of its brightness."""
     red, green, blue = color
     return int(share * red), int(share * green), int(share * blue)
 
@@ -112,6 +113,7 @@ def _wall_hulls(outer: np.ndarray, inner: np.ndarray) -> list[np.ndarray]:
 
 
 def _ring(radius: float, low: float, high: float) -> np.ndarray:
+    """[k 3] m, corners of an upright prism about z between two heights [m]."""
     angle = np.arange(WALL_SEGMENTS) * 2 * np.pi / WALL_SEGMENTS
     circle = radius * np.stack([np.cos(angle), np.sin(angle)], -1)
     return np.concatenate([np.column_stack([circle, np.full(WALL_SEGMENTS, z)]) for z in (low, high)]).astype(np.float32)

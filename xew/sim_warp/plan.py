@@ -1,4 +1,4 @@
-"""Stage 2a: an expert's plan: waypoints of both tool frames on a common clock. It knows no robot.
+"""Plans of experts: waypoints of both tool frames on a common clock. A plan knows no robot.
 
 Reads  a Scene (through a task's `plan` function)
 Writes `Timeline`, and by `Timeline.path` both tools' poses and grippers at every stored frame
@@ -16,13 +16,13 @@ from xew.protocol import FRAME_RATE
 
 LEFT, RIGHT = 0, 1
 Point = Sequence[float] | np.ndarray
-"""x y z [m]."""
+"""Coordinates x y z [m]."""
 TOOL_SPEED = 0.16
 """Mean speed of a tool between two waypoints [m/s]; a minimum-jerk move peaks at 1.875 times its mean."""
 TURN_SPEED = 0.45
 """Mean turning speed of a tool [rad/s]; a move takes the time of its way and of its turn together."""
 SHORTEST_MOVE = 0.42
-"""s."""
+"""Least time of a move [s]."""
 GRIP_TIME = 0.48
 """Time for a gripper to close or open [s]: 8 frames."""
 
@@ -32,15 +32,15 @@ class Tool:
     """A pose of a tool frame, world."""
 
     position: np.ndarray
-    """[3] m."""
+    """[3] m, world frame."""
     rotation: Rotation
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Tool":
-        """Shifted along world axes [m]."""
+        """The tool shifted along world axes [m]."""
         return Tool(self.position + np.array([x, y, z]), self.rotation)
 
     def backed(self, distance: float) -> "Tool":
-        """Drawn back against the approach direction [m]."""
+        """The tool drawn back against the approach direction by a distance [m]."""
         return Tool(self.position - distance * self.rotation.apply([1, 0, 0]), self.rotation)
 
     def carried(self, start: Point, goal: Point, turn: float = 0.0) -> "Tool":
@@ -55,7 +55,7 @@ def tool(position: Point, yaw: float = 0.0, tilt: float = 0.0, roll: float = 0.0
     Args:
         position: [3] m, world.
         yaw: turn of the whole hand about the world's z [rad]; at 0 the fingers open along x.
-        tilt: how far the approach direction leans from straight down, at yaw 0 towards +y, away from the robot [rad].
+        tilt: how far the approach direction leans from straight down, at yaw 0 toward +y, away from the robot [rad].
         roll: turn about the approach direction [rad]; at 0 the fingers open horizontally.
     """
     down = Rotation.from_matrix(np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]]))
@@ -64,11 +64,11 @@ def tool(position: Point, yaw: float = 0.0, tilt: float = 0.0, roll: float = 0.0
 
 
 HOME = (tool((-0.17, -0.24, 0.88), tilt=np.radians(30)), tool((0.17, -0.24, 0.88), tilt=np.radians(30)))
-"""Where both tools are when an episode begins: every robot's home posture puts them there, in the head camera's view."""
+"""Poses of both tools when an episode begins: every robot's home posture puts them there, in the head camera's view."""
 ASIDE = (tool((-0.28, -0.24, 0.93), tilt=np.radians(30)), tool((0.28, -0.24, 0.93), tilt=np.radians(30)))
-"""Where a tool waits while the other arm works alone: wide hands would meet over the middle of the table."""
+"""Poses where a tool waits while the other arm works alone: wide hands would meet over the middle of the table."""
 ASIDE_TIME = 0.96
-"""For the way from home to aside [s]: in less the PiPER's wrist would turn faster than it may."""
+"""Time for the way from home to aside [s]: in less the PiPER's wrist would turn faster than it may."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Hold:
     arm: int
     name: str
     start: float
-    """s."""
+    """Begin [s]."""
     end: float
 
 
@@ -101,26 +101,27 @@ class ToolPath:
     """[t 2] float64, 0 closed, 1 open."""
     holds: tuple[Hold, ...]
     frame_rate: float = FRAME_RATE
-    """Hz."""
+    """Stored frames a second [Hz]."""
 
     @property
     def frame_count(self) -> int:
+        """Number of stored frames t."""
         return len(self.gripper)
 
 
 @dataclass
 class Timeline:
-    """Written by a task, from time 0 at which both arms are home with open grippers."""
+    """Moves, grips and waits in order, as a task writes them; at time 0 both arms are home with open grippers."""
 
     time: float = 0.0
-    """s, now."""
+    """Time now [s]."""
     at: list[Tool] = field(default_factory=lambda: list(HOME))
-    """Where each tool is now."""
+    """Pose of each tool now."""
     segments: tuple[list[_Segment], list[_Segment]] = field(default_factory=lambda: ([], []))
     grips: tuple[list[tuple[float, float]], list[tuple[float, float]]] = field(
         default_factory=lambda: ([(0.0, 1.0)], [(0.0, 1.0)])
     )
-    """(time, value) knots of each gripper, linear between."""
+    """Knots (time [s], value 0 to 1) of each gripper; values between are linear."""
     holds: list[Hold] = field(default_factory=list)
 
     def move(self, goals: dict[int, Tool], at_least: float = 0.0) -> None:
@@ -145,6 +146,7 @@ class Timeline:
         self.time += seconds
 
     def wait(self, seconds: float) -> None:
+        """Let time pass while the tools stand still."""
         self.time += seconds
 
     def hold(self, arm: int, name: str) -> None:
@@ -160,13 +162,14 @@ class Timeline:
 
 
 def _duration(start: Tool, end: Tool) -> float:
+    """Time of a move [s]."""
     distance = np.linalg.norm(end.position - start.position)
     angle = (start.rotation.inv() * end.rotation).magnitude()
     return max(SHORTEST_MOVE, float(distance / TOOL_SPEED + angle / TURN_SPEED))
 
 
 def minimum_jerk(share: np.ndarray) -> np.ndarray:
-    """Progress in [0, 1] that starts and ends at rest without jerk, for a share of the time in [0, 1]."""
+    """Progress [t] from 0 to 1 that starts and ends at rest without jerk, at shares of the time [t] from 0 to 1."""
     share = np.clip(share, 0, 1)
     return np.clip(share**3 * (10 - 15 * share + 6 * share**2), 0, 1)
 
@@ -177,11 +180,12 @@ def _sample(home: Tool, segments: list[_Segment], times: np.ndarray) -> np.ndarr
     for segment in segments:
         now = times >= segment.start_time
         progress = minimum_jerk((times[now] - segment.start_time) / (segment.end_time - segment.start_time))
-        pose[now] = _along(segment.waypoints, progress)
+        pose[now] = _interpolate_waypoints(segment.waypoints, progress)
     return pose
 
 
-def _along(waypoints: tuple[Tool, ...], progress: np.ndarray) -> np.ndarray:
+def _interpolate_waypoints(waypoints: tuple[Tool, ...], progress: np.ndarray) -> np.ndarray:
+    """[t 7] poses at progress [t] from 0 to 1 through waypoints that are evenly spaced in it."""
     knots = np.linspace(0, 1, len(waypoints))
     positions = np.stack([waypoint.position for waypoint in waypoints])
     position = np.stack([np.interp(progress, knots, positions[:, axis]) for axis in range(3)], -1)

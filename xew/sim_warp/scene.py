@@ -1,4 +1,4 @@
-"""Stage 1: a scene from (task, seed). It knows no robot.
+"""Scenes: what stands on the table for a (task, seed). A scene knows no robot.
 
 Reads  nothing but a counter-based random stream
 Writes `Scene`: objects with poses, masses, hinges; the same bytes for every robot
@@ -15,7 +15,7 @@ from xew.sim_warp.geometry.poses import Pose
 from xew.sim_warp.objects import Shape
 
 Point = Sequence[float] | np.ndarray
-"""x y or x y z [m]."""
+"""Coordinates x y or x y z [m]."""
 
 
 @dataclass(frozen=True)
@@ -23,23 +23,23 @@ class Hinge:
     """A lid on a revolute joint whose other side is the object's own, fixed body."""
 
     lid: Shape
-    """In the object's frame, as it lies at angle 0."""
+    """Shape of the lid in the object's frame, as it lies at angle 0."""
     mass: float
-    """kg."""
+    """Mass of the lid [kg]."""
     anchor: tuple[float, float, float]
-    """A point of the axis in the object's frame [m]."""
+    """Point of the axis in the object's frame [m]."""
     axis: tuple[float, float, float]
     lower: float
-    """rad."""
+    """Least angle [rad]."""
     upper: float
     start: float
     """Angle at which the scene begins [rad]."""
     friction: float
-    """Dry friction [N m]: what keeps the lid where it is left."""
+    """Dry friction [N m]; it keeps the lid where it is left."""
     damping: float
-    """N m s/rad."""
+    """Viscous damping [N m s/rad]."""
     stiffness: float = 0.0
-    """Of a spring [N m/rad]."""
+    """Stiffness of a spring [N m/rad]."""
     rest: float = 0.0
     """Angle at which the spring is slack, inside the range or outside [rad]."""
 
@@ -53,11 +53,11 @@ class Grasp:
     """How a hand takes an object from above: across the object's x axis, the tool over its origin."""
 
     height: float
-    """Of the tool above the object's origin [m]."""
+    """Height of the tool above the object's origin [m]."""
     width: float
-    """Of the object between the fingers [m]."""
+    """Width of the object between the fingers [m]."""
     symmetry: float
-    """Turning the hand about the object's z by this angle [rad] gives an equally good grasp."""
+    """Angle by which the hand may turn about the object's z for an equally good grasp [rad]."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,12 @@ class SceneObject:
     shape: Shape
     pose: Pose
     mass: float = 0.0
-    """kg; 0 means fixed to the table."""
+    """Mass [kg]; 0 means fixed to the table."""
     hinge: Hinge | None = None
     friction: float = 0.6
     """Sliding friction coefficient; a contact has the larger of its two sides'."""
     grasp: Grasp | None = None
-    """Where it is taken, for things that are taken from above."""
+    """Grasp from above, for things that are taken so."""
 
     @property
     def is_fixed(self) -> bool:
@@ -93,7 +93,7 @@ class Scene:
     seed: int
     objects: tuple[SceneObject, ...]
     words: dict[str, str] = field(default_factory=dict)
-    """What the instruction's slots say of this scene (colors, sizes)."""
+    """Words of this scene (colors, sizes) for the slots of the instruction."""
     targets: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Places drawn with the scene that are no objects, such as where a row of blocks goes: x y [m]."""
 
@@ -118,15 +118,15 @@ def scene_hash(scene: Scene) -> str:
     """SHA-256 over everything that the scene is made of."""
     digest = hashlib.sha256(repr((scene.task, scene.seed, sorted(scene.words.items()), sorted(scene.targets.items()))).encode())
     for thing in scene.objects:
-        digest.update(repr(_numbers(thing)).encode())
+        digest.update(repr(_plain_numbers(thing)).encode())
         for shape in (thing.shape, *((thing.hinge.lid,) if thing.hinge else ())):
             mesh = shape.mesh
             digest.update(array_hash(mesh.vertices, mesh.triangles, mesh.colors, mesh.normals, *shape.hulls).encode())
     return digest.hexdigest()
 
 
-def _numbers(thing: SceneObject) -> tuple[object, ...]:
-    """The numbers of an object without its shapes."""
+def _plain_numbers(thing: SceneObject) -> tuple[object, ...]:
+    """Numbers of an object without its shapes, as `scene_hash` reads them."""
     hinge = thing.hinge
     numbers = {f.name: None if f.name == "lid" else getattr(hinge, f.name) for f in fields(hinge)} if hinge else None
     return (thing.name, thing.pose, thing.mass, thing.friction, thing.grasp, numbers)
@@ -141,7 +141,7 @@ def upright(xy: Point, z: float, yaw: float = 0.0) -> Pose:
 def draw(
     rng: np.random.Generator, low: Sequence[float], high: Sequence[float], accept: Callable[[np.ndarray], bool]
 ) -> np.ndarray:
-    """A uniform point of a box that `accept` takes, by rejection."""
+    """A uniform point [d] of the box from `low` [d] to `high` [d] that `accept` takes, found by rejection."""
     for _ in range(10_000):
         point = rng.uniform(low, high)
         if accept(point):

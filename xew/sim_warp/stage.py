@@ -1,6 +1,6 @@
-"""What never moves: table, wall, ground and lights, as plain data. The scene, the physics and the renderer read it here.
+"""The stage: table, wall, ground and lights, which never move, as plain data for scenes, physics and renderer.
 
-Reads nothing, writes nothing. Sizes and lights are RoboTwin 2.0's (`demo_clean`); meters, world frame.
+Sizes and lights are RoboTwin 2.0's (`demo_clean`); meters, world frame.
 To change the place where everything happens, change these constants.
 """
 
@@ -16,7 +16,7 @@ TABLE_SIZE = (1.2, 0.7, 0.05)
 """Full size of the table's plate [m]; its center is over the world's origin."""
 LEG_SIZE = 0.05
 LEG_XY = (0.55, 0.30)
-"""A leg stands at every (+-x, +-y) [m]."""
+"""Distances of the four legs from the table's middle along x and y [m]."""
 WALL_CENTER = (0.0, 1.0, 1.5)
 WALL_SIZE = (6.0, 1.2, 3.0)
 GROUND_SIZE = 12.0
@@ -32,7 +32,7 @@ SKY_SHARE = 0.35
 EXPOSURE = 0.5
 """Factor from light to linear image value: it puts the lit white table at 0.8, below the white of the image."""
 KNEE, CEILING = 0.7, 0.95
-"""Linear image values above the knee bend towards the ceiling, so that what is lit never reaches white."""
+"""Linear image values: above the knee they bend toward the ceiling, so that what is lit never reaches white."""
 SPECULAR = 0.12
 """Strength of the highlight that all surfaces share."""
 
@@ -43,9 +43,9 @@ class Light:
 
     intensity: float
     direction: tuple[float, float, float]
-    """Where it shines; for a point light the axis of its shadow map."""
+    """Direction in which it shines; for a point light the axis of its shadow map."""
     position: tuple[float, float, float] | None = None
-    """World frame [m]."""
+    """Position in the world frame [m]; None makes the light directional."""
 
 
 LIGHTS = (
@@ -56,11 +56,11 @@ LIGHTS = (
 SKY = (1.0, 1.0, 1.0)
 """Linear color where there is nothing, and of the ground of a render without the stage."""
 SHADOW_CENTER = (0.0, -0.1, 0.85)
-"""Middle of what the directional light's shadow map holds [m]."""
+"""Middle of the volume that the directional light's shadow map covers [m]."""
 SHADOW_WIDTH = 1.8
 """Side of the square that the directional light's shadow map covers [m]."""
 SHADOW_DISTANCE = 4.0
-"""How far from that middle the directional light's shadow map begins [m]."""
+"""Distance from that middle at which the directional light's shadow map begins [m]."""
 SHADOW_ANGLE = 80.0
 """Full angle of a point light's shadow map [deg]."""
 
@@ -80,13 +80,13 @@ def stage_mesh() -> Mesh:
 
 
 def linear_from_srgb(color: np.ndarray) -> np.ndarray:
-    """sRGB values 0 to 255 of any shape -> linear light 0 to 1, float64 (IEC 61966-2-1)."""
+    """Linear light [...] float64, 0 to 1, of sRGB values [...] from 0 to 255 (IEC 61966-2-1)."""
     value = np.asarray(color, np.float64) / 255
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
 def srgb_from_linear(light: np.ndarray) -> np.ndarray:
-    """Linear light, clipped to 0 to 1, of any shape -> sRGB uint8 (IEC 61966-2-1)."""
+    """sRGB values [...] uint8 of linear light [...], clipped to 0 to 1 (IEC 61966-2-1)."""
     light = np.clip(np.asarray(light, np.float64), 0, 1)
     value = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
     return np.round(value * 255).astype(np.uint8)

@@ -24,13 +24,13 @@ from tqdm import tqdm
 
 from xew.config import user_errors
 from xew.episode import EpisodeError, Record
-from xew.sim_warp.devices.workers import Workers, has_kernels, named_device, quiet_warp, worker_count
+from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
 from xew.sim_warp.production.episodes import header
 from xew.sim_warp.robots import ROBOTS, get_robot
 from xew.sim_warp.tasks import TASKS, Task, get_task
 
-PARAGRAPHS = ("Task", "Randomisation", "Success", "After")
+PARAGRAPHS = ("Task", "Randomization", "Success", "After")
 """Words with which the paragraphs of a task's module docstring begin."""
 COMMAND = "python -m xew.sim_warp.yields"
 
@@ -74,7 +74,7 @@ def attempt_seeds(args: Args) -> Iterator[list[Record]]:
             f"nothing to try of {len(tasks)} tasks, {len(robots)} robots and {args.seeds} seeds from {args.first_seed}; name "
             "tasks and robots, --seeds from 1 and --first-seed from 0."
         )
-    device = named_device(args.device)
+    device = find_device(args.device)
     size = max(1, args.batch // len(robots)) if device.is_cuda else 1
     batches = [jobs[start : start + size] for start in range(0, len(jobs), size)]
     attempt = partial(attempt_batch, device=device.alias, batch=args.batch)
@@ -133,7 +133,7 @@ def describe_task(task: Task) -> dict[str, str]:
     """The paragraphs of a task's module docstring by how they begin: what to do, what varies, when it is done."""
     module = importlib.import_module(task.sample.__module__)
     found: dict[str, str] = {}
-    for line in inspect.cleandoc(module.__doc__ or "").splitlines():
+    for line in inspect.cleandoc(module.__doc__ or "").replace("Randomisation:", "Randomization:").splitlines():
         begun = next((part for part in PARAGRAPHS if line.startswith((part + ":", part + " "))), None)
         if begun:
             found[begun] = line.removeprefix(begun + ":").strip()
@@ -146,7 +146,7 @@ def describe_task(task: Task) -> dict[str, str]:
 def task_section(task: Task) -> str:
     """A task as a section of the page."""
     parts = describe_task(task)
-    lines = [f"- **{part}**: {parts[part]}" for part in ("Task", "Randomisation", "Success") if part in parts]
+    lines = [f"- **{part}**: {parts[part]}" for part in ("Task", "Randomization", "Success") if part in parts]
     return "\n".join([f"### `{task.name}`", f"*{task.instruction}*", "", *lines, "", parts.get("After", "")]).strip()
 
 

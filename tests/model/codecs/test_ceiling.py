@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from xew.metrics import psnr
-from xew.model.codecs.ceiling import measure_ceiling, spread
+from xew.model.codecs.ceiling import choose_evenly, measure_ceiling
 from xew.model.codecs.codec import PatchCodec
 from xew.model.video.frames import to_camera_size, to_model_size
 
@@ -31,5 +31,5 @@ def test_ceiling() -> None:
 
 
 def test_spread_takes_evenly() -> None:
-    assert spread(range(10), 4) == [0, 3, 6, 9]
-    assert spread("abc", 8) == ["a", "b", "c"]
+    assert choose_evenly(range(10), 4) == [0, 3, 6, 9]
+    assert choose_evenly("abc", 8) == ["a", "b", "c"]

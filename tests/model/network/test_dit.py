@@ -135,9 +135,9 @@ def test_two_rows_equal_a_timestep_for_every_token(inputs: tuple[jax.Array, jax.
 
 def test_noise_levels_told_to_streams() -> None:
     grid = (3, 1, 2)
-    assert dit.token_rows(STREAMS["rgb"], grid).tolist() == [0, 0, 1, 1, 1, 1]
-    assert dit.token_rows(STREAMS["action"], grid).tolist() == [0, 0, 1, 1, 1, 1]
-    assert dit.token_rows(STREAMS["embodiment"], grid).tolist() == [0] * 6
+    assert dit.token_levels(STREAMS["rgb"], grid).tolist() == [0, 0, 1, 1, 1, 1]
+    assert dit.token_levels(STREAMS["action"], grid).tolist() == [0, 0, 1, 1, 1, 1]
+    assert dit.token_levels(STREAMS["embodiment"], grid).tolist() == [0] * 6
 
 
 @pytest.mark.parametrize(("head_dim", "parts"), [(128, (44, 42, 42)), (64, (24, 20, 20)), (16, (8, 4, 4))])
@@ -202,7 +202,7 @@ def test_sizes_are_consistent(name: str) -> None:
 def test_rows_and_their_gradient(rows: list[int]) -> None:
     """A choice of two or a gather of many: values and gradient of plain indexing."""
     values, weights = normal(7, 2, max(2, max(rows) + 1), 5), normal(8, 2, len(rows), 5)
-    for function in (lambda x: dit.take_rows(x, np.array(rows)), lambda x: x[:, np.array(rows)]):
+    for function in (lambda x: dit.select_levels(x, np.array(rows)), lambda x: x[:, np.array(rows)]):
         found, gradient = jax.value_and_grad(lambda x, f=function: (f(x) * weights).sum())(values)
         expected = np.zeros(values.shape, np.float32)
         np.add.at(expected, (slice(None), rows), np.asarray(weights))
@@ -263,7 +263,7 @@ def test_learned_words() -> None:
 def test_compute_params_are_the_same_model_rounded_once(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
     latents, sigma, text = inputs
     graph, params = nnx.split(tiny(("embodiment",), dtype=jnp.bfloat16), nnx.Param)
-    rounded = dit.compute_params(graph, params)
+    rounded = dit.cast_params(graph, params)
     types = {".".join(map(str, path)): leaf.dtype for path, leaf in nnx.to_flat_state(rounded)}
     for name in (
         "blocks.ffn.first.kernel",
@@ -288,7 +288,7 @@ def test_compute_params_are_the_same_model_rounded_once(inputs: tuple[jax.Array,
 
     with jax.numpy_dtype_promotion("standard"):
         np.testing.assert_allclose(jax.jit(loss)(rounded), jax.jit(loss)(params), rtol=1e-3)
-        gradient = jax.eval_shape(jax.grad(lambda params: loss(dit.compute_params(graph, params))), params)
+        gradient = jax.eval_shape(jax.grad(lambda params: loss(dit.cast_params(graph, params))), params)
     assert jax.tree.map(lambda leaf: leaf.dtype, gradient) == jax.tree.map(lambda leaf: leaf.dtype, params)
 
 
@@ -402,7 +402,7 @@ def test_what_blocks_keep_is_what_the_memory_estimate_says(remat: dit.RematName,
     size, tokens = dit.ModelSize(dim=512, depth=3, heads=4, ffn_dim=2048, text_dim=16, text_tokens=7), 3 * 8 * 8
     options = {"dtype": dtype, "residual": residual, "remat": remat}
     graph, params = nnx.split(nnx.eval_shape(lambda: WorldModel(size, CHANNELS, rngs=nnx.Rngs(0), **options)), nnx.Param)
-    params = jax.eval_shape(lambda params: dit.compute_params(graph, params), params)
+    params = jax.eval_shape(lambda params: dit.cast_params(graph, params), params)
 
     def loss(params: nnx.State, latents: jax.Array, sigma: jax.Array, text: jax.Array) -> jax.Array:
         return nnx.merge(graph, params)(latents, {}, sigma, text).sum()

@@ -16,8 +16,8 @@ from xew.config import ConfigError
 from xew.episode import HEIGHT, WIDTH, read_record, read_states
 from xew.model.codecs.codec import CODECS
 from xew.model.codecs.vae import VAES
-from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition, command_of
-from xew.model.diffusion.samplers import GRIDS, SAMPLERS
+from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition, list_conditions, make_command
+from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES
 from xew.model.experiment import load_experiment
 from xew.model.network import dit
 from xew.model.network.dit import MODELS, STREAMS, WorldModel
@@ -54,9 +54,8 @@ def model_of(streams: tuple[str, ...], **options: object) -> WorldModel:
 
 
 def streams_of(action: str, embodiment: str, history: bool) -> tuple[str, ...]:
-    chosen = ACTIONS[action]
-    conditions = [*(chosen if isinstance(chosen, tuple) else (chosen,)), CONDITIONS[embodiment], HISTORY if history else None]
-    return tuple(condition.stream for condition in conditions if condition is not None)
+    conditions = [*list_conditions(ACTIONS[action]), *list_conditions(CONDITIONS[embodiment]), *([HISTORY] if history else [])]
+    return tuple(condition.stream for condition in conditions)
 
 
 KINDS = [(action, embodiment, action == "ctrl_world") for action in ACTIONS for embodiment in ("none", "robot_render")]
@@ -88,10 +87,7 @@ def test_every_condition_fits_is_used_and_can_be_learned(action: str, embodiment
 
 def test_mechanisms_are_named_by_the_registry() -> None:
     """Every entry point is a stream or a mechanism, each mechanism is used by a system, and pictures are no numbers."""
-    chosen = [
-        c for entry in (*ACTIONS.values(), *CONDITIONS.values()) for c in (entry if isinstance(entry, tuple) else (entry,))
-    ]
-    fed = {condition.stream for condition in chosen if condition is not None}
+    fed = {c.stream for entry in (*ACTIONS.values(), *CONDITIONS.values()) for c in list_conditions(entry)}
     assert fed <= set(STREAMS) | set(MECHANISMS) and set(MECHANISMS) <= fed
     assert not set(STREAMS) & set(MECHANISMS)
     assert HISTORY.stream in STREAMS and HISTORY.make is None
@@ -127,7 +123,7 @@ def test_each_frame_is_told_its_own_vector() -> None:
     model, conditions = model_of(("action", "pose_time")), told(("action", "pose_time"))
     tokens, rows, _ = model.embed_streams(LATENTS, conditions)
     time = model.embed_time(SIGMA)
-    framed, told_rows = model.tell_frames(time, rows, LATENTS.shape, conditions)
+    framed, told_rows = model.add_frame_vectors(time, rows, LATENTS.shape, conditions)
     vectors = model.mechanisms["pose_time"](conditions["pose_time"])
     np.testing.assert_allclose(framed[:, 2], time[:, 0] + vectors[:, 0], atol=1e-5)
     np.testing.assert_allclose(framed[:, 3:], time[:, 1:] + vectors[:, 1:], atol=1e-5)
@@ -138,7 +134,7 @@ def test_each_frame_is_told_its_own_vector() -> None:
 def test_frame_rows_equal_a_timestep_of_every_token() -> None:
     model, conditions = model_of(("pose_time",)), told(("pose_time",))
     tokens, rows, rotary = model.embed_streams(LATENTS, conditions)
-    time, rows = model.tell_frames(model.embed_time(SIGMA), rows, LATENTS.shape, conditions)
+    time, rows = model.add_frame_vectors(model.embed_time(SIGMA), rows, LATENTS.shape, conditions)
     every, of_tokens = np.arange(tokens.shape[1]), time[:, rows]
     seen = model.apply_blocks(tokens, model.modulation(of_tokens), every, rotary, model.context(TEXT), len(every))
     expected = dit.unpatchify(model.head(seen, of_tokens, every), LATENTS.shape)
@@ -169,7 +165,7 @@ def test_frames_see_their_own_context_and_no_other() -> None:
     q = attention._heads(attention.norm_q(attention.q(tokens)), None)
     k, v = attention.keys_values(everything, None)
     expected = attention.o(jax.nn.dot_product_attention(q, k, v, mask=mask[None, None]).reshape(tokens.shape))
-    np.testing.assert_allclose(attention.by_frame(tokens, context), expected, atol=2e-5)
+    np.testing.assert_allclose(attention.attend_by_frame(tokens, context), expected, atol=2e-5)
 
 
 def test_poses_of_earlier_frames_go_to_earlier_frames() -> None:
@@ -313,7 +309,7 @@ def test_conditions_of_a_system_are_all_of_one_kind() -> None:
     """Numbers that are scaled are scaled alike wherever they go by one name, since the cache knows them by it."""
     by_name: dict[str, Condition] = {}
     for system in ACTIONS.values():
-        for condition in system if isinstance(system, tuple) else ():
+        for condition in list_conditions(system):
             same = by_name.setdefault(condition.name, condition)
             assert (same.make, same.change, same.group, same.scale) == (
                 condition.make,
@@ -327,7 +323,7 @@ PAGE = (ROOT / "docs" / "models.md").read_text()
 
 
 def test_the_page_names_all_that_can_be_chosen() -> None:
-    registries = (MODELS, STREAMS, ACTIONS, CONDITIONS, MECHANISMS, CODECS, VAES, SAMPLERS, GRIDS)
+    registries = (MODELS, STREAMS, ACTIONS, CONDITIONS, MECHANISMS, CODECS, VAES, SAMPLERS, SCHEDULES)
     absent = [name for registry in registries for name in registry if f"`{name}`" not in PAGE]
     assert not absent
     assert all((ROOT / path).is_file() for path in re.findall(r"configs/[\w/]+\.yaml", PAGE))
@@ -343,7 +339,7 @@ def test_the_page_s_condition_from_outside_works(tmp_path: Path, monkeypatch: py
     experiment = load_experiment(ROOT / "configs" / "fixed.yaml", chosen)
     assert experiment.conditions["embodiment"].name == "still_render"
     folder = synthetic.write_cell(tmp_path / "data", "place_empty_cup", 0, "piper", frames=3)
-    command = command_of(folder, read_record(folder), read_states(folder))
+    command = make_command(folder, read_record(folder), read_states(folder))
     made = experiment.conditions["embodiment"].make(command)
     np.testing.assert_array_equal(made, np.repeat(command.render[:1], 3, axis=0))
     system = load_experiment(

@@ -18,10 +18,10 @@ from xew.model.network.dit import MODELS, WorldModel
 from xew.model.network.dit_layouts import (
     check_dit,
     dit_layout,
+    find_naming,
     flowwam_layout,
     load_dit,
     load_dit_params,
-    naming_of,
     save_dit,
     wan_layout,
 )
@@ -356,7 +356,7 @@ def test_official_checkpoint_to_diffusers_and_back(form: str, tmp_path: Path) ->
     load_dit(model, path)
     save_dit(model, tmp_path / "diffusers")
     converted = read_tensors(tmp_path / "diffusers")
-    assert naming_of(converted) == "diffusers" and converted.keys() == renamed.keys()
+    assert find_naming(converted) == "diffusers" and converted.keys() == renamed.keys()
     layouts = [wan_layout(model, naming) for naming in ("official", "diffusers")]
     pairs = [(a, b) for leaf in layouts[0] for a, b in zip(layouts[0][leaf].keys, layouts[1][leaf].keys, strict=True)]
     assert len(pairs) == len(official)

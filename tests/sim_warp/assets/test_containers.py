@@ -16,7 +16,7 @@ from xew.sim_warp.tasks import TASKS
 from xew.sim_warp.tasks.lift_pot import OPENING, handles
 from xew.sim_warp.tasks.move_can_pot import BESIDE
 from xew.sim_warp.tasks.place_container_plate import WALL
-from xew.sim_warp.tasks.task import Moment, arm_for, outward
+from xew.sim_warp.tasks.task import Moment, arm_for, side_sign
 
 VARIANTS = 40
 WIDEST = 0.065
@@ -50,7 +50,7 @@ def test_variants_differ_and_are_seen_where_they_collide(kind: str) -> None:
 @pytest.mark.parametrize("kind", ["can", "pill_bottle"])
 def test_hands_meet_flats_of_what_stands_at_every_turn_of_its_symmetry(kind: str) -> None:
     for shape, _ in variants(kind):
-        thing = containers.standing("thing", shape, (0.1, 0.0), 0.3, mass=0.1)
+        thing = containers.place_standing("thing", shape, (0.1, 0.0), 0.3, mass=0.1)
         assert thing.grasp is not None and thing.grasp.width <= WIDEST
         hull = thing.shape.hulls[0]
         for turn in (0, 1, 5):
@@ -63,11 +63,11 @@ def test_hands_meet_flats_of_what_stands_at_every_turn_of_its_symmetry(kind: str
 
 def test_a_bottle_lies_on_a_flat_under_its_point_of_balance() -> None:
     for shape, _ in variants("bottle"):
-        thing = containers.lying("bottle", shape, (0.1, -0.1), 0.2, mass=0.1)
+        thing = containers.place_lying("bottle", shape, (0.1, -0.1), 0.2, mass=0.1)
         points = np.concatenate(thing.shape.hulls)
         ground = points[points[:, 2] < 1e-5]
         assert points[:, 2].min() == pytest.approx(0, abs=1e-6) and len(ground) >= 4
-        np.testing.assert_allclose(containers.balance(thing.shape)[:2], 0, atol=1e-4)
+        np.testing.assert_allclose(containers.center_of_mass(thing.shape)[:2], 0, atol=1e-4)
         assert (ground[:, :2].min(0) < -0.008).all() and (ground[:, :2].max(0) > 0.008).all()
         assert thing.grasp is not None and thing.grasp.width <= WIDEST
         slab = thing.shape.hulls[0]
@@ -100,7 +100,7 @@ def moment_of(scene: Scene, name: str, pose: np.ndarray, gripper: tuple[float, f
 def goal(scene: Scene) -> tuple[str, np.ndarray]:
     """The name of what is carried and where it belongs [3]."""
     if scene.task == "move_can_pot":
-        side = outward(arm_for(scene.object("can").pose[0]))
+        side = side_sign(arm_for(scene.object("can").pose[0]))
         return "can", np.array(scene.object("pot").pose[:3]) + [side * BESIDE, 0, 0]
     if scene.task == "move_pillbottle_pad":
         return "bottle", np.array(scene.object("pad").pose[:3]) + [0, 0, 0.001]

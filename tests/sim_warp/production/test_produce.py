@@ -8,13 +8,13 @@ import pytest
 
 from tests.sim_warp.small import SLOW, TASK
 from xew.config import ConfigError
+from xew.dataset import find_accepted
 from xew.episode import (
     EpisodeError,
     Record,
     States,
     array_hash,
     episode_folder,
-    find_accepted,
     read_record,
     read_states,
     read_video,

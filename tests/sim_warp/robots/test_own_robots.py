@@ -15,7 +15,8 @@ import yaml
 from tests.sim_warp.robots.own_robot import STRIPES, robotwin_config, write_embodiment, write_urdf
 from tests.sim_warp.small import TASK
 from xew.config import ConfigError
-from xew.episode import array_hash, find_accepted
+from xew.dataset import find_accepted
+from xew.episode import array_hash
 from xew.sim_warp import generate as command
 from xew.sim_warp.embodiment import mesh_files
 from xew.sim_warp.generate import Args, generate

@@ -24,6 +24,8 @@ from xew.analysis.statistics.grades import (
     pooled,
 )
 from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.model.conditions import ACTIONS as REPRESENTATIONS
+from xew.model.conditions import CONDITIONS
 from xew.protocol import (
     FORGETTING_ROBOT,
     HELD_OUT_ROBOTS,
@@ -50,16 +52,17 @@ DIMENSION_TITLES = {
 SHORT_ROBOTS = {key: robot.label for key, robot in ROBOTS.items()}
 SEEN_TITLE = "Seen pool: Aloha-AgileX, ARX-X5 and UR5"
 
-ACTIONS = {"joints": "Joint pose", "ray_map": "Ray map", "mask": "Mask", "optical_flow": "Optical flow"}
-LADDER = {
-    "none": "flow only",
-    "reference_image": "+ reference image",
-    "nine_views": "+ nine views",
-    "articulation_clip": "+ articulation clip",
-    "robot_render": "per-frame render",
+ACTIONS = {variant.action: REPRESENTATIONS[variant.action].title for variant in PARTS["actions"]}
+"""Title of each action representation by its key."""
+LADDER = {variant.embodiment: CONDITIONS[variant.embodiment].label for variant in PARTS["ladder"]}
+"""Label of each condition of the ladder by its key, from nothing to a render of every frame."""
+SYSTEMS = {
+    variant.system: "reference model" if variant.system == REFERENCE else REPRESENTATIONS[variant.action].title
+    for variant in PARTS["baselines"]
 }
-SYSTEMS = {"irasim": "IRASim", "ctrl_world": "Ctrl-World", "enerverse_ac": "EnerVerse-AC", REFERENCE: "reference model"}
-SYSTEM_ACTIONS = ("relative tool poses", "absolute tool poses", "tool poses + ray maps", "optical flow")
+"""Title of each world model by its key."""
+SYSTEM_ACTIONS = tuple(REPRESENTATIONS[variant.action].label for variant in PARTS["baselines"])
+"""What each of SYSTEMS is told of actions."""
 STILL, TRUE = "frozen first frame", "true video, graded"
 REMEDIES = {"replay": "with replay", "lora": "with LoRA"}
 

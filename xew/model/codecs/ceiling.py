@@ -54,6 +54,6 @@ def measure_ceiling(codec: Codec, videos: Iterable[np.ndarray], frames: int, hei
     return Ceiling(float(means[0]), float(means[1]), len(scores))
 
 
-def spread(items: Sequence[T], count: int) -> list[T]:
+def choose_evenly(items: Sequence[T], count: int) -> list[T]:
     """At most `count` of them, evenly chosen."""
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(len(items), count)).astype(int))]

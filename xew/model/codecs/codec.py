@@ -24,8 +24,7 @@ from jax import Array, lax
 from xew.config import ConfigError, parse, pick
 from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae
 from xew.model.codecs.vae_layouts import load_vae, save_vae
-
-TEMPORAL_FACTOR = 4
+from xew.model.video.frames import TEMPORAL_FACTOR
 
 
 @dataclass(frozen=True)
@@ -156,14 +155,16 @@ class Basis:
 
     def encode(self, patches: Array) -> Array:
         """[... p] -> [... c]. At the highest precision: TF32, the default of some GPUs, costs the codec decibels."""
-        centered = patches - over_last(self.mean, patches.ndim)
-        return jnp.matmul(centered, self.directions, precision=lax.Precision.HIGHEST) / over_last(self.scale, patches.ndim)
+        centered = patches - broadcast_over_last(self.mean, patches.ndim)
+        return jnp.matmul(centered, self.directions, precision=lax.Precision.HIGHEST) / broadcast_over_last(
+            self.scale, patches.ndim
+        )
 
     def decode(self, latents: Array) -> Array:
         """[... c] -> [... p]."""
-        scaled = latents * over_last(self.scale, latents.ndim)
+        scaled = latents * broadcast_over_last(self.scale, latents.ndim)
         patches = jnp.matmul(scaled, self.directions.T, precision=lax.Precision.HIGHEST)
-        return patches + over_last(self.mean, latents.ndim)
+        return patches + broadcast_over_last(self.mean, latents.ndim)
 
 
 @functools.partial(jax.tree_util.register_dataclass, data_fields=("first", "later"), meta_fields=("spatial_factor",))
@@ -300,7 +301,7 @@ class WanVaeCodec(BatchCodec):
     def load(cls, folder: Path) -> "WanVaeCodec":
         stored = json.loads((folder / "vae.json").read_text())
         size = parse(VaeSize, stored["size"], str(folder / "vae.json"))
-        return cls.read(folder / "vae.safetensors", size, stored["dtype"], stored["chunk"])
+        return cls.from_weights(folder / "vae.safetensors", size, stored["dtype"], stored["chunk"])
 
     @classmethod
     def check(cls, settings: CodecSettings) -> None:
@@ -325,17 +326,17 @@ class WanVaeCodec(BatchCodec):
                 "the codec wan_vae needs codec.weights: Wan2.2_VAE.pth, the vae folder of Wan2.2-TI2V-5B-Diffusers, or the"
                 " folder of an autoencoder trained by `python -m xew.model.train_vae CONFIG`."
             )
-        return cls.read(settings.weights, pick(VAES, settings.vae, "autoencoder"), settings.dtype, settings.chunk)
+        return cls.from_weights(settings.weights, pick(VAES, settings.vae, "autoencoder"), settings.dtype, settings.chunk)
 
     @classmethod
-    def read(cls, weights: Path, size: VaeSize, dtype: str = "float32", chunk: int = 8) -> "WanVaeCodec":
+    def from_weights(cls, weights: Path, size: VaeSize, dtype: str = "float32", chunk: int = 8) -> "WanVaeCodec":
         """A codec from a file of weights of any known kind."""
         vae = abstract_vae(size, jnp.dtype(dtype))
         load_vae(vae, weights)
-        return cls.of(vae, chunk)
+        return cls.from_vae(vae, chunk)
 
     @classmethod
-    def of(cls, vae: VideoVae, chunk: int = 8) -> "WanVaeCodec":
+    def from_vae(cls, vae: VideoVae, chunk: int = 8) -> "WanVaeCodec":
         """The codec of an autoencoder."""
         graph, params = nnx.split(vae)
         dtype = jnp.dtype(vae.dtype).name
@@ -349,12 +350,12 @@ class WanVaeCodec(BatchCodec):
 CODECS: dict[str, type[Codec]] = {"patch_pca": PatchCodec, "wan_vae": WanVaeCodec}
 
 
-def codec_of(settings: CodecSettings) -> type[Codec]:
+def codec_class(settings: CodecSettings) -> type[Codec]:
     """The kind of codec that a config names. Raises ConfigError if there is none of that name."""
     return pick(CODECS, settings.name, "codec")
 
 
-def over_last(vector: Array, ndim: int) -> Array:
+def broadcast_over_last(vector: Array, ndim: int) -> Array:
     """[c] -> [1 ... 1 c]: to be broadcast over the last of `ndim` axes."""
     return jnp.reshape(vector, (1,) * (ndim - 1) + (-1,))
 

@@ -118,7 +118,7 @@ class VideoVae(nnx.Module):
         def step(part: Array, history: History) -> Array:
             return self.encoder(patchify(part, self.size.patch), history)
 
-        encoded = in_chunks(step, frames.astype(self.dtype), 4 * even_chunk(frames.shape[1] // 4, chunk))
+        encoded = apply_in_chunks(step, frames.astype(self.dtype), 4 * even_chunk(frames.shape[1] // 4, chunk))
         mean, log_variance = jnp.split(self.quant(encoded).astype(jnp.float32), 2, axis=-1)
         return mean, jnp.clip(log_variance, *LOG_VARIANCE_RANGE)
 
@@ -138,7 +138,7 @@ class VideoVae(nnx.Module):
         Returns:
             [b t h w 3] float32 in [-1, 1], t = 4 (t' - 1) + 1, or 1.
         """
-        return jnp.clip(self.decode_moments(self.denormalise(latents), chunk, last_only=last_only), -1, 1)
+        return jnp.clip(self.decode_moments(self.denormalize(latents), chunk, last_only=last_only), -1, 1)
 
     def decode_moments(self, latents: Array, chunk: int = 0, *, last_only: bool = False) -> Array:
         """`decode` of latents as `moments` gives them, and not clipped: what training takes."""
@@ -148,14 +148,14 @@ class VideoVae(nnx.Module):
             return frames[:, -1:] if last_only else frames
 
         chunk = even_chunk(latents.shape[1] - 1, chunk)
-        decoded = in_chunks(step, self.post_quant(latents.astype(self.dtype)), chunk)
+        decoded = apply_in_chunks(step, self.post_quant(latents.astype(self.dtype)), chunk)
         return (decoded[:, -1:] if last_only else decoded).astype(jnp.float32)
 
     def normalize(self, mean: Array) -> Array:
         """Latents of about unit size."""
         return (mean - _row(self.latents_mean[...])) / _row(self.latents_std[...])
 
-    def denormalise(self, latents: Array) -> Array:
+    def denormalize(self, latents: Array) -> Array:
         """The inverse of `normalize`."""
         return latents.astype(jnp.float32) * _row(self.latents_std[...]) + _row(self.latents_mean[...])
 
@@ -216,7 +216,7 @@ class History:
         return x
 
 
-def in_chunks(step: Callable[[Array, History], Array], video: Array, size: int) -> Array:
+def apply_in_chunks(step: Callable[[Array, History], Array], video: Array, size: int) -> Array:
     """A causal function of a video, all at once or chunk by chunk.
 
     Args:
@@ -402,7 +402,7 @@ class Downsample(nnx.Module):
         self.time = nnx.data(Conv((WINDOW, 1, 1, width, width), layers) if halve_time else None)
 
     def __call__(self, x: Array, history: History) -> Array:
-        x = each_frame(x, lambda frames: self.conv.apply(frames, stride=2, padding=((0, 1), (0, 1))))
+        x = apply_to_frames(x, lambda frames: self.conv.apply(frames, stride=2, padding=((0, 1), (0, 1))))
         if self.time is None:
             return x
         begins = history.begins
@@ -421,7 +421,7 @@ class Upsample(nnx.Module):
     def __call__(self, x: Array, history: History) -> Array:
         if self.time is not None:
             x = double_time(x, self.time, history)
-        return each_frame(x, lambda frames: double_sides(frames, self.conv))
+        return apply_to_frames(x, lambda frames: double_sides(frames, self.conv))
 
 
 def double_time(x: Array, conv: "Conv", history: History) -> Array:
@@ -478,7 +478,7 @@ class Conv(nnx.Module):
     def apply_over_time(self, x: Array, stride: int = 1) -> Array:
         """A kernel [3 1 1 i o] without padding: [b t h w i] -> [b (t - 3) // stride + 1 h w o], as one matrix product."""
         kernel = self.kernel[...].reshape(WINDOW * self.kernel.shape[-2], self.kernel.shape[-1])
-        return self.biased(side_by_side(x.astype(self.dtype), stride) @ kernel.astype(self.dtype))
+        return self.biased(concatenate_windows(x.astype(self.dtype), stride) @ kernel.astype(self.dtype))
 
     def biased(self, x: Array) -> Array:
         return x + _row(self.bias[...], x.ndim).astype(x.dtype)
@@ -493,10 +493,10 @@ def _as_frames(x: Array, kernel: Array) -> Array:
     """[b t+2 h w i] -> [b t h w o] by a 2-D convolution of frames that have their two predecessors in their channels."""
     i, o = kernel.shape[-2:]
     flat = jnp.moveaxis(kernel, 0, 2).reshape(3, 3, WINDOW * i, o)
-    return each_frame(side_by_side(x), lambda frames: _conv(frames, flat, (1, 1), ((1, 1), (1, 1))))
+    return apply_to_frames(concatenate_windows(x), lambda frames: _conv(frames, flat, (1, 1), ((1, 1), (1, 1))))
 
 
-def side_by_side(x: Array, stride: int = 1) -> Array:
+def concatenate_windows(x: Array, stride: int = 1) -> Array:
     """Every window of three frames as channels: [b t h w i] -> [b (t - 3) // stride + 1 h w 3i]."""
     stop = x.shape[1] - WINDOW + 1
     return jnp.concatenate([x[:, tap : tap + stop : stride] for tap in range(WINDOW)], axis=-1)
@@ -508,7 +508,7 @@ def _conv(x: Array, kernel: Array, strides: Sequence[int], padding: Sequence[tup
     return lax.conv_general_dilated(x, kernel, strides, padding, dimension_numbers=names)
 
 
-def each_frame(x: Array, function: Callable[[Array], Array]) -> Array:
+def apply_to_frames(x: Array, function: Callable[[Array], Array]) -> Array:
     """Apply a function of frames [n h w c] to a video [b t h w c]."""
     b, t = x.shape[:2]
     made = function(x.reshape(b * t, *x.shape[2:]))

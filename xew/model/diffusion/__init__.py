@@ -1,6 +1,6 @@
-"""Flow matching: noise levels and training pairs on the way in, samplers along a noise schedule on the way back.
+"""Flow matching: noise levels and training pairs for training, samplers and noise schedules for rollouts.
 
-Pure functions of arrays and noise levels in [0, 1]; they know neither network nor data.
+The functions are pure, take arrays and noise levels in [0, 1], and know neither network nor data.
 """
 
 __all__ = ["flow_matching", "samplers"]

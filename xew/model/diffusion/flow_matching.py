@@ -1,7 +1,7 @@
-"""Flow matching: noise levels, the training pair and the RGB loss. (samplers.py goes the way back.)
+"""Flow matching: noise levels, the training pair and the RGB loss; samplers.py integrates what the network learns.
 
 x_sigma = (1 - sigma) x_0 + sigma n; the network predicts the velocity n - x_0. Latent frame 0 is the given reference:
-clean in training (up to a small perturbation), put back after every sampling step, and never in the loss.
+clean in training but for a small perturbation, put back after every sampling step, and never in the loss.
 """
 
 from typing import NamedTuple
@@ -10,35 +10,33 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Float, Key, Num
 
 TRAIN_LEVELS = 1000
+"""Number of noise levels that training draws from."""
 REFERENCE_NOISE = 0.1
-"""Upper end of the uniform strength of the perturbation that the reference latent gets in training (FlowWAM)."""
+"""Largest standard deviation of the noise that perturbs the reference latent in training; it is drawn uniformly (FlowWAM)."""
 
 
 class TrainingPair(NamedTuple):
     """What one training example asks of the network."""
 
-    noisy: Array
-    """[b t h w c], latent frame 0 the perturbed reference."""
-    velocity: Array
-    """[b t h w c], the target."""
-    sigma: Array
-    """[b], noise level of latent frames 1 and on."""
+    noisy: Float[Array, "b t h w c"]
+    """Noisy latents [b t h w c] float32, whose latent frame 0 is the perturbed reference."""
+    velocity: Float[Array, "b t h w c"]
+    """Target [b t h w c] float32."""
+    sigma: Float[Array, " b"]
+    """Noise level [b] float32 of latent frames 1 and on."""
 
 
-def shift_sigma(sigma: np.ndarray, shift: float) -> np.ndarray:
-    """Move noise levels towards 1: s u / (1 + (s - 1) u)."""
-    return shift * sigma / (1 + (shift - 1) * sigma)
+def training_pair(key: Key[Array, ""], latents: Float[Array, "b t h w c"], shift: float) -> TrainingPair:
+    """Noisy latents and their velocity, at a level drawn for each sample.
 
-
-def sampling_sigmas(steps: int, shift: float) -> np.ndarray:
-    """`steps` + 1 levels from 1 to 0 on the grid of DiffSynth and FlowWAM (float64)."""
-    return np.append(shift_sigma(np.linspace(1, 0, steps + 1)[:-1], shift), 0.0)
-
-
-def training_pair(key: Array, latents: Array, shift: float) -> TrainingPair:
-    """Noise latents [b t h w c]: level uniform over the shifted grid of 1000, perturbed reference in frame 0."""
+    Args:
+        key: of the random numbers.
+        latents: [b t h w c] float32, clean.
+        shift: moves the `TRAIN_LEVELS` levels, which are drawn uniformly, toward noise.
+    """
     key_level, key_noise, key_strength, key_reference = jax.random.split(key, 4)
     batch = latents.shape[0]
     levels = jnp.asarray(sampling_sigmas(TRAIN_LEVELS, shift)[:-1], jnp.float32)
@@ -51,9 +49,30 @@ def training_pair(key: Array, latents: Array, shift: float) -> TrainingPair:
     return TrainingPair(jnp.concatenate([reference, noisy[:, 1:]], axis=1), noise - latents, sigma)
 
 
-def sample_losses(predicted: Array, pair: TrainingPair, shown: Array | None = None) -> Array:
-    """Mean squared velocity error [b] over latent frames 1 and on, of those that show the episode [b t] (else all)."""
+def sample_losses(
+    predicted: Float[Array, "b t h w c"], pair: TrainingPair, valid: Num[Array, "b t"] | None = None
+) -> Float[Array, " b"]:
+    """Mean squared error of the velocity of each sample, over latent frames 1 and on.
+
+    Args:
+        predicted: [b t h w c] float32, velocity.
+        pair: what it was predicted for.
+        valid: [b t] float32, 1 for latent frames that show the episode and 0 past its end; all count if left out.
+
+    Returns:
+        [b] float32; 0 where no frame counts.
+    """
     errors = jnp.square(predicted[:, 1:] - pair.velocity[:, 1:]).mean(axis=(2, 3, 4))
-    if shown is None:
+    if valid is None:
         return errors.mean(axis=1)
-    return (errors * shown[:, 1:]).sum(axis=1) / jnp.maximum(shown[:, 1:].sum(axis=1), 1)
+    return (errors * valid[:, 1:]).sum(axis=1) / jnp.maximum(valid[:, 1:].sum(axis=1), 1)
+
+
+def sampling_sigmas(steps: int, shift: float) -> Float[np.ndarray, " levels"]:
+    """Noise levels [steps + 1] float64 from 1 to 0, in the schedule of DiffSynth and FlowWAM."""
+    return np.append(shift_sigma(np.linspace(1, 0, steps + 1)[:-1], shift), 0.0)
+
+
+def shift_sigma(sigma: Float[np.ndarray, "*n"], shift: float) -> Float[np.ndarray, "*n"]:
+    """Noise levels [...] float64 moved toward 1: s u / (1 + (s - 1) u)."""
+    return shift * sigma / (1 + (shift - 1) * sigma)

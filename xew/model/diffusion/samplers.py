@@ -1,11 +1,12 @@
-"""Samplers: from noise to latents along a grid of noise levels.
+"""Samplers and noise schedules: from noise to latents through decreasing noise levels.
 
-Reads  a velocity (latents, level) -> velocity, the reference (clean latent frame 0), noise, a `Grid`
+Reads  a velocity (latents, level) -> velocity, the reference (clean latent frame 0), noise, a `NoiseSchedule`
 Writes latents whose frame 0 is the reference
-To add a grid: a function (steps, shift) -> Grid and one line in GRIDS; a sampler: a function as `euler`, one line in SAMPLERS.
+To add a schedule: a function (steps, shift) -> NoiseSchedule and one line in SCHEDULES. To add a sampler: a function as
+`euler` and one line in SAMPLERS.
 
-Four grids are in circulation for "Wan2.2, shift 5"; they differ in the third digit, and results only compare on the same
-one, so a grid is chosen by name.
+Four schedules are in circulation for "Wan2.2, shift 5". They differ in the third digit, and results compare only under the
+same one, so a schedule is chosen by name (the config calls it `rollout.grid`).
 """
 
 from collections.abc import Callable
@@ -15,57 +16,65 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Float
 
 from xew.model.diffusion.flow_matching import TRAIN_LEVELS, sampling_sigmas, shift_sigma
 
 Velocity = Callable[[Array, Array], Array]
-"""(latents [b t h w c], noise level that the network is told [b]) -> velocity [b t h w c]."""
+"""Function (latents [b t h w c], noise level that the network gets as input [b]) -> velocity [b t h w c], all float32."""
+Schedule = Callable[[int, float], "NoiseSchedule"]
+"""Function (steps, shift) -> noise schedule."""
 _Carry = tuple[Array, Array, Array, Array]
 NEARLY_ONE = 1 - 1e-6
-"""UniPC works in the log of the signal-to-noise ratio, which pure noise does not have; diffusers starts here too."""
+"""Highest noise level that UniPC computes with: pure noise has no logarithm of a signal-to-noise ratio. As in diffusers."""
 
 
 @dataclass(frozen=True)
-class Grid:
-    """Noise levels of a sampler; hashable, so that a compiled function can take it as static."""
+class NoiseSchedule:
+    """Noise levels that a sampler goes through; hashable, so that a compiled function can take it as static."""
 
     sigmas: tuple[float, ...]
-    """`steps` + 1 decreasing levels, the last 0."""
-    told: tuple[float, ...]
-    """`steps` levels as the network is told them: some projects cut their timesteps (level times 1000) to whole numbers."""
+    """Decreasing levels, `steps` + 1 of them, the last 0."""
+    input_levels: tuple[float, ...]
+    """Levels that the network gets as input, `steps` of them: some projects cut their timesteps (level times 1000) to whole
+    numbers."""
 
     @property
     def steps(self) -> int:
-        return len(self.told)
+        """Number of evaluations of the network."""
+        return len(self.input_levels)
 
 
-def flowwam(steps: int, shift: float) -> Grid:
-    """From 1, evenly spaced before the shift. FlowWAM and DiffSynth; also the grid that training draws levels from."""
+def flowwam(steps: int, shift: float) -> NoiseSchedule:
+    """The schedule of FlowWAM and DiffSynth, and of training: from 1, evenly spaced before the shift."""
     sigmas = sampling_sigmas(steps, shift)
-    return _grid(sigmas, sigmas[:-1])
+    return _make_schedule(sigmas, sigmas[:-1])
 
 
-def wan_official(steps: int, shift: float) -> Grid:
-    """From 0.999, evenly spaced before the shift, timesteps whole. Wan's repository (`fm_solvers_unipc.py`)."""
+def wan_official(steps: int, shift: float) -> NoiseSchedule:
+    """The schedule of Wan's repository (`fm_solvers_unipc.py`): from 0.999, evenly spaced before the shift, timesteps whole."""
     sigmas = shift_sigma(np.linspace(1 - 1 / TRAIN_LEVELS, 0, steps + 1), shift)
-    return _grid(sigmas, np.floor(sigmas[:-1] * TRAIN_LEVELS) / TRAIN_LEVELS)
+    return _make_schedule(sigmas, np.floor(sigmas[:-1] * TRAIN_LEVELS) / TRAIN_LEVELS)
 
 
-def diffusers_unipc(steps: int, shift: float) -> Grid:
-    """From 1 to 0.001 before the shift, the last left out, timesteps whole. `UniPCMultistepScheduler` with flow sigmas."""
+def diffusers_unipc(steps: int, shift: float) -> NoiseSchedule:
+    """The schedule of diffusers' `UniPCMultistepScheduler` with flow sigmas.
+
+    The levels go from 1 to 0.001 before the shift, the last left out; timesteps are whole.
+    """
     sigmas = shift_sigma(np.linspace(1, 1 / TRAIN_LEVELS, steps + 1)[:-1], shift)
     sigmas[0] = min(sigmas[0], NEARLY_ONE)
-    return _grid(np.append(sigmas, 0), np.floor(sigmas * TRAIN_LEVELS) / TRAIN_LEVELS)
+    return _make_schedule(np.append(sigmas, 0), np.floor(sigmas * TRAIN_LEVELS) / TRAIN_LEVELS)
 
 
-def diffusers_euler(steps: int, shift: float) -> Grid:
-    """From 1 to the shifted 0.001, then shifted again. `FlowMatchEulerDiscreteScheduler`."""
-    lowest = shift_sigma(np.array(1 / TRAIN_LEVELS), shift)
+def diffusers_euler(steps: int, shift: float) -> NoiseSchedule:
+    """The schedule of diffusers' `FlowMatchEulerDiscreteScheduler`: from 1 to the shifted 0.001, then shifted again."""
+    lowest = shift_sigma(np.array([1 / TRAIN_LEVELS]), shift)[0]
     sigmas = shift_sigma(np.linspace(1, lowest, steps), shift)
-    return _grid(np.append(sigmas, 0), sigmas)
+    return _make_schedule(np.append(sigmas, 0), sigmas)
 
 
-GRIDS: dict[str, Callable[[int, float], Grid]] = {
+SCHEDULES: dict[str, Schedule] = {
     "flowwam": flowwam,
     "wan_official": wan_official,
     "diffusers_unipc": diffusers_unipc,
@@ -73,61 +82,85 @@ GRIDS: dict[str, Callable[[int, float], Grid]] = {
 }
 
 
-def euler(velocity: Velocity, reference: Array, noise: Array, grid: Grid) -> Array:
-    """Straight steps along the velocity.
+def euler(
+    velocity: Velocity,
+    reference: Float[Array, "b 1 h w c"],
+    noise: Float[Array, "b t h w c"],
+    schedule: NoiseSchedule,
+) -> Float[Array, "b t h w c"]:
+    """Integrate the velocity by straight steps.
 
     Args:
         velocity: see `Velocity`.
-        reference: [b 1 h w c], clean latent frame 0; put back after every step.
-        noise: [b t h w c], unit normal; its frame 0 is not used.
-        grid: see `GRIDS`.
+        reference: [b 1 h w c] float32, clean latent frame 0; put back after every step.
+        noise: [b t h w c] float32, unit normal; its frame 0 is not used.
+        schedule: see `SCHEDULES`.
 
     Returns:
-        [b t h w c] whose frame 0 is the reference.
+        [b t h w c] float32 whose frame 0 is the reference.
     """
 
     def step(latents: Array, levels: tuple[Array, Array]) -> tuple[Array, None]:
-        told, difference = levels
-        change = difference * velocity(latents, _for_batch(told, latents))
+        input_level, difference = levels
+        change = difference * velocity(latents, _repeat_for_batch(input_level, latents))
         return _put_back(reference, latents + change), None
 
-    levels = (_floats(grid.told), _floats(np.diff(grid.sigmas)))
+    levels = (_to_float32(schedule.input_levels), _to_float32(np.diff(schedule.sigmas)))
     return jax.lax.scan(step, _put_back(reference, noise), levels)[0]
 
 
-def unipc(velocity: Velocity, reference: Array, noise: Array, grid: Grid) -> Array:
-    """UniPC (Zhao et al., arXiv 2302.04867) of order 2, predicting data, variant B2, first and last step of order 1.
+def unipc(
+    velocity: Velocity,
+    reference: Float[Array, "b 1 h w c"],
+    noise: Float[Array, "b t h w c"],
+    schedule: NoiseSchedule,
+) -> Float[Array, "b t h w c"]:
+    """Integrate the velocity by UniPC (Zhao et al., arXiv 2302.04867).
 
-    Each evaluation first corrects the latents that it was made at, then predicts the next. All coefficients follow from
-    the grid alone, so a step is two weighted sums. Arguments and result are those of `euler`.
+    It is of order 2, predicts data, and is the variant B2; its first and last step are of order 1. Each evaluation first
+    corrects the latents that it was made at, then predicts the next. All coefficients follow from the schedule alone, so a
+    step is two weighted sums.
+
+    Args:
+        velocity: see `Velocity`.
+        reference: [b 1 h w c] float32, as of `euler`.
+        noise: [b t h w c] float32, as of `euler`.
+        schedule: see `SCHEDULES`.
+
+    Returns:
+        [b t h w c] float32 whose frame 0 is the reference.
     """
 
     def step(carry: _Carry, weights: tuple[Array, ...]) -> tuple[_Carry, None]:
         latents, before, data_1, data_2 = carry
-        told, sigma, correct, predict = weights
-        data = latents - sigma * velocity(latents, _for_batch(told, latents))
-        corrected = _weighted(correct, (latents, before, data, data_1, data_2))
-        latents = _weighted(predict, (corrected, data, data_1))
+        input_level, sigma, correct, predict = weights
+        data = latents - sigma * velocity(latents, _repeat_for_batch(input_level, latents))
+        corrected = _sum_weighted(correct, (latents, before, data, data_1, data_2))
+        latents = _sum_weighted(predict, (corrected, data, data_1))
         return (_put_back(reference, latents), corrected, data, data_1), None
 
     start = _put_back(reference, noise)
     nothing = jnp.zeros_like(start)
-    weights = (grid.told, grid.sigmas[:-1], correctors(grid.sigmas), predictors(grid.sigmas))
-    latents, *_ = jax.lax.scan(step, (start, nothing, nothing, nothing), tuple(_floats(weight) for weight in weights))[0]
+    sigmas = schedule.sigmas
+    weights = (schedule.input_levels, sigmas[:-1], corrector_weights(sigmas), predictor_weights(sigmas))
+    latents, *_ = jax.lax.scan(step, (start, nothing, nothing, nothing), tuple(_to_float32(weight) for weight in weights))[0]
     return latents
 
 
 SAMPLERS = {"euler": euler, "unipc": unipc}
 
 
-def predictors(sigmas: tuple[float, ...]) -> np.ndarray:
-    """UniP's weights [steps 3] of the corrected latents, of the data predicted here and of that predicted a step before."""
+def predictor_weights(sigmas: tuple[float, ...]) -> Float[np.ndarray, "steps 3"]:
+    """UniP's weights [steps 3] float64 of the corrected latents, of the data predicted here and of those a step before."""
     return np.array([_predictor(sigmas, step) for step in range(len(sigmas) - 1)])
 
 
-def correctors(sigmas: tuple[float, ...]) -> np.ndarray:
-    """UniC's weights [steps 5] of the latents, the corrected latents a step before, and the data predicted here, one and two
-    steps before. Nothing precedes the first step, which keeps its latents."""
+def corrector_weights(sigmas: tuple[float, ...]) -> Float[np.ndarray, "steps 5"]:
+    """UniC's weights [steps 5] float64.
+
+    They are those of the latents, the corrected latents a step before, and the data predicted here, one and two steps
+    before. Nothing precedes the first step, which keeps its latents.
+    """
     keep = (1.0, 0.0, 0.0, 0.0, 0.0)
     return np.array([keep, *(_corrector(sigmas, step) for step in range(1, len(sigmas) - 1))])
 
@@ -160,11 +193,11 @@ class _Interval:
     """What an exact exponential step from one level to the next does when the predicted data stay what they are."""
 
     length: float
-    """In log signal-to-noise; infinite for the last."""
+    """Difference in log signal-to-noise; infinite for the last step."""
     decay: float
     """Weight of the latents."""
     phi: float
-    """exp(-length) - 1."""
+    """Value of exp(-length) - 1."""
     gain: float
     """Weight of the data."""
 
@@ -182,12 +215,12 @@ def _log_snr(sigma: float) -> float:
 
 
 def _ratio(sigmas: tuple[float, ...], step: int, interval: _Interval) -> float:
-    """Where the level before lies, in lengths of this interval (negative)."""
+    """Place of the level before, in lengths of this interval (negative)."""
     return (_log_snr(sigmas[step - 1]) - _log_snr(sigmas[step])) / interval.length
 
 
 def _order(sigmas: tuple[float, ...], step: int) -> int:
-    """2 but for the first step, which has no past, and the last."""
+    """Order of a step: 2 but for the first, which has no past, and the last."""
     return 1 if step in (0, len(sigmas) - 2) else 2
 
 
@@ -195,17 +228,17 @@ def _put_back(reference: Array, latents: Array) -> Array:
     return jnp.concatenate([reference, latents[:, 1:]], axis=1)
 
 
-def _for_batch(level: Array, latents: Array) -> Array:
+def _repeat_for_batch(level: Array, latents: Array) -> Array:
     return jnp.broadcast_to(level, latents.shape[:1])
 
 
-def _weighted(weights: Array, terms: tuple[Array, ...]) -> Array:
+def _sum_weighted(weights: Array, terms: tuple[Array, ...]) -> Array:
     return sum((weights[i] * term for i, term in enumerate(terms[1:], start=1)), start=weights[0] * terms[0])
 
 
-def _floats(values: np.ndarray | tuple[float, ...]) -> Array:
+def _to_float32(values: np.ndarray | tuple[float, ...]) -> Array:
     return jnp.asarray(np.asarray(values), jnp.float32)
 
 
-def _grid(sigmas: np.ndarray, told: np.ndarray) -> Grid:
-    return Grid(tuple(map(float, sigmas)), tuple(map(float, told)))
+def _make_schedule(sigmas: np.ndarray, input_levels: np.ndarray) -> NoiseSchedule:
+    return NoiseSchedule(tuple(map(float, sigmas)), tuple(map(float, input_levels)))

@@ -120,7 +120,7 @@ def load_dit(model: WorldModel, path: Path) -> None:
         ConfigError: tensors are missing, left over or of another shape.
     """
     tensors = read_tensors(path)
-    layout = dit_layout(model, naming_of(tensors))
+    layout = dit_layout(model, find_naming(tensors))
     fill(model, tensors, layout, optional=_may_differ(model, tensors))
     for name in model.condition_streams:
         if STREAMS[name].source == "latents" and layout[f"stream_inputs.{name}.kernel"].keys[0] not in tensors:
@@ -133,12 +133,12 @@ def load_dit(model: WorldModel, path: Path) -> None:
 def check_dit(model: WorldModel, path: Path) -> None:
     """Raises what `load_dit` would, without reading a tensor; `model` may be of `nnx.eval_shape`."""
     tensors = read_tensors(path)
-    check_fit(model, tensors, dit_layout(model, naming_of(tensors)), optional=_may_differ(model, tensors))
+    check_fit(model, tensors, dit_layout(model, find_naming(tensors)), optional=_may_differ(model, tensors))
 
 
 def _may_differ(model: WorldModel, tensors: Tensors) -> tuple[str, ...]:
     """Leaves that a checkpoint may lack (all that Wan does not have) and keys that it may have beside."""
-    naming = naming_of(tensors)
+    naming = find_naming(tensors)
     return (*(dit_layout(model, naming).keys() - wan_layout(model, naming).keys()), *NOT_OURS)
 
 
@@ -184,7 +184,7 @@ def diffusers_config(model: WorldModel) -> dict[str, Any]:
     }
 
 
-def naming_of(tensors: Tensors) -> Naming:
+def find_naming(tensors: Tensors) -> Naming:
     """Whose names a checkpoint uses."""
     return "diffusers" if any(key.startswith("condition_embedder.") for key in tensors) else "official"
 

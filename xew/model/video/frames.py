@@ -10,6 +10,9 @@ import numpy as np
 
 from xew.episode import HEIGHT, WIDTH
 
+TEMPORAL_FACTOR = 4
+"""Number of frames of video in a latent frame; the first latent frame holds one."""
+
 
 class Padding(NamedTuple):
     """Rows or columns added before resizing [pixels of the camera]."""

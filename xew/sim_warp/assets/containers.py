@@ -27,14 +27,15 @@ DARK: Color = (48, 48, 52)
 AMBER: Color = (214, 120, 30)
 
 SECTIONS = 32
-"""Facets round what is turned."""
+"""Number of facets round a body of revolution."""
 SIDES = 12
-"""Flat sides of what stands."""
+"""Number of flat sides of a container that stands."""
 GRASP_BELOW_TOP = 0.014
-"""Of the tool when what stands is taken from above [m]: deeper, and the palm of a leaning hand would meet the edge."""
+"""Depth of the tool below the top when a standing container is taken from above [m]: deeper, and the palm of a leaning hand
+would meet the edge."""
 
 Outline = Sequence[tuple[float, float]]
-"""(radius, height) pairs [m] from the bottom to the top."""
+"""Pairs (radius, height) [m] from the bottom to the top."""
 
 
 @dataclass(frozen=True)
@@ -42,14 +43,14 @@ class Band:
     """A stretch of a container's height that is painted."""
 
     low: float
-    """m."""
+    """Lower end [m]."""
     high: float
     color: Color
     front: Color | None = None
-    """Of the label's front, a third of the way round."""
+    """Color of the label's front, a third of the way round."""
 
 
-def turned(outline: Outline, color: Color, bands: Sequence[Band] = (), facing: float = 0.0) -> Mesh:
+def revolve_painted(outline: Outline, color: Color, bands: Sequence[Band] = (), facing: float = 0.0) -> Mesh:
     """A body of revolution whose stretches of height are painted.
 
     Args:
@@ -84,7 +85,7 @@ def column(radii: tuple[float, float], low: float, high: float, sides: int) -> n
     return np.concatenate(ends).astype(np.float32)
 
 
-def balance(shape: Shape) -> np.ndarray:
+def center_of_mass(shape: Shape) -> np.ndarray:
     """[3] center of mass [m] of a shape's convex pieces, all of one density."""
     pieces = [trimesh.convex.convex_hull(np.asarray(points, float)) for points in shape.hulls]
     volumes = np.array([piece.volume for piece in pieces])
@@ -92,11 +93,11 @@ def balance(shape: Shape) -> np.ndarray:
 
 
 def height(shape: Shape) -> float:
-    """Of the top above the bottom face [m]."""
+    """Height of the top above the bottom face [m]."""
     return float(shape.mesh.vertices[:, 2].max())
 
 
-def palette(rng: np.random.Generator, count: int) -> list[str]:
+def draw_color_names(rng: np.random.Generator, count: int) -> list[str]:
     """Names of different colors of `objects.PALETTE`."""
     return [str(name) for name in rng.permutation(sorted(objects.PALETTE))[:count]]
 
@@ -107,7 +108,7 @@ def palette(rng: np.random.Generator, count: int) -> list[str]:
 def can(rng: np.random.Generator) -> tuple[Shape, str]:
     """A tin can with a paper label, and its color's name: radius 25 to 29 mm, 88 to 108 mm high."""
     radius, top = rng.uniform([0.025, 0.088], [0.029, 0.108])
-    label, stripe = palette(rng, 2)
+    label, stripe = draw_color_names(rng, 2)
     middle = rng.uniform(0.35, 0.65) * top
     facing = rng.uniform(-np.pi, np.pi)
     bands = [
@@ -125,7 +126,7 @@ def can(rng: np.random.Generator) -> tuple[Shape, str]:
         (radius - 0.002, top),
         (radius - 0.005, top - 0.002),
     ]
-    return Shape(turned(outline, METAL, bands, facing), (column((radius, radius), 0.0, top, SIDES),)), label
+    return Shape(revolve_painted(outline, METAL, bands, facing), (column((radius, radius), 0.0, top, SIDES),)), label
 
 
 def pill_bottle(rng: np.random.Generator) -> tuple[Shape, str]:
@@ -134,7 +135,7 @@ def pill_bottle(rng: np.random.Generator) -> tuple[Shape, str]:
     cap = rng.uniform(0.018, 0.023)
     name, color = _pill_colors()[rng.integers(len(_pill_colors()))]
     lid = [WHITE, WHITE, objects.PALETTE["red"], objects.PALETTE["blue"], DARK][rng.integers(5)]
-    stripe = objects.PALETTE[palette(rng, 1)[0]]
+    stripe = objects.PALETTE[draw_color_names(rng, 1)[0]]
     low, high = 0.012, top - cap - 0.014
     bands = [Band(low, high, PAPER), Band(high - 0.010, high, stripe), Band(top - cap, top + 0.001, lid)]
     outline = [
@@ -150,7 +151,7 @@ def pill_bottle(rng: np.random.Generator) -> tuple[Shape, str]:
         (radius, top - 0.003),
         (radius - 0.003, top),
     ]
-    body = turned(outline, color, bands, rng.uniform(-np.pi, np.pi))
+    body = revolve_painted(outline, color, bands, rng.uniform(-np.pi, np.pi))
     ribs = [_rib(radius, angle, top - cap + 0.003, top - 0.004, lid) for angle in np.arange(24) * np.pi / 12]
     return Shape(meshes.merge([body, *ribs]), (column((radius, radius), 0.0, top, SIDES),)), name
 
@@ -165,7 +166,7 @@ def _rib(radius: float, angle: float, low: float, high: float, color: Color) -> 
     return rib.transformed(rpy=(0, 0, angle))
 
 
-def standing(name: str, shape: Shape, xy: Point, yaw: float, mass: float) -> SceneObject:
+def place_standing(name: str, shape: Shape, xy: Point, yaw: float, mass: float) -> SceneObject:
     """A can or pill bottle on the table at `xy` [2] m, turned by `yaw` [rad], to be taken by its upper end."""
     width = 2 * float(shape.hulls[0][:, 0].max())
     grasp = Grasp(height(shape) - GRASP_BELOW_TOP, width, 2 * np.pi / SIDES)
@@ -175,12 +176,12 @@ def standing(name: str, shape: Shape, xy: Point, yaw: float, mass: float) -> Sce
 # --- Bottles, that lie on the table.
 
 
-def lying(name: str, shape: Shape, xy: Point, yaw: float, mass: float) -> SceneObject:
+def place_lying(name: str, shape: Shape, xy: Point, yaw: float, mass: float) -> SceneObject:
     """A bottle on its side with its point of balance over `xy` [2] m, its neck along +y turned by `yaw` [rad]; a hand takes it
     there, across. In its own frame it lies on z = 0, the origin under its point of balance."""
     turn = Rotation.from_euler("x", -np.pi / 2)
     thickness = 2 * float(shape.hulls[0][:, 1].max())  # of the flat side that looks down
-    shift = np.array([0.0, 0.0, thickness / 2]) - turn.apply(balance(shape))
+    shift = np.array([0.0, 0.0, thickness / 2]) - turn.apply(center_of_mass(shape))
     hulls = tuple((turn.apply(hull) + shift).astype(np.float32) for hull in shape.hulls)
     mesh = shape.mesh.transformed(shift, (-np.pi / 2, 0, 0))
     grasp = Grasp(thickness / 2, 2 * float(shape.hulls[0][:, 0].max()), 2 * np.pi)
@@ -196,7 +197,7 @@ def bottle(rng: np.random.Generator) -> tuple[Shape, str]:
 def _drink_bottle(rng: np.random.Generator) -> tuple[Shape, str]:
     """Long shoulders, a neck and a screw cap, a paper label round the belly."""
     radius, shoulder, neck = rng.uniform([0.026, 0.105, 0.045], [0.030, 0.120, 0.060])
-    drink, label = palette(rng, 2)
+    drink, label = draw_color_names(rng, 2)
     top = shoulder + neck + 0.020
     outline = [
         (radius - 0.004, 0.0),
@@ -212,7 +213,7 @@ def _drink_bottle(rng: np.random.Generator) -> tuple[Shape, str]:
     ]
     bands = [Band(0.030, shoulder - 0.025, objects.PALETTE[label], PAPER), Band(top - 0.017, top + 0.001, WHITE)]
     hulls = (column((radius, radius), 0.0, shoulder, 8), column((radius * 0.95, 0.014), shoulder, top, 8))
-    return Shape(turned(outline, objects.PALETTE[drink], bands, rng.uniform(-np.pi, np.pi)), hulls), drink
+    return Shape(revolve_painted(outline, objects.PALETTE[drink], bands, rng.uniform(-np.pi, np.pi)), hulls), drink
 
 
 def _sauce_bottle(rng: np.random.Generator) -> tuple[Shape, str]:
@@ -234,13 +235,13 @@ def _sauce_bottle(rng: np.random.Generator) -> tuple[Shape, str]:
     ]
     bands = [Band(0.035, shoulder - 0.030, PAPER, objects.PALETTE[sauce]), Band(shoulder, top + 0.001, WHITE)]
     hulls = (column((radius, radius), 0.0, shoulder, 8), column((0.019, 0.004), shoulder, top, 8))
-    return Shape(turned(outline, objects.PALETTE[sauce], bands, rng.uniform(-np.pi, np.pi)), hulls), sauce
+    return Shape(revolve_painted(outline, objects.PALETTE[sauce], bands, rng.uniform(-np.pi, np.pi)), hulls), sauce
 
 
 def _flask(rng: np.random.Generator) -> tuple[Shape, str]:
     """An insulated flask with a wide cap."""
     radius, shoulder = rng.uniform([0.027, 0.140], [0.030, 0.155])
-    paint = palette(rng, 1)[0]
+    paint = draw_color_names(rng, 1)[0]
     cap = [DARK, METAL, WHITE][rng.integers(3)]
     top = shoulder + 0.038
     outline = [
@@ -256,18 +257,18 @@ def _flask(rng: np.random.Generator) -> tuple[Shape, str]:
     ]
     bands = [Band(0.0, 0.014, METAL), Band(shoulder, shoulder + 0.006, METAL), Band(shoulder + 0.006, top + 0.001, cap)]
     hulls = (column((radius, radius), 0.0, shoulder, 8), column((0.024, 0.024), shoulder, top, 8))
-    return Shape(turned(outline, objects.PALETTE[paint], bands, 0.0), hulls), paint
+    return Shape(revolve_painted(outline, objects.PALETTE[paint], bands, 0.0), hulls), paint
 
 
 def _shampoo(rng: np.random.Generator) -> tuple[Shape, str]:
     """A flat bottle with rounded edges and a flip cap; it lies on its broad side."""
     width, depth, shoulder = rng.uniform([0.050, 0.038, 0.125], [0.058, 0.044, 0.145])
-    paint, label = palette(rng, 2)
+    paint, label = draw_color_names(rng, 2)
     top = shoulder + 0.036
-    body = _rounded(width, depth, 0.0, shoulder - 0.010)
-    tapered = np.concatenate([body, _rounded(0.6 * width, 0.7 * depth, shoulder, shoulder + 0.002)])
-    sticker = meshes.hull(_rounded(width * 0.7, depth + 0.001, 0.035, shoulder - 0.035), PAPER)
-    stripe = meshes.hull(_rounded(width * 0.7, depth + 0.002, 0.060, 0.075), objects.PALETTE[label])
+    body = _rounded_box_points(width, depth, 0.0, shoulder - 0.010)
+    tapered = np.concatenate([body, _rounded_box_points(0.6 * width, 0.7 * depth, shoulder, shoulder + 0.002)])
+    sticker = meshes.hull(_rounded_box_points(width * 0.7, depth + 0.001, 0.035, shoulder - 0.035), PAPER)
+    stripe = meshes.hull(_rounded_box_points(width * 0.7, depth + 0.002, 0.060, 0.075), objects.PALETTE[label])
     cap = meshes.cylinder(0.016, 0.034, WHITE).transformed((0, 0, shoulder + 0.019))
     mesh = meshes.merge([meshes.hull(tapered, objects.PALETTE[paint]), sticker, stripe, cap])
     half = np.array([width, depth, 0.0]) / 2
@@ -275,8 +276,8 @@ def _shampoo(rng: np.random.Generator) -> tuple[Shape, str]:
     return Shape(mesh, ((corners * [*half[:2], 1]).astype(np.float32), column((0.016, 0.016), shoulder, top, 8))), paint
 
 
-def _rounded(width: float, depth: float, low: float, high: float, edge: float = 0.012) -> np.ndarray:
-    """Points of a box about z whose upright edges are rounded."""
+def _rounded_box_points(width: float, depth: float, low: float, high: float, edge: float = 0.012) -> np.ndarray:
+    """Points [k 3] m of a box about z whose upright edges are rounded."""
     angle = np.linspace(0, np.pi / 2, 4)
     quarter = np.stack([width / 2 - edge + edge * np.cos(angle), depth / 2 - edge + edge * np.sin(angle)], -1)
     ring = np.concatenate([quarter * [sx, sy] for sx in (-1, 1) for sy in (-1, 1)])
@@ -295,15 +296,15 @@ def pot(rng: np.random.Generator, radius: tuple[float, float], height: tuple[flo
         reach: of the handles' bars beyond the body [m].
     """
     body, top = (float(rng.uniform(*span)) for span in (radius, height))
-    paint = palette(rng, 1)[0]
+    paint = draw_color_names(rng, 1)[0]
     steel = rng.random() < 0.4
     color = METAL if steel else objects.PALETTE[paint]
     outline = [(body - 0.010, 0.0), (body, 0.010), (body, top - 0.012), (body, top - 0.004), (body + 0.003, top)]
     rim = [Band(top - 0.012, top + 0.001, METAL)]
     if rng.random() < 0.3:
-        parts = [turned([*outline, (body - 0.004, top), (body - 0.006, 0.006)], color, rim)]
+        parts = [revolve_painted([*outline, (body - 0.004, top), (body - 0.006, 0.006)], color, rim)]
     else:
-        parts = [turned([*outline, (body - 0.004, top)], color, rim), _lid(rng, body, top, color)]
+        parts = [revolve_painted([*outline, (body - 0.004, top)], color, rim), _lid(rng, body, top, color)]
     shape = Shape(meshes.merge(parts), (column((body, body), 0.0, top, SIDES),))
     grip = DARK if rng.random() < 0.5 else METAL
     loops = [_loop(side, body, body + reach, top + 0.004, grip) for side in (-1, 1)]
@@ -319,10 +320,10 @@ def handles(pot: Shape) -> np.ndarray:
 def _lid(rng: np.random.Generator, radius: float, top: float, color: Color) -> Mesh:
     """A shallow dome with a knob, low enough for the palms of hands at the handles."""
     paint = [METAL, color, (150, 165, 170)][rng.integers(3)]
-    dome = turned(
+    dome = revolve_painted(
         [(radius - 0.001, top), (radius - 0.004, top + 0.003), (0.5 * radius, top + 0.006), (0.012, top + 0.008)], paint
     )
-    knob = turned([(0.006, top + 0.008), (0.006, top + 0.012), (0.011, top + 0.014), (0.010, top + 0.019)], DARK)
+    knob = revolve_painted([(0.006, top + 0.008), (0.006, top + 0.012), (0.011, top + 0.014), (0.010, top + 0.019)], DARK)
     return meshes.merge([dome, knob])
 
 

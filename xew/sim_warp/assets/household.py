@@ -21,10 +21,10 @@ from xew.sim_warp.stage import TABLE_TOP
 LOWEST_GRASP = 0.019
 """Height of the tool above the table at which a leaning pad just clears it [m]: pads reach 15 mm beyond the tool."""
 PALM = 0.020
-"""How far above the tool a long thing may reach [m]: the palm of the hand with the shortest fingers leans over its end."""
+"""Greatest reach of a long thing above the tool [m]: the palm of the hand with the shortest fingers leans over its end."""
 HALF_TURN, QUARTER_TURN = np.pi, np.pi / 2
 SKIN = 0.0006
-"""How far a printed or glued part stands out of the face that it decorates [m]."""
+"""Distance by which a printed or glued part stands out of the face that it decorates [m]."""
 
 DARK: Color = (45, 46, 50)
 STEEL: Color = (168, 172, 178)
@@ -36,7 +36,7 @@ MATS: dict[str, Color] = {name: COLORS[name] for name in ("red", "green", "blue"
     "cyan": (70, 190, 205),
     "magenta": (190, 60, 150),
 }
-"""RoboTwin's eight colors of the mats on which things are put."""
+"""Colors of the mats on which things are put, RoboTwin's eight."""
 MAT_THICKNESS = 0.001
 
 
@@ -57,41 +57,41 @@ class Thing:
     kind: str
     """Key of `THINGS`."""
     words: str
-    """What an instruction calls it, without an article: "red toy car"."""
+    """Name in an instruction, without an article: "red toy car"."""
     shape: Shape
     mass: float
-    """kg."""
+    """Mass [kg]."""
     grasp_height: float
-    """Of the tool above the object's bottom, on the object's own z axis [m]."""
+    """Height of the tool above the object's bottom, on the object's own z axis [m]."""
     width: float
-    """Between the fingers [m]."""
+    """Width between the fingers [m]."""
     symmetry: float
-    """Turning the hand by this angle about z [rad] gives an equally good grasp: pi for what is long, less for what is
-    square or round."""
+    """Angle by which the hand may turn about z for an equally good grasp [rad]: pi for what is long, less for what is square
+    or round."""
 
-    def placed(self, name: str, xy: Point, yaw: float) -> SceneObject:
+    def place_at(self, name: str, xy: Point, yaw: float) -> SceneObject:
         """The thing upright on the table at `xy` [2] m, turned by `yaw` [rad]."""
         grasp = Grasp(self.grasp_height, self.width, self.symmetry)
         return SceneObject(name, self.shape, upright(xy, TABLE_TOP, yaw), self.mass, grasp=grasp)
 
     @property
     def height(self) -> float:
-        """m."""
+        """Height of the top above the bottom [m]."""
         return float(max(hull[:, 2].max() for hull in self.shape.hulls))
 
     @property
     def length(self) -> float:
-        """Along y [m]."""
+        """Length along y [m]."""
         return float(np.ptp(np.concatenate(self.shape.hulls)[:, 1]))
 
     @property
     def radius(self) -> float:
-        """Of the circle about the origin that holds the footprint [m]."""
+        """Radius of the circle about the origin that holds the footprint [m]."""
         return footprint_radius(self.shape)
 
 
 def footprint_radius(shape: Shape) -> float:
-    """Of the circle about a shape's z axis that holds all that collides of it [m]."""
+    """Radius of the circle about a shape's z axis that holds all that collides of it [m]."""
     return float(max(np.hypot(hull[:, 0], hull[:, 1]).max() for hull in shape.hulls))
 
 
@@ -108,12 +108,7 @@ def _color(rng: np.random.Generator, names: Sequence[str]) -> tuple[str, Color]:
     return name, COLORS[name]
 
 
-def _darker(color: Color, share: float) -> Color:
-    red, green, blue = color
-    return int(share * red), int(share * green), int(share * blue)
-
-
-def _holding(height: float) -> float:
+def _holding_height(height: float) -> float:
     """Height of the tool for a long thing of a height, both over its bottom [m]: as low as the palm allows."""
     return max(LOWEST_GRASP, height - PALM)
 
@@ -131,7 +126,7 @@ def part(size: Sequence[float], at: Sequence[float], color: Color) -> Mesh:
     return meshes.box(size, color).transformed(at)
 
 
-def on_top(length: Sequence[float], at: Sequence[float], color: Color) -> Mesh:
+def print_on(length: Sequence[float], at: Sequence[float], color: Color) -> Mesh:
     """A printed rectangle of `length` x y [m] on the horizontal face at the point `at` of it."""
     return part((*length, 2 * SKIN), at, color)
 
@@ -190,13 +185,13 @@ class StaplerParts:
     words: str
     base: Shape
     arm: Shape
-    """As it stands open: the gap below it is widest at the front."""
+    """Upper arm as it stands open: the gap below it is widest at the front."""
     hinge: tuple[float, float, float]
-    """A point of the axis, which runs along x [m]."""
+    """Point of the axis, which runs along x [m]."""
     width: float
     length: float
     height: float
-    """m."""
+    """Height of the whole [m]."""
     opening: float
     """Angle by which the arm comes down until its front meets the base [rad]."""
 
@@ -207,7 +202,7 @@ def stapler_parts(rng: np.random.Generator) -> StaplerParts:
     width, length, height = rng.uniform([0.026, 0.088, 0.044], [0.034, 0.100, 0.050])
     back, foot, gap = -length / 2, 0.010, 0.016
     base = slab((width, length, foot), 0.0015, DARK)
-    anvil = on_top((width * 0.5, 0.014), (0, length * 0.36, foot), STEEL)
+    anvil = print_on((width * 0.5, 0.014), (0, length * 0.36, foot), STEEL)
     post = part((width * 0.7, 0.016, 0.012), (0, back + 0.012, foot + 0.006), STEEL)
     top = height + np.array([-0.007, 0, -0.002, -0.014])
     ways = length * np.array([-0.5, -0.38, 0.30, 0.49])
@@ -218,7 +213,7 @@ def stapler_parts(rng: np.random.Generator) -> StaplerParts:
         width * 0.5,
         STEEL,
     )
-    rest = part((width * 0.62, 0.34 * length, 0.002), (0, 0.08 * length, height - 0.0012), _darker(color, 0.6))
+    rest = part((width * 0.62, 0.34 * length, 0.002), (0, 0.08 * length, height - 0.0012), objects.darken(color, 0.6))
     nose = part((width * 0.55, 0.006, 0.012), (0, 0.49 * length, height - 0.022), STEEL)
     return StaplerParts(
         words=f"{name} stapler",
@@ -236,7 +231,13 @@ def stapler(rng: np.random.Generator) -> Thing:
     """A desk stapler as one rigid piece."""
     parts = stapler_parts(rng)
     return Thing(
-        "stapler", parts.words, objects.merge(parts.base, parts.arm), 0.09, _holding(parts.height), parts.width, HALF_TURN
+        "stapler",
+        parts.words,
+        objects.merge(parts.base, parts.arm),
+        0.09,
+        _holding_height(parts.height),
+        parts.width,
+        HALF_TURN,
     )
 
 
@@ -300,10 +301,10 @@ def toy_car(rng: np.random.Generator) -> Thing:
         for side in (-1, 1)
         for way, light in ((1, CREAM), (-1, COLORS["red"]))
     ]
-    bed = [on_top((width * 0.8, 0.32 * length), (0, -0.29 * length, deck), DARK)] if form == "pickup" else []
+    bed = [print_on((width * 0.8, 0.32 * length), (0, -0.29 * length, deck), DARK)] if form == "pickup" else []
     shape = Shape(meshes.merge([body, cabin, windows, *panes, *wheels, *lamps, *bed]), (under.vertices, cabin.vertices))
     words = {"car": "toy car", "van": "toy van", "pickup": "toy pickup"}[form]
-    return Thing("toy_car", f"{name} {words}", shape, 0.07, _holding(deck + roof), width, HALF_TURN)
+    return Thing("toy_car", f"{name} {words}", shape, 0.07, _holding_height(deck + roof), width, HALF_TURN)
 
 
 CUBE_FACES: tuple[Color, ...] = ((200, 45, 40), (225, 120, 45), (240, 240, 235), (225, 195, 55), (50, 90, 190), (60, 150, 70))
@@ -353,7 +354,7 @@ def bread(rng: np.random.Generator) -> Thing:
             meshes.box((0.62 * width, 0.006, 0.004), pale).transformed((0, y * end, height - 0.0028), (0, 0, 0.5)) for y in cuts
         ]
     words = {"bun": "bread bun", "roll": "bread roll", "loaf": "loaf of bread", "baguette": "baguette"}[form]
-    return Thing("bread", words, _solid(body, seen=scores), 0.06, _holding(height), width, HALF_TURN)
+    return Thing("bread", words, _solid(body, seen=scores), 0.06, _holding_height(height), width, HALF_TURN)
 
 
 def phone(rng: np.random.Generator) -> Thing:
@@ -361,15 +362,15 @@ def phone(rng: np.random.Generator) -> Thing:
     name, color = _color(rng, ("black", "gray", "blue", "red", "purple", "green"))
     width, length, thickness = rng.uniform([0.058, 0.120, 0.012], [0.064, 0.136, 0.015])
     body = slab((width, length, thickness), 0.0022, color)
-    glass = on_top((width - 0.006, length - 0.010), (0, 0, thickness), (24, 28, 38))
+    glass = print_on((width - 0.006, length - 0.010), (0, 0, thickness), (24, 28, 38))
     tint: Color = ((60, 110, 190), (40, 150, 140), (150, 80, 160))[rng.integers(3)]
-    picture = on_top((width - 0.012, length - 0.026), (0, 0, thickness + SKIN / 2), tint)
+    picture = print_on((width - 0.012, length - 0.026), (0, 0, thickness + SKIN / 2), tint)
     icons = [
-        on_top((0.008, 0.008), ((column - 1.5) * 0.012, -length * 0.32 + row * 0.014, thickness + SKIN), icon)
+        print_on((0.008, 0.008), ((column - 1.5) * 0.012, -length * 0.32 + row * 0.014, thickness + SKIN), icon)
         for row in range(2)
         for column, icon in enumerate([(240, 240, 240), (230, 180, 60), (110, 200, 120), (225, 95, 85)])
     ]
-    ear = on_top((0.014, 0.0025), (0, length / 2 - 0.009, thickness + SKIN), (95, 98, 105))
+    ear = print_on((0.014, 0.0025), (0, length / 2 - 0.009, thickness + SKIN), (95, 98, 105))
     shape = _solid(body, seen=[glass, picture, *icons, ear])
     return Thing("phone", f"{name} phone", shape, 0.10, LOWEST_GRASP, width, HALF_TURN)
 
@@ -379,9 +380,9 @@ def playing_cards(rng: np.random.Generator) -> Thing:
     name, color = _color(rng, ("red", "blue", "green", "black"))
     width, length, height = rng.uniform([0.057, 0.086, 0.019], [0.063, 0.094, 0.024])
     body = slab((width, length, height), 0.0008, CREAM)
-    back = on_top((width - 0.008, length - 0.008), (0, 0, height), color)
-    frame = on_top((width - 0.018, length - 0.018), (0, 0, height + SKIN / 2), CREAM)
-    field = on_top((width - 0.021, length - 0.021), (0, 0, height + SKIN), color)
+    back = print_on((width - 0.008, length - 0.008), (0, 0, height), color)
+    frame = print_on((width - 0.018, length - 0.018), (0, 0, height + SKIN / 2), CREAM)
+    field = print_on((width - 0.021, length - 0.021), (0, 0, height + SKIN), color)
     diamond = meshes.box((0.02, 0.02, 2 * SKIN), CREAM).transformed((0, 0, height + 1.5 * SKIN), (0, 0, np.pi / 4))
     edges = [part((width + SKIN, length + SKIN, 0.0012), (0, 0, height * share), (200, 196, 186)) for share in (0.35, 0.65)]
     shape = _solid(body, seen=[back, frame, field, diamond, *edges])
@@ -391,13 +392,13 @@ def playing_cards(rng: np.random.Generator) -> Thing:
 def wooden_block(rng: np.random.Generator) -> Thing:
     """A block of wood with its grain on top."""
     wood: Color = ((206, 164, 110), (176, 124, 74), (142, 92, 54))[rng.integers(3)]
-    grain = _darker(wood, 0.78)
+    grain = objects.darken(wood, 0.78)
     width, length, height = rng.uniform([0.040, 0.068, 0.030], [0.056, 0.098, 0.048])
     body = slab((width, length, height), 0.002, wood)
     lines = rng.uniform(-0.42, 0.42, 5) * width
-    seen = [on_top((0.0022, length * 0.95), (x, 0, height - SKIN / 2), grain) for x in lines]
+    seen = [print_on((0.0022, length * 0.95), (x, 0, height - SKIN / 2), grain) for x in lines]
     seen += [part((0.0022, length + 2 * SKIN - 0.001, height * 0.9), (x, 0, height / 2), grain) for x in lines[:2]]
-    return Thing("wooden_block", "wooden block", _solid(body, seen=seen), 0.10, _holding(height), width, HALF_TURN)
+    return Thing("wooden_block", "wooden block", _solid(body, seen=seen), 0.10, _holding_height(height), width, HALF_TURN)
 
 
 def tea_box(rng: np.random.Generator) -> Thing:
@@ -405,14 +406,14 @@ def tea_box(rng: np.random.Generator) -> Thing:
     name, color = _color(rng, ("green", "teal", "red", "purple", "yellow"))
     width, length, height = rng.uniform([0.048, 0.070, 0.042], [0.060, 0.092, 0.060])
     leaf = meshes.cylinder(0.013, 2 * SKIN, (70, 125, 60), sections=16)
-    leaf = _squeezed(leaf, 0.5).transformed((0, 0, height + SKIN), (0, 0, 0.7))
+    leaf = _squeeze(leaf, 0.5).transformed((0, 0, height + SKIN), (0, 0, 0.7))
     rib = meshes.box((0.001, 0.026, 2 * SKIN), (190, 215, 160)).transformed((0, 0, height + 1.5 * SKIN), (0, 0, 0.7))
     return Thing(
         "tea_box",
         f"{name} tea box",
         _carton((width, length, height), color, CREAM, [leaf, rib]),
         0.08,
-        _holding(height),
+        _holding_height(height),
         width,
         HALF_TURN,
     )
@@ -423,14 +424,14 @@ def coffee_box(rng: np.random.Generator) -> Thing:
     box: Color = ((84, 54, 38), (58, 44, 40), (120, 72, 44))[rng.integers(3)]
     name, label = _color(rng, ("orange", "yellow", "red", "gray"))
     width, length, height = rng.uniform([0.050, 0.066, 0.044], [0.062, 0.084, 0.062])
-    bean = _squeezed(meshes.cylinder(0.013, 2 * SKIN, (70, 42, 28), sections=16), 0.66).transformed((0, 0, height + SKIN))
+    bean = _squeeze(meshes.cylinder(0.013, 2 * SKIN, (70, 42, 28), sections=16), 0.66).transformed((0, 0, height + SKIN))
     cleft = meshes.box((0.002, 0.022, 2 * SKIN), (190, 150, 110)).transformed((0, 0, height + 1.5 * SKIN), (0, 0, 0.2))
     return Thing(
         "coffee_box",
         f"coffee box with a {name} label",
         _carton((width, length, height), box, label, [bean, cleft]),
         0.08,
-        _holding(height),
+        _holding_height(height),
         width,
         HALF_TURN,
     )
@@ -442,11 +443,11 @@ def _carton(size: Sequence[float], color: Color, label: Color, top: Sequence[Mes
     body = slab(size, 0.0008, color)
     band = part((width + 2 * SKIN, length * 0.5, height * 0.55), (0, 0, height * 0.5), label)
     ends = part((width * 0.6, length + 2 * SKIN, height * 0.55), (0, 0, height * 0.5), label)
-    lid = on_top((width * 0.72, length * 0.6), (0, 0, height), label)
+    lid = print_on((width * 0.72, length * 0.6), (0, 0, height), label)
     return _solid(body, seen=[band, ends, lid, *top])
 
 
-def _squeezed(mesh: Mesh, share: float) -> Mesh:
+def _squeeze(mesh: Mesh, share: float) -> Mesh:
     """A flat mesh made narrower along x; its normals, up or along the rim, stay good enough."""
     return Mesh((mesh.vertices * [share, 1, 1]).astype(np.float32), mesh.triangles, mesh.colors, mesh.normals)
 
@@ -467,9 +468,9 @@ def soap(rng: np.random.Generator) -> Thing:
     half, end, color = width / 2, length / 2, SOAPS[name]
     corners = [(-1, 0.6, 0.82), (-0.76, 1, 1), (0.76, 1, 1), (1, 0.6, 0.82)]
     body = _loft([(y * end, w * half, h * height) for y, w, h in corners], 0.7, color)
-    deep = _darker(color, 0.86)
-    oval = _squeezed(meshes.cylinder(length * 0.28, 0.003, deep, sections=20), 0.5).transformed((0, 0, height - 0.0008))
-    inner = _squeezed(meshes.cylinder(length * 0.22, 0.003, color, sections=20), 0.45).transformed((0, 0, height - 0.0003))
+    deep = objects.darken(color, 0.86)
+    oval = _squeeze(meshes.cylinder(length * 0.28, 0.003, deep, sections=20), 0.5).transformed((0, 0, height - 0.0008))
+    inner = _squeeze(meshes.cylinder(length * 0.22, 0.003, color, sections=20), 0.45).transformed((0, 0, height - 0.0003))
     return Thing("soap", f"{name} soap", _solid(body, seen=[oval, inner]), 0.08, LOWEST_GRASP, width, HALF_TURN)
 
 

@@ -1,11 +1,11 @@
-"""Waiting for a GPU without keeping a core busy: CUDA's own wait spins, and workers have better use for the core."""
+"""Waiting for a GPU without keeping a core busy. CUDA's own wait spins, and workers need the core."""
 
 import time
 
 import warp as wp
 
 PAUSE = 0.0005
-"""Between two looks [s]."""
+"""Time between two looks [s]."""
 
 
 def wait_for(device: wp.Device) -> None:

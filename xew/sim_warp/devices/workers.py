@@ -27,10 +27,10 @@ Result = TypeVar("Result")
 
 
 MEMORY_PER_WORKER = 9e9
-"""Of a GPU [bytes]: a batch of 256 worlds, 512 frames in flight and what CUDA itself takes."""
+"""Memory of a GPU that a worker takes [bytes]: a batch of 256 worlds, 512 frames in flight and what CUDA itself takes."""
 
 
-def named_device(name: str | None) -> warp.Device:
+def find_device(name: str | None) -> warp.Device:
     """The device that a command's --device names, or the one that Warp prefers. Raises ConfigError if it is not there."""
     try:
         return warp.get_device(name)

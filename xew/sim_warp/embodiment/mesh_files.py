@@ -17,9 +17,9 @@ from trimesh.resolvers import Resolver
 from trimesh.visual import TextureVisuals
 
 LARGEST_FILE = 200e6
-"""Bytes of a mesh file; a larger one is refused before it is read."""
+"""Largest size of a mesh file [bytes]; a larger one is refused before it is read."""
 MOST_TRIANGLES = 1_000_000
-"""Of one mesh file; a link of our own robots has some hundreds."""
+"""Largest number of triangles of a mesh file; a link of our own robots has some hundreds."""
 SAMPLES = np.array([(4, 1, 1), (1, 4, 1), (1, 1, 4), (2, 2, 2), (3, 3, 0), (0, 3, 3), (3, 0, 3)]) / 6
 """Barycentric coordinates at which a texture is read."""
 
@@ -33,7 +33,7 @@ class Part:
     """A piece of a mesh file."""
 
     shape: trimesh.Trimesh
-    """In the file's units and frame."""
+    """Mesh in the file's units and frame."""
     colors: np.ndarray | None
     """[f 3] uint8, sRGB, or None where the file gives none."""
 
@@ -61,7 +61,7 @@ def read_mesh(path: Path) -> MeshFile:
             scene = trimesh.load_scene(file, file_type=path.suffix[1:].lower(), resolver=companions)
         pieces = [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
     except Exception as error:  # one kind of error per file format
-        raise MeshError(f"cannot be read as a mesh ({_one_line(error)})") from error
+        raise MeshError(f"cannot be read as a mesh ({_join_lines(error)})") from error
     if not pieces:
         raise MeshError("holds no triangle")
     count = sum(len(piece.faces) for piece in pieces)
@@ -74,13 +74,13 @@ def face_colors(shape: trimesh.Trimesh) -> np.ndarray | None:
     """[f 3] uint8 colors of the triangles by the mesh's own texture, material or vertex colors; None without any."""
     visual = shape.visual
     if isinstance(visual, TextureVisuals):
-        return _textured(shape, visual)
+        return _texture_colors(shape, visual)
     if visual.defined:
         return np.asarray(visual.face_colors)[:, :3].astype(np.uint8)
     return None
 
 
-def sampled(image: Any, uv: np.ndarray, faces: np.ndarray, factor: np.ndarray) -> np.ndarray:
+def sample_texture(image: Any, uv: np.ndarray, faces: np.ndarray, factor: np.ndarray) -> np.ndarray:
     """Mean colors of triangles under a texture.
 
     Args:
@@ -100,23 +100,23 @@ def sampled(image: Any, uv: np.ndarray, faces: np.ndarray, factor: np.ndarray) -
     return np.round(texture[row, column].mean(0) * factor).astype(np.uint8)
 
 
-def _textured(shape: trimesh.Trimesh, visual: TextureVisuals) -> np.ndarray | None:
+def _texture_colors(shape: trimesh.Trimesh, visual: TextureVisuals) -> np.ndarray | None:
     material = visual.material
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is None or visual.uv is None:
         main = np.asarray(material.main_color)[:3].astype(np.uint8)
         return np.tile(main, (len(shape.faces), 1))
     factor = getattr(material, "baseColorFactor", None)
-    share = np.ones(3) if factor is None else _unit(np.asarray(factor)[:3])
-    return sampled(image, np.asarray(visual.uv), shape.faces, share)
+    share = np.ones(3) if factor is None else _unit_color(np.asarray(factor)[:3])
+    return sample_texture(image, np.asarray(visual.uv), shape.faces, share)
 
 
-def _unit(color: np.ndarray) -> np.ndarray:
-    """0 to 1, whether stored so or as 0 to 255."""
+def _unit_color(color: np.ndarray) -> np.ndarray:
+    """The color in 0 to 1, whether it is stored so or in 0 to 255."""
     return color / 255 if color.dtype == np.uint8 else color.astype(float)
 
 
-def _one_line(error: Exception) -> str:
+def _join_lines(error: Exception) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 

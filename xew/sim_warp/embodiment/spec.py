@@ -1,4 +1,4 @@
-"""What the simulator must know of a robot beside its URDF."""
+"""`RobotSpec`: what the simulator knows of a robot beside its URDF."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,16 +13,16 @@ class Arm:
     root_pose: Pose
     """Pose of the URDF's root link in the world. A robot of one URDF with both arms has the same in both."""
     joints: tuple[str, ...]
-    """Six or seven revolute joints of the URDF, from the base outwards."""
+    """Six or seven revolute joints of the URDF, from the base outward."""
     home: tuple[float, ...]
     """Joint positions at rest [rad], as many as `joints`."""
     tool_link: str
-    """The link that carries the tool frame."""
+    """Name of the link that carries the tool frame."""
     tool_pose: Pose
     """Tool frame in `tool_link`: x approach (out of the hand), y along which the fingers open, origin between
     the finger pads where an object is held (the tool center point, TCP)."""
     fingers: tuple[str, str]
-    """The two prismatic joints of the gripper."""
+    """Names of the two prismatic joints of the gripper."""
     finger_closed: tuple[float, float]
     """Finger joint positions at gripper 0 [m]."""
     finger_open: tuple[float, float]
@@ -39,7 +39,7 @@ class RobotSpec:
     """Name in headings of tables and pages."""
     urdf: Path
     arms: tuple[Arm, Arm]
-    """Left (at -x) and right (at +x); the robot stands at -y and looks to +y."""
+    """Left arm (at -x) and right arm (at +x); the robot stands at -y and looks to +y."""
     joint_lower: tuple[float, ...]
     """Lower position limits of an arm that experts keep [rad]: the real robot's, inside the URDF's."""
     joint_upper: tuple[float, ...]
@@ -53,8 +53,10 @@ class RobotSpec:
 
     @property
     def one_urdf_holds_both_arms(self) -> bool:
+        """True for one URDF with two arms, False for a URDF of one arm that is put up twice."""
         return self.arms[0].joints != self.arms[1].joints
 
     @property
     def arm_joint_count(self) -> int:
+        """Number of joints of each arm, six or seven."""
         return len(self.arms[0].joints)

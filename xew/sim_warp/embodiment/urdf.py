@@ -20,11 +20,11 @@ from xew.sim_warp.embodiment.mesh_files import MeshError, MeshFile, Part, read_m
 from xew.sim_warp.geometry.meshes import Color, Mesh, from_trimesh, merge
 
 DEFAULT_COLOR: Color = (190, 190, 190)
-"""Of a visual that names no material."""
+"""Color of a visual that names no material."""
 HULL_POINTS = 64
-"""Corners of a collision hull; of finer ones those are kept that lie farthest out in as many directions."""
+"""Largest number of corners of a collision hull; of finer ones those are kept that lie farthest out in as many directions."""
 LARGEST_LINK = 10.0
-"""Extent of a link [m] beyond which its mesh must be in millimeters."""
+"""Largest extent of a link [m]; beyond it its mesh must be in millimeters."""
 
 
 class UrdfError(ConfigError):
@@ -36,7 +36,7 @@ class Inertial:
     """Mass properties of a link."""
 
     mass: float
-    """kg."""
+    """Mass [kg]."""
     center: np.ndarray
     """[3] center of mass in the link frame, m."""
     inertia: np.ndarray
@@ -48,7 +48,7 @@ class Collision:
     """A convex shape that a link collides with."""
 
     name: str
-    """As in the URDF; "pad" is the gripping face of a finger. Empty where the URDF names none."""
+    """Name in the URDF; "pad" is the gripping face of a finger. Empty where the URDF names none."""
     points: np.ndarray
     """[k 3] float32, corners of its convex hull in the link frame, m."""
 
@@ -57,7 +57,7 @@ class Collision:
 class Link:
     name: str
     visual: Mesh | None
-    """All visuals of the link as one mesh."""
+    """Mesh of all visuals of the link; None where it has none."""
     collisions: tuple[Collision, ...]
     inertial: Inertial | None
 
@@ -66,7 +66,7 @@ class Link:
 class Joint:
     name: str
     kind: str
-    """fixed, revolute, continuous or prismatic."""
+    """One of fixed, revolute, continuous or prismatic."""
     parent: str
     child: str
     origin: np.ndarray
@@ -92,9 +92,9 @@ class Urdf:
     links: dict[str, Link]
     joints: dict[str, Joint]
     meshes: dict[str, Path]
-    """Where each mesh is that the URDF names."""
+    """File of each mesh by the name that the URDF gives it."""
     files: tuple[Path, ...]
-    """All that was read: the URDF, meshes, their materials and textures."""
+    """Files that were read: the URDF, meshes, their materials and textures."""
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -177,7 +177,7 @@ def _check_names(path: Path, kind: str, names: list[str]) -> None:
         raise UrdfError(f"{path}: more than one {kind} is called {', '.join(twice)}; names must be unique.")
 
 
-def _finite(values: object, path: Path, what: str) -> np.ndarray:
+def _finite_array(values: object, path: Path, what: str) -> np.ndarray:
     """The values as float64. Raises UrdfError if one is not a finite number."""
     array = np.asarray(values, float)
     if not np.isfinite(array).all():
@@ -200,7 +200,9 @@ def _check_tree(urdf: Urdf) -> None:
 def _joint(joint: yourdfpy.Joint, path: Path) -> Joint:
     if joint.type not in ("fixed", "revolute", "continuous", "prismatic"):
         raise UrdfError(f"{path}: joint {joint.name} is {joint.type}; expected fixed, revolute, continuous or prismatic.")
-    axis = np.array([1.0, 0.0, 0.0]) if joint.axis is None else _finite(joint.axis, path, f"the axis of joint {joint.name}")
+    axis = (
+        np.array([1.0, 0.0, 0.0]) if joint.axis is None else _finite_array(joint.axis, path, f"the axis of joint {joint.name}")
+    )
     if not np.any(axis):
         raise UrdfError(f"{path}: joint {joint.name} has the axis 0 0 0; give it a direction.")
     limit = joint.limit
@@ -220,11 +222,11 @@ def _joint(joint: yourdfpy.Joint, path: Path) -> Joint:
 
 
 def _number(value: float | None, default: float, path: Path, joint: str) -> float:
-    return default if value is None else float(_finite(value, path, f"the limit of joint {joint}"))
+    return default if value is None else float(_finite_array(value, path, f"the limit of joint {joint}"))
 
 
 def _origin(origin: np.ndarray | None, path: Path, what: str) -> np.ndarray:
-    return np.eye(4) if origin is None else _finite(origin, path, what)
+    return np.eye(4) if origin is None else _finite_array(origin, path, what)
 
 
 def _link(link: yourdfpy.Link, source: _Source) -> Link:
@@ -245,11 +247,11 @@ def _inertial(link: yourdfpy.Link, path: Path) -> Inertial | None:
     if inertial is None or not inertial.mass:
         return None
     what = f"the inertial of link {link.name}"
-    mass = float(_finite(inertial.mass, path, what))
+    mass = float(_finite_array(inertial.mass, path, what))
     if mass < 0:
         raise UrdfError(f"{path}: {what} has a mass of {mass:g} kg; expected more than 0.")
     origin = _origin(inertial.origin, path, what)
-    inertia = np.zeros((3, 3)) if inertial.inertia is None else _finite(inertial.inertia, path, what)
+    inertia = np.zeros((3, 3)) if inertial.inertia is None else _finite_array(inertial.inertia, path, what)
     return Inertial(mass, origin[:3, 3], origin[:3, :3] @ inertia @ origin[:3, :3].T)
 
 
@@ -285,10 +287,10 @@ def _collision(collision: yourdfpy.Collision, link: str, source: _Source) -> Col
         corners = np.asarray(shape.convex_hull.vertices, np.float32)
     except Exception as error:  # qhull's own: all points in a plane
         raise UrdfError(f"{source.path}: link {link} has a collision without volume; give it a box.") from error
-    return Collision(collision.name or "", outermost(corners, HULL_POINTS))
+    return Collision(collision.name or "", outermost_points(corners, HULL_POINTS))
 
 
-def outermost(points: np.ndarray, most: int) -> np.ndarray:
+def outermost_points(points: np.ndarray, most: int) -> np.ndarray:
     """Of points [k 3] those that lie farthest out in `most` evenly spread directions; all if there are no more."""
     if len(points) <= most:
         return points
@@ -317,7 +319,7 @@ def _mesh_parts(mesh: yourdfpy.Mesh, link: str, source: _Source) -> list[Part]:
     scale = np.broadcast_to(np.asarray(1.0 if mesh.scale is None else mesh.scale, float), 3)
     parts = [Part(part.shape.copy(), part.colors) for part in source.meshes[mesh.filename].parts]
     for part in parts:
-        part.shape.apply_scale(_finite(scale, source.path, f"the scale of a mesh of link {link}"))
+        part.shape.apply_scale(_finite_array(scale, source.path, f"the scale of a mesh of link {link}"))
     return parts
 
 

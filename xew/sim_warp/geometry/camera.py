@@ -34,7 +34,7 @@ def look_at(
     width: int = WIDTH,
     height: int = HEIGHT,
 ) -> Camera:
-    """A centered camera at `position` [m] that looks at `target` [m], `up` upwards in the image.
+    """A centered camera at `position` [m] that looks at `target` [m], `up` upward in the image.
 
     Args:
         vertical_fov: full vertical angle of view [deg].

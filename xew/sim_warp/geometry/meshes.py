@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 Color = tuple[int, int, int]
-"""sRGB, 0 to 255."""
+"""sRGB values, 0 to 255."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,8 @@ def sphere(radius: float, color: Color, subdivisions: int = 2) -> Mesh:
 
 
 def revolve(profile: Sequence[Sequence[float]], color: Color, sections: int = 32) -> Mesh:
-    """A body of revolution about z from a profile of (radius, height) pairs [m], listed from the axis upwards
-    along the outside and back along the inside, so that the surface faces outwards."""
+    """A body of revolution about z from a profile of (radius, height) pairs [m], listed from the axis upward
+    along the outside and back along the inside, so that the surface faces outward."""
     return from_trimesh(trimesh.creation.revolve(np.asarray(profile, float), sections=sections), color)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 Pose = tuple[float, float, float, float, float, float, float]
-"""x y z [m], quaternion x y z w."""
+"""Position x y z [m] and quaternion x y z w."""
 
 
 def pose_from_matrix(matrix: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from xew.sim_warp.geometry.poses import Pose, pose_from_matrix
 from xew.sim_warp.kinematics.kernels import FIXED, SLIDING, TURNING, kinematics_kernels
 
 BLOCK = 64
-"""Threads of a block: with 65,536 configurations every multiprocessor of a large GPU has some."""
+"""Number of threads of a block: with 65,536 configurations every multiprocessor of a large GPU has some."""
 AT_ORIGIN: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -38,14 +38,14 @@ class Node:
     """A link in the order in which a thread walks."""
 
     copy: int
-    """Copy of the URDF: 0, or 1 for the right arm of a robot that uses it twice."""
+    """Number of the copy of the URDF: 0, or 1 for the right arm of a robot that uses it twice."""
     link: str
     above: int
     """Number of the parent's node, -1 for the world."""
     origin: Pose
     joint: Joint | None = None
     source: Source | None = None
-    """None where the joint does not move."""
+    """Source of the position; None where the joint does not move."""
 
 
 class BatchedKinematics:
@@ -68,7 +68,7 @@ class BatchedKinematics:
         self.device = wp.get_device(device)
         self.dtype = dtype
         self._kernels = kinematics_kernels(dtype)
-        self._forest = _packed(forests, self._kernels, dtype, self.device)
+        self._forest = _pack(forests, self._kernels, dtype, self.device)
         self._no_robot = wp.empty(0, dtype=int, device=self.device)
         self._arrays: tuple[wp.array | None, wp.array | None, wp.array | None] = (None, None, None)
         self._launch: wp.Launch | None = None
@@ -178,25 +178,26 @@ def _pose(matrix: np.ndarray) -> Pose:
     return (x, y, z, qx, qy, qz, qw)
 
 
-def _packed(forests: Sequence[Sequence[Node]], kernels: object, dtype: type, device: wp.Device) -> object:
+def _pack(forests: Sequence[Sequence[Node]], kernels: object, dtype: type, device: wp.Device) -> object:
     """Device arrays of the links of all robots, see `kinematics_kernels`."""
     nodes = [node for forest in forests for node in forest]
     counts = np.array([len(forest) for forest in forests])
     still = Source(0, 0.0)
     packed = kernels.Forest()  # type: ignore[attr-defined]
 
-    def array(values: Sequence[object] | np.ndarray, kind: type) -> wp.array:
+    def to_device(values: Sequence[object] | np.ndarray, kind: type) -> wp.array:
+        """Numbers [l ...] as an array of a type of Warp."""
         return wp.array(np.array(values), dtype=kind, device=device)
 
-    packed.links = array(np.stack([np.cumsum(counts) - counts, counts], -1), wp.vec2i)
-    packed.above = array([node.above for node in nodes], int)
-    packed.kind = array([_kind(node) for node in nodes], int)
-    packed.origin = array([node.origin for node in nodes], kernels.frame)  # type: ignore[attr-defined]
+    packed.links = to_device(np.stack([np.cumsum(counts) - counts, counts], -1), wp.vec2i)
+    packed.above = to_device([node.above for node in nodes], int)
+    packed.kind = to_device([_kind(node) for node in nodes], int)
+    packed.origin = to_device([node.origin for node in nodes], kernels.frame)  # type: ignore[attr-defined]
     axes = [node.joint.axis if node.joint else np.zeros(3) for node in nodes]
-    packed.axis = array(axes, kernels.vector)  # type: ignore[attr-defined]
-    packed.column = array([(node.source or still).column for node in nodes], int)
-    packed.gain = array([(node.source or still).gain for node in nodes], dtype)
-    packed.bias = array([(node.source or still).bias for node in nodes], dtype)
+    packed.axis = to_device(axes, kernels.vector)  # type: ignore[attr-defined]
+    packed.column = to_device([(node.source or still).column for node in nodes], int)
+    packed.gain = to_device([(node.source or still).gain for node in nodes], dtype)
+    packed.bias = to_device([(node.source or still).bias for node in nodes], dtype)
     return packed
 
 

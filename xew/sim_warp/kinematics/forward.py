@@ -32,14 +32,14 @@ def forward_kinematics(robot: RobotSpec | Urdf, joint_pos: np.ndarray) -> dict[s
     from xew.sim_warp.kinematics.batched import BatchedKinematics
 
     urdf = robot if isinstance(robot, Urdf) else load_urdf(robot.urdf)
-    rows = _checked(urdf, joint_pos)
+    rows = _check_rows(urdf, joint_pos)
     batched = BatchedKinematics.of_urdf(urdf, dtype=wp.float64)
     poses = batched.poses(wp.array(rows, dtype=wp.float64, device=batched.device)).numpy()
     found = {link: poses[:, number] for number, (_, link) in enumerate(batched.links[0])}
     return {name: np.ascontiguousarray(found[name]) for name in urdf.links}
 
 
-def _checked(urdf: Urdf, joint_pos: np.ndarray) -> np.ndarray:
+def _check_rows(urdf: Urdf, joint_pos: np.ndarray) -> np.ndarray:
     """joint_pos as float64 [n j]."""
     joint_pos = np.asarray(joint_pos, float)
     if joint_pos.ndim != 2 or joint_pos.shape[1] != len(urdf.joint_names):
@@ -52,7 +52,7 @@ def _checked(urdf: Urdf, joint_pos: np.ndarray) -> np.ndarray:
 
 def link_matrices(urdf: Urdf, joint_pos: np.ndarray) -> dict[str, np.ndarray]:
     """As `forward_kinematics`, but in NumPy and as homogeneous transforms [n 4 4]."""
-    joint_pos = _checked(urdf, joint_pos)
+    joint_pos = _check_rows(urdf, joint_pos)
     column = {name: index for index, name in enumerate(urdf.joint_names)}
     frames = {urdf.root: np.tile(np.eye(4), (len(joint_pos), 1, 1))}
     for joint in urdf.tree:

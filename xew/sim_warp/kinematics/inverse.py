@@ -22,14 +22,15 @@ from xew.sim_warp.kinematics.forward import tool_matrix
 
 JOINT_COUNT = 7
 POSITION_WEIGHT = 4.0
-"""A residual of 1 m counts as much as one of 4 rad: near a pose both then converge at the same pace."""
+"""Weight of a position residual: 1 m counts as much as 4 rad, so that near a pose both converge at the same pace."""
 LIMIT_WEIGHT = 2.0
 POSTURE_WEIGHT = 0.01
-"""Pull of a seven-joint arm towards the mean of its two homes, so that its elbow does not drift."""
+"""Weight of the pull of a seven-joint arm toward the mean of its two homes, so that its elbow does not drift."""
 POLISH_STEPS = 4
-"""Last steps, without that pull, so that it does not move the tool."""
+"""Number of last steps without that pull, so that it does not move the tool."""
 ANCHOR_STRIDE = 8
-"""Frames of a path between two that are solved one after the other; those between are then solved all at once."""
+"""Number of frames from one pose of a path that is solved after the one before to the next; those between are solved at once.
+"""
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,7 @@ class ArmSolver:
         at_anchor = np.empty((len(anchors), *start.shape))
         for index, frame in enumerate(anchors):
             start = at_anchor[index] = self._nearest(targets[frame * count : (frame + 1) * count], start)
-        seed = _interpolated(np.arange(frames), anchors, at_anchor)
+        seed = _interpolate(np.arange(frames), anchors, at_anchor)
         joint_pos = self._nearest(targets, seed.reshape(frames * count, -1))
         position, rotation = self._errors(arms, poses, joint_pos)
         return Solution(joint_pos.reshape(seed.shape), position.reshape(frames, count), rotation.reshape(frames, count))
@@ -148,7 +149,7 @@ def arm_solver(robot: RobotSpec) -> ArmSolver:
     return ArmSolver(robot)
 
 
-def _interpolated(frames: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _interpolate(frames: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Values [a n d] at anchor frames [a], linearly between them at frames [t]: [t n d]."""
     after = np.clip(np.searchsorted(anchors, frames), 1, max(1, len(anchors) - 1))
     if len(anchors) == 1:
@@ -228,8 +229,8 @@ class _Problems:
     def solve(self, target: np.ndarray, seed: np.ndarray) -> np.ndarray:
         """Joint positions [n d] for tool poses [n 7] in the arm's base frame; n may be less than the size."""
         count, joints = seed.shape
-        self.positions.assign(_padded(target[:, :3], self.positions.shape[0]))
-        self.rotations.assign(_padded(target[:, 3:], self.positions.shape[0]))
+        self.positions.assign(_pad(target[:, :3], self.positions.shape[0]))
+        self.rotations.assign(_pad(target[:, 3:], self.positions.shape[0]))
         start = np.zeros((self.positions.shape[0], JOINT_COUNT), np.float32)
         start[:count, :joints] = seed
         self.joint_pos.assign(start)
@@ -255,6 +256,6 @@ class _Problems:
             self.solver.step(self.joint_pos, self.joint_pos, iterations=iterations)
 
 
-def _padded(rows: np.ndarray, size: int) -> np.ndarray:
+def _pad(rows: np.ndarray, size: int) -> np.ndarray:
     """Rows [n ...] float32, the last one repeated up to `size` rows."""
     return np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), 0)]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Forward kinematics on a device: one thread a configuration walks the tree of joints from the root outwards.
+"""Forward kinematics on a device: one thread a configuration walks the tree of joints from the root outward.
 
 A pose is that of a link, `above` its parent: pose = pose[above] * origin * motion(gain * joint_pos[column] + bias).
 """
@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 FIXED, TURNING, SLIDING = 0, 1, 2
-"""How the joint above a link moves it."""
+"""Kinds of joint above a link."""
 TYPES = {wp.float32: (wp.vec3f, wp.quatf, wp.transformf), wp.float64: (wp.vec3d, wp.quatd, wp.transformd)}
 
 
@@ -54,7 +54,7 @@ def kinematics_kernels(scalar: type) -> SimpleNamespace:
         # Out
         pose_out: wp.array3d(dtype=scalar),  # [l 7 n] as joint_pos, m and quaternion x y z w; threads write side by side
     ):
-        """Walk the links of one configuration from the root outwards; one thread a row."""
+        """Walk the links of one configuration from the root outward: a thread makes the poses [l 7] of one row of [n]."""
         row = wp.tid()
         which = 0
         if robot.shape[0] > 0:

@@ -22,7 +22,7 @@ def authored_files(key: str) -> dict[Path, bytes]:
     """The URDF of a robot and its meshes as they should be, by path."""
     shapes = importlib.import_module(f"xew.sim_warp.robots.shapes.{key}")
     path = ROBOTS[key].urdf
-    root = _read(path)
+    root = _read_tree(path)
     for old in root.findall("material"):
         root.remove(old)
     for index, (name, color) in enumerate(shapes.MATERIALS.items()):
@@ -37,15 +37,15 @@ def authored_files(key: str) -> dict[Path, bytes]:
             link.append(_visual(f"meshes/{key}/{file}", material))
         for box in shapes.COLLISIONS.get(name, ()):
             link.append(_collision(box))
-    return {path: _written(root)} | meshes
+    return {path: _serialize(root)} | meshes
 
 
-def _read(path: Path) -> ElementTree.Element:
+def _read_tree(path: Path) -> ElementTree.Element:
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
     return ElementTree.parse(path, parser).getroot()
 
 
-def _written(root: ElementTree.Element) -> bytes:
+def _serialize(root: ElementTree.Element) -> bytes:
     ElementTree.indent(root)
     buffer = io.BytesIO()
     ElementTree.ElementTree(root).write(buffer, encoding="utf-8", xml_declaration=True)
@@ -62,7 +62,7 @@ def _link_meshes(name: str, parts: list[Part]) -> list[tuple[str, trimesh.Trimes
 
 def _material(name: str, color: Color) -> ElementTree.Element:
     material = ElementTree.Element("material", name=name)
-    ElementTree.SubElement(material, "color", rgba=_numbers([value / 255 for value in color] + [1]))
+    ElementTree.SubElement(material, "color", rgba=_format_numbers([value / 255 for value in color] + [1]))
     return material
 
 
@@ -75,12 +75,12 @@ def _visual(file: str, material: str) -> ElementTree.Element:
 
 def _collision(box: Box) -> ElementTree.Element:
     collision = ElementTree.Element("collision", {"name": box.name} if box.name else {})
-    ElementTree.SubElement(collision, "origin", xyz=_numbers(box.center), rpy=_numbers(box.rpy))
-    ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), "box", size=_numbers(box.size))
+    ElementTree.SubElement(collision, "origin", xyz=_format_numbers(box.center), rpy=_format_numbers(box.rpy))
+    ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), "box", size=_format_numbers(box.size))
     return collision
 
 
-def _numbers(values: Iterable[float]) -> str:
+def _format_numbers(values: Iterable[float]) -> str:
     return " ".join(f"{round(float(value), 6) + 0.0:g}" for value in values)
 
 

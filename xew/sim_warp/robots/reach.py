@@ -17,9 +17,9 @@ from xew.sim_warp.kinematics.reachability import GRASP_TILT, WORK_X, WORK_Y, WOR
 from xew.sim_warp.robots import ROBOTS, RobotSpec, get_robot
 
 X, Y, Z = np.linspace(-0.32, 0.10, 6), np.linspace(-0.25, 0.15, 5), np.array([0.76, 0.85, 0.95])
-"""The work volume of the left arm [m]; the right arm's is its mirror image."""
+"""Grid over the work volume of the left arm [m]; the right arm's is its mirror image."""
 TILTS, YAWS = (0, 15, 30, 45, 60), (-90, -60, -30, 0, 30, 60, 90)
-"""Degrees; a negative yaw of the left hand turns it inwards. The right arm is given the mirrored yaw."""
+"""Leans and turns of the left hand [deg]; a negative yaw turns it inward. The right arm is given the mirrored yaw."""
 RADIAL_OFFSETS = (-45, -22.5, 0, 22.5, 45)
 
 
@@ -45,7 +45,7 @@ def work_reach(robot: RobotSpec, arm: int) -> np.ndarray:
     return found.reshape(len(RADIAL_OFFSETS), len(WORK_X), len(WORK_Y), len(WORK_Z))
 
 
-def markdown(robots: list[RobotSpec]) -> str:
+def format_tables(robots: list[RobotSpec]) -> str:
     """Both tables."""
     lines = ["| robot | left arm | right arm |", "|---|---|---|"]
     for robot in robots:
@@ -70,7 +70,7 @@ class Args:
 def main() -> None:
     quiet_warp()
     args = tyro.cli(Args)
-    print(markdown([get_robot(name) for name in args.robots]))
+    print(format_tables([get_robot(name) for name in args.robots]))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Task: pick up a hammer and strike a block with its face.
 
-Randomisation: the block (fixed to the table) at |x| in [.05, .25], y in [-.05, .15], yaw within 29 degrees; its color.
-    The hammer stands on its head at (0, -.06), its handle towards the robot.
+Randomization: the block (fixed to the table) at |x| in [.05, .25], y in [-.05, .15], yaw within 29 degrees; its color.
+    The hammer stands on its head at (0, -.06), its handle toward the robot.
 Success: the center of the hammer's face within 20 mm of the block's top center in x and y, and on it (6 mm).
 After RoboTwin 2.0's beat_block_hammer.
 """
@@ -19,17 +19,17 @@ from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, pick
 
 HEAD_SIZE = (0.05, 0.05, 0.07)
 HANDLE_HEIGHT = 0.045
-"""Of the handle's axis above the hammer's face [m]."""
+"""Height of the handle's axis above the hammer's face [m]."""
 HANDLE_LENGTH = 0.11
 GRIP_AT = -0.075
-"""y of the grasp in the hammer's frame [m]."""
+"""Place of the grasp along y in the hammer's frame [m]."""
 BLOCK = 0.05
 
 
 def hammer() -> Shape:
     """A mallet whose face is its frame's origin; the handle points along -y, light enough that it stands on its head."""
     head = objects.block(HEAD_SIZE, (95, 98, 105))
-    face = objects.moved(objects.block((0.036, 0.036, 0.004), (60, 62, 66)), (0, 0, HEAD_SIZE[2]))
+    face = objects.move(objects.block((0.036, 0.036, 0.004), (60, 62, 66)), (0, 0, HEAD_SIZE[2]))
     handle = meshes.box((0.02, HANDLE_LENGTH, 0.022), (165, 105, 55))
     handle = handle.transformed((0, -HEAD_SIZE[1] / 2 - HANDLE_LENGTH / 2, HANDLE_HEIGHT))
     return objects.merge(head, Shape(face.mesh), Shape(handle, (handle.vertices,)))

@@ -1,7 +1,8 @@
 """Task: put a red, a green and a blue block in a row, from left to right, one hand at a time.
 
-Randomisation: three cubes of one size (half edge 15 to 25 mm) at |x| in [.05, .28], y in [-.08, .05] (y at most 0 where
-    |x| < .15), any yaw within 43 degrees, at least .10 apart; never in order already. The row's y and its three x.
+Randomization: three cubes of one size (half edge 15 to 25 mm) at |x| in [.05, .28], y in [-.08, .05] (y at most 0 where
+    |x| < .15), any yaw within 43 degrees, at least .10 apart; never in order already. The row's y and its three x
+    vary too.
 Success: red left of green left of blue, neighbors within 130 mm in x and 30 mm in y, both grippers open.
 After RoboTwin 2.0's blocks_ranking_rgb.
 """
@@ -16,7 +17,7 @@ from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, arm_for, pick, pla
 
 COLORS = ("red", "green", "blue")
 GRASP_BELOW_TOP = 0.014
-"""High enough that a wide hand passes over the blocks beside [m]."""
+"""Depth of the tool below the top of a block [m]: small enough that a wide hand passes over the blocks beside."""
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
@@ -24,10 +25,10 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     targets = [(rng.uniform(low, high), 0.0) for low, high in ((-0.09, -0.08), (-0.01, 0.01), (0.08, 0.09))]
     row = rng.uniform(-0.2, -0.1)
     places: list[np.ndarray] = []
-    while not places or in_order(np.array(places)):
+    while not places or are_in_order(np.array(places)):
         places = []
         for _ in COLORS:
-            places.append(draw(rng, [-0.28, -0.08], [0.28, 0.05], lambda p: free(p, places)))  # noqa: B023
+            places.append(draw(rng, [-0.28, -0.08], [0.28, 0.05], lambda p: is_free(p, places)))  # noqa: B023
     yaws = rng.uniform(-0.75, 0.75, 3)
     blocks = tuple(
         SceneObject(
@@ -42,7 +43,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     return Scene("blocks_ranking_rgb", seed, blocks, targets=row_places)
 
 
-def free(point: np.ndarray, places: list[np.ndarray]) -> bool:
+def is_free(point: np.ndarray, places: list[np.ndarray]) -> bool:
     """Can a block begin at `point` [2], clear of the row's middle and of the `places` of other blocks?"""
     x, y = point
     if abs(x) < 0.05 or (abs(x) < 0.15 and y > 0) or np.hypot(x, y + 0.1) < 0.1:
@@ -50,7 +51,7 @@ def free(point: np.ndarray, places: list[np.ndarray]) -> bool:
     return all(np.hypot(*(point - other)) >= 0.1 for other in places)
 
 
-def in_order(places: np.ndarray) -> bool:
+def are_in_order(places: np.ndarray) -> bool:
     """Do blocks at [3 2] stand in a row in their order, each a little to the right of the one before?"""
     step = np.diff(places, axis=0)
     return bool((step[:, 0] > 0).all() and (step[:, 0] < 0.13).all() and (np.abs(step[:, 1]) < 0.03).all())
@@ -78,7 +79,7 @@ def move_block(
 
 def success(scene: Scene, now: Moment) -> bool:
     places = now.object_pose[[scene.index(f"{color}_block") for color in COLORS], :2]
-    return in_order(places) and now.both_open
+    return are_in_order(places) and now.both_open
 
 
 TASK = Task(

@@ -1,8 +1,8 @@
 """Task: put three blocks in a row by size, the largest on the left, one hand at a time.
 
-Randomisation: three cubes of half edges 28 to 31, 23 to 26 and 18 to 21 mm in three colors at |x| in [.05, .28], y in
+Randomization: three cubes of half edges 28 to 31, 23 to 26 and 18 to 21 mm in three colors at |x| in [.05, .28], y in
     [-.08, .05] (y at most 0 where |x| < .15), any yaw within 43 degrees, at least .12 apart and .10 from the places of the
-    row; never in order already. The row's y and its three x.
+    row; never in order already. The row's y and its three x vary too.
 Success: large left of medium left of small, neighbors within 130 mm in x and 30 mm in y, both grippers open.
 After RoboTwin 2.0's blocks_ranking_size, whose large block is 60 to 66 mm wide (the narrowest of our hands opens 80 mm) and
     whose medium block goes within 70 mm of the small one, where a wide hand has no room between them.
@@ -14,13 +14,13 @@ from xew.sim_warp import objects
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.blocks_ranking_rgb import free, in_order, move_block
+from xew.sim_warp.tasks.blocks_ranking_rgb import are_in_order, is_free, move_block
 from xew.sim_warp.tasks.task import LET_GO, NARROWEST_HAND, Moment, Task, arm_for
 
 SIZES = {"large": (0.028, 0.031), "medium": (0.023, 0.026), "small": (0.018, 0.021)}
 """Half edges [m], from the left end of the row to the right."""
 ROW = ((-0.10, -0.09), (-0.005, 0.005), (0.09, 0.10))
-"""x of each size in the row [m]."""
+"""Place of each size along x in the row [m]."""
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
@@ -28,10 +28,10 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     row = rng.uniform(-0.2, -0.1)
     targets = [np.array([rng.uniform(low, high), row]) for low, high in ROW]
     places: list[np.ndarray] = []
-    while not places or in_order(np.array(places)):
+    while not places or are_in_order(np.array(places)):
         places = []
         for _ in SIZES:
-            places.append(draw(rng, [-0.28, -0.08], [0.28, 0.05], lambda p: _free(p, places, targets)))  # noqa: B023
+            places.append(draw(rng, [-0.28, -0.08], [0.28, 0.05], lambda p: _is_free(p, places, targets)))  # noqa: B023
     yaws = rng.uniform(-0.75, 0.75, 3)
     colors = [str(color) for color in rng.permutation(sorted(objects.PALETTE))]
     blocks = tuple(
@@ -47,9 +47,9 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     return Scene("blocks_ranking_size", seed, blocks, words=dict(zip(SIZES, colors, strict=False)), targets=row_places)
 
 
-def _free(point: np.ndarray, places: list[np.ndarray], targets: list[np.ndarray]) -> bool:
+def _is_free(point: np.ndarray, places: list[np.ndarray], targets: list[np.ndarray]) -> bool:
     room = all(np.hypot(*(point - target)) >= 0.1 for target in targets)
-    return room and free(point, places) and all(np.hypot(*(point - other)) >= 0.12 for other in places)
+    return room and is_free(point, places) and all(np.hypot(*(point - other)) >= 0.12 for other in places)
 
 
 def plan(scene: Scene) -> Timeline:
@@ -70,7 +70,7 @@ def plan(scene: Scene) -> Timeline:
 
 def success(scene: Scene, now: Moment) -> bool:
     places = now.object_pose[[scene.index(f"{size}_block") for size in SIZES], :2]
-    return in_order(places) and now.both_open
+    return are_in_order(places) and now.both_open
 
 
 TASK = Task(

@@ -1,6 +1,6 @@
 """Task: lift a roller with both hands at once, one at each end.
 
-Randomisation: center at |x| at most .15, y in [-.25, -.05], yaw within 46 degrees; length, thickness and color.
+Randomization: center at |x| at most .15, y in [-.25, -.05], yaw within 46 degrees; length, thickness and color.
 Success: roller higher than .80, both grippers closed on it.
 After RoboTwin 2.0's grab_roller.
 """
@@ -15,7 +15,7 @@ from xew.sim_warp.tasks.task import GRIPPER_CLOSED, Moment, Task, across, pick
 
 GRASP_FROM_END = 0.03
 GRASP_ABOVE_AXIS = 0.006
-"""Keeps the lower finger of a leaning hand off the table [m]."""
+"""Height of the tool above the roller's axis [m]; it keeps the lower finger of a leaning hand off the table."""
 LIFT = 0.12
 
 

@@ -1,6 +1,6 @@
 """Task: lift a cooking pot level with both hands, one at each handle.
 
-Randomisation: the pot at |x| at most .05, y in [-.05, .05], its handles within 22 degrees of x; its size, colors and lid.
+Randomization: the pot at |x| at most .05, y in [-.05, .05], its handles within 22 degrees of x; its size, colors and lid.
 Success: pot higher than .82 and upright within 37 degrees, each tool within 30 mm of its handle.
 After RoboTwin 2.0's lift_pot.
 """
@@ -17,9 +17,9 @@ from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, pick
 WIDEST_TURN = np.radians(22.5)
 LIFT = 0.14
 OPENING = 0.4
-"""Of the grippers on their way to the handles: a finger has to go between each and the pot."""
+"""Opening of the grippers on their way to the handles: a finger has to go between each and the pot."""
 HIGH_ENOUGH, UPRIGHT, NEAR = 0.82, 0.8, 0.03
-"""m, cosine, m."""
+"""Limits of success: height of the pot [m], cosine of its lean, distance of a tool from its handle [m]."""
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:

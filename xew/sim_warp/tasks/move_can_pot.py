@@ -1,6 +1,6 @@
 """Task: pick up a can and put it beside a cooking pot.
 
-Randomisation: the pot (fixed to the table) in the middle, its handles within 22 degrees of x; its size, colors and lid.
+Randomization: the pot (fixed to the table) in the middle, its handles within 22 degrees of x; its size, colors and lid.
     The can at |x| in [.20, .30], y in [.05, .15], yaw within 43 degrees; size and colors. The arm is that of the can's side.
 Success: the can on the arm's side of the pot, at most 200 mm from it in x and 35 mm in y, upright within 15 degrees and on
     the table (5 mm), both grippers open.
@@ -15,7 +15,7 @@ from xew.sim_warp.assets import containers
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, carry, outward, radial_yaw
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, carry, radial_yaw, side_sign
 
 BESIDE = 0.18
 """Distance of the can from the pot's axis [m]."""
@@ -30,7 +30,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         "move_can_pot",
         seed,
         (
-            containers.standing("can", can, at, rng.uniform(-0.75, 0.75), mass=0.1),
+            containers.place_standing("can", can, at, rng.uniform(-0.75, 0.75), mass=0.1),
             SceneObject("pot", pot, upright((0, 0), TABLE_TOP, rng.uniform(-0.39, 0.39))),
         ),
         words={"can": label, "pot": metal},
@@ -40,7 +40,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 def plan(scene: Scene) -> Timeline:
     can, pot = scene.object("can"), scene.object("pot")
     arm = arm_for(can.pose[0])
-    goal = np.array(pot.pose[:3]) + [outward(arm) * BESIDE, 0, 0]
+    goal = np.array(pot.pose[:3]) + [side_sign(arm) * BESIDE, 0, 0]
     timeline = Timeline()
     carry(timeline, can, goal, radial_yaw(arm, goal) - radial_yaw(arm, can.pose), tilt=GRASP_TILT)
     return timeline

@@ -1,6 +1,6 @@
 """Task: put a pill bottle on a square pad.
 
-Randomisation: bottle at |x| in [.05, .25], y in [-.10, .10], any yaw; its size and colors. The pad (fixed to
+Randomization: bottle at |x| in [.05, .25], y in [-.10, .10], any yaw; its size and colors. The pad (fixed to
     the table) on the same side, |x| in [.05, .25], y in [-.20, .10], at least .10 away; its color.
 Success: bottle within 30 mm of the pad's center in x and y, standing on it (5 mm), both grippers open.
 After RoboTwin 2.0's move_pillbottle_pad, whose pads are all blue.
@@ -29,7 +29,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         "move_pillbottle_pad",
         seed,
         (
-            containers.standing("bottle", shape, bottle * [side, 1], rng.uniform(-np.pi, np.pi), mass=0.08),
+            containers.place_standing("bottle", shape, bottle * [side, 1], rng.uniform(-np.pi, np.pi), mass=0.08),
             SceneObject("pad", household.mat((PAD, PAD), household.MATS[color]), upright(pad * [side, 1], TABLE_TOP)),
         ),
         words={"color": color},

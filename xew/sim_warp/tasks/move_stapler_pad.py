@@ -1,6 +1,6 @@
 """Task: move a stapler onto a mat, its long side along the mat's.
 
-Randomisation: stapler at |x| in [.05, .25], y in [-.20, -.03], its long side within 50 degrees of the direction from its
+Randomization: stapler at |x| in [.05, .25], y in [-.20, -.03], its long side within 50 degrees of the direction from its
     arm's shoulder, either way round; mat (110 x 60 mm, its long side along x) on the same side at |x| in [.05, .16], y in
     [-.20, -.10], at least .12 away; size and color of the stapler, one of eight colors of the mat, not its own.
 Success: stapler within 20 mm of the mat's center in x and y and standing on it (10 mm), its long side within 10 degrees of x,
@@ -30,7 +30,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         "move_stapler_pad",
         seed,
         (
-            stapler.placed("stapler", at, graspable_yaw(rng, at, np.radians(50))),
+            stapler.place_at("stapler", at, graspable_yaw(rng, at, np.radians(50))),
             SceneObject("mat", household.mat(MAT, household.MATS[color]), upright(goal * [side, 1], TABLE_TOP)),
         ),
         words={"stapler": stapler.words, "color": color},

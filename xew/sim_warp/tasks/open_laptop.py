@@ -1,6 +1,6 @@
 """Task: open a laptop with one hand, a finger under the edge of its lid.
 
-Randomisation: center at |x| at most .05, y in [-.08, .03]; its front turned up to 45 degrees to the left or right (the arm
+Randomization: center at |x| at most .05, y in [-.08, .03]; its front turned up to 45 degrees to the left or right (the arm
     on that side works); size of the lid, color. The lid begins at 20 % of its range, the base is fixed.
 Success: lid open beyond 40 % of its range, the tool within 10 cm of the lid's free edge.
 After RoboTwin 2.0's open_laptop, whose front turns up to 60 degrees and whose expert grasps the lid.
@@ -14,30 +14,30 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool, tool
 from xew.sim_warp.scene import Hinge, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, aside, radial_yaw
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, aside_poses, radial_yaw
 
 BASE_HEIGHT = 0.016
 LID_THICKNESS = 0.009
 RANGE = 3.1
-"""rad, of the hinge: the widest of the original's laptops, so that 20 % of it leaves room for a hand."""
+"""Range of the hinge [rad]: the widest of the original's laptops, so that 20 % of it leaves room for a hand."""
 START, GOAL, DONE = 0.2, 0.47, 0.4
 """Shares of the range at which the lid begins, to which the expert opens it, and from which it counts as open."""
 FINGER_HALF_WIDTH = 0.011
-"""Of every robot's pads, along the tool's z [m]: how far the pushing face is from the tool's axis."""
+"""Half width of every robot's pads along the tool's z [m]: the distance of the pushing face from the tool's axis."""
 PRESS = 0.004
-"""How far the commanded tool is beyond touching [m]: the lid's hinge is stiffer than nothing."""
+"""Distance of the commanded tool beyond touching [m]: the lid's hinge is stiffer than nothing."""
 RUN_UP = 0.06
 """Distance before the lid at which the finger comes down [m]."""
 WIDEST_TURN = np.radians(30)
-"""Of the hand from its radial yaw towards the laptop's own [rad]."""
+"""Largest turn of the hand from its radial yaw toward the laptop's own [rad]."""
 
 
 def laptop(width: float, depth: float, color: objects.Color) -> tuple[Shape, Hinge]:
     """The fixed base and the lid; the front is at -y, the hinge along the edge at +y."""
-    deck = objects.moved(objects.block((width * 0.8, depth * 0.4, 0.001), (45, 45, 48)), (0, depth * 0.12, BASE_HEIGHT))
+    deck = objects.move(objects.block((width * 0.8, depth * 0.4, 0.001), (45, 45, 48)), (0, depth * 0.12, BASE_HEIGHT))
     base = objects.merge(objects.block((width, depth, BASE_HEIGHT), color), Shape(deck.mesh))
-    screen = objects.moved(objects.block((width * 0.92, depth * 0.86, 0.001), (25, 35, 60)), (0, 0, BASE_HEIGHT + 0.001))
-    panel = objects.moved(objects.block((width, depth - 0.008, LID_THICKNESS), color), (0, -0.004, BASE_HEIGHT + 0.002))
+    screen = objects.move(objects.block((width * 0.92, depth * 0.86, 0.001), (25, 35, 60)), (0, 0, BASE_HEIGHT + 0.001))
+    panel = objects.move(objects.block((width, depth - 0.008, LID_THICKNESS), color), (0, -0.004, BASE_HEIGHT + 0.002))
     hinge = Hinge(
         lid=objects.merge(panel, Shape(screen.mesh)),
         mass=0.12,
@@ -70,8 +70,8 @@ def lid_edge(scene: Scene, fraction: float) -> np.ndarray:
     return np.array(thing.pose[:3]) + Rotation.from_euler("z", _yaw(thing)).apply(local)
 
 
-def _pushing(scene: Scene, arm: int, fraction: float, short_by: float) -> Tool:
-    """The closed hand whose far side touches the lid's edge, drawn back towards the laptop's front by `short_by` [m]."""
+def _pushing_pose(scene: Scene, arm: int, fraction: float, short_by: float) -> Tool:
+    """The closed hand whose far side touches the lid's edge, drawn back toward the laptop's front by `short_by` [m]."""
     edge, yaw = lid_edge(scene, fraction), _yaw(scene.object("laptop"))
     radial = radial_yaw(arm, edge)
     hand = tool(edge, radial + np.clip(yaw - radial, -WIDEST_TURN, WIDEST_TURN), GRASP_TILT)
@@ -83,11 +83,13 @@ def plan(scene: Scene) -> Timeline:
     arm = RIGHT if _yaw(scene.object("laptop")) > 0 else LEFT
     timeline = Timeline()
     timeline.grip({arm: 0.0})
-    before = _pushing(scene, arm, START, RUN_UP)
-    timeline.move(aside([arm]) | {arm: before.moved(z=0.05)})
+    before = _pushing_pose(scene, arm, START, RUN_UP)
+    timeline.move(aside_poses([arm]) | {arm: before.moved(z=0.05)})
     timeline.move({arm: before})
-    timeline.move({arm: _pushing(scene, arm, START, 0.0)})
-    timeline.follow(arm, [_pushing(scene, arm, fraction, -PRESS) for fraction in np.linspace(START, GOAL, 16)[1:]], seconds=2.4)
+    timeline.move({arm: _pushing_pose(scene, arm, START, 0.0)})
+    timeline.follow(
+        arm, [_pushing_pose(scene, arm, fraction, -PRESS) for fraction in np.linspace(START, GOAL, 16)[1:]], seconds=2.4
+    )
     timeline.wait(0.2)
     timeline.hold(arm, "laptop")
     return timeline

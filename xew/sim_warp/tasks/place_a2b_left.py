@@ -1,6 +1,6 @@
 """Task: put one everyday thing to the left of another.
 
-Randomisation: two different things A and B out of mouse, stapler, bell, toy car, magic cube, bread, phone, playing cards,
+Randomization: two different things A and B out of mouse, stapler, bell, toy car, magic cube, bread, phone, playing cards,
     wooden block, tea box, coffee box, soap, each a random variant. A at |x| in [.02, .22], y in [-.20, 0], its long side
     within 55 degrees of the direction from its arm's shoulder, either way round. B at y in [-.20, 0], any yaw, x in
     [.18, .23] if A is on the right, else in [-.10, .10]; the two at least .10 apart in y and 35 mm free of each other.
@@ -30,9 +30,9 @@ GAP = 0.035
 OVER = 0.08
 """Height at which A is carried [m]: over all that B may be."""
 PALM_HALF_WIDTH = 0.108
-"""Of the widest hand, the Panda's, with a little room: it stands over what is lower than it alone [m]."""
+"""Half width of the widest hand, the Panda's, with a little room: it stands over what is lower than it alone [m]."""
 MARGIN = 0.02
-"""By which A is nearer than what counts [m]."""
+"""Distance by which A is put nearer than what counts [m]."""
 NEAREST, FARTHEST = 0.08, 0.2
 """Distances between the two that count [m]."""
 
@@ -45,17 +45,17 @@ def sample_beside(rng: np.random.Generator, task: str, seed: int, side: float) -
     mirror = np.array([half, 1, -side, 1])
     # B leaves room for A between itself and the end of the arm's reach.
     near, far = (0.18, 0.23) if half == -side else (-0.1, 0.1)
-    places = draw(rng, [0.02, -0.2, near, -0.2], [0.22, 0.0, far, 0.0], lambda p: _apart(p * mirror, first, second, side))
+    places = draw(rng, [0.02, -0.2, near, -0.2], [0.22, 0.0, far, 0.0], lambda p: _are_apart(p * mirror, first, second, side))
     at, beside = np.split(places * mirror, 2)
     return Scene(
         task,
         seed,
-        (first.placed("a", at, graspable_yaw(rng, at)), second.placed("b", beside, rng.uniform(-np.pi, np.pi))),
+        (first.place_at("a", at, graspable_yaw(rng, at)), second.place_at("b", beside, rng.uniform(-np.pi, np.pi))),
         words={"a": first.words, "b": second.words},
     )
 
 
-def _apart(places: np.ndarray, first: Thing, second: Thing, side: float) -> bool:
+def _are_apart(places: np.ndarray, first: Thing, second: Thing, side: float) -> bool:
     """Are A and B, at [4] x y x y, free of each other, and is A not yet where it is to go?"""
     offset = places[2:] - places[:2]
     free = np.hypot(*offset) >= max(0.1, first.radius + second.radius + GAP) and abs(offset[1]) >= 0.1

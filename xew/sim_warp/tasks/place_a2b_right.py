@@ -1,6 +1,6 @@
 """Task: put one everyday thing to the right of another.
 
-Randomisation: that of place_a2b_left, mirrored: B at x in [-.23, -.18] if A is on the left, else in [-.10, .10].
+Randomization: that of place_a2b_left, mirrored: B at x in [-.23, -.18] if A is on the left, else in [-.10, .10].
 Success: A right of B, between .08 and .20 away, within 50 mm of it in y, both grippers open.
 After RoboTwin 2.0's place_a2b_right, with the departures of place_a2b_left.
 """

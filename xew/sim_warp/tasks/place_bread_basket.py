@@ -1,6 +1,6 @@
 """Task: put one or two pieces of bread into a basket, each with the hand on its side.
 
-Randomisation: breads at |x| in [.15, .28], y in [-.20, .02], at least .20 from the basket's middle and .14 apart, turned up
+Randomization: breads at |x| in [.15, .28], y in [-.20, .02], at least .20 from the basket's middle and .14 apart, turned up
     to 45 degrees from the direction in which their side's arm reaches; three times in four there are two. Basket (fixed) at
     (0, -.15): round or square, yaw within 14 degrees, color; kind, size and color of the breads.
 Success: every bread within 60 mm of the basket's middle in x and y and inside it (its bottom below the rim), both grippers
@@ -32,7 +32,7 @@ from xew.sim_warp.tasks.task import (
     Moment,
     Task,
     arm_for,
-    aside,
+    aside_poses,
     grasp_across,
     graspable_yaw,
     pick,
@@ -42,7 +42,7 @@ from xew.sim_warp.tasks.task import (
 
 BASKET = (0.0, -0.15)
 HALF = (0.108, 0.082)
-"""Half the inner size of the square basket [m]."""
+"""Half width of the square basket inside [m]."""
 RADIUS = 0.112
 """Inner radius of the round one [m]."""
 WALL, FLOOR, RIM = 0.007, 0.007, 0.036
@@ -51,15 +51,15 @@ SLOT = 0.043
 """Distance from the middle at which each of two breads goes [m]."""
 LIFT = 0.08
 PALM = 0.028
-"""How much of a bread may be above the tool [m]: the shortest fingers reach 39 mm from palm to tool, less the lean."""
+"""Greatest height of a bread above the tool [m]: the shortest fingers reach 39 mm from palm to tool, less the lean."""
 WIDEST_TURN = np.radians(45)
-"""Of a hand that leans by `STEEP_TILT` from its radial yaw [rad]."""
+"""Largest turn of a hand that leans by `STEEP_TILT` from its radial yaw [rad]."""
 WICKER: tuple[Color, ...] = ((196, 152, 92), (158, 108, 62), (214, 184, 132))
 
 
 def basket(form: str, color: Color) -> Shape:
     """A low wicker basket, woven light and dark, with a cloth in it."""
-    shade = objects.darker(color, 0.88)
+    shade = objects.darken(color, 0.88)
     if form == "round":
         body = objects.vessel([(RADIUS + WALL, 0), (RADIUS + WALL, RIM)], WALL, color, shade)
         angle = np.arange(36) * 2 * np.pi / 36
@@ -69,8 +69,8 @@ def basket(form: str, color: Color) -> Shape:
         return Shape(meshes.merge(seen), body.hulls)
     x, y = HALF
     floor = objects.block((2 * x + WALL, 2 * y + WALL, FLOOR), shade)
-    walls = [objects.moved(objects.block((2 * x + 2 * WALL, WALL, RIM), color), (0, s * (y + WALL / 2), 0)) for s in (-1, 1)]
-    walls += [objects.moved(objects.block((WALL, 2 * y, RIM), color), (s * (x + WALL / 2), 0, 0)) for s in (-1, 1)]
+    walls = [objects.move(objects.block((2 * x + 2 * WALL, WALL, RIM), color), (0, s * (y + WALL / 2), 0)) for s in (-1, 1)]
+    walls += [objects.move(objects.block((WALL, 2 * y, RIM), color), (s * (x + WALL / 2), 0, 0)) for s in (-1, 1)]
     along, deep = (np.linspace(-half + 0.01, half - 0.01, count) for half, count in ((x, 12), (y, 9)))
     spots = [(u, s * w, 0.0) for s in (-1, 1) for w in (y, y + WALL) for u in along]
     spots += [(s * w, v, np.pi / 2) for s in (-1, 1) for w in (x, x + WALL) for v in deep]
@@ -79,7 +79,7 @@ def basket(form: str, color: Color) -> Shape:
 
 def _weave(spots: Sequence[tuple[float, float, float]], color: Color) -> Mesh:
     """Dark and light withies on a wall at (x, y, direction along the wall [rad]), in turn over and under; only seen."""
-    dark, light = objects.darker(color, 0.72), objects.darker(color, 0.94)
+    dark, light = objects.darken(color, 0.72), objects.darken(color, 0.94)
     withies = [
         meshes.box((0.0165, 0.0024, 0.008), dark if (number + row) % 2 else light).transformed((x, y, z), (0, 0, angle))
         for number, (x, y, angle) in enumerate(spots)
@@ -105,11 +105,11 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     count = 1 + int(rng.random() < 0.75)
     places: list[np.ndarray] = []
     for _ in range(count):
-        places.append(draw(rng, [-0.28, -0.20], [0.28, 0.02], lambda p: _free(p, places)))
+        places.append(draw(rng, [-0.28, -0.20], [0.28, 0.02], lambda p: _is_free(p, places)))
     breads = [_bread(rng) for _ in places]
     form, color = str(rng.choice(["round", "square"])), WICKER[rng.integers(len(WICKER))]
     things = [
-        bread.placed(name, at, graspable_yaw(rng, at, WIDEST_TURN))
+        bread.place_at(name, at, graspable_yaw(rng, at, WIDEST_TURN))
         for name, bread, at in zip(("first_bread", "second_bread"), breads, sorted(places, key=lambda p: p[1]), strict=False)
     ]
     fixed = SceneObject("basket", basket(form, color), upright(BASKET, TABLE_TOP, rng.uniform(-0.25, 0.25)))
@@ -123,7 +123,7 @@ def _bread(rng: np.random.Generator) -> Thing:
     return replace(bread, grasp_height=max(bread.grasp_height, bread.height - PALM))
 
 
-def _free(point: np.ndarray, others: list[np.ndarray]) -> bool:
+def _is_free(point: np.ndarray, others: list[np.ndarray]) -> bool:
     clear = abs(point[0]) >= 0.15 and np.hypot(*(point - BASKET)) >= 0.2
     return bool(clear and all(np.hypot(*(point - other)) >= 0.14 for other in others))
 
@@ -141,19 +141,19 @@ def plan(scene: Scene) -> Timeline:
         for thing in things:
             arm = arm_for(thing.pose[0])
             pick(timeline, {arm: grasp_across(thing, arm, STEEP_TILT)}, LIFT)
-            _put(timeline, arm, thing, goals[thing.name])
+            _put_bread(timeline, arm, thing, goals[thing.name])
         return timeline
     left, right = sorted(things, key=lambda thing: thing.pose[0])
     pick(timeline, {LEFT: grasp_across(left, LEFT, STEEP_TILT), RIGHT: grasp_across(right, RIGHT, STEEP_TILT)}, LIFT)
-    _put(timeline, LEFT, left, goals[left.name])
-    timeline.move(aside([RIGHT]) | {RIGHT: goals[right.name].moved(z=LIFT)})
-    _put(timeline, RIGHT, right, goals[right.name])
+    _put_bread(timeline, LEFT, left, goals[left.name])
+    timeline.move(aside_poses([RIGHT]) | {RIGHT: goals[right.name].moved(z=LIFT)})
+    _put_bread(timeline, RIGHT, right, goals[right.name])
     return timeline
 
 
 def _goals(scene: Scene) -> dict[str, Tool]:
     """The hand as it lets go of each bread: one goes to the middle, two lie side by side."""
-    fixed, things = scene.object("basket"), _left_to_right(breads(scene))
+    fixed, things = scene.object("basket"), _sort_left_to_right(breads(scene))
     sideways = Rotation.from_quat(fixed.pose[3:]).apply([1.0, 0, 0])
     goals = {}
     for thing, shift in zip(things, [0.0] if len(things) == 1 else [-SLOT, SLOT], strict=True):
@@ -164,7 +164,7 @@ def _goals(scene: Scene) -> dict[str, Tool]:
     return goals
 
 
-def _left_to_right(things: list[SceneObject]) -> list[SceneObject]:
+def _sort_left_to_right(things: list[SceneObject]) -> list[SceneObject]:
     """How breads lie in the basket. Of two on one side the one put down first goes to the far place."""
     arms = {arm_for(thing.pose[0]) for thing in things}
     if len(arms) == 2:
@@ -172,7 +172,7 @@ def _left_to_right(things: list[SceneObject]) -> list[SceneObject]:
     return things if arms == {RIGHT} else things[::-1]
 
 
-def _put(timeline: Timeline, arm: int, thing: SceneObject, goal: Tool) -> None:
+def _put_bread(timeline: Timeline, arm: int, thing: SceneObject, goal: Tool) -> None:
     assert thing.grasp is not None
     release = min(1.0, (thing.grasp.width + LET_GO) / NARROWEST_HAND)
     place(timeline, arm, thing.name, goal, above=0.05, retreat=LIFT, release=release)

@@ -1,6 +1,6 @@
 """Task: put a burger and a portion of fries on a tray, both grasped at once, set down one after the other.
 
-Randomisation: tray (fixed) in the middle at y in [-.15, -.10]; burger at x in [-.30, -.25], fries at x in [.20, .30], both at
+Randomization: tray (fixed) in the middle at y in [-.15, -.10]; burger at x in [-.30, -.25], fries at x in [.20, .30], both at
     y in [-.15, -.07]; filling and size of the burger, color and size of the carton, color of the tray.
 Success: burger within 80 mm of the middle of the tray's left half, fries of its right half, both on the tray (15 mm), both
     grippers open. (RoboTwin 2.0 does not test the height.)
@@ -16,7 +16,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, aside, pick, place, radial_yaw
+from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, aside_poses, pick, place, radial_yaw
 
 TRAY = (0.30, 0.19)
 """Outer size of the tray [m]."""
@@ -25,11 +25,11 @@ SPOT = 0.073
 """Distance of the two places on the tray from its middle, in x [m]."""
 LIFT = 0.08
 SIDES = 12
-"""Flat sides of the burger, on which pads lie."""
+"""Number of flat sides of the burger, on which pads lie."""
 BURGER_GRASP, FRIES_GRASP = 0.023, 0.019
 """Heights of the tool above the bottom [m]."""
 CARTON_BACK = -0.046
-"""y of the carton's bottom end [m]; the fries stick out towards +y."""
+"""Place of the carton's bottom end along y [m]; the fries stick out toward +y."""
 CARTON_LENGTH = 0.056
 
 
@@ -37,12 +37,11 @@ def tray(color: Color) -> Shape:
     """A low tray with a rim."""
     width, depth = TRAY
     floor = objects.block((width, depth, TRAY_FLOOR), color)
-    rim = objects.darker(color, 0.82)
+    rim = objects.darken(color, 0.82)
     edges = [
-        objects.moved(objects.block((width, 0.006, 0.009), rim), (0, side * (depth / 2 - 0.003), TRAY_FLOOR))
-        for side in (-1, 1)
+        objects.move(objects.block((width, 0.006, 0.009), rim), (0, side * (depth / 2 - 0.003), TRAY_FLOOR)) for side in (-1, 1)
     ] + [
-        objects.moved(objects.block((0.006, depth - 0.012, 0.009), rim), (side * (width / 2 - 0.003), 0, TRAY_FLOOR))
+        objects.move(objects.block((0.006, depth - 0.012, 0.009), rim), (side * (width / 2 - 0.003), 0, TRAY_FLOOR))
         for side in (-1, 1)
     ]
     paper = meshes.box((width * 0.86, depth * 0.8, 0.0006), (246, 243, 234)).transformed((0, 0, TRAY_FLOOR))
@@ -65,7 +64,7 @@ def burger(rng: np.random.Generator) -> Shape:
         height += thickness
     crown = [_ring(radius * share, height + rise) for share, rise in ((0.98, 0.0), (1.0, 0.005), (0.8, 0.014), (0.42, 0.019))]
     seeds = [
-        meshes.box((0.0035, 0.002, 0.0016), (246, 226, 178)).transformed(_on_crown(radius, height, angle), (0, 0, angle))
+        meshes.box((0.0035, 0.002, 0.0016), (246, 226, 178)).transformed(_crown_point(radius, height, angle), (0, 0, angle))
         for angle in rng.uniform(0, np.pi / 3, 6) + np.arange(6) * np.pi / 3
     ]
     mesh = meshes.merge([*layers, meshes.hull(np.concatenate(crown), bun), *seeds])
@@ -92,13 +91,13 @@ def _filling(name: str, radius: float, low: float, thickness: float) -> Mesh:
     return _layer(radius * (0.94 if name == "tomato" else 1.0), low, low + thickness, color)
 
 
-def _on_crown(radius: float, height: float, angle: float) -> tuple[float, float, float]:
+def _crown_point(radius: float, height: float, angle: float) -> tuple[float, float, float]:
     at = 0.6 * radius
     return float(at * np.cos(angle)), float(at * np.sin(angle)), height + 0.0168
 
 
 def fries(rng: np.random.Generator) -> Shape:
-    """A carton of fries on its back, open towards +y."""
+    """A carton of fries on its back, open toward +y."""
     width, height = rng.uniform([0.046, 0.031], [0.054, 0.035])
     color, stripe = [((200, 40, 36), (245, 200, 60)), ((235, 232, 226), (200, 40, 36)), ((50, 90, 180), (240, 240, 238))][
         rng.integers(3)
@@ -157,7 +156,7 @@ def plan(scene: Scene) -> Timeline:
     put_burger = grasps[LEFT].carried(left, goal["burger"], turn)
     place(timeline, LEFT, "burger", put_burger, above=0.07, retreat=LIFT, release=0.95)
     put_fries = grasps[RIGHT].carried(right, goal["fries"])
-    timeline.move(aside([RIGHT]) | {RIGHT: put_fries.moved(z=0.07)})
+    timeline.move(aside_poses([RIGHT]) | {RIGHT: put_fries.moved(z=0.07)})
     place(timeline, RIGHT, "fries", put_fries, above=0.03, retreat=LIFT, release=0.9)
     return timeline
 

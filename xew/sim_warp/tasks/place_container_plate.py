@@ -1,6 +1,6 @@
 """Task: put a bowl or a cup on a plate, with one hand by the rim.
 
-Randomisation: a bowl or a cup at |x| in [.20, .28], y in [-.10, .05]; the plate (fixed to the table) on the same side,
+Randomization: a bowl or a cup at |x| in [.20, .28], y in [-.10, .05]; the plate (fixed to the table) on the same side,
     |x| in [.02, .08], y in [-.15, -.10], clear of the container; size and colors of both.
 Success: container within 50 mm of the plate's center in x and y and standing on it (10 mm), both grippers open.
 After RoboTwin 2.0's place_container_plate, whose plate is wider by a quarter.
@@ -53,7 +53,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     at = draw(rng, [0.20, -0.10], [0.28, 0.05], lambda p: True)
     dish = draw(rng, [0.02, -0.15], [0.08, -0.10], lambda p: np.hypot(*(p - at)) >= CLEAR)
     kind = ("bowl", "cup")[rng.integers(2)]
-    color, trim = containers.palette(rng, 2)
+    color, trim = containers.draw_color_names(rng, 2)
     shape = {"bowl": bowl, "cup": cup}[kind](rng, objects.PALETTE[color])
     return Scene(
         "place_container_plate",

@@ -1,7 +1,7 @@
 """Task: put a pair of shoes into their box side by side, tips to the left; both are grasped at once.
 
-Randomisation: box (fixed) at (0, -.14); left shoe at x in [-.29, -.22], right shoe at x in [.22, .29], both at y in
-    [-.15, -.07]; tips up to 75 degrees from the left, of the left shoe towards the robot, of the right shoe away from it
+Randomization: box (fixed) at (0, -.14); left shoe at x in [-.29, -.22], right shoe at x in [.22, .29], both at y in
+    [-.15, -.07]; tips up to 75 degrees from the left, of the left shoe toward the robot, of the right shoe away from it
     (and 12 degrees the other way); size, kind and colors of the shoes, color of the box.
 Success: the left shoe within 50 mm in x and y of the box's nearer place, the right one of the farther, tips to the left
     (within 15 degrees), on the box's floor (15 mm), both grippers open.
@@ -22,7 +22,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool, tool
 from xew.sim_warp.scene import Grasp, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import HOVER, LET_GO, NARROWEST_HAND, Moment, Task, aside, outward, pick, place
+from xew.sim_warp.tasks.task import HOVER, LET_GO, NARROWEST_HAND, Moment, Task, aside_poses, pick, place, side_sign
 
 BOX = (0.0, -0.14)
 BOX_SIZE = (0.236, 0.214)
@@ -32,16 +32,17 @@ WALL, FLOOR, RIM = 0.005, 0.004, 0.034
 SLOT = 0.044
 """Distance of each shoe's place from the box's middle, in y [m]."""
 LIFT = 0.05
-"""High enough to pass over the rim, low enough for short wrists that point straight down [m]."""
+"""Height to which the shoes are lifted [m]: enough to pass over the rim, little enough for short wrists that point straight
+down."""
 TURNS = np.radians([-12, 75])
-"""Range of a shoe's turn from its place in the box: of the left one anticlockwise, of the right one clockwise [rad]."""
+"""Range of a shoe's turn from its place in the box [rad]: of the left one counterclockwise, of the right one clockwise."""
 TIP_LEFT = np.pi / 2
 """Yaw at which a shoe's tip, its y axis, points to the left [rad]."""
 SOLE = 0.012
 GRASP_HEIGHT = 0.036
-"""Of the tool above the sole's bottom [m]: the pads end above the rim of the sole."""
+"""Height of the tool above the sole's bottom [m]: the pads end above the rim of the sole."""
 GRASP_AT = -0.010
-"""y of the grasp in a shoe's frame [m]: its center of mass is there."""
+"""Place of the grasp along y in a shoe's frame [m]: its center of mass is there."""
 LEATHERS: dict[str, Color] = objects.PALETTE | {"black": (52, 53, 58), "white": (236, 236, 232), "brown": (122, 78, 46)}
 
 
@@ -98,7 +99,7 @@ def _collar(grip: float, half: float, top: float, trim: Color) -> list[Mesh]:
         outline = [(x * grip * inside, (y + 0.46) * half * inside - 0.46 * half) for x, y in sides]
         return _plate(outline, lambda y: slope(y) - 0.002, lambda y: slope(y) + proud, color)
 
-    return [ring(1.0, 0.0012, objects.darker(trim, 0.85)), ring(0.84, 0.0020, (34, 31, 31))]
+    return [ring(1.0, 0.0012, objects.darken(trim, 0.85)), ring(0.84, 0.0020, (34, 31, 31))]
 
 
 def _details(kind: str, grip: float, half: float, top: float, trim: Color) -> list[Mesh]:
@@ -131,10 +132,10 @@ def _details(kind: str, grip: float, half: float, top: float, trim: Color) -> li
 def shoe_box(color: Color) -> Shape:
     """The lower part of a shoe box, with tissue paper on its floor."""
     width, depth = BOX_SIZE
-    floor = objects.block((width - WALL, depth - WALL, FLOOR), objects.darker(color, 0.9))
-    walls = [objects.moved(objects.block((width, WALL, RIM), color), (0, s * (depth - WALL) / 2, 0)) for s in (-1, 1)]
+    floor = objects.block((width - WALL, depth - WALL, FLOOR), objects.darken(color, 0.9))
+    walls = [objects.move(objects.block((width, WALL, RIM), color), (0, s * (depth - WALL) / 2, 0)) for s in (-1, 1)]
     walls += [
-        objects.moved(objects.block((WALL, depth - 2 * WALL, RIM), color), (s * (width - WALL) / 2, 0, 0)) for s in (-1, 1)
+        objects.move(objects.block((WALL, depth - 2 * WALL, RIM), color), (s * (width - WALL) / 2, 0, 0)) for s in (-1, 1)
     ]
     paper = meshes.box((width - 0.02, depth - 0.02, 0.0008), (246, 244, 240)).transformed((0, 0, FLOOR))
     label = meshes.box((0.07, 0.0012, 0.018), (246, 244, 240)).transformed((0, -depth / 2, RIM / 2))
@@ -162,10 +163,10 @@ def places(scene: Scene) -> dict[str, np.ndarray]:
 
 
 def _grasp(thing: SceneObject, arm: int) -> tuple[Tool, float]:
-    """The hand straight down across a shoe, and the turn [rad] that brings the tip to the left and ends a quarter outwards."""
+    """The hand straight down across a shoe, and the turn [rad] that brings the tip to the left and ends a quarter outward."""
     turn = TIP_LEFT - thing.yaw
     middle = np.array(thing.pose[:3]) + Rotation.from_euler("z", thing.yaw).apply([0, GRASP_AT, GRASP_HEIGHT])
-    return tool(middle, outward(arm) * np.pi / 2 - turn), turn
+    return tool(middle, side_sign(arm) * np.pi / 2 - turn), turn
 
 
 def plan(scene: Scene) -> Timeline:
@@ -182,7 +183,7 @@ def plan(scene: Scene) -> Timeline:
     timeline = Timeline()
     pick(timeline, grasps, LIFT)
     place(timeline, LEFT, names[LEFT], goals[LEFT], above=LIFT, retreat=LIFT, release=release)
-    timeline.move(aside([RIGHT]) | {RIGHT: goals[RIGHT].moved(z=LIFT)})
+    timeline.move(aside_poses([RIGHT]) | {RIGHT: goals[RIGHT].moved(z=LIFT)})
     place(timeline, RIGHT, names[RIGHT], goals[RIGHT], above=0.03, retreat=LIFT, release=release)
     return timeline
 

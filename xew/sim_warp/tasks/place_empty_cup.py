@@ -1,6 +1,6 @@
 """Task: put an empty cup on a coaster, with one hand by the rim.
 
-Randomisation: cup at |x| in [.15, .30], y in [-.20, .05]; coaster near the middle on the same side, at least .12 away;
+Randomization: cup at |x| in [.15, .30], y in [-.20, .05]; coaster near the middle on the same side, at least .12 away;
     size and color of the cup, color of the coaster.
 Success: cup within 35 mm of the coaster's center and standing on it (15 mm), both grippers open.
 After RoboTwin 2.0's place_empty_cup.

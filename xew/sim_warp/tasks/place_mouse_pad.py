@@ -1,6 +1,6 @@
 """Task: put a computer mouse on a mat, lengthwise.
 
-Randomisation: mouse at |x| in [.05, .25], y in [-.20, 0], its long side within 55 degrees of the direction from its arm's
+Randomization: mouse at |x| in [.05, .25], y in [-.20, 0], its long side within 55 degrees of the direction from its arm's
     shoulder, either way round; mat (70 x 130 mm, its long side along y) on the same side in the same range, at least .13
     away; size and color of the mouse, one of eight colors of the mat, not its own.
 Success: mouse within 15 mm in x and 12 mm in y of the mat's center, its long side within 15 degrees of y, both grippers open.
@@ -30,7 +30,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         "place_mouse_pad",
         seed,
         (
-            mouse.placed("mouse", at, graspable_yaw(rng, at)),
+            mouse.place_at("mouse", at, graspable_yaw(rng, at)),
             SceneObject("mat", household.mat(MAT, household.MATS[color]), upright(goal, TABLE_TOP)),
         ),
         words={"mouse": mouse.words, "color": color},

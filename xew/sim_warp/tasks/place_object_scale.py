@@ -1,6 +1,6 @@
 """Task: put an everyday thing on a kitchen scale.
 
-Randomisation: one of mouse, stapler, bell at |x| in [.04, .25], y in [-.20, 0], its long side within 55 degrees of the
+Randomization: one of mouse, stapler, bell at |x| in [.04, .25], y in [-.20, 0], its long side within 55 degrees of the
     direction from its arm's shoulder, either way round; scale on the same side at |x| in [.04, .25], y in [-.18, .02], its
     display turned at most 40 degrees off the robot, 20 mm free of it; variant of the thing, form (round or square pan),
     size and color of the scale, which is fixed to the table.
@@ -11,7 +11,7 @@ After RoboTwin 2.0's place_object_scale, whose scale is free and stands at any y
 import numpy as np
 
 from xew.sim_warp.assets import household
-from xew.sim_warp.assets.household import on_top, slab
+from xew.sim_warp.assets.household import print_on, slab
 from xew.sim_warp.geometry import meshes
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline
@@ -39,9 +39,9 @@ def scale(rng: np.random.Generator) -> tuple[str, Shape]:
     else:
         pan = slab((2 * half, 2 * half, PLATE), 0.002, household.STEEL, height - PLATE)
     front = half + 0.004 - depth + 0.016
-    window = on_top((0.040, 0.018), (0, front, low), (60, 66, 62))
-    digits = [on_top((0.004, 0.010), (x, front, low + household.SKIN), (190, 230, 150)) for x in (-0.010, 0.001, 0.012)]
-    keys = [on_top((0.010, 0.010), (side * 0.034, front, low), (205, 205, 200)) for side in (-1, 1)]
+    window = print_on((0.040, 0.018), (0, front, low), (60, 66, 62))
+    digits = [print_on((0.004, 0.010), (x, front, low + household.SKIN), (190, 230, 150)) for x in (-0.010, 0.001, 0.012)]
+    keys = [print_on((0.010, 0.010), (side * 0.034, front, low), (205, 205, 200)) for side in (-1, 1)]
     seen = meshes.merge([body, neck, pan, window, *digits, *keys])
     return name, Shape(seen, (body.vertices, pan.vertices))
 
@@ -59,7 +59,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         "place_object_scale",
         seed,
         (
-            thing.placed("thing", at, graspable_yaw(rng, at)),
+            thing.place_at("thing", at, graspable_yaw(rng, at)),
             SceneObject("scale", shape, upright(beneath, TABLE_TOP, turn)),
         ),
         words={"thing": thing.words, "color": color},

@@ -1,6 +1,6 @@
 """Task: put an everyday thing on a display stand.
 
-Randomisation: one of mouse, stapler, bell, magic cube, toy car, remote control at |x| in [.20, .28], y in [-.05, .05], its
+Randomization: one of mouse, stapler, bell, magic cube, toy car, remote control at |x| in [.20, .28], y in [-.05, .05], its
     long side within 45 degrees of the direction from its arm's shoulder, either way round; stand at |x| at most .05 on the
     same side, y in [-.15, -.10], its yaw within 30 degrees, free of the thing; variant of the thing, form (round, square,
     long), size and color of the stand.
@@ -28,7 +28,7 @@ STAND_MASS = 0.3
 GAP = 0.01
 """Free space between the two at first [m]."""
 SEATED = 0.01
-"""How far a thing's height above the table may be from the stand's [m]."""
+"""Largest difference between a thing's height above the table and the stand's [m]."""
 
 
 def stand(rng: np.random.Generator) -> tuple[str, Shape]:
@@ -66,7 +66,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
         "place_object_stand",
         seed,
         (
-            thing.placed("thing", at, graspable_yaw(rng, at, np.radians(45))),
+            thing.place_at("thing", at, graspable_yaw(rng, at, np.radians(45))),
             SceneObject("stand", shape, upright(beneath, TABLE_TOP, turn), mass=STAND_MASS),
         ),
         words={"thing": thing.words, "color": color},
@@ -74,7 +74,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 
 def top_height(scene: Scene) -> float:
-    """Of the stand's upper face over its origin [m]."""
+    """Height of the stand's upper face over its origin [m]."""
     return float(max(hull[:, 2].max() for hull in scene.object("stand").shape.hulls))
 
 

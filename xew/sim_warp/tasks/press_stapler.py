@@ -1,6 +1,6 @@
 """Task: press a stapler shut twice with the closed fingers of one hand, and hold it down.
 
-Randomisation: stapler at |x| at most .20, y in [-.10, .05], any yaw (the arm on its side works); its size and color. Its
+Randomization: stapler at |x| at most .20, y in [-.10, .05], any yaw (the arm on its side works); its size and color. Its
     foot is fixed to the table, its arm stands on a sprung hinge.
 Success: arm of the stapler pressed down beyond 60 % of its way, closed fingers on it, the tool within 40 mm of the place to
     press.
@@ -15,28 +15,29 @@ from xew.sim_warp.assets.household import StaplerParts
 from xew.sim_warp.plan import ASIDE_TIME, Timeline, Tool, tool
 from xew.sim_warp.scene import Hinge, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRIPPER_CLOSED, TURN_TILT, Moment, Task, arm_for, aside, radial_yaw
+from xew.sim_warp.tasks.task import GRIPPER_CLOSED, TURN_TILT, Moment, Task, arm_for, aside_poses, radial_yaw
 
 PRESS_AT = 0.28
-"""y of the place to press, as a share of the stapler's length."""
+"""Place to press along y, as a share of the stapler's length."""
 PRESSED, DONE = 1.3, 0.6
-"""Shares of the arm's way to which the expert means to press it, past the stop since a robot gives way by a millimeter or two
+"""Shares of the arm's way: to which the expert means to press it, past the stop since a robot gives way by a millimeter or two
 under the spring, and from which it counts as pressed."""
 STIFFNESS, PRELOAD = 1.0, 0.15
-"""Of the spring [N m/rad], and the angle [rad] by which it is wound when the arm stands open: 2 N at the fingers, 4 N shut."""
+"""Stiffness of the spring [N m/rad], and the angle [rad] by which it is wound when the arm stands open: 2 N at the fingers, 4
+N shut."""
 BEYOND_TOOL, HALF_WIDTH = 0.015, 0.011
-"""Of every robot's pads: how far they reach ahead of the tool, and how far to its sides [m]."""
+"""Reach of every robot's pads ahead of the tool, and to its sides [m]."""
 NEAR = 0.04
-"""Farthest that the tool may be from the place to press [m]."""
+"""Largest distance of the tool from the place to press [m]."""
 STROKES = 2
-"""How often it is pressed: in between the spring lifts the arm again, at the end it is held down."""
+"""Number of strokes: in between the spring lifts the arm again, at the end it is held down."""
 STROKE_TIME = 0.72
-"""Of each way down [s]."""
+"""Time of each way down [s]."""
 CLEAR, APPROACH = 0.01, 0.06
 """Heights over the place to press between strokes, and from which the way down is straight [m]."""
 
 
-def hinged(parts: StaplerParts) -> Hinge:
+def stapler_hinge(parts: StaplerParts) -> Hinge:
     """The stapler's arm on its hinge: at 0 as it stands open, pressed down at `upper`."""
     return Hinge(
         lid=parts.arm,
@@ -60,7 +61,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     return Scene(
         "press_stapler",
         seed,
-        (SceneObject("stapler", parts.base, pose, hinge=hinged(parts)),),
+        (SceneObject("stapler", parts.base, pose, hinge=stapler_hinge(parts)),),
         words={"stapler": parts.words},
     )
 
@@ -76,7 +77,7 @@ def press_point(scene: Scene, fraction: float) -> np.ndarray:
     return np.array(thing.pose[:3]) + Rotation.from_euler("z", thing.yaw).apply(local)
 
 
-def _pressing(scene: Scene, arm: int, fraction: float) -> Tool:
+def _pressing_pose(scene: Scene, arm: int, fraction: float) -> Tool:
     """The closed hand whose lower edge touches the place to press."""
     at = press_point(scene, fraction)
     hand = tool(at, radial_yaw(arm, at), TURN_TILT)
@@ -85,13 +86,13 @@ def _pressing(scene: Scene, arm: int, fraction: float) -> Tool:
 
 def plan(scene: Scene) -> Timeline:
     arm = arm_for(scene.object("stapler").pose[0])
-    touch = _pressing(scene, arm, 0.0)
+    touch = _pressing_pose(scene, arm, 0.0)
     timeline = Timeline()
     timeline.grip({arm: 0.0})
-    timeline.move(aside([arm]) | {arm: touch.moved(z=APPROACH)}, at_least=ASIDE_TIME)
+    timeline.move(aside_poses([arm]) | {arm: touch.moved(z=APPROACH)}, at_least=ASIDE_TIME)
     for _ in range(STROKES):
         timeline.move({arm: touch.moved(z=CLEAR)})
-        timeline.follow(arm, [_pressing(scene, arm, PRESSED)], seconds=STROKE_TIME)
+        timeline.follow(arm, [_pressing_pose(scene, arm, PRESSED)], seconds=STROKE_TIME)
         timeline.wait(0.3)
     timeline.hold(arm, "stapler")
     return timeline

@@ -1,6 +1,6 @@
 """Task: stack two bowls in the middle, the nearer one first, each hand serving its own side.
 
-Randomisation: two equal bowls at |x| in [.09, .30], y in [-.15, .15] (y at most 0 where |x| < .15), at least .15 apart and
+Randomization: two equal bowls at |x| in [.09, .30], y in [-.15, .15] (y at most 0 where |x| < .15), at least .15 apart and
     .15 from the place of the stack; size and colors.
 Success: centers within 40 mm in x and y, the lower bowl on the table (below .76), the upper inside it (between 10 and
     45 mm higher), both grippers open. (RoboTwin 2.0 tests only upper bounds of the heights.)
@@ -24,8 +24,8 @@ RIM_DEPTH = 0.006
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
     radius = rng.uniform(0.054, 0.062)
-    first = draw(rng, [-0.30, -0.15], [0.30, 0.15], lambda p: _free(p, []))
-    second = draw(rng, [-0.30, -0.15], [0.30, 0.15], lambda p: _free(p, [first]))
+    first = draw(rng, [-0.30, -0.15], [0.30, 0.15], lambda p: _is_free(p, []))
+    second = draw(rng, [-0.30, -0.15], [0.30, 0.15], lambda p: _is_free(p, [first]))
     nearer, farther = sorted((first, second), key=lambda p: p[1])
     colors = rng.permutation(sorted(objects.PALETTE))
     outline = [(radius - 0.026, 0), (radius - 0.006, 0.02), (radius, 0.05)]
@@ -41,7 +41,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     return Scene("stack_bowls_two", seed, bowls, words={"lower": colors[0], "upper": colors[1]})
 
 
-def _free(point: np.ndarray, others: list[np.ndarray]) -> bool:
+def _is_free(point: np.ndarray, others: list[np.ndarray]) -> bool:
     x, y = point
     if abs(x) < 0.09 or (abs(x) < 0.15 and y > 0) or np.hypot(x - STACK[0], y - STACK[1]) < 0.15:
         return False

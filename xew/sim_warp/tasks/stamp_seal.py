@@ -1,6 +1,6 @@
 """Task: stamp a seal on a colored square, with one hand.
 
-Randomisation: the seal upright at |x| in [.05, .25], |y| at most .05, one of eight turns; the square (only seen, 70 mm wide)
+Randomization: the seal upright at |x| in [.05, .25], |y| at most .05, one of eight turns; the square (only seen, 70 mm wide)
     on the same side at |x| in [.05, .25], |y| at most .05, at least .10 away; round, square or eight-sided foot, sizes,
     kind of wood, color of the square.
 Success: the seal's middle within 10 mm of the square's in x and y, standing on the table (5 mm, upright within 8 degrees),
@@ -21,7 +21,7 @@ from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, pick, place, radial_yaw
 
 FACETS = 8
-"""Flat sides of the knob, so that a pad lies on one."""
+"""Number of flat sides of the knob, so that a pad lies on one."""
 TURN = 2 * np.pi / FACETS
 GRASP_BELOW_TOP = 0.022
 TARGET = 0.07

@@ -1,4 +1,4 @@
-"""What a task is: a scene to sample, a plan that solves it, and a test of success."""
+"""Tasks and the moves that they share: a task is a scene to sample, a plan that solves it, and a test of success."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -17,19 +17,19 @@ STEEP_TILT = np.radians(10)
 TURN_TILT = np.radians(20)
 """Lean for grasps across things that may lie turned: the one with which all robots turn a hand up to `WIDEST_TURN`."""
 WIDEST_TURN = np.radians(55)
-"""Of a hand from its radial yaw, over the near part of the table (y below .02) [rad]."""
+"""Largest turn of a hand from its radial yaw, over the near part of the table (y below .02) [rad]."""
 EASY_TURN = np.radians(35)
-"""Of a hand from its radial yaw where it need not be more [rad]: reached higher and farther than `WIDEST_TURN`."""
+"""Turn of a hand from its radial yaw where it need not be more [rad]: reached higher and farther than `WIDEST_TURN`."""
 PRE_GRASP = 0.09
 """Distance before a grasp from which the approach is straight [m]."""
 HOVER = 0.001
 """Height above its place at which a thing is let go [m]."""
 LET_GO = 0.016
-"""How much wider than the thing in it a hand opens to be clear of it [m]."""
+"""Distance by which a hand opens wider than the thing in it, to be clear of it [m]."""
 NARROWEST_HAND = 0.08
-"""Between the open pads of the narrowest gripper [m]."""
+"""Distance between the open pads of the narrowest gripper [m]."""
 GRIPPER_OPEN = 0.8
-"""A gripper commanded beyond this counts as open (RoboTwin 2.0)."""
+"""Command beyond which a gripper counts as open (RoboTwin 2.0)."""
 GRIPPER_CLOSED = 0.2
 
 
@@ -42,7 +42,7 @@ class Moment:
     object_joint: np.ndarray
     """[o] rad."""
     tool_pose: np.ndarray
-    """[2 7] measured, world."""
+    """[2 7] measured tool poses, m and quaternion x y z w, world."""
     gripper: np.ndarray
     """[2] commanded, 0 closed, 1 open."""
     contact: np.ndarray
@@ -50,6 +50,7 @@ class Moment:
 
     @property
     def both_open(self) -> bool:
+        """Are both grippers open?"""
         return bool((self.gripper > GRIPPER_OPEN).all())
 
 
@@ -59,13 +60,13 @@ class Task:
 
     name: str
     instruction: str
-    """English, with {slots} that the scene's words fill."""
+    """Sentence in English, with {slots} that the words of the scene fill."""
     sample: Callable[[np.random.Generator, int], Scene]
-    """(random stream, seed) -> the scene; knows no robot."""
+    """Function (random stream, seed) -> scene; it knows no robot."""
     plan: Callable[[Scene], Timeline]
-    """Scene -> waypoints of both tools; knows no robot."""
+    """Function scene -> waypoints of both tools; it knows no robot."""
     success: Callable[[Scene, Moment], bool]
-    """Is the task done at this moment?"""
+    """Function (scene, moment) -> is the task done?"""
 
 
 def arm_for(x: float) -> int:
@@ -73,7 +74,7 @@ def arm_for(x: float) -> int:
     return RIGHT if x > 0 else LEFT
 
 
-def outward(arm: int) -> float:
+def side_sign(arm: int) -> float:
     """+1 for the right arm, -1 for the left: the sign of x on its side."""
     return 1.0 if arm == RIGHT else -1.0
 
@@ -85,7 +86,7 @@ def pick(timeline: Timeline, grasps: dict[int, Tool], lift: float, opening: floa
     """
     if opening < 1.0:
         timeline.grip(dict.fromkeys(grasps, opening), seconds=0.24)
-    idle = aside(grasps)
+    idle = aside_poses(grasps)
     seconds = ASIDE_TIME if any(timeline.at[arm] is not goal for arm, goal in idle.items()) else 0.0
     timeline.move(idle | {arm: grasp.backed(PRE_GRASP) for arm, grasp in grasps.items()}, at_least=seconds)
     timeline.move(grasps)
@@ -96,11 +97,11 @@ def pick(timeline: Timeline, grasps: dict[int, Tool], lift: float, opening: floa
 def radial_yaw(arm: int, position: Point) -> float:
     """The hand's yaw [rad] at which its lean points away from the arm's shoulder: the one that all robots reach best."""
     x, y = position[:2]
-    return outward(arm) * float(np.arctan2(0.25 - outward(arm) * x, y + 0.45))
+    return side_sign(arm) * float(np.arctan2(0.25 - side_sign(arm) * x, y + 0.45))
 
 
 def symmetric_yaw(arm: int, position: Point, yaw: float, symmetry: float) -> float:
-    """Of the yaws `yaw` plus multiples of `symmetry` [rad] the one nearest to the radial yaw."""
+    """The yaw nearest to the radial one, out of `yaw` plus multiples of `symmetry` [rad]."""
     return float(yaw + symmetry * np.round((radial_yaw(arm, position) - yaw) / symmetry))
 
 
@@ -150,7 +151,7 @@ def carry(
 
 
 def across(position: Point, direction: float, arm: int) -> Tool:
-    """A grasp from above across a rod that lies along the horizontal `direction` [rad], leaning inwards."""
+    """A grasp from above across a rod that lies along the horizontal `direction` [rad], leaning inward."""
     yaw = radial_yaw(arm, position)
     approach, opening = tool(position, yaw, STEEP_TILT).rotation.apply([[1.0, 0, 0], [0, 1.0, 0]])
     wanted = np.cross(approach, [np.cos(direction), np.sin(direction), 0.0])
@@ -160,7 +161,7 @@ def across(position: Point, direction: float, arm: int) -> Tool:
 
 
 def vessel_pose(position: Point) -> Pose:
-    """Upright on the table at (x, y), turned so that a wall segment faces the hand that will take it."""
+    """A pose upright on the table at (x, y), turned so that a wall segment faces the hand that will take it."""
     return upright(position[:2], TABLE_TOP, radial_yaw(arm_for(position[0]), position))
 
 
@@ -177,17 +178,17 @@ def rim_grasp(vessel: SceneObject, wall: float, depth: float) -> tuple[int, Tool
     vertices = vessel.shape.mesh.vertices
     radius = float(np.hypot(*vertices[:, :2].T).max()) - wall / 2
     yaw = radial_yaw(arm, position)
-    radial = outward(arm) * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    radial = side_sign(arm) * np.array([np.cos(yaw), np.sin(yaw), 0.0])
     return arm, tool(position + radius * radial + [0, 0, vertices[:, 2].max() - depth], yaw, GRASP_TILT)
 
 
-def aside(working: Collection[int]) -> dict[int, Tool]:
-    """Where the arms that are not working wait."""
+def aside_poses(working: Collection[int]) -> dict[int, Tool]:
+    """Poses where the arms that are not working wait."""
     return {arm: ASIDE[arm] for arm in (LEFT, RIGHT) if arm not in working}
 
 
 def place(timeline: Timeline, arm: int, name: str, goal: Tool, *, above: float, retreat: float, release: float) -> None:
-    """Bring what `arm` has held since its last grip to `goal` from `above` [m], let go, draw back upwards and open.
+    """Bring what `arm` has held since its last grip to `goal` from `above` [m], let go, draw back upward and open.
 
     `release` is the gripper's opening between letting go and being clear of the object and its neighbors.
     """

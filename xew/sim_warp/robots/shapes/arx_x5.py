@@ -19,7 +19,7 @@ from xew.sim_warp.robots.shapes.solids import (
 )
 
 cylinder = partial(solids.cylinder, sections=13)
-"""Coarser than elsewhere: the ALOHA carries four of these arms."""
+"""Cylinders coarser than elsewhere: the ALOHA carries four of these arms."""
 
 MATERIALS = {
     "black": (48, 48, 52),
@@ -40,7 +40,7 @@ PALM = (Box((0, -0.033, -0.028), (0.062, 0.033, 0.03)), Box((0.0486, -0.087, -0.
 
 
 def finger(side: int, tip: float, face: float, middle: float) -> tuple[Box, ...]:
-    """Pad and carriage of the finger that opens towards `side` (+1, -1) of y.
+    """Pad and carriage of the finger that opens toward `side` (+1, -1) of y.
 
     Its tip is at x = tip, its face at y = -side * face, and its middle at z = middle, in the finger's frame.
     """

@@ -6,13 +6,13 @@ from xew.sim_warp.robots.shapes.solids import (
     Box,
     Part,
     Vector,
-    between,
     box_solid,
     camera,
     cylinder,
     dome,
     hull,
     loft,
+    point_between,
     rounded_box,
 )
 
@@ -29,7 +29,7 @@ MESH_NAMES: dict[str, str] = {}
 
 
 def finger(side: int) -> tuple[Box, ...]:
-    """Pad and carriage of the finger that opens towards `side` (+1, -1) of y."""
+    """Pad and carriage of the finger that opens toward `side` (+1, -1) of y."""
     low, high = sorted((0, side * PAD_THICKNESS))
     inner, outer = sorted((side * 0.004, side * 0.026))
     return (
@@ -69,7 +69,7 @@ COLLISIONS = {
 
 def drum(start: Vector, end: Vector, radius: float = 0.0545) -> list[Part]:
     """Half of a joint: dark at the seam where it starts, a white dome where it ends."""
-    seam = between(start, end, 0.06)
+    seam = point_between(start, end, 0.06)
     return [("gray", cylinder(start, seam, 0.96 * radius)), ("white", dome(seam, end, radius))]
 
 

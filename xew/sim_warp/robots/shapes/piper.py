@@ -27,11 +27,11 @@ MESH_NAMES: dict[str, str] = {}
 
 UPPER_ARM = (0, 0, 0.10095)
 FOREARM = (0, 0, 1.3826)
-"""The vendor's later frames of link2 and link3, in which mesh sizes are known: x, respectively y, along the arm."""
+"""Axes of the vendor's later frames of link2 and link3, in which mesh sizes are known: x, respectively y, along the arm."""
 
 
 def finger(side: int) -> tuple[Box, ...]:
-    """Pad and carriage of the finger whose frame has the approach along `side` (+1, -1) of y; it opens towards -z."""
+    """Pad and carriage of the finger whose frame has the approach along `side` (+1, -1) of y; it opens toward -z."""
     tip = 0.14 - 0.13503
     low, high = sorted((side * tip, side * (tip - 0.035)))
     back, front = sorted((side * (tip - 0.035), side * -0.0715))
@@ -167,7 +167,7 @@ def link6_parts() -> list[Part]:
 
 
 def finger_parts(side: int) -> list[Part]:
-    """A paddle that narrows towards its rubber tip; the approach is along `side` of y."""
+    """A paddle that narrows toward its rubber tip; the approach is along `side` of y."""
     stations = [
         (-0.0715, -0.026, 0.026, -0.0245, -0.002),
         (-0.0572, -0.026, 0.026, -0.0243, -0.002),

@@ -12,7 +12,7 @@ Part = tuple[str, trimesh.Trimesh]
 """Name of a material, and a solid in the frame of its link."""
 
 PAD_HALF_WIDTH, PAD_THICKNESS = 0.011, 0.008
-"""A gripping face reaches this far to either side of the tool center point, and outwards [m]."""
+"""Reach of a gripping face to either side of the tool center point, and outward [m]."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,7 @@ class Box:
 
     @property
     def size(self) -> np.ndarray:
+        """[3] edge lengths [m]."""
         return np.subtract(self.high, self.low)
 
     @property
@@ -34,7 +35,7 @@ class Box:
         return Rotation.from_euler("xyz", self.rpy).apply(np.add(self.low, self.high) / 2)
 
 
-def between(start: Vector, end: Vector, share: float) -> Vector:
+def point_between(start: Vector, end: Vector, share: float) -> Vector:
     """The point that lies `share` of the way from start to end."""
     x, y, z = (a + share * (b - a) for a, b in zip(start, end, strict=True))
     return x, y, z
@@ -62,7 +63,7 @@ def cylinder(
     if not bevel:
         profile = [(0, 0), (radius, 0), (last, length), (0, length)]
     solid = trimesh.creation.revolve(np.array(profile), sections=sections)
-    return _placed(solid, trimesh.geometry.align_vectors([0, 0, 1], axis / length), start)
+    return _move(solid, trimesh.geometry.align_vectors([0, 0, 1], axis / length), start)
 
 
 def dome(start: Vector, end: Vector, radius: float, sections: int = 16) -> trimesh.Trimesh:
@@ -73,7 +74,7 @@ def dome(start: Vector, end: Vector, radius: float, sections: int = 16) -> trime
     turn = np.radians([0, 30, 60])
     rim = np.stack([radius * np.cos(turn), length - rise + rise * np.sin(turn)], 1)
     solid = trimesh.creation.revolve(np.vstack([[0, 0], [radius, 0], rim, [0, length]]), sections=sections)
-    return _placed(solid, trimesh.geometry.align_vectors([0, 0, 1], axis / length), start)
+    return _move(solid, trimesh.geometry.align_vectors([0, 0, 1], axis / length), start)
 
 
 def rounded_box(low: Vector, high: Vector, chamfer: float = 0.004, rpy: Vector = (0, 0, 0)) -> trimesh.Trimesh:
@@ -83,7 +84,7 @@ def rounded_box(low: Vector, high: Vector, chamfer: float = 0.004, rpy: Vector =
         inset = np.full(3, chamfer)
         inset[axis] = 0
         corners.append(trimesh.creation.box(bounds=[np.add(low, inset), np.subtract(high, inset)]).vertices)
-    return _placed(trimesh.convex.convex_hull(np.vstack(corners)), transform(rpy=rpy), (0, 0, 0))
+    return _move(trimesh.convex.convex_hull(np.vstack(corners)), transform(rpy=rpy), (0, 0, 0))
 
 
 def hull(*solids: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -113,7 +114,7 @@ def loft(axis: str, stations: Sequence[Sequence[float]], rpy: Vector = (0, 0, 0)
     solid = trimesh.Trimesh(points.reshape(-1, 3), _skin(len(stations)), process=False)
     if solid.volume < 0:
         solid.invert()
-    return _placed(solid, transform(rpy=rpy), (0, 0, 0))
+    return _move(solid, transform(rpy=rpy), (0, 0, 0))
 
 
 def _skin(rings: int) -> np.ndarray:
@@ -129,7 +130,7 @@ def _skin(rings: int) -> np.ndarray:
     return np.array(faces)
 
 
-def _placed(solid: trimesh.Trimesh, rotation: np.ndarray, xyz: Sequence[float]) -> trimesh.Trimesh:
+def _move(solid: trimesh.Trimesh, rotation: np.ndarray, xyz: Sequence[float]) -> trimesh.Trimesh:
     matrix = rotation.copy()
     matrix[:3, 3] = xyz
     solid.apply_transform(matrix)

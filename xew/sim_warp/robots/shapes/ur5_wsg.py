@@ -6,12 +6,12 @@ from xew.sim_warp.robots.shapes.solids import (
     Box,
     Part,
     Vector,
-    between,
     box_solid,
     camera,
     cylinder,
     dome,
     hull,
+    point_between,
     rounded_box,
 )
 
@@ -45,7 +45,7 @@ COLLISIONS = {
 
 def housing(start: Vector, end: Vector, radius: float) -> list[Part]:
     """A joint's housing along its axis: gray, with a blue cap over its end."""
-    seam = between(start, end, 0.78)
+    seam = point_between(start, end, 0.78)
     return [("gray", cylinder(start, seam, radius)), ("blue", dome(seam, end, 0.985 * radius))]
 
 

@@ -1,4 +1,4 @@
-"""What a user says of a robot of their own: a `RobotDraft`, most of which may be left open.
+"""Descriptions of users' robots as `RobotDraft`s, most of which may be left open.
 
 Reads  a URDF, a folder with a robot.yaml, or a RoboTwin embodiment folder (config.yml)
 Writes RobotDraft; `xew.sim_warp.robots.user.own` fills in what is open
@@ -17,7 +17,7 @@ from xew.config import ConfigError, parse, read_yaml
 from xew.sim_warp.geometry.poses import Pose
 
 OWN, ROBOTWIN = "robot.yaml", "config.yml"
-"""The file that describes a robot in our own way, and in RoboTwin's."""
+"""Names of the file that describes a robot in our own way, and in RoboTwin's."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,11 @@ class ArmDraft:
     joints: tuple[str, ...] | None = None
     home: tuple[float, ...] | None = None
     near: tuple[float, ...] | None = None
-    """A posture to search the home from, if home is left open [rad]."""
+    """Posture to search the home from, if home is left open [rad]."""
     tool_link: str | None = None
     tool_pose: Pose | None = None
     tool_at_tips: bool = False
-    """Take only the orientation of `tool_pose`, and for its origin the place at the fingers where all our robots have it."""
+    """True takes only the orientation of `tool_pose`; the origin is the place at the fingers where all our robots have it."""
     fingers: tuple[str, str] | None = None
     finger_closed: tuple[float, float] | None = None
     finger_open: tuple[float, float] | None = None
@@ -46,15 +46,15 @@ class RobotDraft:
     """Path of the URDF, relative to the file that says so."""
     title: str | None = None
     arms: tuple[ArmDraft, ArmDraft] = (ArmDraft(), ArmDraft())
-    """Left, right. What only the left says holds for the right too, but for `root_pose` and `home`."""
+    """Left and right arm. What only the left says holds for the right too, but for `root_pose` and `home`."""
     joint_lower: tuple[float, ...] | None = None
     """Limits that experts keep [rad]; open: the URDF's."""
     joint_upper: tuple[float, ...] | None = None
     joint_velocity: tuple[float, ...] | None = None
-    """[rad/s]; open: the URDF's."""
+    """Speed limits that experts keep [rad/s]; open: the URDF's."""
     distance: float | None = None
-    """Between the bases of two equal arms [m], to either side of `root_pose`; open: the first of `placement.DISTANCES` at
-    which both arms reach home."""
+    """Distance between the bases of two equal arms [m], half to either side of `root_pose`; open: the first of
+    `placement.DISTANCES` at which both arms reach home."""
     source: str | None = None
     """SHA-256 of what a kept robot was made from; leave it out."""
 
@@ -123,16 +123,16 @@ def _robotwin_arm(reader: "_Reader", side: int, tool: Pose) -> ArmDraft:
     pose = np.asarray(reader.per_side("robot_pose", side), float)
     gripper = reader.per_side("gripper_name", side)
     if pose.shape != (7,):
-        raise reader.wrong("robot_pose", "lists of x y z and a quaternion w x y z")
+        raise reader.error("robot_pose", "lists of x y z and a quaternion w x y z")
     try:
         (mimic,) = gripper["mimic"]
         fingers = (str(gripper["base"]), str(mimic[0]))
         factor, offset = float(mimic[1]), float(mimic[2])
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise reader.wrong("gripper_name", "a base joint and one mimic of [joint, factor, offset] an arm") from error
+        raise reader.error("gripper_name", "a base joint and one mimic of [joint, factor, offset] an arm") from error
     closed, opened = reader.numbers("gripper_scale", (2,))
     return ArmDraft(
-        root_pose=(*pose[:3].tolist(), *_unit(pose[[4, 5, 6, 3]], reader)),
+        root_pose=(*pose[:3].tolist(), *_unit_quaternion(pose[[4, 5, 6, 3]], reader)),
         joints=tuple(map(str, joints)),
         near=tuple(map(float, home)),
         tool_link=str(reader.per_side("ee_joints", side)),
@@ -144,11 +144,11 @@ def _robotwin_arm(reader: "_Reader", side: int, tool: Pose) -> ArmDraft:
     )
 
 
-def _unit(quaternion: np.ndarray, reader: "_Reader") -> tuple[float, float, float, float]:
-    """RoboTwin writes .707 for the root of a half."""
+def _unit_quaternion(quaternion: np.ndarray, reader: "_Reader") -> tuple[float, float, float, float]:
+    """The quaternion [4] at unit length, for RoboTwin writes .707 for the root of a half."""
     length = float(np.linalg.norm(quaternion))
     if not 0.9 < length < 1.1:
-        raise reader.wrong("robot_pose", "unit quaternions w x y z")
+        raise reader.error("robot_pose", "unit quaternions w x y z")
     x, y, z, w = (quaternion / length).tolist()
     return x, y, z, w
 
@@ -161,33 +161,36 @@ class _Reader:
     source: str
 
     def value(self, key: str, kind: type) -> Any:
+        """The value of a key, which must be there and of a type."""
         if key not in self.config:
             raise ConfigError(f"{self.source}: missing key {key!r}; a RoboTwin embodiment has it.")
         if not isinstance(self.config[key], kind):
-            raise self.wrong(key, f"a {kind.__name__}")
+            raise self.error(key, f"a {kind.__name__}")
         return self.config[key]
 
     def per_side(self, key: str, side: int) -> Any:
         """The left (first) or right (last) entry of a list; with one entry both are the same."""
         entries = self.value(key, list)
         if not entries:
-            raise self.wrong(key, "one entry an arm")
+            raise self.error(key, "one entry an arm")
         return entries[-1 if side else 0]
 
     def numbers(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
+        """Finite numbers [...] float64 of a shape."""
         try:
             array = np.asarray(self.value(key, object), float)
         except (TypeError, ValueError) as error:
-            raise self.wrong(key, "numbers") from error
+            raise self.error(key, "numbers") from error
         if array.shape != shape or not np.isfinite(array).all():
-            raise self.wrong(key, f"finite numbers of shape {shape}" if shape else "a finite number")
+            raise self.error(key, f"finite numbers of shape {shape}" if shape else "a finite number")
         return array
 
     def rotation(self, key: str) -> np.ndarray:
+        """A rotation matrix [3 3]."""
         matrix = self.numbers(key, (3, 3))
         if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3) or np.linalg.det(matrix) < 0:
-            raise self.wrong(key, "a rotation matrix")
+            raise self.error(key, "a rotation matrix")
         return matrix
 
-    def wrong(self, key: str, expected: str) -> ConfigError:
+    def error(self, key: str, expected: str) -> ConfigError:
         return ConfigError(f"{self.source}: {key} is {self.config[key]!r}; expected {expected}.")

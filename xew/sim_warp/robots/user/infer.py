@@ -1,4 +1,4 @@
-"""What a URDF shows of itself: its hands, the joints of its arms, its tool frame, which way its fingers close.
+"""Inference from a URDF: its hands, the joints of its arms, its tool frame, which way its fingers close.
 
 Reads  a Urdf
 Writes the fields of an Arm that a draft leaves open. Where the URDF leaves more than one reading, a ConfigError says which
@@ -17,13 +17,14 @@ from xew.sim_warp.kinematics.forward import link_matrices
 
 ARM_JOINTS = (6, 7)
 TIP_MARGIN = 0.015
-"""How far behind the finger tips the tool frame is put [m], as on our own robots."""
+"""Distance of the tool frame behind the finger tips [m], as on our own robots."""
 SNAP = math.cos(math.radians(20))
-"""An approach direction within 20 degrees of an axis of the hand is taken to be that axis."""
+"""Cosine of the largest angle at which an approach direction is taken to be the axis of the hand that is nearest: 20 degrees.
+"""
 LARGEST_ANGLE = 2 * math.pi
-"""Position limits beyond it are placeholders [rad]."""
+"""Largest position limit [rad]; one beyond it is a placeholder."""
 LARGEST_SPEED, DEFAULT_SPEED = 10.0, 3.0
-"""A speed limit that is absent, 0 or larger than the first [rad/s] is a placeholder; the second is used."""
+"""Largest speed limit [rad/s], and the one that is used where the URDF has none, 0 or a larger one: those are placeholders."""
 
 
 def find_fingers(urdf: Urdf) -> list[tuple[str, str]]:
@@ -69,7 +70,7 @@ def finger_ends(urdf: Urdf, fingers: tuple[str, str]) -> tuple[tuple[float, floa
     Raises:
         ConfigError: a finger has no limits or no way to go.
     """
-    middles = {name: _middle(urdf.joints[name], urdf) for name in fingers}
+    middles = {name: _middle_position(urdf.joints[name], urdf) for name in fingers}
     closed, opened = [], []
     for name, other in (fingers, fingers[::-1]):
         ends = (urdf.joints[name].lower, urdf.joints[name].upper)
@@ -81,7 +82,8 @@ def finger_ends(urdf: Urdf, fingers: tuple[str, str]) -> tuple[tuple[float, floa
     return (closed[0], closed[1]), (opened[0], opened[1])
 
 
-def _middle(joint: Joint, urdf: Urdf) -> float:
+def _middle_position(joint: Joint, urdf: Urdf) -> float:
+    """The middle of a finger's way [m]. Raises ConfigError if it has none."""
     if joint.kind != "prismatic" or not math.isfinite(joint.upper - joint.lower) or joint.upper - joint.lower < 1e-4:
         raise ConfigError(
             f"{urdf.path}: the finger {joint.name} is {joint.kind} from {joint.lower:g} to {joint.upper:g}; expected a "
@@ -91,7 +93,7 @@ def _middle(joint: Joint, urdf: Urdf) -> float:
 
 
 def _finger_points(urdf: Urdf, name: str, positions: dict[str, float]) -> np.ndarray:
-    """Points [k 3] of all that a finger joint moves, in the frame of the hand; its origin if that has no shape."""
+    """Points [k 3] m of all that a finger joint moves, in the frame of the hand; its origin if that has no shape."""
     row = np.array([[positions.get(joint, 0.0) for joint in urdf.joint_names]])
     frames = link_matrices(urdf, row)
     hand = np.linalg.inv(frames[urdf.joints[name].parent][0])
@@ -121,11 +123,11 @@ def tool_frame(urdf: Urdf, joints: tuple[str, ...], fingers: tuple[str, str], cl
     approach -= opening * (approach @ opening)
     if np.linalg.norm(approach) < 1e-3:
         raise ConfigError(f"{urdf.path}: cannot tell which way {hand} points; give tool_pose in a robot.yaml.")
-    approach = _snapped(approach / np.linalg.norm(approach), opening)
-    return at_tips(urdf, hand, np.stack([approach, opening, np.cross(approach, opening)], axis=1), fingers, closed)
+    approach = _snap_to_axis(approach / np.linalg.norm(approach), opening)
+    return tool_at_tips(urdf, hand, np.stack([approach, opening, np.cross(approach, opening)], axis=1), fingers, closed)
 
 
-def at_tips(urdf: Urdf, link: str, rotation: np.ndarray, fingers: tuple[str, str], closed: tuple[float, float]) -> Pose:
+def tool_at_tips(urdf: Urdf, link: str, rotation: np.ndarray, fingers: tuple[str, str], closed: tuple[float, float]) -> Pose:
     """A tool frame in `link` of the orientation `rotation` [3 3], its origin between the fingers, behind their tips."""
     row = np.zeros((1, len(urdf.joint_names)))
     frames = link_matrices(urdf, row)
@@ -137,7 +139,7 @@ def at_tips(urdf: Urdf, link: str, rotation: np.ndarray, fingers: tuple[str, str
     return (x, y, z, *Rotation.from_matrix(rotation).as_quat(canonical=True).tolist())
 
 
-def _snapped(direction: np.ndarray, opening: np.ndarray) -> np.ndarray:
+def _snap_to_axis(direction: np.ndarray, opening: np.ndarray) -> np.ndarray:
     """The nearest axis of the hand that is square to `opening`, if it is near, else the direction itself."""
     axis = np.zeros(3)
     axis[np.argmax(np.abs(direction))] = np.sign(direction[np.argmax(np.abs(direction))])

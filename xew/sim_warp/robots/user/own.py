@@ -27,14 +27,23 @@ from xew.protocol import ROBOT_NAMES
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
 from xew.sim_warp.robots.user.draft import OWN, ArmDraft, RobotDraft, find_description, read_draft
+from xew.sim_warp.robots.user.infer import (
+    arm_joints,
+    find_fingers,
+    finger_ends,
+    hand_link,
+    joint_limits,
+    tool_at_tips,
+    tool_frame,
+)
 
 FOLDERS = "XEW_ROBOTS"
-"""Environment variable: folders of robots, separated as in PATH."""
+"""Name of the environment variable that lists folders of robots, separated as in PATH."""
 KEPT = "robots"
-"""Folder of a data set that holds its robots."""
+"""Name of the folder of a data set that holds its robots."""
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 STROKE_TOLERANCE = 1e-3
-"""The two fingers of a hand move together: how far their strokes may differ [m]."""
+"""Largest difference between the strokes of the two fingers of a hand, which move together [m]."""
 
 
 def is_path(name: str) -> bool:
@@ -58,7 +67,7 @@ def load_robot(path: Path | str) -> RobotSpec:
 @lru_cache(maxsize=16)
 def _load(description: Path, modified: int) -> RobotSpec:
     draft = read_draft(description)
-    return completed(draft, load_urdf(description.parent / draft.urdf), robot_key(description), str(description))
+    return complete_draft(draft, load_urdf(description.parent / draft.urdf), robot_key(description), str(description))
 
 
 def robot_key(description: Path) -> str:
@@ -73,13 +82,13 @@ def robot_key(description: Path) -> str:
 # --- What a draft leaves open.
 
 
-def completed(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> RobotSpec:
+def complete_draft(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> RobotSpec:
     """A RobotSpec of a draft and its URDF; `source` names the draft in errors."""
-    arms = _arms(draft, urdf, source)
+    arms = _complete_arms(draft, urdf, source)
     counts = [len(arm.joints) for arm in arms]
     if counts[0] != counts[1] or counts[0] not in (6, 7):
         raise ConfigError(f"{source}: the arms have {counts[0]} and {counts[1]} joints; expected equal arms of six or seven.")
-    lower, upper, speed = _limits(draft, urdf, arms, source)
+    lower, upper, speed = _complete_limits(draft, urdf, arms, source)
     robot = RobotSpec(
         key=key,
         title=draft.title or urdf.name or key,
@@ -89,26 +98,25 @@ def completed(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> RobotSpec
         joint_upper=tuple(upper.tolist()),
         joint_velocity=tuple(speed.tolist()),
     )
-    return _settled(draft, robot, source)
+    return _settle(draft, robot, source)
 
 
-def _arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]:
-    from xew.sim_warp.robots.user.infer import arm_joints, at_tips, find_fingers, finger_ends, hand_link, tool_frame
-
-    told = _alike(draft.arms)
+def _complete_arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]:
+    """Left and right arm with nothing open but homes and bases."""
+    told = _fill_right_arm(draft.arms)
     found = [] if all(arm.fingers for arm in told) else find_fingers(urdf)
     arms: list[Arm] = []
     for side, given in enumerate(told):
         fingers = given.fingers or found[min(side, len(found) - 1)]
-        _demand_joints(urdf, fingers, source)
+        _check_joints(urdf, fingers, source)
         joints = given.joints or arm_joints(urdf, fingers)
-        _demand_joints(urdf, joints, source)
+        _check_joints(urdf, joints, source)
         ends = finger_ends(urdf, fingers)
         closed, opened = given.finger_closed or ends[0], given.finger_open or ends[1]
-        link = _link_named(urdf, given.tool_link, source) if given.tool_link else hand_link(urdf, fingers)
+        link = _find_link(urdf, given.tool_link, source) if given.tool_link else hand_link(urdf, fingers)
         tool = given.tool_pose or tool_frame(urdf, joints, fingers, ends[0])
         if given.tool_pose and given.tool_at_tips:
-            tool = at_tips(urdf, link, Rotation.from_quat(given.tool_pose[3:]).as_matrix(), fingers, ends[0])
+            tool = tool_at_tips(urdf, link, Rotation.from_quat(given.tool_pose[3:]).as_matrix(), fingers, ends[0])
         arms.append(
             Arm(
                 root_pose=given.root_pose or IDENTITY,
@@ -117,28 +125,28 @@ def _arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]:
                 tool_link=link,
                 tool_pose=tool,
                 fingers=fingers,
-                finger_closed=_inside(urdf, fingers, closed),
-                finger_open=_inside(urdf, fingers, opened),
+                finger_closed=_clip_fingers(urdf, fingers, closed),
+                finger_open=_clip_fingers(urdf, fingers, opened),
             )
         )
         _check_arm(urdf, arms[-1], source)
     return arms[0], arms[1]
 
 
-def _alike(arms: tuple[ArmDraft, ArmDraft]) -> tuple[ArmDraft, ArmDraft]:
-    """Where the right arm is left open it is told as the left, but for its home."""
+def _fill_right_arm(arms: tuple[ArmDraft, ArmDraft]) -> tuple[ArmDraft, ArmDraft]:
+    """Both arms, the right one as the left where it is left open, but for its home."""
     left, right = arms
     return (left, replace(left, home=None)) if right == ArmDraft() else (left, right)
 
 
-def _demand_joints(urdf: Urdf, names: Sequence[str], source: str) -> None:
+def _check_joints(urdf: Urdf, names: Sequence[str], source: str) -> None:
     if missing := [name for name in names if name not in urdf.joints]:
         raise ConfigError(
             f"{source}: {urdf.path.name} has no joint {', '.join(missing)}; it has {', '.join(urdf.joint_names)}."
         )
 
 
-def _link_named(urdf: Urdf, name: str, source: str) -> str:
+def _find_link(urdf: Urdf, name: str, source: str) -> str:
     """A link, or the child link of a joint, as RoboTwin names it."""
     if name in urdf.links:
         return name
@@ -147,7 +155,7 @@ def _link_named(urdf: Urdf, name: str, source: str) -> str:
     raise ConfigError(f"{source}: {urdf.path.name} has no link or joint {name}; name the one that carries the tool.")
 
 
-def _inside(urdf: Urdf, fingers: tuple[str, str], positions: tuple[float, float]) -> tuple[float, float]:
+def _clip_fingers(urdf: Urdf, fingers: tuple[str, str], positions: tuple[float, float]) -> tuple[float, float]:
     """Finger positions within the URDF's limits: RoboTwin's scales reach beyond them, to press."""
     first, second = (
         min(max(position, urdf.joints[name].lower), urdf.joints[name].upper)
@@ -171,9 +179,10 @@ def _check_arm(urdf: Urdf, arm: Arm, source: str) -> None:
         raise ConfigError(f"{source}: {', '.join(loose)} do not lead to {arm.tool_link}; name the joints of this arm.")
 
 
-def _limits(draft: RobotDraft, urdf: Urdf, arms: tuple[Arm, Arm], source: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    from xew.sim_warp.robots.user.infer import joint_limits
-
+def _complete_limits(
+    draft: RobotDraft, urdf: Urdf, arms: tuple[Arm, Arm], source: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lower and upper position limits [d] rad and speed limits [d] rad/s that experts keep."""
     both = [joint_limits(urdf, arm.joints) for arm in arms]
     found = (np.maximum(both[0][0], both[1][0]), np.minimum(both[0][1], both[1][1]), np.minimum(both[0][2], both[1][2]))
     given = (draft.joint_lower, draft.joint_upper, draft.joint_velocity)
@@ -186,11 +195,11 @@ def _limits(draft: RobotDraft, urdf: Urdf, arms: tuple[Arm, Arm], source: str) -
     return lower, upper, speed
 
 
-def _settled(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
-    """The robot with bases and homes, given or found."""
+def _settle(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
+    """The robot with bases and homes, which are found where the draft leaves them open."""
     from xew.sim_warp.robots.user import placement
 
-    left, right = _alike(draft.arms)
+    left, right = _fill_right_arm(draft.arms)
     if left.root_pose is not None and left.home is not None and right.home is not None:
         return robot
     bases = robot.arms[0].root_pose, robot.arms[1].root_pose
@@ -198,16 +207,16 @@ def _settled(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
 
     def settle(robot: RobotSpec) -> RobotSpec:
         if left.root_pose is None:
-            return placement.with_place(robot, near)
+            return placement.find_place(robot, near)
         if not robot.one_urdf_holds_both_arms and bases[0][0] == bases[1][0]:
-            return placement.with_distance(robot, near, draft.distance)
-        return placement.with_home(robot, near)
+            return placement.find_distance(robot, near, draft.distance)
+        return placement.find_homes(robot, near)
 
-    return settle(robot) if left.tool_pose else placement.better_turned(robot, settle)
+    return settle(robot) if left.tool_pose else placement.try_turned_tools(robot, settle)
 
 
 def _posture(arm: ArmDraft, robot: RobotSpec, source: str) -> np.ndarray | None:
-    """Where to look for a home. Raises ConfigError if it does not fit the arm."""
+    """Posture [d] rad to look for a home from, if the draft has one. Raises ConfigError if it does not fit the arm."""
     near = arm.home or arm.near
     if near is not None and len(near) != robot.arm_joint_count:
         raise ConfigError(f"{source}: a home has {len(near)} joints, the arm {robot.arm_joint_count}; expected as many.")
@@ -273,7 +282,7 @@ def keep_robot(robot: RobotSpec, data: Path, digest: str = "") -> RobotSpec:
 
 
 def _write(robot: RobotSpec, digest: str, folder: Path) -> None:
-    """robot.yaml, the URDF and its files under a folder, as they lie to one another."""
+    """Write robot.yaml, the URDF and its files under a folder, as they lie to one another."""
     urdf = load_urdf(robot.urdf)
     top = Path(os.path.commonpath([file.resolve().parent for file in urdf.files]))
     with complete_folder(folder) as temporary:
@@ -284,7 +293,7 @@ def _write(robot: RobotSpec, digest: str, folder: Path) -> None:
         inside = urdf.path.relative_to(top)
         (temporary / inside).parent.mkdir(parents=True, exist_ok=True)
         (temporary / inside).write_bytes(_with_relative_meshes(urdf))
-        content = _described(robot, str(inside), digest)
+        content = _robot_yaml(robot, str(inside), digest)
         (temporary / OWN).write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 
 
@@ -297,11 +306,11 @@ def _with_relative_meshes(urdf: Urdf) -> bytes:
     return ElementTree.tostring(tree.getroot(), encoding="utf-8", xml_declaration=True)
 
 
-def _described(robot: RobotSpec, urdf: str, digest: str) -> dict[str, object]:
+def _robot_yaml(robot: RobotSpec, urdf: str, digest: str) -> dict[str, object]:
     """A robot.yaml that leaves nothing open."""
     limits = {name: list(getattr(robot, name)) for name in ("joint_lower", "joint_upper", "joint_velocity")}
-    return {"urdf": urdf, "title": robot.title, "arms": [_plain(arm) for arm in robot.arms], **limits, "source": digest}
+    return {"urdf": urdf, "title": robot.title, "arms": [_plain_arm(arm) for arm in robot.arms], **limits, "source": digest}
 
 
-def _plain(arm: Arm) -> dict[str, object]:
+def _plain_arm(arm: Arm) -> dict[str, object]:
     return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(arm).items()}
