@@ -58,6 +58,7 @@ class Contender:
 
 
 def kernel_contender(urdf: Urdf, joint_pos: np.ndarray, device: str) -> Contender:
+    """Our kernel at configurations [n j] float32 rad."""
     batched = BatchedKinematics.of_urdf(urdf, device)
     rows = wp.array(joint_pos, device=device)
     out = batched.poses(rows)
@@ -70,7 +71,7 @@ def kernel_contender(urdf: Urdf, joint_pos: np.ndarray, device: str) -> Contende
 
 
 def newton_contender(urdf: Urdf, joint_pos: np.ndarray, device: str) -> Contender:
-    """One world a configuration, built from the URDF without its shapes."""
+    """Newton at configurations [n j] float32 rad: one world each, built from the URDF without its shapes."""
     one = newton.ModelBuilder()
     one.add_urdf(remove_shapes(urdf), floating=False, ignore_inertial_definitions=True)
     all_worlds = newton.ModelBuilder()
@@ -90,6 +91,7 @@ def newton_contender(urdf: Urdf, joint_pos: np.ndarray, device: str) -> Contende
 
 
 def pytorch_contender(urdf: Urdf, joint_pos: np.ndarray, device: str, compiled: bool) -> Contender:
+    """pytorch-kinematics at configurations [n j] float32 rad."""
     import pytorch_kinematics
     import torch
 

@@ -63,6 +63,7 @@ def cells_for(count: int, tasks: Sequence[str] = tuple(TASKS)) -> list[Cell]:
 
 
 def find_successes(cells: Sequence[Cell], motions: Sequence[Motion]) -> np.ndarray:
+    """[n] bool, whether each cell with this motion ends in success."""
     return np.array([replace(cell, motion=motion).failure is None for cell, motion in zip(cells, motions, strict=True)])
 
 

@@ -287,6 +287,7 @@ class Sensor:
         wp.synchronize_device(self.device)
 
     def render_to_host(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Color [n h w] uint32, shape index [n h w] and depth [n h w] m of all views."""
         self.render()
         return self.color.numpy(), self.shape_index.numpy(), self.depth.numpy()
 
@@ -327,7 +328,7 @@ def is_copy(name: str) -> bool:
 
 
 def agreement(first: np.ndarray, second: np.ndarray) -> float:
-    """Intersection over union."""
+    """Intersection over union of two masks [h w] bool."""
     return float((first & second).sum() / (first | second).sum())
 
 
@@ -389,7 +390,7 @@ def race(work: Workload, renderer: Renderer, worlds: int, pictures: Path | None)
 
 
 def save_pictures(path: Path, panels: dict[str, np.ndarray]) -> None:
-    """Pictures side by side at twice their size, two a row, with labels."""
+    """Write pictures [h w 3] uint8 side by side at twice their size, two a row, with labels."""
     path.parent.mkdir(parents=True, exist_ok=True)
     labeled = []
     for label, image in panels.items():

@@ -90,6 +90,7 @@ class Episode:
 
     @property
     def things(self) -> tuple[list[Body], np.ndarray]:
+        """All bodies but the robot's, and their poses [t b 7], world."""
         return scene_things(self.scene, self.motion.object_pose, self.motion.object_joint)
 
     @property
@@ -279,7 +280,7 @@ class Theirs:
 
 
 def one_color_parts(mesh: Mesh) -> list[tuple[trimesh.Trimesh, np.ndarray]]:
-    """The triangles of each color, with a vertex and a normal for every corner."""
+    """The triangles of each color, with a vertex and a normal for every corner, and the color [3] uint8."""
     parts = []
     for color in np.unique(mesh.colors, axis=0):
         own = (mesh.colors == color).all(1)
@@ -417,16 +418,17 @@ def measure_our_steps(episode: Episode, worlds: int, device: str) -> float:
 
 
 def agreement(theirs: np.ndarray, ours: np.ndarray) -> float:
-    """Intersection over union of two masks."""
+    """Intersection over union of two masks [h w] bool."""
     return float((theirs & ours).sum() / (theirs | ours).sum())
 
 
 def to_rgb(image: np.ndarray) -> np.ndarray:
-    """SAPIEN's float RGBA as RoboTwin stores it: uint8 RGB."""
+    """SAPIEN's RGBA [h w 4] float32 as RoboTwin stores it: [h w 3] uint8."""
     return (image[..., :3] * 255).clip(0, 255).astype(np.uint8)
 
 
 def save_pictures(folder: Path, panels: dict[str, np.ndarray]) -> None:
+    """Write pictures [h w 3] uint8 side by side at twice their size, with labels."""
     folder.mkdir(parents=True, exist_ok=True)
     labeled = []
     for label, image in panels.items():
