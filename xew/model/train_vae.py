@@ -187,7 +187,7 @@ class Losses(NamedTuple):
 
 def vae_losses(vae: VideoVae, frames: jax.Array, key: jax.Array, settings: VaeTrainSettings) -> Losses:
     """The loss of frames [b t h w 3] in [-1, 1], with latents drawn from what the encoder gives."""
-    from xew.metrics import lpips  # only here: the model room does without metrics
+    from xew.metrics import lpips
 
     mean, log_variance = vae.moments(frames)
     latents = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)

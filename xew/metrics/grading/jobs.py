@@ -13,12 +13,13 @@ from xew.episode import EpisodeError, Record, episode_folder, read_record
 from xew.files import digest_files
 from xew.metrics.grading.scores import Cell
 from xew.metrics.truth import Truth
+from xew.protocol import COPY_FIRST_FRAME, GROUND_TRUTH
 from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video, resized
 from xew.threads import in_order
 
 BASELINES: dict[str, Callable[[Truth], np.ndarray]] = {
-    "copy_first_frame": lambda truth: np.repeat(truth.rgb[:1], len(truth.rgb), axis=0),
-    "ground_truth": lambda truth: truth.rgb,
+    COPY_FIRST_FRAME: lambda truth: np.repeat(truth.rgb[:1], len(truth.rgb), axis=0),
+    GROUND_TRUTH: lambda truth: truth.rgb,
 }
 """What a score of nothing and a score of everything look like; the second is the noise floor of the estimators."""
 SOFTNESS = 0.8

@@ -12,9 +12,6 @@ def episode_command(folder: Path, record: Record, rendered: np.ndarray | None = 
     """Read what conditions may be made from, of an episode of a data set.
 
     Args:
-        rendered: [t 240 320 3] uint8, the robot alone, where it is at hand; else its video is read when it is needed.
+        rendered: [t 240 320 3] uint8, the robot alone, where it is in memory; else its video is read when it is needed.
     """
-    from xew.sim_warp.robots import use_robots_of
-
-    use_robots_of(folder.absolute().parents[2])  # a robot of a user's own is kept beside its data
     return make_command(folder, record, read_states(folder), rendered)

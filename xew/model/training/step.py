@@ -273,7 +273,8 @@ def chunk_weights(batch: Batch) -> Array:
     """Each chunk's share [b k] in its sample's loss: equal over those that show the episode beyond their first frame."""
     if batch.following is None:
         return jnp.ones((len(batch.latents), 1), jnp.float32)
-    valid = jnp.stack([jnp.ones(len(batch.latents)), batch.following.shown[:, 1:].any(axis=1)], axis=1).astype(jnp.float32)
+    later = batch.following.shown[:, 1:].any(axis=1).astype(jnp.float32)
+    valid = jnp.stack([jnp.ones(len(later)), later], axis=1)
     return valid / valid.sum(axis=1, keepdims=True)
 
 
