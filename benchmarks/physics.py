@@ -4,7 +4,7 @@
 
 The worlds are those of `generate`: the first seeds of every task on every robot, each along the commands of its expert,
 from the first frame to the last of the longest, with contacts and states recorded at every stored frame. Building (the
-Newton model, its conversion to MuJoCo Warp) is told apart from stepping, which begins with the first forward pass and ends
+Newton model, its conversion to MuJoCo Warp) is timed apart from stepping, which begins with the first forward pass and ends
 with the motions on the host. Before a figure is printed, the work is checked: nothing overflowed, and as many worlds as
 physics has in other batches, 90 % and more, end in success.
 

@@ -8,7 +8,7 @@ optical flow). It is drawn with capsules for links, with the robot's own meshes,
 SensorCamera is called once for each of the two: color (MSAA 4; in the scene with the shadows of one light, where ours has
 three), shape index for the mask, and depth, from which visibility and flow would have to be computed; that is not timed.
 Capsules are primitives to it and triangles to us. "kernels" is the time on the device, "with copies" until all images are on
-the host; on a CPU the two are one. Before a figure is told, the silhouettes of both are compared.
+the host; on a CPU the two are one. Before a figure is printed, the silhouettes of both are compared.
 """
 
 import platform

@@ -8,7 +8,8 @@ RoboTwin. SAPIEN runs as its users run it, one scene frame by frame: `set_qpos`,
 `get_picture`. Rasterized is its shader pack "default", ray traced its "rt" with 32 samples a pixel, path depth 8 and the
 denoiser OIDN, as in RoboTwin. Ours is `Renderer.render_batch` with shadows of all three lights and robot mask, up to images
 on the host. Physics: SAPIEN's PhysX on the CPU, one world, 4 ms a step, driven along the same commands; ours in MuJoCo's C
-engine, one world, and on a GPU in MuJoCo Warp. Before a figure is told, the robot's silhouettes in both pictures are compared.
+engine, one world, and on a GPU in MuJoCo Warp. Before a figure is printed, the robot's silhouettes in both
+pictures are compared.
 """
 
 import platform

@@ -47,7 +47,7 @@ class Cell:
     robot: RobotSpec
     commands: Commands
     motion: Motion | None = None
-    """What physics made of the commands; None before, and where the robot cannot follow the plan."""
+    """Motion that physics made of the commands; None before, and where the robot cannot follow the plan."""
 
     @property
     def known_motion(self) -> Motion:
