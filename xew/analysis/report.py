@@ -135,7 +135,7 @@ def _report_scores(args: Args, scores: Scores) -> None:
         *map(page.note, report_study.missing_note(missing)),
         _held_out_section(held_out, scores.metrics),
         _strip_section(strips),
-        page.section("How the error grows with time", page.chart(curves)),
+        page.section("How the error grows with time", page.chart(curves)) if curves.panels else None,
         _seen_section(seen, scores.metrics),
         _data_section(sheets, records),
         _method_section(scores, args),

@@ -105,7 +105,10 @@ def themed_color(color: str) -> str:
 
 
 def chart_files(chart: Chart) -> dict[str, bytes]:
-    """<name>.png, <name>.pdf and <name>.csv."""
+    """Files <name>.png, <name>.pdf and <name>.csv of a chart; the last one only where it has no panel."""
+    numbers = {f"{chart.name}.csv": chart.data.to_csv(index=False).encode()}
+    if not chart.panels:
+        return numbers
     columns = min(chart.columns, len(chart.panels))
     rows = -(-len(chart.panels) // columns)
     size = PANEL[0] * columns, max(panel.height for panel in chart.panels) * rows + 0.5
@@ -121,11 +124,7 @@ def chart_files(chart: Chart) -> dict[str, bytes]:
         png, pdf = io.BytesIO(), io.BytesIO()
         figure.savefig(png, format="png", dpi=160)
         figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
-    return {
-        f"{chart.name}.png": png.getvalue(),
-        f"{chart.name}.pdf": pdf.getvalue(),
-        f"{chart.name}.csv": chart.data.to_csv(index=False).encode(),
-    }
+    return {f"{chart.name}.png": png.getvalue(), f"{chart.name}.pdf": pdf.getvalue(), **numbers}
 
 
 def _handle(series: Series) -> Line2D:

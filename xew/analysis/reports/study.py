@@ -35,6 +35,7 @@ from xew.analysis.tables.distances import (
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask, findings_frame
 from xew.analysis.tables.labels import ACTIONS, LADDER, SHORT_ROBOTS
 from xew.analysis.tables.layouts import build_tables, count_table
+from xew.analysis.tables.outside import outside_tables
 from xew.analysis.tables.table import MARKS, Table
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
 from xew.statistics import interval
@@ -47,6 +48,7 @@ PART_TITLES = {
     "few_shot": "Adaptation, and what it costs",
     "loeo": "Does distance predict difficulty?",
     "baselines": "Other world models",
+    "outside": "Outside the protocol",
 }
 SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]] = {
     "fixed": ((), ("gap",), ()),
@@ -59,6 +61,7 @@ SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]]
         ("certainty", "distances", "features", "matrices"),
     ),
     "baselines": ((), ("baselines",), ()),
+    "outside": ((), ("outside",), ()),
 }
 """By part: charts, tables that stand open, and tables that are folded away."""
 FRAME_CHARTS = {"actions": "frames_actions", "ladder": "frames_ladder"}
@@ -111,7 +114,7 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
     printed = PaperGrades(paper, scores.metrics)
     planned = scores.attributes.get("study", {}).get("variants", {})
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
-    tables = [*build_tables(builder), count_table(builder), *distance_tables(known)]
+    tables = [*build_tables(builder), *outside_tables(builder, scores.rows), count_table(builder), *distance_tables(known)]
     if builder.has_results("loeo"):
         tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
         tables.append(certainty_table(grades, known, paper))

@@ -51,7 +51,7 @@ GAIN_ROWS = (
 
 
 def study_charts(builder: Builder, distances: Distances, curves: pd.DataFrame) -> dict[str, Chart]:
-    """All charts for which something was measured, by name."""
+    """All charts that have something to draw, by name."""
     made = {f"gains_{gain.part}": gain_chart(builder, gain) for gain in GAIN_ROWS if builder.has_results(gain.part)}
     if builder.has_results("forgetting"):
         made["forgetting"] = forgetting_chart(builder)
@@ -61,7 +61,7 @@ def study_charts(builder: Builder, distances: Distances, curves: pd.DataFrame) -
     for part, labels in (("actions", ACTIONS), ("ladder", LADDER)):
         if builder.has_results(part) and len(curves):
             made[f"frames_{part}"] = frame_chart(curves, part, labels)
-    return made
+    return {name: chart for name, chart in made.items() if chart.panels}
 
 
 def gain_chart(builder: Builder, gain: GainRows) -> Chart:

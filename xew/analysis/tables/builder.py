@@ -107,9 +107,13 @@ class Builder:
         return f"{word}. {' '.join(parts)}"
 
     def baseline(self, model: str, robots: Sequence[str], metric: str) -> TableCell:
-        """Mean of COPY or TRUTH on some robots."""
+        """The mean of COPY or TRUTH on some robots, pooled."""
+        return self.variant_cell(model, tuple(robots), metric)
+
+    def variant_cell(self, model: str, robots: tuple[str, ...], metric: str) -> TableCell:
+        """The mean of a variant, or of COPY or TRUTH, on some robots, pooled; without the paper's value."""
         info = self.ours.metrics.get(metric)
-        mean = self.ours.baseline(model, robots, metric) if isinstance(self.ours, StudyGrades) else None
+        mean = self.ours.variant_mean(model, robots, metric) if isinstance(self.ours, StudyGrades) else None
         if info is None or mean is None:
             return TableCell()
         if model == TRUTH and metric == "psnr":
