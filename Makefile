@@ -1,6 +1,8 @@
 # The ground floor. A newcomer needs python3 (3.11 to 3.13) with venv, and make; everything else is set up here.
 #   make demo    the whole system at debug size, from a seed to a report page
 #   make test    every room's tests, with PyTorch, diffusers and transformers beside to compare with
+#   make test-fast   in two minutes, for the edit loop: no trainings, simulations or whole commands, no parity with others'
+#                    networks (SLOW in tests/conftest.py lists what is left out); make test-fast TESTS=tests/metrics for one room
 #   make lint    ruff and mypy
 #   make setup   only the environment (.venv, at the versions of requirements/test.txt)
 
@@ -11,7 +13,7 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 REFERENCE := .venv/.reference
 
-.PHONY: setup demo test lint clean
+.PHONY: setup demo test test-fast lint clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
@@ -28,9 +30,16 @@ $(REFERENCE): $(STAMP)
 	SAM2_BUILD_CUDA=0 $(BIN)/python -m pip install --disable-pip-version-check --no-deps --no-build-isolation sam2==1.1.0
 	touch $@
 
-# One thread a worker in the numerical libraries: two workers with a pool each only wait for one another.
+# One thread a worker in the numerical libraries: two workers with a pool each only wait for one another. A file stays with one
+# worker, since its tests share what they make, and long files come first (tests/conftest.py orders them).
+TESTS ?=
+PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+
 test: $(REFERENCE)
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+	$(PYTEST) $(TESTS)
+
+test-fast: $(STAMP)
+	$(PYTEST) -m "not slow" $(TESTS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check

@@ -25,10 +25,12 @@ import numpy as np
 import tyro
 import warp as wp
 
-from xew.episode import Record, find_accepted, find_records, verify_episode
+from xew.dataset import find_accepted, find_records
+from xew.episode import Record, verify_episode
 from xew.sim_warp import generate
 from xew.sim_warp.devices.workers import has_kernels, worker_count
-from xew.sim_warp.production.produce import Cell, Job, plan_cells, simulate_cells, write_cell
+from xew.sim_warp.production.cells import Cell, Job, plan_cells, simulate_cells
+from xew.sim_warp.production.episodes import write_cell
 from xew.sim_warp.rendering.observe import observe
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import command_renders

@@ -30,7 +30,7 @@ import warp as wp
 from xew.sim_warp.physics import simulate
 from xew.sim_warp.physics.gpu import Batch
 from xew.sim_warp.physics.worlds import STEPS_PER_FRAME, Motion, World
-from xew.sim_warp.production.produce import Cell, Job, plan_cells
+from xew.sim_warp.production.cells import Cell, Job, plan_cells
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.tasks import TASKS, get_task
 

@@ -1,23 +1,43 @@
-"""The pages that show how to add something are run: files are written, code and commands executed, in a folder of their own."""
+"""README and docs hold: pages that add something are run, snippets executed, commands parsed, links and paths looked up."""
 
+import argparse
+import ast
+import importlib
+import io
 import os
 import re
+import runpy
+import shlex
 import subprocess
 import sys
+import warnings
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import tyro
+
+from tests.synthetic import write_synthetic_data
+from xew.episode import read_video
 
 ROOT = Path(__file__).parents[1]
-PAGES = ("add_a_robot", "add_a_task")
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+WALKED = ("add_a_robot", "add_a_task")
+"""Pages that are run as a whole, in a folder of their own."""
+WITH_ARRAYS = ("metrics",)
+"""Pages whose snippets are run in order, and held against their comments, in tests/metrics/test_page.py."""
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+INLINE = re.compile(r"`([^`]+)`")
+OPTIONAL = re.compile(r"\[(--[^\]]+)\]")
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+PLACEHOLDER = re.compile(r"…|<\w+>")
 
 
-def blocks(page: str) -> list[tuple[str, str]]:
+def blocks(page: Path) -> list[tuple[str, str]]:
     """(language, text) of all code blocks of a page."""
-    found = [(match[1], match[2]) for match in BLOCK.finditer((ROOT / "docs" / f"{page}.md").read_text())]
-    assert found and all(text.startswith(("# file: ", "# run\n")) for language, text in found if language != "bash")
-    return found
+    return [(match[1], match[2]) for match in BLOCK.finditer(page.read_text())]
 
 
 def run_block(language: str, text: str, folder: Path) -> None:
@@ -38,9 +58,150 @@ def run_block(language: str, text: str, folder: Path) -> None:
         assert " 0 (0 %)" not in run.stdout, f"a page shows what works:\n{run.stdout}"
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.slow
+@pytest.mark.parametrize("page", WALKED)
 def test_a_page_does_what_it_says(page: str, tmp_path: Path) -> None:
-    for language, text in blocks(page):
+    found = blocks(ROOT / "docs" / f"{page}.md")
+    assert found and all(text.startswith(("# file: ", "# run\n")) for language, text in found if language != "bash")
+    for language, text in found:
         run_block(language, text, tmp_path)
     made = {"add_a_robot": "data/robots/embodiment/robot.yaml", "add_a_task": "data/my_tasks:TASK/0000000/piper/rgb.mkv"}
     assert (tmp_path / made[page]).is_file()
+
+
+SNIPPETS = [
+    pytest.param(text, id=f"{page.stem}-{number}")
+    for page in PAGES
+    if page.stem not in WALKED + WITH_ARRAYS
+    for number, (language, text) in enumerate(blocks(page))
+    if language == "python"
+]
+
+
+@pytest.mark.parametrize("snippet", SNIPPETS)
+def test_a_snippet_runs(snippet: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a folder with data of the episode that pages speak of, and with arrays of the names that they use."""
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {"Path": Path, "np": np}
+    if "data/" in snippet:
+        (folder,) = write_synthetic_data(tmp_path / "data", seeds=(1_000_000,), robots=("piper",), frames=5)
+        (tmp_path / "data/place_empty_cup/1000000").symlink_to(folder.parent) if "1000000" not in str(folder) else None
+        names["video"] = read_video(folder / "rgb.mkv")
+    target = np.random.default_rng(0).integers(0, 256, (2, 48, 64, 3), np.uint8)
+    mask = target[..., 0] > 128
+    names |= {"prediction": target[::-1], "target": target, "predicted_mask": ~mask, "target_mask": mask}
+    exec(compile(snippet, "a snippet of the docs", "exec"), names)
+
+
+def normalize(command: str) -> str:
+    """A command on one line, without its comment."""
+    return re.sub(r"\s+", " ", command.replace("\\\n", " ").split("  #")[0].split(" # ")[0]).strip()
+
+
+def commands_of(page: Path) -> list[str]:
+    """The `python -m xew...` commands of a page, from its blocks and from its sentences."""
+    text = page.read_text()
+    found = []
+    for _, block in blocks(page):
+        found += [line for line in block.replace("\\\n", " ").splitlines() if line.strip().startswith("python -m xew.")]
+    prose = BLOCK.sub("", text)
+    found += [match[1] for match in INLINE.finditer(prose) if re.match(r"python\s+-m\s+xew\.", match[1])]
+    return [normalize(command) for command in found]
+
+
+COMMANDS = sorted({command for page in PAGES for command in commands_of(page)})
+
+
+class Parsed(Exception):
+    """The arguments of a command were accepted."""
+
+
+def dry_run(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> str:
+    """Give arguments to `python -m arguments[0]` and stop once they are parsed; returns what was printed."""
+    parse, cli = argparse.ArgumentParser.parse_known_args, tyro.cli
+
+    def parse_and_stop(parser: argparse.ArgumentParser, *given: Any, **named: Any) -> Any:
+        parsed, rest = parse(parser, *given, **named)
+        if type(parser) is argparse.ArgumentParser and not rest:
+            raise Parsed
+        return parsed, rest
+
+    def cli_and_stop(*given: Any, **named: Any) -> Any:
+        parsed = cli(*given, **named)
+        if named.get("return_unknown_args") and parsed[1]:
+            return parsed
+        raise Parsed
+
+    said = io.StringIO()
+    with monkeypatch.context() as patch, redirect_stdout(said), redirect_stderr(said), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # the module may have been imported before
+        patch.setattr(argparse.ArgumentParser, "parse_known_args", parse_and_stop)
+        patch.setattr(tyro, "cli", cli_and_stop)
+        patch.setattr(sys, "argv", list(arguments))
+        patch.chdir(ROOT)
+        try:
+            runpy.run_module(arguments[0], run_name="__main__", alter_sys=True)
+        except Parsed:
+            return "parsed"
+        except SystemExit as stop:
+            if stop.code:
+                raise AssertionError(f"{' '.join(arguments)}\n{said.getvalue()}") from None
+    return said.getvalue()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_is_accepted(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Options in [brackets] are looked up in --help; without them the command's own parser takes all that stands there."""
+    optional = OPTIONAL.findall(command)
+    required = PLACEHOLDER.sub("", OPTIONAL.sub("", command))
+    module, *arguments = shlex.split(required)[2:]
+    if module == "xew.sim_warp.robots.author" or PLACEHOLDER.search(command):
+        assert importlib.util.find_spec(module) is not None  # the first takes no arguments, the others are forms to fill in
+    else:
+        assert dry_run([module, *arguments], monkeypatch) == "parsed"
+    if optional:
+        helped = dry_run([module, "--help"], monkeypatch)
+        for option in re.findall(r"--[\w.-]+", " ".join(optional)):
+            assert option in helped, f"{module} --help knows no {option}"
+
+
+def test_a_wrong_option_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(AssertionError, match="--batches"):
+        dry_run(["xew.sim_warp.generate", "--batches", "256"], monkeypatch)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page: Path) -> None:
+    links = [link for link in LINK.findall(BLOCK.sub("", page.read_text())) if not re.match(r"https?:|mailto:|#", link)]
+    broken = [link for link in links if not (page.parent / link.split("#")[0]).exists()]
+    assert not broken
+
+
+@pytest.mark.parametrize(
+    "page", [*PAGES, ROOT / "CITATION.cff", *sorted((ROOT / "configs").rglob("*.yaml"))], ids=lambda page: page.stem
+)
+def test_paths_and_modules_exist(page: Path) -> None:
+    """Paths below xew, configs, examples, benchmarks and tests, and modules by their dotted names."""
+    text = page.read_text()
+    paths = re.findall(r"(?<![\w/.])((?:xew|configs|examples|benchmarks|tests)/[\w/.-]*\w)", text)
+    keys = ("xew/robot", "xew/task", "xew/seed")  # attributes in imported HDF5 files
+    missing = [path for path in paths if not (ROOT / path).exists() and path not in keys]
+    names = re.findall(r"(?<![\w/.])(xew(?:\.[a-z]\w*)+)(?![\w:/]|\.\w)", text)
+    missing += [name for name in names if not is_importable(name)]
+    assert not missing
+
+
+def is_importable(name: str) -> bool:
+    """Whether a dotted name is a module of ours, or the name of something in one."""
+    path = ROOT.joinpath(*name.split("."))
+    if path.is_dir() or path.with_suffix(".py").is_file():
+        return True
+    module, _, attribute = name.rpartition(".")
+    folder = ROOT.joinpath(*module.split("."))
+    file = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
+    if not file.is_file():
+        return False
+    tree = ast.parse(file.read_text())
+    named = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    named |= {alias.asname or alias.name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names}
+    return attribute in named | {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}

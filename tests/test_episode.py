@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from xew import episode
+from xew.dataset import find_accepted, find_records
 from xew.episode import (
     HEIGHT,
     SCHEMA_VERSION,
@@ -21,8 +22,6 @@ from xew.episode import (
     States,
     array_hash,
     episode_folder,
-    find_accepted,
-    find_records,
     read_record,
     read_states,
     read_video,

@@ -1,4 +1,4 @@
-"""The contract between rooms: what an episode holds, and how it is written, read, found and verified.
+"""The contract between rooms: what an episode holds, and how it is written, read and verified (`xew.dataset` finds them).
 
 An episode is a folder `<data>/<task>/<seed>/<robot>/`:
     episode.json   who, how long, success or the reason of failure, versions, hashes (always there)
@@ -32,10 +32,8 @@ WIDTH, HEIGHT = 320, 240
 FAILURES = ("plan", "grasp", "slip", "timeout", "physics", "overflow")
 """plan: no joint path. grasp: never held. slip: held and lost. timeout: the plan ended short of success.
 physics: an object sank into something, fell off the table or crept in a hand. overflow: a physics buffer was too small."""
-
-
-_TEMPORARY = ".writing-"
-"""How the name of a folder begins that is not complete."""
+TEMPORARY = ".writing-"
+"""Beginning of the name of a folder that is not complete yet."""
 
 
 class EpisodeError(Exception):
@@ -175,7 +173,7 @@ def write_episode(
 def complete_folder(folder: Path) -> Iterator[Path]:
     """A temporary folder to fill, which takes the name `folder` when the block ends well and else is removed."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY, dir=folder.parent))
+    temporary = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=folder.parent))
     replaced = temporary.with_name(f"{temporary.name}-replaced")
     try:
         yield temporary
@@ -301,51 +299,7 @@ def verify_episode(folder: Path) -> Record:
     return record
 
 
-def find_folders(data: Path) -> list[Path]:
-    """Folders of all cells of a data set, sorted by task, seed, robot. They are the index."""
-    folders = (path.parent for path in Path(data).glob("*/*/*/episode.json"))
-    return sorted(folder for folder in folders if not folder.name.startswith(_TEMPORARY))
-
-
-def find_records(data: Path) -> Iterator[tuple[Path, Record]]:
-    """All cells of a data set with their headers, accepted or not. Raises EpisodeError at a damaged header.
-
-    A cell that goes while they are read, because it is being replaced, is left out.
-    """
-    for folder in find_folders(data):
-        try:
-            record = read_record(folder)
-        except EpisodeError as error:
-            if isinstance(error.__cause__, FileNotFoundError):
-                continue
-            raise
-        yield folder, record
-
-
-def find_accepted(data: Path) -> list[tuple[Path, Record]]:
-    """Episodes of seeds in which every robot tried has succeeded: the paired data set.
-
-    Raises EpisodeError if there is none, and says what to do.
-    """
-    cells = list(find_records(data))
-    # Where somebody failed the others have no pictures, also if the run was stopped before it wrote who had failed.
-    failed = {(record.task, record.seed) for _, record in cells if not record.success or not record.hashes}
-    accepted = [(folder, record) for folder, record in cells if (record.task, record.seed) not in failed]
-    if not accepted:
-        raise none_under(data, "accepted episode")
-    return accepted
-
-
-def none_under(data: Path, what: str = "episode") -> EpisodeError:
-    """What is told of a folder without episodes: to make some or, if it lies inside of a data set, to name that."""
-    for levels, pattern in enumerate(("*/*/episode.json", "*/episode.json", "episode.json")):
-        if next(Path(data).glob(pattern), None):
-            root = Path(data).absolute().parents[levels]
-            return EpisodeError(f"{data} lies inside of a data set; name the whole of it: {root}.")
-    return EpisodeError(f"no {what} under {data}; make some: python -m xew.sim_warp.generate --out {data}")
-
-
 def remove_left_overs(data: Path) -> None:
     """Remove what a run that was killed left half-written: episodes and, one folder up, robots."""
-    for folder in [*Path(data).glob(f"*/*/{_TEMPORARY}*"), *Path(data).glob(f"*/{_TEMPORARY}*")]:
+    for folder in [*Path(data).glob(f"*/*/{TEMPORARY}*"), *Path(data).glob(f"*/{TEMPORARY}*")]:
         shutil.rmtree(folder, ignore_errors=True)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from tests.synthetic import write_synthetic_data
-from xew.episode import find_accepted, read_video
+from xew.dataset import find_accepted
+from xew.episode import read_video
 from xew.metrics.evaluate import Args, main
 from xew.protocol import seed_split
 from xew.rollout import write_rollout

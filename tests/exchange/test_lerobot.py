@@ -10,7 +10,8 @@ import pyarrow.parquet as parquet
 import pytest
 
 from tests.synthetic import write_synthetic_data
-from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, States, find_accepted, read_states, read_video, write_episode
+from xew.dataset import find_accepted
+from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, States, read_states, read_video, write_episode
 from xew.exchange import lerobot
 from xew.exchange.lerobot import Args, _color_statistics, color_counts, export, main
 from xew.protocol import TEST_SEED_START

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from tests.exchange import robotwin_file as made
+from xew.dataset import find_accepted
 from xew.episode import (
     HEIGHT,
     WIDTH,
     EpisodeError,
     Record,
     demand_known,
-    find_accepted,
     read_record,
     read_states,
     read_video,

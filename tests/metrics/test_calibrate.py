@@ -12,7 +12,8 @@ import pytest
 from tests.sim_warp.small import TASK
 from tests.synthetic import write_synthetic_data
 from xew.config import ConfigError
-from xew.episode import find_accepted, read_record, read_states, read_video
+from xew.dataset import find_accepted
+from xew.episode import read_record, read_states, read_video
 from xew.metrics import METRICS
 from xew.metrics.calibrate import (
     ESTIMATED,
@@ -40,7 +41,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An episode of the simulation, twelve frames."""
-    from xew.sim_warp.production.produce import Job, produce
+    from xew.sim_warp.production.cells import Job
+    from xew.sim_warp.production.produce import produce
     from xew.sim_warp.rendering.render import Renderer
 
     root = tmp_path_factory.mktemp("simulated")

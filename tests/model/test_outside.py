@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from tests import synthetic
-from xew.episode import find_records, read_video
+from xew.dataset import find_records
+from xew.episode import read_video
 from xew.model import outside
 from xew.model.outside import read_inputs
 from xew.rollout import find_rollouts, read_rollout_video

@@ -21,7 +21,8 @@ from typing import Any
 import tyro
 
 from tests.sim_warp.small import SLOW, TASK
-from xew.episode import EpisodeError, Record, find_accepted, read_states, read_video, verify_episode
+from xew.dataset import find_accepted
+from xew.episode import EpisodeError, Record, read_states, read_video, verify_episode
 
 ROOT = Path(__file__).parents[2]
 FLAGS = ("--tasks", TASK, "--robots", "franka_panda", SLOW, "--train-seeds", "5", "--test-seeds", "2", "--device", "cpu")

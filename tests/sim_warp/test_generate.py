@@ -13,12 +13,14 @@ import pytest
 
 from tests.sim_warp.small import SLOW, TASK
 from xew.config import ConfigError
-from xew.episode import EpisodeError, Record, episode_folder, find_accepted, find_records, verify_episode, write_episode
+from xew.dataset import find_accepted, find_records
+from xew.episode import EpisodeError, Record, episode_folder, verify_episode, write_episode
 from xew.protocol import TEST_SEED_START
 from xew.sim_warp import generate as command
 from xew.sim_warp.devices.workers import Workers
 from xew.sim_warp.generate import Args, Family, generate, main, yield_table
-from xew.sim_warp.production.produce import Job, produce
+from xew.sim_warp.production.cells import Job
+from xew.sim_warp.production.produce import produce
 from xew.sim_warp.rendering.render import Renderer
 
 ROOT = Path(__file__).parents[2]

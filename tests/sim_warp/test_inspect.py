@@ -24,9 +24,10 @@ from xew.sim_warp.inspect import (
     main,
     read_headers,
     strip,
-    tiled,
+    tile,
 )
-from xew.sim_warp.production.produce import Job, produce
+from xew.sim_warp.production.cells import Job
+from xew.sim_warp.production.produce import produce
 from xew.sim_warp.rendering.render import Renderer
 
 ROBOTS = ("franka_panda", SLOW)
@@ -176,7 +177,7 @@ def test_imported_episodes_of_one_seed_may_differ_in_length(made: Path, data: Pa
 
 def test_tiles_lie_in_rows_with_white_between() -> None:
     red, blue = (np.full((2, 3, 3), color, np.uint8) for color in ((255, 0, 0), (0, 0, 255)))
-    picture = tiled([[red, blue]])
+    picture = tile([[red, blue]])
     assert (picture[:2, :3] == [255, 0, 0]).all() and (picture[:2, 3 + GAP : 6 + GAP] == [0, 0, 255]).all()
     assert (picture[2:] == 255).all() and (picture[:, 3 : 3 + GAP] == 255).all()
 

@@ -8,7 +8,8 @@ import threading
 from pathlib import Path
 
 from tests.sim_warp.kill import contents, finish, killed, reading, start, undisturbed
-from xew.episode import Record, complete_folder, episode_folder, find_records, write_episode
+from xew.dataset import find_records
+from xew.episode import Record, complete_folder, episode_folder, write_episode
 
 
 def test_kills_change_no_byte(tmp_path: Path) -> None:

@@ -36,7 +36,8 @@ from xew.analysis.statistics.summary import RobotTable, Row, finding, flat_summa
 from xew.analysis.tables import formats
 from xew.analysis.tables.table import Table, TableCell, TableRow, TableSection, format_interval, format_number, metric_columns
 from xew.config import ConfigError, user_errors
-from xew.episode import Record, episode_folder, find_records, read_video
+from xew.dataset import find_records
+from xew.episode import Record, episode_folder, read_video
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
 from xew.statistics import MIN_SCENES

@@ -25,7 +25,8 @@ from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from xew.config import ConfigError, user_errors
-from xew.episode import EpisodeError, Record, find_accepted, read_video
+from xew.dataset import find_accepted
+from xew.episode import EpisodeError, Record, read_video
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
 from xew.metrics.calibration.wrong import WrongVideo, wrong_videos
@@ -57,7 +58,7 @@ class Args:
     """Folder of the tables."""
     codec: Path | None = None
     """A run of `xew.model.train`, through whose codec the true videos go."""
-    codec_opener: str = "xew.model.codecs.roundtrip:open_roundtrip"
+    codec_opener: str = "xew.model.runs.roundtrip:open_roundtrip"
     """Function that opens it, as module:NAME: of the run's folder to a function of video to video, [t h w 3] uint8."""
     seeds: tuple[int, ...] = ()
     """Only episodes of these seeds; all others serve as another seed's."""

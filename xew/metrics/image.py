@@ -1,4 +1,4 @@
-"""Metrics, visual quality without a network: PSNR and SSIM. (prediction, target) -> one value a frame.
+"""Visual quality without a network: PSNR and SSIM, one value a frame.
 
 uint8 goes through integers: sums of squares and window moments are exact, so that flat bright images lose nothing to
 float32 and results agree with a float64 reference to about 1e-7. Floating input in [0, 1] is for use as a loss.
@@ -12,16 +12,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Bool
 
 from xew.metrics.mergeable.sums import Mean, Mergeable, empty_mean, mean_of, merge_means, to_float
-from xew.metrics.metric import check_videos, map_frames
+from xew.metrics.metric import ByFrame, Scalar, Video, check_first, check_videos, map_frames
 
 SSIM_WINDOW = 7
 SSIM_C1, SSIM_C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
 
 
 @functools.partial(jax.jit, static_argnames="chunk")
-def psnr(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) -> jax.Array:
+@check_first(check_videos)
+def psnr(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFrame:
     """Peak signal-to-noise ratio of each frame [dB], higher is better.
 
     Exact frames have no finite PSNR. As in the paper they are capped at the largest finite value among the frames they
@@ -37,7 +39,6 @@ def psnr(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) 
     Returns:
         [t] float32.
     """
-    check_videos(prediction, target)
     error = mean_squared_error(prediction, target, chunk)
     finite = finite_psnr(error)
     largest = jnp.max(jnp.where(error > 0, finite, -jnp.inf))
@@ -45,29 +46,30 @@ def psnr(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) 
     return jnp.where(error > 0, finite, cap)
 
 
-def finite_psnr(error: jax.Array) -> jax.Array:
-    """[dB] of mean squared errors in levels of 255; 48.13, of an error of 1, where there is none."""
+def finite_psnr(error: ByFrame) -> ByFrame:
+    """[t] float32 [dB] of mean squared errors [t] in levels of 255; 48.13, of an error of 1, where there is none."""
     return -10 * jnp.log10(jnp.where(error > 0, error, 1) / 255**2)
 
 
-def attainable_psnr(shape: tuple[int, ...]) -> jax.Array:
-    """[dB], the most that an inexact frame of a video [t h w 3] can have: one channel of one pixel off by one level."""
+def attainable_psnr(shape: tuple[int, ...]) -> Scalar:
+    """Scalar float32 [dB], the most that an inexact frame of [t h w 3] can have: one channel of one pixel off by one level."""
     return 10 * jnp.log10(jnp.float32(255**2 * math.prod(shape[1:])))
 
 
 @jax.jit
-def exact_frames(prediction: jax.Array, target: jax.Array) -> jax.Array:
+@check_first(check_videos)
+def exact_frames(prediction: Video, target: Video) -> Bool[jax.Array, " t"]:
     """[t] bool, which frames equal the target in every pixel: those whose PSNR is a cap.
 
     Args:
         prediction, target: [t h w 3] uint8, or floating in [0, 1].
     """
-    check_videos(prediction, target)
     return jnp.all(prediction == target, axis=(1, 2, 3))
 
 
-def mean_squared_error(prediction: jax.Array, target: jax.Array, chunk: int | None = None) -> jax.Array:
-    """[t] float32, mean over a frame of the squared difference in levels of 255; exact up to its last rounding."""
+def mean_squared_error(prediction: Video, target: Video, chunk: int | None = None) -> ByFrame:
+    """[t] float32, mean over a frame of two videos [t h w 3] of the squared difference in levels of 255; exact up to its last
+    rounding."""
     return map_frames(lambda pair: _frame_error(*pair), (prediction, target), chunk)
 
 
@@ -82,7 +84,8 @@ def _frame_error(x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 @functools.partial(jax.jit, static_argnames="chunk")
-def ssim(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) -> jax.Array:
+@check_first(check_videos, smallest_side=SSIM_WINDOW)
+def ssim(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFrame:
     """Structural similarity of each frame in [-1, 1], higher is better.
 
     The definition of scikit-image's `structural_similarity(channel_axis=-1, data_range=255)`: uniform 7x7 windows that
@@ -98,7 +101,6 @@ def ssim(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) 
     Raises:
         ValueError: shapes differ or a side is under 7 pixels.
     """
-    check_videos(prediction, target, smallest_side=SSIM_WINDOW)
     return map_frames(lambda pair: _frame_ssim(*pair), (prediction, target), chunk)
 
 
@@ -122,7 +124,7 @@ def _stabilized(total: jax.Array, size: int, constant: float) -> jax.Array:
     return total.astype(jnp.float32) / size + constant
 
 
-def _levels(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, float]:
+def _levels(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, int | float]:
     """Both as [h w*3] in levels of 255 less an offset: integers as they are, floats centered to keep their squares small."""
     x, y = (image.reshape(len(image), -1) for image in (x, y))
     if x.dtype == jnp.uint8:
@@ -168,8 +170,8 @@ def _empty_capped() -> CappedMean:
     return CappedMean(empty_mean(), jnp.int32(0), nothing, nothing)
 
 
-def _update_capped(state: CappedMean, prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) -> CappedMean:
-    check_videos(prediction, target)
+@check_first(check_videos)
+def _update_capped(state: CappedMean, prediction: Video, target: Video, *, chunk: int | None = None) -> CappedMean:
     error = mean_squared_error(prediction, target, chunk)
     values = finite_psnr(error)
     return _merge_capped(

@@ -1,4 +1,4 @@
-"""Make the paired data set: episodes of every task, seed and robot.
+"""The command that makes the paired data set: episodes of every task, seed and robot.
 
 Reads  the registries of tasks and robots
 Writes <out>/<task>/<seed>/<robot>/, see xew/episode.py; one line per task and robot at the end
@@ -25,18 +25,20 @@ import warp as wp
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.episode import EpisodeError, Record, episode_folder, find_records, remove_left_overs
+from xew.dataset import find_records
+from xew.episode import EpisodeError, Record, episode_folder, remove_left_overs
 from xew.protocol import TEST_SEED_START, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK
 from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
-from xew.sim_warp.production.produce import Job, produce
+from xew.sim_warp.production.cells import Job
+from xew.sim_warp.production.produce import produce
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS, adopt_robots, get_robot, is_path
 from xew.sim_warp.tasks import TASKS, get_task
 
 TRIES_PER_SEED = 3
 SPARE_TRIES = 20
-"""A task gives up when 3 n + 20 seeds have been tried and fewer than n accepted."""
+"""Numbers of seeds after which a task gives up: 3 n + 20 have been tried and fewer than n accepted."""
 
 
 @dataclass(frozen=True)
@@ -48,22 +50,22 @@ class Args:
     robots: tuple[str, ...] = tuple(ROBOTS)
     """Keys of the registry, module:NAME, or paths of your own (docs/add_a_robot.md)."""
     robot: Path | None = None
-    """Only this robot of your own: a URDF, a folder with a robot.yaml, or a RoboTwin embodiment folder."""
+    """The only robot to make, one of your own: a URDF, a folder with a robot.yaml, or a RoboTwin embodiment folder."""
     train_seeds: int = TRAIN_SEEDS_PER_TASK
-    """Accepted training seeds a task."""
+    """Number of accepted training seeds a task."""
     test_seeds: int = TEST_SEEDS_PER_TASK
-    """Accepted test seeds a task; their numbers begin where no training seed comes."""
+    """Number of accepted test seeds a task; they count from where no training seed comes."""
     out: Path = Path("data")
     batch: int = 256
-    """Worlds that a GPU steps together. On a CPU each is stepped by itself, as many at a time as there are workers."""
+    """Number of worlds that a GPU steps together. A CPU steps each by itself, as many at a time as there are workers."""
     workers: int | None = None
-    """Processes; by default one a core, on a GPU one for two cores."""
+    """Number of processes; by default one a core, on a GPU one for two cores."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
     """Default: a GPU if Warp finds one."""
     states_only: bool = False
     """Store no videos, only states and all hashes; `python -m xew.sim_warp.inspect DATA --render` makes them on demand."""
     manifest: Path = PACKAGED
-    """Which seeds are known to fail."""
+    """File that says which seeds are known to fail."""
     search: bool = False
     """Try every seed, whatever the manifest says."""
 
@@ -87,46 +89,46 @@ class Family:
     def tries(self) -> list[int]:
         """The seeds that may be tried."""
         count = TRIES_PER_SEED * self.wanted + SPARE_TRIES
-        untold = (seed for seed in itertools.count(self.first_seed) if seed not in self.failing)
-        return list(itertools.islice(untold, count))
+        candidates = (seed for seed in itertools.count(self.first_seed) if seed not in self.failing)
+        return list(itertools.islice(candidates, count))
 
     @property
     def accepted(self) -> int:
-        """Complete seeds on which nobody failed, counted as long as they are wanted."""
-        return min(self.wanted, sum(not self._missing(seed) and self._hopeful(seed) for seed in list(self.done)))
+        """Number of complete seeds on which no robot failed, at most as many as are wanted."""
+        return min(self.wanted, sum(not self._missing_robots(seed) and self._is_hopeful(seed) for seed in list(self.done)))
 
     def next_jobs(self) -> list[Job]:
-        """What is missing of the first seeds: as many as it takes if from now on nobody fails.
+        """What is missing of the first seeds: as many as it takes if from now on no robot fails.
 
-        Seeds on which somebody has failed are completed too, so that a run that was stopped ends like one that was not.
+        Seeds on which a robot has failed are completed too, so that a run that was stopped ends like one that was not.
         """
         jobs: list[Job] = []
         hopeful = 0
         for seed in self.tries:
             if hopeful == self.wanted:
                 break
-            if missing := self._missing(seed):
-                jobs.append(Job(self.task, seed, missing, rejected=not self._hopeful(seed)))
-            hopeful += self._hopeful(seed)
+            if missing := self._missing_robots(seed):
+                jobs.append(Job(self.task, seed, missing, rejected=not self._is_hopeful(seed)))
+            hopeful += self._is_hopeful(seed)
         return jobs
 
-    def _missing(self, seed: int) -> tuple[str, ...]:
+    def _missing_robots(self, seed: int) -> tuple[str, ...]:
         """Robots without a record or, where all have succeeded, without an episode."""
         done = self.done[seed]
-        return tuple(r for r in self.robots if r not in done or (self._hopeful(seed) and not done[r].hashes))
+        return tuple(r for r in self.robots if r not in done or (self._is_hopeful(seed) and not done[r].hashes))
 
-    def _hopeful(self, seed: int) -> bool:
-        """Has nobody failed so far?"""
+    def _is_hopeful(self, seed: int) -> bool:
+        """Whether no robot has failed so far."""
         return all(record.success for record in self.done[seed].values())
 
 
 Made = tuple[list[Record], float]
-"""Records of one job, and the seconds spent on it."""
+"""Headers of one job's cells, and the seconds spent on it."""
 
 
 @contextmanager
-def maker(args: Args) -> Iterator[Callable[[Sequence[Job]], Iterator[Made]]]:
-    """What runs jobs on the device at hand: in worker processes, one job at a time on a CPU, in large batches on a GPU."""
+def start_workers(args: Args) -> Iterator[Callable[[Sequence[Job]], Iterator[Made]]]:
+    """Start worker processes; what is given runs jobs in them, one at a time on a CPU, in large batches on a GPU."""
     device = find_device(args.device)
     size = max(1, args.batch // len(args.robots)) if device.is_cuda else 1
     make = partial(_make, out=args.out, device=device.alias, batch=args.batch, videos=not args.states_only)
@@ -142,12 +144,12 @@ def maker(args: Args) -> Iterator[Callable[[Sequence[Job]], Iterator[Made]]]:
 
 @cache
 def _renderer(device: str) -> Renderer:
-    """A worker's own, made once."""
+    """The renderer of a worker process, made once."""
     return Renderer(device)
 
 
 def _make(jobs: Sequence[Job], out: Path, device: str, batch: int, videos: bool) -> list[Made]:
-    """Some jobs in a worker process."""
+    """Make some jobs in a worker process."""
     begin = time.perf_counter()
     seeds = produce(jobs, out, _renderer(device), batch, videos)
     seconds = (time.perf_counter() - begin) / len(jobs)
@@ -172,7 +174,7 @@ def generate(args: Args) -> list[Family]:
     frames: Counter[str] = Counter()
     total = sum(family.wanted for family in families)
     bar = tqdm(total=total, initial=sum(f.accepted for f in families), desc="accepted seeds", unit="seed")
-    with bar, maker(args) as make:
+    with bar, start_workers(args) as make:
         while jobs := {(family.task, job.seed): (family, job) for family in families for job in family.next_jobs()}:
             for records, seconds in make([job for _, job in jobs.values()]):
                 family, _ = jobs[records[0].task, records[0].seed]
@@ -187,7 +189,7 @@ def generate(args: Args) -> list[Family]:
 
 
 def _check(args: Args) -> None:
-    """Names, numbers and the folder, before any work."""
+    """Check names, numbers and the folder before any work. Raises ConfigError or EpisodeError."""
     for task in args.tasks:
         get_task(task)
     for robot in args.robots:
@@ -208,7 +210,7 @@ def _check(args: Args) -> None:
 
 
 def _read_existing(families: list[Family], args: Args) -> None:
-    """Take in what is on disk.
+    """Add what is on disk to the families.
 
     Raises:
         EpisodeError: a header is damaged or in another's place, an episode of these tasks was imported, or videos are wanted
@@ -254,16 +256,16 @@ def yield_table(records: Sequence[Record]) -> str:
         good = [record for record in tried if record.success]
         frames = sum(record.frame_count for record in good) // max(1, len(good))
         reasons = Counter(record.failure for record in tried if not record.success)
-        told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
+        listed = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
         share = f"{len(good)} ({100 * len(good) / len(tried):.0f} %)"
-        lines.append(f"{task:<{wide}} {robot:<{room}} {len(tried):>6}{share:>11}{frames:>8}  {told}")
+        lines.append(f"{task:<{wide}} {robot:<{room}} {len(tried):>6}{share:>11}{frames:>8}  {listed}")
     for task, accepted in sorted(seeds.items()):
         lines.append(f"{task:<{wide}} all robots together: {sum(accepted.values())} of {len(accepted)} seeds accepted")
     return "\n".join(lines)
 
 
 def _demand_enough(families: Sequence[Family]) -> None:
-    """Raises EpisodeError where the tries of a task are used up."""
+    """Raise EpisodeError where the tries of a task are used up."""
     short = [
         f"{family.task}: only {family.accepted} of {family.wanted} seeds were accepted in {len(family.tries)} tries."
         for family in families
@@ -273,8 +275,8 @@ def _demand_enough(families: Sequence[Family]) -> None:
         raise EpisodeError("\n".join([*short, "The table shows why; make the task easier or leave out a robot."]))
 
 
-def _tell_device(name: str | None) -> None:
-    """On what it runs, and why the first run seems to stand still."""
+def _print_device(name: str | None) -> None:
+    """Print which device does the work, and why the first run takes a while to begin."""
     device = find_device(name)
     print(f"device: {device.name}")
     if not has_kernels(device):
@@ -286,7 +288,7 @@ def _tell_device(name: str | None) -> None:
 def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
-    _tell_device(args.device)
+    _print_device(args.device)
     families = generate(args)
     print(yield_table([record for family in families for seed in family.done.values() for record in seed.values()]))
     _demand_enough(families)

@@ -1,4 +1,4 @@
-"""Look into a data set: yields, hashes, contact sheets and strips.
+"""The command that looks into a data set: yields, hashes, contact sheets and strips.
 
 Reads  <data>/<task>/<seed>/<robot>/
 Writes a table to the terminal and, where asked, pictures: a sheet a task (start, middle and end of every robot) and a strip
@@ -21,35 +21,26 @@ from PIL import Image
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.episode import (
-    HEIGHT,
-    WIDTH,
-    EpisodeError,
-    Record,
-    find_folders,
-    none_under,
-    read_record,
-    read_states,
-    read_video,
-    verify_episode,
-)
+from xew.dataset import explain_missing, read_dataset
+from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, read_record, read_states, read_video, verify_episode
 from xew.sim_warp.devices.workers import Workers, quiet_warp
 from xew.sim_warp.generate import yield_table
-from xew.sim_warp.production.produce import add_videos, demand_plausible, render_again
+from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS
 
 EPISODES_PER_WORKER = 32
-"""So many are verified in the time in which a process starts."""
+"""Number of episodes that are verified in the time in which a process starts."""
 STRIP_FRAMES = 8
 SHEET_TIMES = (0.0, 0.5, 1.0)
+"""Instants that a contact sheet shows, as shares of the episode."""
 BLANK = np.full((HEIGHT // 2, WIDTH // 2, 3), 255, np.uint8)
 GAP = 4
-"""White pixels between pictures."""
+"""Width of the white between pictures [pixels]."""
 AT_WORK = 0.6
-"""How far an episode has gone when the hands are at work."""
+"""Share of an episode after which the hands are at work."""
 LABEL_WIDTH, LABEL_HEIGHT, TEXT_SCALE = 96, 24, 0.42
-"""Of the names in a grid or sheet [pixels], and of their letters."""
+"""Size of the names in a grid or sheet [pixels], and the scale of their letters."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +51,13 @@ class Args:
     verify: bool = False
     """Read everything and compare with the recorded hashes, and the motions with what is plausible."""
     rerender: int = 0
-    """Render this many episodes again from their states and compare with the recorded hashes."""
+    """Number of episodes to render again from their states and compare with the recorded hashes."""
     render: bool = False
     """Make the videos of episodes that were generated with --states-only, and store them."""
     pictures: Path | None = None
     """Folder for contact sheets and strips; none are drawn without it."""
     seeds: int = 2
-    """Seeds of each task that are drawn."""
+    """Number of seeds of each task that are drawn."""
     grid: Path | None = None
     """PNG file for one picture of all tasks and robots at work: the first accepted seed of each task."""
 
@@ -92,37 +83,32 @@ def main() -> None:
     if args.render:
         render_videos([folder for folder, record in pictured if not record.videos])
     if args.pictures:
-        draw(pictured, args.pictures, args.seeds)
+        draw_pictures(pictured, args.pictures, args.seeds)
     if args.grid:
         draw_grid(pictured, args.grid)
 
 
 def read_headers(data: Path) -> tuple[list[tuple[Path, Record]], list[str]]:
     """All cells whose headers can be read, and what is wrong with the others. Raises EpisodeError if there is no cell."""
-    cells: list[tuple[Path, Record]] = []
     damaged: list[str] = []
-    for folder in find_folders(data):
-        try:
-            cells.append((folder, read_record(folder)))
-        except EpisodeError as error:
-            damaged.append(str(error))
+    cells = list(read_dataset(data, damaged).cells)
     if not cells and not damaged:
-        raise none_under(data)
+        raise explain_missing(data)
     return cells, damaged
 
 
 def verify(folders: list[Path]) -> list[str]:
-    """Compare all files with their hashes, and motions with what is plausible; what is wrong with which episode."""
+    """Compare all files with their hashes, and motions with what is plausible; returns what is wrong with which episode."""
     with Workers(min(os.cpu_count() or 1, len(folders) // EPISODES_PER_WORKER), first_alone=False) as workers:
-        found = workers.run(verdict, folders) if len(folders) >= 2 * EPISODES_PER_WORKER else map(verdict, folders)
+        found = workers.run(find_problem, folders) if len(folders) >= 2 * EPISODES_PER_WORKER else map(find_problem, folders)
         bar = tqdm(found, desc="verifying", unit="episode", total=len(folders))
         damaged = sorted(problem for problem in bar if problem)
     print(f"{len(folders) - len(damaged)} of {len(folders)} episodes agree with their hashes and are plausible")
     return damaged
 
 
-def verdict(folder: Path) -> str:
-    """What is wrong with an episode, or nothing."""
+def find_problem(folder: Path) -> str:
+    """What is wrong with an episode; an empty text where nothing is."""
     try:
         if not verify_episode(folder).source:
             demand_plausible(folder)
@@ -134,10 +120,10 @@ def verdict(folder: Path) -> str:
 def rerender(folders: list[Path], count: int) -> None:
     """Render some episodes again, spread over the data set."""
     renderer = Renderer()
-    chosen = [folders[index] for index in np.unique(np.linspace(0, len(folders) - 1, max(1, count)).astype(int))]
-    for folder in tqdm(chosen, desc="rendering again", unit="episode"):
+    sample = [folders[index] for index in np.unique(np.linspace(0, len(folders) - 1, max(1, count)).astype(int))]
+    for folder in tqdm(sample, desc="rendering again", unit="episode"):
         render_again(folder, renderer)
-    print(f"{len(chosen)} episodes rendered again from their states agree with their hashes")
+    print(f"{len(sample)} episodes rendered again from their states agree with their hashes")
 
 
 def render_videos(folders: list[Path]) -> None:
@@ -148,8 +134,8 @@ def render_videos(folders: list[Path]) -> None:
     print(f"videos of {len(folders)} episodes made from their states")
 
 
-def draw(cells: list[tuple[Path, Record]], out: Path, seeds: int) -> None:
-    """Sheets and strips of the first seeds of each task, as PNG."""
+def draw_pictures(cells: list[tuple[Path, Record]], out: Path, seeds: int) -> None:
+    """Draw sheets and strips of the first seeds of each task, as PNG."""
     by_task = seeds_by_task(cells)
     _make_folder(out, "--pictures")
     for task, of_task in tqdm(by_task.items(), desc="drawing", unit="task"):
@@ -186,32 +172,34 @@ def draw_grid(cells: list[tuple[Path, Record]], path: Path) -> None:
 
 
 def grid(seeds: list[list[tuple[Path, Record]]]) -> np.ndarray:
-    """One seed of every task, a column each under its name, and a robot a row, at half size: uint8 [h w 3].
+    """One seed of every task, a column each under its name, and a robot a row, at half size: [h w 3] uint8.
 
     In a column all robots are shown at the same instant, see `busy_instants`. Columns stand in bands of equal length, one
     under the other, about as many as make the picture as wide as high.
     """
-    shown = {record.robot for cells in seeds for _, record in cells}
-    robots = [robot for robot in ROBOTS if robot in shown] + sorted(shown - set(ROBOTS))
+    present = {record.robot for cells in seeds for _, record in cells}
+    robots = [robot for robot in ROBOTS if robot in present] + sorted(present - set(ROBOTS))
     columns = [_column(cells, robots) for cells in seeds]
     bands = math.ceil(len(columns) ** 0.5 / 2)
     length = -(-len(columns) // bands)
     names = np.concatenate([_label("", LABEL_WIDTH), *(_label(robot, LABEL_WIDTH, HEIGHT // 2 + GAP) for robot in robots)])
     blank = np.full_like(columns[0], 255)
-    rows = []
+    drawn = []
     for first in range(0, len(columns), length):
         band = columns[first : first + length]
-        rows.append(np.concatenate([names, *band, *[blank] * (length - len(band))], 1))
-    return np.concatenate(rows)
+        drawn.append(np.concatenate([names, *band, *[blank] * (length - len(band))], 1))
+    return np.concatenate(drawn)
 
 
 def _column(cells: list[tuple[Path, Record]], robots: list[str]) -> np.ndarray:
-    """A task's name over one picture a robot: [h w 3]."""
+    """A task's name over one picture a robot: [h w 3] uint8."""
     folders = {record.robot: folder for folder, record in cells}
     instants = dict(zip(folders, busy_instants([read_states(folder).contact for folder in folders.values()]), strict=True))
-    images = [_half(read_video(folders[robot] / "rgb.mkv")[instants[robot]]) if robot in folders else BLANK for robot in robots]
+    images = [
+        _halve(read_video(folders[robot] / "rgb.mkv")[instants[robot]]) if robot in folders else BLANK for robot in robots
+    ]
     name = cells[0][1].task.rsplit(":", 1)[-1]
-    return np.concatenate([_label(name, WIDTH // 2 + GAP), tiled([[image] for image in images])])
+    return np.concatenate([_label(name, WIDTH // 2 + GAP), tile([[image] for image in images])])
 
 
 def busy_instants(contacts: list[np.ndarray]) -> list[int]:
@@ -220,7 +208,7 @@ def busy_instants(contacts: list[np.ndarray]) -> list[int]:
     It is one frame for all, but for episodes of different lengths, as imported ones are: those share no clock.
 
     Args:
-        contacts: [t 2 o] bool of every robot.
+        contacts: [t 2 o] bool of every robot, whether its left, right fingers touch each object.
     """
     if len({len(contact) for contact in contacts}) > 1:
         return [instant for contact in contacts for instant in busy_instants([contact])]
@@ -230,7 +218,7 @@ def busy_instants(contacts: list[np.ndarray]) -> list[int]:
 
 
 def _label(text: str, width: int, height: int = LABEL_HEIGHT) -> np.ndarray:
-    """Text on white [height width 3], smaller where it would not fit."""
+    """Text on white [h w 3] uint8, smaller where it would not fit."""
     image = np.full((height, width, 3), 255, np.uint8)
     (wide, high), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 1)
     scale = min(TEXT_SCALE, (width - 8) / max(1, wide))
@@ -238,35 +226,35 @@ def _label(text: str, width: int, height: int = LABEL_HEIGHT) -> np.ndarray:
     return cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (40, 40, 40), 1, cv2.LINE_AA)
 
 
-def _half(image: np.ndarray) -> np.ndarray:
+def _halve(image: np.ndarray) -> np.ndarray:
     return cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
 
 
 def contact_sheet(cells: list[tuple[Path, Record]]) -> np.ndarray:
-    """A seed's robots one under the other by name, each at its start, middle and end, under the instruction: uint8 [h w 3]."""
+    """A seed's robots one under the other by name, each at its start, middle and end, under the instruction: [h w 3] uint8."""
     rows = []
     for folder, _ in cells:
         video = read_video(folder / "rgb.mkv")
         rows.append([video[round(time * (len(video) - 1))] for time in SHEET_TIMES])
     names = np.concatenate([_label(record.robot, LABEL_WIDTH, HEIGHT + GAP) for _, record in cells])
-    pictures = np.concatenate([names, tiled(rows)], 1)
+    pictures = np.concatenate([names, tile(rows)], 1)
     record = cells[0][1]
-    told = f"{record.task}, seed {record.seed}: {record.instruction}"
-    return np.concatenate([_label(told, pictures.shape[1]), pictures])
+    title = f"{record.task}, seed {record.seed}: {record.instruction}"
+    return np.concatenate([_label(title, pictures.shape[1]), pictures])
 
 
 def strip(folder: Path) -> np.ndarray:
-    """Eight evenly spaced frames of an episode, with keypoints, over the robot alone: uint8 [h w 3]."""
+    """Eight evenly spaced frames of an episode, with keypoints, over the robot alone: [h w 3] uint8."""
     rgb, states = read_video(folder / "rgb.mkv"), read_states(folder)
     is_known = "robot" in read_record(folder).hashes  # an imported episode may be without
     robot = read_video(folder / "robot.mkv") if is_known else np.full_like(rgb, 255)
     frames = np.linspace(0, len(rgb) - 1, STRIP_FRAMES).round().astype(int)
-    marked = [_marked(rgb[t], states.keypoints[t][states.keypoint_visible[t]], states.robot_mask[t]) for t in frames]
-    return tiled([marked, [robot[t] for t in frames]])
+    marked = [_mark_robot(rgb[t], states.keypoints[t][states.keypoint_visible[t]], states.robot_mask[t]) for t in frames]
+    return tile([marked, [robot[t] for t in frames]])
 
 
-def _marked(image: np.ndarray, keypoints: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """The image with the robot's outline and its visible keypoints."""
+def _mark_robot(image: np.ndarray, keypoints: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The image [h w 3] with the outline of the robot's mask [h w] and its visible keypoints [k 2] pixels."""
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     image = cv2.drawContours(image.copy(), outlines, -1, (255, 120, 0), 1)
     for x, y in keypoints:
@@ -274,13 +262,14 @@ def _marked(image: np.ndarray, keypoints: np.ndarray, mask: np.ndarray) -> np.nd
     return image
 
 
-def tiled(rows: list[list[np.ndarray]]) -> np.ndarray:
-    """Rows of equal pictures as one, white between them."""
+def tile(rows: list[list[np.ndarray]]) -> np.ndarray:
+    """Rows of equal pictures [h w 3] uint8 as one, white between them."""
     padded = [[np.pad(image, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for image in row] for row in rows]
     return np.concatenate([np.concatenate(row, 1) for row in padded])
 
 
 def save_png(path: Path, image: np.ndarray) -> None:
+    """Write an image [h w 3] uint8 RGB. Raises EpisodeError where it cannot be written."""
     if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
         raise EpisodeError(f"cannot write {path}; choose another folder with --pictures.")
 

@@ -1,4 +1,4 @@
-"""Which seeds make the data set, found once in physics, so that nobody has to search again.
+"""The manifest: which seeds make the data set, found once in physics so that nobody has to search again.
 
 Reads  seeds.json in this folder, or a file of the same form; headers of a data set
 Writes a manifest from the headers of a data set: accepted training and test seeds of each task and, of the others, which
@@ -21,7 +21,8 @@ import cattrs
 import tyro
 
 from xew.config import user_errors
-from xew.episode import EpisodeError, Record, find_records, none_under
+from xew.dataset import explain_missing, find_records
+from xew.episode import EpisodeError, Record
 from xew.files import replacing
 from xew.protocol import TEST_SEED_START
 
@@ -33,10 +34,11 @@ class TaskSeeds:
     """What is known of one task's seeds."""
 
     train: tuple[int, ...]
-    """Seeds on which every robot of the manifest succeeded, ascending."""
+    """Training seeds on which every robot of the manifest succeeded, ascending."""
     test: tuple[int, ...]
+    """Test seeds on which every robot of the manifest succeeded, ascending."""
     rejected: dict[str, dict[str, str]] = field(default_factory=dict)
-    """Seed -> robot -> reason of failure, one of `xew.episode.FAILURES`."""
+    """Reasons of failure, each one of `xew.episode.FAILURES`, by seed and robot."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ def read_manifest(path: Path = PACKAGED) -> Manifest:
         EpisodeError: it is not there or not of this form; the message says where.
     """
     try:
-        return _checked(_converter().structure(_demand_object(json.loads(Path(path).read_text())), Manifest))
+        return _check(_converter().structure(_demand_object(json.loads(Path(path).read_text())), Manifest))
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, cattrs.BaseValidationError) as error:
         raise EpisodeError(
             f"{path} is no manifest of seeds ({error}); make one: python -m xew.sim_warp.manifest DATA --out {path}"
@@ -88,8 +90,8 @@ def _demand_object(value: Any) -> dict[str, Any]:
     return value
 
 
-def _checked(manifest: Manifest) -> Manifest:
-    """Raises ValueError for names that could lead out of a folder and for seeds that are none."""
+def _check(manifest: Manifest) -> Manifest:
+    """The same manifest. Raises ValueError for names that could lead out of a folder and for seeds that are none."""
     for task, seeds in manifest.tasks.items():
         if not task or not task.isprintable() or "/" in task or "\\" in task or task.startswith("."):
             raise ValueError(f"found the task {task!r}, expected a name of the registry or module:NAME")
@@ -133,7 +135,7 @@ def _task_seeds(seeds: dict[int, dict[str, Record]], robots: set[str]) -> TaskSe
 
 
 def to_json(manifest: Manifest) -> str:
-    """A line a task and list, so that a change of one seed is a change of one line."""
+    """The text of a manifest's file, a line a task and list, so that a change of one seed is a change of one line."""
     plain = cattrs.unstructure(manifest)
     head = {name: plain[name] for name in ("robots", "device", "versions")}
     tasks = [f"  {json.dumps(task)}: {{\n   {_lines(seeds, '   ')}\n  }}" for task, seeds in plain["tasks"].items()]
@@ -147,7 +149,7 @@ def _lines(values: dict[str, Any], indent: str) -> str:
 
 @dataclass(frozen=True)
 class Args:
-    """From which data to which file."""
+    """Which data to read and which file to write."""
 
     data: Annotated[Path, tyro.conf.Positional]
     out: Path
@@ -159,7 +161,7 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     manifest = manifest_of([record for _, record in find_records(args.data)])
     if not manifest.tasks:
-        raise none_under(args.data)
+        raise explain_missing(args.data)
     try:
         with replacing(args.out) as file:
             file.write_text(to_json(manifest))

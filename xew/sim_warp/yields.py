@@ -1,4 +1,4 @@
-"""How often the experts succeed: a fixed number of seeds of every task on every robot, in physics, without pictures.
+"""The command that counts how often the experts succeed, on some seeds of every task and robot, in physics, without pictures.
 
 Reads  the registries of tasks and robots
 Writes a Markdown table to the terminal and, with --page, docs/tasks.md: the tasks in words and the table
@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -24,12 +25,13 @@ from tqdm import tqdm
 from xew.config import user_errors
 from xew.episode import EpisodeError, Record
 from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
-from xew.sim_warp.production.produce import Job, header, plan_cells, simulate_cells
+from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
+from xew.sim_warp.production.episodes import header
 from xew.sim_warp.robots import ROBOTS, get_robot
 from xew.sim_warp.tasks import TASKS, Task, get_task
 
-PARTS = ("Task", "Randomization", "Success", "After")
-"""How the paragraphs of a task's module docstring begin."""
+PARAGRAPHS = ("Task", "Randomization", "Success", "After")
+"""Words with which the paragraphs of a task's module docstring begin."""
 COMMAND = "python -m xew.sim_warp.yields"
 
 
@@ -42,20 +44,20 @@ class Args:
     robots: tuple[str, ...] = tuple(ROBOTS)
     """Keys of the registry, module:NAME, or paths of your own (docs/add_a_robot.md)."""
     seeds: int = 20
-    """Seeds of each task, all of which count."""
+    """Number of seeds of each task, all of which count."""
     first_seed: int = 0
     batch: int = 256
-    """Worlds that a GPU steps together."""
+    """Number of worlds that a GPU steps together."""
     workers: int | None = None
-    """Processes; by default one a core, on a GPU one for two cores."""
+    """Number of processes; by default one a core, on a GPU one for two cores."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
     """Default: a GPU if Warp finds one."""
     page: Path | None = None
     """Markdown file to write; none is written without it."""
 
 
-def attempts(args: Args) -> Iterator[list[Record]]:
-    """Headers of all robots of a seed, as they come.
+def attempt_seeds(args: Args) -> Iterator[list[Record]]:
+    """Try all seeds in worker processes; the headers of all robots of a seed, as they come.
 
     Raises:
         ConfigError: an unknown task, robot or device.
@@ -88,27 +90,23 @@ def attempt_batch(jobs: Sequence[Job], device: str, batch: int) -> list[list[Rec
 
 
 def markdown(records: Sequence[Record]) -> str:
-    """The yields of tasks (rows) on robots (columns), then every failure with its reason."""
+    """A table of yields, a line a task and a column a robot, then every failure with its reason."""
     cells: dict[tuple[str, str], list[bool]] = defaultdict(list)
     for record in sorted(records, key=lambda record: (record.task, record.seed, record.robot)):
         cells[record.task, record.robot].append(record.success)
     tasks = list(dict.fromkeys(task for task, _ in cells))
     robots = [name for name in ROBOTS if any(name == r for _, r in cells)]
     robots += sorted({robot for _, robot in cells} - set(robots))
-    rows = [
-        [f"`{task}`", *(_share(cells[task, robot]) for robot in robots), _share(_together(records, task))] for task in tasks
-    ]
-    every = [[success for task in tasks for success in cells[task, robot]] for robot in robots]
-    rows.append(
-        ["**all tasks**", *map(_share, every), _share([together for task in tasks for together in _together(records, task)])]
-    )
+    seeds = {task: _seed_successes(records, task) for task in tasks}
+    shares = {f"`{task}`": [*(cells[task, robot] for robot in robots), seeds[task]] for task in tasks}
+    shares["**all tasks**"] = [list(chain.from_iterable(column)) for column in zip(*shares.values(), strict=True)]
     head = ["task", *(f"`{robot}`" for robot in robots), "all robots on the same seed"]
-    lines = ["| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows)]
-    return "\n".join([*lines, "", *_failures(records)])
+    table = [head, ["---"] * len(head), *([name, *map(_format_share, counted)] for name, counted in shares.items())]
+    return "\n".join([*("| " + " | ".join(line) + " |" for line in table), "", *_failure_lines(records)])
 
 
-def _together(records: Sequence[Record], task: str) -> list[bool]:
-    """For every seed of a task: have all robots succeeded?"""
+def _seed_successes(records: Sequence[Record], task: str) -> list[bool]:
+    """For every seed of a task, whether all robots have succeeded."""
     seeds: dict[int, bool] = {}
     for record in records:
         if record.task == task:
@@ -116,11 +114,11 @@ def _together(records: Sequence[Record], task: str) -> list[bool]:
     return list(seeds.values())
 
 
-def _share(successes: Sequence[bool]) -> str:
+def _format_share(successes: Sequence[bool]) -> str:
     return f"{sum(successes)}/{len(successes)} ({100 * sum(successes) / len(successes):.0f} %)" if successes else "–"
 
 
-def _failures(records: Sequence[Record]) -> list[str]:
+def _failure_lines(records: Sequence[Record]) -> list[str]:
     failed = sorted((r for r in records if not r.success), key=lambda record: (record.task, record.robot, record.seed))
     if not failed:
         return ["Nothing failed."]
@@ -131,12 +129,12 @@ def _failures(records: Sequence[Record]) -> list[str]:
     ]
 
 
-def described(task: Task) -> dict[str, str]:
+def describe_task(task: Task) -> dict[str, str]:
     """The paragraphs of a task's module docstring by how they begin: what to do, what varies, when it is done."""
     module = importlib.import_module(task.sample.__module__)
     found: dict[str, str] = {}
     for line in inspect.cleandoc(module.__doc__ or "").replace("Randomisation:", "Randomization:").splitlines():
-        begun = next((part for part in PARTS if line.startswith((part + ":", part + " "))), None)
+        begun = next((part for part in PARAGRAPHS if line.startswith((part + ":", part + " "))), None)
         if begun:
             found[begun] = line.removeprefix(begun + ":").strip()
         elif line.strip() and found:
@@ -145,16 +143,16 @@ def described(task: Task) -> dict[str, str]:
     return found
 
 
-def description(task: Task) -> str:
+def task_section(task: Task) -> str:
     """A task as a section of the page."""
-    parts = described(task)
+    parts = describe_task(task)
     lines = [f"- **{part}**: {parts[part]}" for part in ("Task", "Randomization", "Success") if part in parts]
     return "\n".join([f"### `{task.name}`", f"*{task.instruction}*", "", *lines, "", parts.get("After", "")]).strip()
 
 
 def page(records: Sequence[Record], args: Args) -> str:
-    """docs/tasks.md."""
-    tasks = "\n\n".join(description(get_task(name)) for name in sorted(args.tasks))
+    """The text of docs/tasks.md."""
+    tasks = "\n\n".join(task_section(get_task(name)) for name in sorted(args.tasks))
     seeds = f"{args.seeds} seeds from {args.first_seed}"
     first = f" --first-seed {args.first_seed}" if args.first_seed else ""
     device = next(record.device for record in records)
@@ -182,7 +180,7 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     records: list[Record] = []
     with tqdm(total=args.seeds * len(set(args.tasks)), desc="trying seeds", unit="seed") as bar:
-        for seed in attempts(args):
+        for seed in attempt_seeds(args):
             records += seed
             bar.update()
     print(markdown(records))

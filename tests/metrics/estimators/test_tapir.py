@@ -19,6 +19,8 @@ from xew.config import ConfigError
 from xew.metrics.backends import open_tracker
 from xew.metrics.estimators.tapir import open_tapir, read_checkpoint
 
+pytestmark = pytest.mark.loose_types("TAPIR and its stand-in add whole numbers and floats")
+
 
 class StandIn:
     """Follows the color under each query, in pixels whose centers are at halves, as tolerantly as its parameter says."""

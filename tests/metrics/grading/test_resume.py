@@ -17,7 +17,8 @@ import pytest
 from tests.metrics.small import write_many
 from tests.synthetic import write_synthetic_data
 from xew import files
-from xew.episode import find_accepted, read_video
+from xew.dataset import find_accepted
+from xew.episode import read_video
 from xew.metrics import evaluate
 from xew.metrics.evaluate import Args, main
 from xew.metrics.grading.workers import Bench

@@ -7,7 +7,6 @@ import pytest
 
 from xew.model.diffusion import flow_matching as fm
 
-pytestmark = pytest.mark.usefixtures("strict_types")
 SHAPE = (64, 3, 2, 2, 4)
 
 

@@ -11,7 +11,6 @@ from xew.model.network import blocks, dit
 from xew.model.network.dit import MODELS, STREAMS, WorldModel
 from xew.model.training.memory import kept_bytes
 
-pytestmark = pytest.mark.usefixtures("strict_types")
 CHANNELS = 3
 SHAPE = (2, 3, 4, 6, CHANNELS)
 TOLERANCE = 2e-5

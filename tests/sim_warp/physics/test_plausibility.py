@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from xew.protocol import FRAME_RATE
 from xew.sim_warp import objects
-from xew.sim_warp.physics.plausibility import implausible, slip
+from xew.sim_warp.physics.plausibility import find_implausible, measure_slip
 from xew.sim_warp.plan import Hold
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
@@ -31,33 +31,33 @@ def parts():
     return Scene("test", 0, (cube, plate)), pose, np.zeros((FRAMES, 2), np.float32), tools
 
 
-def verdict(parts, holds=(HOLD,)):
+def found(parts, holds=(HOLD,)):
     scene, pose, penetration, tools = parts
-    return implausible(scene, holds, pose, penetration, tools, FRAME_RATE)
+    return find_implausible(scene, holds, pose, penetration, tools, FRAME_RATE)
 
 
 def test_what_moves_with_the_hand_is_plausible(parts):
-    assert verdict(parts) is None
-    assert slip(parts[3][:, 0], parts[1][:, 0]) < 1e-6
+    assert found(parts) is None
+    assert measure_slip(parts[3][:, 0], parts[1][:, 0]) < 1e-6
 
 
 def test_a_blow_passes_and_what_stays_sunk_does_not(parts):
     parts[2][10:13, 0] = 0.006
-    assert verdict(parts) is None
+    assert found(parts) is None
     parts[2][13, 0] = 0.006
-    assert "cube sank 6 mm" in verdict(parts)
+    assert "cube sank 6 mm" in found(parts)
 
 
 @pytest.mark.parametrize("away", [(0.7, 0, 0.0), (0, -0.5, 0.0), (0, 0, -0.4)])
 def test_what_leaves_the_table_is_told(parts, away):
     parts[1][-1, 0, :3] += np.float32(away)
-    assert "cube left the table" in verdict(parts)
+    assert "cube left the table" in found(parts)
 
 
 def test_creep_counts_while_held_and_in_the_frame_of_the_hand(parts):
     _, pose, _, _ = parts
     pose[21:, 0, 0] += 0.05
-    assert verdict(parts) is None, "let go at frame 20"
+    assert found(parts) is None, "let go at frame 20"
     pose[15:, 0, 0] += 0.011
-    assert "cube crept 11 mm in the left hand" in verdict(parts)
-    assert verdict(parts, holds=()) is None
+    assert "cube crept 11 mm in the left hand" in found(parts)
+    assert found(parts, holds=()) is None

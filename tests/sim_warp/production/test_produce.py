@@ -8,13 +8,13 @@ import pytest
 
 from tests.sim_warp.small import SLOW, TASK
 from xew.config import ConfigError
+from xew.dataset import find_accepted
 from xew.episode import (
     EpisodeError,
     Record,
     States,
     array_hash,
     episode_folder,
-    find_accepted,
     read_record,
     read_states,
     read_video,
@@ -22,8 +22,12 @@ from xew.episode import (
     write_episode,
 )
 from xew.sim_warp.physics import Motion, World, simulate
-from xew.sim_warp.production import produce as stage
-from xew.sim_warp.production.produce import Job, add_videos, demand_plausible, produce, render_again
+from xew.sim_warp.production import cells as cells_module
+from xew.sim_warp.production import produce as produce_module
+from xew.sim_warp.production.cells import Cell, Job
+from xew.sim_warp.production.episodes import fill_instruction
+from xew.sim_warp.production.produce import produce
+from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import command_streams_batch
 from xew.sim_warp.scene import scene_rng
@@ -65,8 +69,8 @@ def test_the_same_bytes_alone_among_others_and_in_groups(
     data: Path, renderer: Renderer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     others = [Job("grab_roller", 1, ("piper",)), *reversed(JOBS)]
-    monkeypatch.setattr(stage, "FRAMES_AT_ONCE", 1)  # every seed is a group of its own
-    monkeypatch.setattr(stage, "plan_cells", shortened(stage.plan_cells))
+    monkeypatch.setattr(produce_module, "FRAMES_AT_ONCE", 1)  # every seed is a group of its own
+    monkeypatch.setattr(produce_module, "plan_cells", shortened(produce_module.plan_cells))
     produce(others, tmp_path / "among", renderer)
     for job in JOBS:
         produce([job], tmp_path / "alone", renderer)
@@ -79,10 +83,10 @@ def test_the_same_bytes_alone_among_others_and_in_groups(
 def shortened(plan_cells: object) -> object:
     """Only the first frames of a real task: company for the others, not an episode."""
 
-    def first_frames(jobs: list[Job], out: Path) -> list[list[stage.Cell]]:
+    def first_frames(jobs: list[Job], out: Path) -> list[list[Cell]]:
         return [[cut(cell) for cell in cells] for cells in plan_cells(jobs, out)]  # type: ignore[operator]
 
-    def cut(cell: stage.Cell) -> stage.Cell:
+    def cut(cell: Cell) -> Cell:
         return replace(cell, commands=replace(cell.commands, action=cell.commands.action[:12]))
 
     return first_frames
@@ -154,7 +158,7 @@ def test_an_episode_of_a_task_that_has_changed_is_told(data: Path, renderer: Ren
 def test_an_instruction_that_its_scene_cannot_fill_is_told(instruction: str) -> None:
     wordless = replace(get_task(TASK), instruction=instruction)
     with pytest.raises(ConfigError, match=r"cannot be filled .* from the words of its scene \(none\)"):
-        stage._instruction(wordless, wordless.sample(scene_rng(TASK, 0), 0))
+        fill_instruction(wordless, wordless.sample(scene_rng(TASK, 0), 0))
 
 
 def test_an_episode_without_videos_gets_them_on_demand(data: Path, renderer: Renderer, tmp_path: Path) -> None:
@@ -199,7 +203,7 @@ def test_conditions_see_commands_and_no_future(
         joints[3:, 0] += np.float32(0.1)
         return replace(motion, object_pose=pose, joint_pos=joints)
 
-    monkeypatch.setattr(stage, "simulate", elsewhere)
+    monkeypatch.setattr(cells_module, "simulate", elsewhere)
     record = produce(JOBS[:1], tmp_path, renderer)[0][0]
     before = record_of(data, 0, record.robot)
     assert record.hashes["rgb"] != before.hashes["rgb"] and record.hashes["states"] != before.hashes["states"]

@@ -15,13 +15,14 @@ import yaml
 from tests.sim_warp.robots.own_robot import STRIPES, robotwin_config, write_embodiment, write_urdf
 from tests.sim_warp.small import TASK
 from xew.config import ConfigError
-from xew.episode import array_hash, find_accepted
+from xew.dataset import find_accepted
+from xew.episode import array_hash
 from xew.sim_warp import generate as command
 from xew.sim_warp.embodiment import mesh_files
 from xew.sim_warp.generate import Args, generate
 from xew.sim_warp.kinematics import tool_pose
 from xew.sim_warp.plan import HOME
-from xew.sim_warp.production.produce import render_again
+from xew.sim_warp.production.rerender import render_again
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import RobotSpec, adopt_robots, get_robot, load_robot, load_urdf
 from xew.sim_warp.robots.user.own import FOLDERS

@@ -11,12 +11,13 @@ from tests.sim_warp.small import SLOW, TASK
 from xew.config import ConfigError
 from xew.episode import FAILURES, EpisodeError, Record
 from xew.sim_warp.plan import LEFT, RIGHT
-from xew.sim_warp.production.produce import Cell, Job, moment, plan_cells, simulate_cells
+from xew.sim_warp.production.cells import Cell, Job, plan_cells, simulate_cells
+from xew.sim_warp.production.outcome import moment
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.scene import Scene, scene_rng
 from xew.sim_warp.tasks import TASKS, get_task
 from xew.sim_warp.tasks.task import Moment
-from xew.sim_warp.yields import PARTS, Args, attempt_batch, attempts, described, description, markdown, page
+from xew.sim_warp.yields import PARAGRAPHS, Args, attempt_batch, attempt_seeds, describe_task, markdown, page, task_section
 
 PAGE = Path(__file__).parents[3] / "docs" / "tasks.md"
 SOLVERS = dict(zip(sorted(TASKS), cycle(ROBOTS), strict=False))
@@ -168,8 +169,8 @@ def test_unknown_tasks_are_told_with_the_nearest_name() -> None:
 
 @pytest.mark.parametrize("name", TASKS)
 def test_the_page_tells_what_the_docstrings_tell(name: str) -> None:
-    assert all(described(TASKS[name]).get(part) for part in PARTS)
-    assert description(TASKS[name]) in PAGE.read_text(), (
+    assert all(describe_task(TASKS[name]).get(part) for part in PARAGRAPHS)
+    assert task_section(TASKS[name]) in PAGE.read_text(), (
         "write docs/tasks.md anew: python -m xew.sim_warp.yields --seeds 50 --page docs/tasks.md"
     )
 
@@ -215,10 +216,10 @@ def test_yields_try_every_robot_and_write_nothing(tmp_path: Path, monkeypatch: p
 
 def test_yields_of_nothing_or_of_the_unknown_are_refused() -> None:
     with pytest.raises(EpisodeError, match="nothing to try"):
-        next(attempts(Args(seeds=0)))
+        next(attempt_seeds(Args(seeds=0)))
     with pytest.raises(ConfigError, match="unknown robot 'ur5'"):
-        next(attempts(Args(robots=("ur5",))))
+        next(attempt_seeds(Args(robots=("ur5",))))
     with pytest.raises(EpisodeError, match="1 robots and 20 seeds from -1; name"):
-        next(attempts(Args(robots=("piper",), first_seed=-1)))
+        next(attempt_seeds(Args(robots=("piper",), first_seed=-1)))
     with pytest.raises(ConfigError, match="--device cuda:99: not on this machine, which has cpu"):
-        next(attempts(Args(device="cuda:99")))
+        next(attempt_seeds(Args(device="cuda:99")))

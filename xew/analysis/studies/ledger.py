@@ -17,8 +17,9 @@ from typing import Any
 
 from xew.analysis.studies.plan import Step, step_key
 from xew.config import ConfigError
-from xew.episode import EpisodeError, find_accepted
-from xew.files import replacing
+from xew.dataset import find_accepted
+from xew.episode import EpisodeError
+from xew.files import checkpoint_time, file_digest, replacing
 
 
 class Ledger:
@@ -129,11 +130,8 @@ def _digest_run(run: Path) -> str | None:
     if not steps:
         return None
     latest = max(steps, key=lambda path: int(path.name))
-    try:
-        begun = json.loads((latest / "_CHECKPOINT_METADATA").read_text())["init_timestamp_nsecs"]
-    except (OSError, ValueError, KeyError):
-        return None
-    return _digest([latest.name, begun])
+    begun = checkpoint_time(run, int(latest.name))
+    return None if begun is None else _digest([latest.name, begun])
 
 
 def _digest_rollouts(root: Path) -> str | None:
@@ -145,7 +143,7 @@ def _digest_rollouts(root: Path) -> str | None:
 
 
 def _digest_file(path: Path) -> str | None:
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16] if path.is_file() else None
+    return file_digest(path)[:16] if path.is_file() else None
 
 
 def _digest_folder(path: Path) -> str | None:

@@ -11,7 +11,7 @@ from xew.analysis.studies.cost import format_duration
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import Machines
 from xew.analysis.studies.plan import Step
-from xew.episode import find_accepted
+from xew.dataset import find_accepted
 from xew.protocol import seed_split
 
 

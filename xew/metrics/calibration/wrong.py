@@ -93,8 +93,7 @@ def render(folder: Path, states: States) -> WrongVideo:
     # Only here: the metrics load without Warp.
     from xew.sim_warp.devices.workers import quiet_warp
     from xew.sim_warp.geometry.camera import HEAD_CAMERA, project
-    from xew.sim_warp.production.produce import recording
-    from xew.sim_warp.rendering.observe import observe
+    from xew.sim_warp.rendering.observe import observe, scene_recording
     from xew.sim_warp.rendering.streams import default_renderer
     from xew.sim_warp.robots import get_robot
     from xew.sim_warp.scene import scene_rng
@@ -104,7 +103,7 @@ def render(folder: Path, states: States) -> WrongVideo:
     record = read_record(folder)
     scene = get_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
     robot = get_robot(record.robot, data_folder(folder))
-    seen = recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
+    seen = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
     view = observe(default_renderer(), [seen])[0]
     objects, _ = project(HEAD_CAMERA, states.object_pose[..., :3].astype(np.float64))
     return WrongVideo(view.rgb, view.robot_mask, view.keypoints, objects.astype(np.float32))

@@ -41,7 +41,7 @@ def rendered_pixels() -> PixelSource:
     It is for episodes that were made on this kind of device with these versions: what differs from the recorded hashes is
     an EpisodeError.
     """
-    from xew.sim_warp.production.produce import render_again
+    from xew.sim_warp.production.rerender import render_again
     from xew.sim_warp.rendering.streams import default_renderer
 
     def render(folder: Path, record: Record, names: Collection[str]) -> Pixels:

@@ -19,7 +19,7 @@ from xew.sim_warp.physics.worlds import (
     shape_owners,
 )
 
-# Warnings are counted in `data.warning` and told as overflow; MuJoCo would write them to a file where the user stands, too.
+# Warnings are counted in `data.warning` and reported as overflow; MuJoCo would also write them to a file in the user's folder.
 mujoco.set_mju_user_warning(lambda message: None)
 
 _ARMS = ((LEFT_FINGERS, LEFT_ARM_LINKS), (RIGHT_FINGERS, RIGHT_ARM_LINKS))
@@ -34,23 +34,24 @@ def simulate_one(world: World) -> Motion:
     data.qpos[:] = initial_joints(world)
     mujoco.mj_forward(model, data)
     count = len(world.scene.objects)
-    frames = [_frame(data, owners, count)]
+    frames = [_record_frame(data, owners, count)]
     for targets in control_targets(world.robot, world.action):
         for target in targets:
             data.ctrl[:] = target
             mujoco.mj_step(model, data)
-        frames.append(_frame(data, owners, count))
+        frames.append(_record_frame(data, owners, count))
     qpos, qvel, contact, penetration, overlap = (np.stack(parts) for parts in zip(*frames, strict=True))
     overflow = any(warning.number for warning in data.warning)
     return motion(world, qpos, qvel, contact, penetration, overlap.max(0), overflow)
 
 
 Frame = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Joint coordinates and velocities, which fingers touch which objects [2 o], how deep each object [o] is in
-something else, and an arm in the table and in the other arm [2] [m]."""
+"""Joint coordinates [40] and velocities [37] of the template [rad, m], which fingers touch which objects [2 o] bool, depth of
+each object in something else [o] m, and depths of an arm in the table and of the arms in each other [2] m."""
 
 
-def _frame(data: mujoco.MjData, owners: np.ndarray, objects: int) -> Frame:
+def _record_frame(data: mujoco.MjData, owners: np.ndarray, objects: int) -> Frame:
+    """What the engine knows of this instant; `owners` [s] int32 of all collision shapes."""
     distance = np.array(data.contact.dist) if data.ncon else np.zeros(0)
     pairs = np.sort(owners[data.contact.geom], axis=-1) if data.ncon else np.zeros((0, 2), int)
     touching = pairs[distance < 0]

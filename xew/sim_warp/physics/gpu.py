@@ -1,4 +1,4 @@
-"""Physics on a GPU: MuJoCo Warp, all worlds of a batch together, a CUDA graph a stored frame.
+"""Physics on a GPU: MuJoCo Warp steps all worlds of a batch together, with one CUDA graph a stored frame.
 
 The same code runs on Warp's CPU device, slowly: that is how it is tested where there is no GPU.
 """
@@ -11,7 +11,7 @@ import warp as wp
 
 from xew.protocol import FRAME_RATE
 from xew.sim_warp.devices.waiting import wait_for
-from xew.sim_warp.physics.kernels import advance, record_contacts, record_joints, set_targets
+from xew.sim_warp.physics.kernels import advance_frame, record_contacts, record_joints, set_targets
 from xew.sim_warp.physics.worlds import (
     ROBOT_DOFS,
     STEPS_PER_FRAME,
@@ -30,6 +30,7 @@ CONTACTS_PER_WORLD = 160
 CONSTRAINTS_PER_WORLD = 768
 """First sizes of MuJoCo Warp's buffers; worlds that overflow them are stepped again with twice as much."""
 ATTEMPTS = 3
+"""Number of times that a world is stepped at most."""
 SOLVER_LIMITS = mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS
 """Flags among MuJoCo Warp's overflows that mean no lost contact: a step whose solver used all of its iterations."""
 
@@ -61,7 +62,7 @@ class Batch:
         )
         self.model, self.data = self.solver.mjw_model, self.solver.mjw_data
         self.model.opt.timestep.fill_(TIME_STEP)
-        self.model.opt.warn_overflow = 0  # what overflows is stepped again, or told in `Motion.overflow`
+        self.model.opt.warn_overflow = 0  # what overflows is stepped again, or reported in `Motion.overflow`
         self.frame_count = max(len(world.action) for world in worlds)
         self.joints = self._array(np.stack([self._joints(world) for world in worlds]))
         self.owners = self._array(self._geom_owners(), wp.int32)
@@ -78,6 +79,7 @@ class Batch:
         self.overlap = self._array(np.zeros((len(worlds), 2)))
 
     def run(self) -> list[Motion]:
+        """Step all worlds from their first command to the last of the longest."""
         with wp.ScopedDevice(self.device):
             mjw.forward(self.model, self.data)
             self._record()
@@ -100,7 +102,7 @@ class Batch:
                 [self.data.ctrl],
             )
             mjw.step(self.model, self.data)
-        wp.launch(advance, 1, [self.frame])
+        wp.launch(advance_frame, 1, [self.frame], [self.frame])
         self._record()
 
     def _record(self) -> None:

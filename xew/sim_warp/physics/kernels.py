@@ -1,4 +1,8 @@
-"""Kernels round MuJoCo Warp's step: targets in, joints and contacts out."""
+"""Warp kernels that run before and after MuJoCo Warp's step: they set targets, and record joints and contacts.
+
+Letters of shapes: n worlds, t stored frames, q joint coordinates, v joint velocities, c contacts that the buffer holds,
+g collision shapes of a world, o objects.
+"""
 
 # Annotations of kernels are types of Warp, which mypy does not know.
 # mypy: ignore-errors
@@ -11,14 +15,14 @@ from xew.sim_warp.physics.worlds import FIRST_OBJECT, LEFT_ARM_LINKS, LEFT_FINGE
 @wp.kernel
 def set_targets(
     # In:
-    joints: wp.array3d[wp.float32],  # [n t 18] commanded robot joints at stored frames
-    frame: wp.array[wp.int32],  # [1]
-    share: wp.float32,
-    frame_rate: wp.float32,
+    joints: wp.array3d[wp.float32],  # [n t 18] float32 commanded robot joints at stored frames [rad; fingers m]
+    frame: wp.array[wp.int32],  # [1] int32 stored frame before this step
+    share: wp.float32,  # of the time to the next stored frame that has gone by at the end of this step, 0 to 1
+    frame_rate: wp.float32,  # Hz
     # Out:
-    ctrl_out: wp.array2d[wp.float32],  # [n 36]
-) -> None:
-    """Targets of one step: position and velocity of each joint, commands being linear between frames."""
+    ctrl_out: wp.array2d[wp.float32],  # [n 36] float32 position [rad, m] and velocity [rad/s, m/s] of each joint in turn
+):
+    """Set the targets of one step; commands are linear between stored frames."""
     world, joint = wp.tid()
     before = joints[world, frame[0], joint]
     after = joints[world, frame[0] + 1, joint]
@@ -29,13 +33,14 @@ def set_targets(
 @wp.kernel
 def record_joints(
     # In:
-    qpos: wp.array2d[wp.float32],
-    qvel: wp.array2d[wp.float32],
-    frame: wp.array[wp.int32],
+    qpos: wp.array2d[wp.float32],  # [n q] float32 the template's joint coordinates [rad, m]
+    qvel: wp.array2d[wp.float32],  # [n v] float32 their velocities [rad/s, m/s]
+    frame: wp.array[wp.int32],  # [1] int32 stored frame that has been reached
     # Out:
-    qpos_out: wp.array3d[wp.float32],  # [n t q]
-    qvel_out: wp.array3d[wp.float32],  # [n t v]
+    qpos_out: wp.array3d[wp.float32],  # [n t q] float32 [rad, m]
+    qvel_out: wp.array3d[wp.float32],  # [n t v] float32 [rad/s, m/s]
 ):
+    """Record where the joints are and how fast they move."""
     world, index = wp.tid()
     if index < qpos.shape[1]:
         qpos_out[world, frame[0], index] = qpos[world, index]
@@ -56,18 +61,18 @@ def side_of(owner: int) -> int:
 @wp.kernel
 def record_contacts(
     # In:
-    count: wp.array[wp.int32],  # [1] contacts of all worlds
-    geom: wp.array[wp.vec2i],
-    world_of: wp.array[wp.int32],
-    distance: wp.array[wp.float32],
-    owners: wp.array2d[wp.int32],  # [n g]
-    frame: wp.array[wp.int32],
+    count: wp.array[wp.int32],  # [1] int32 contacts of all worlds
+    geom: wp.array[wp.vec2i],  # [c 2] int32 the two collision shapes of a contact
+    world_of: wp.array[wp.int32],  # [c] int32 world of a contact
+    distance: wp.array[wp.float32],  # [c] float32 m, negative where the shapes overlap
+    owners: wp.array2d[wp.int32],  # [n g] int32 what each collision shape belongs to, see `worlds.shape_owners`
+    frame: wp.array[wp.int32],  # [1] int32 stored frame that has been reached
     # Out:
-    contact_out: wp.array3d[wp.int32],  # [n t 2] bit i: fingers on object i
-    penetration_out: wp.array3d[wp.float32],  # [n t o] m
-    overlap_out: wp.array2d[wp.float32],  # [n 2] m
+    contact_out: wp.array3d[wp.int32],  # [n t 2] int32, bit i says that the left, right fingers touch object i
+    penetration_out: wp.array3d[wp.float32],  # [n t o] float32 m, how deep an object and anything else are in each other
+    overlap_out: wp.array2d[wp.float32],  # [n 2] float32 m, how deep an arm was in the table, and the arms in each other
 ):
-    """Which fingers touch which objects, how deep objects are in anything else, and arms in the table or in each other."""
+    """Record which fingers touch which objects and how deep things are in each other."""
     index = wp.tid()
     if index >= wp.min(count[0], geom.shape[0]) or distance[index] >= 0.0:
         return
@@ -90,5 +95,11 @@ def record_contacts(
 
 
 @wp.kernel
-def advance(frame: wp.array[wp.int32]):
-    frame[0] = frame[0] + 1
+def advance_frame(
+    # In:
+    frame: wp.array[wp.int32],  # [1] int32 stored frame
+    # Out:
+    frame_out: wp.array[wp.int32],  # [1] int32 stored frame after it; may be the same array
+):
+    """Count one stored frame more."""
+    frame_out[0] = frame[0] + 1

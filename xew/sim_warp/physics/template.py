@@ -1,4 +1,4 @@
-"""The common template: one Newton world that any robot, task and seed fits, so that all are rows of one batch.
+"""The common template: one Newton world that any robot, task and seed fits, so that all of them form one batch.
 
 Reads  RobotSpec (through its URDF) and Scene
 Writes a world of a newton.ModelBuilder: two arms of seven revolute joints and two finger slides each, `FREE_SLOTS` free
@@ -31,8 +31,9 @@ from xew.sim_warp.stage import TABLE_SIZE, TABLE_TOP
 
 ARM_JOINTS = 7
 FREE_SLOTS = 3
+"""Number of bodies that move freely."""
 PARKED = tuple((0.3 * slot, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0) for slot in range(FREE_SLOTS))
-"""Where free bodies float that a scene has no object for: under the table, out of sight."""
+"""Poses (xyz [m] and quaternion xyzw) of free bodies that a scene has no object for: under the table, out of sight."""
 SIDES = ("left", "right")
 
 ARM_STIFFNESS, ARM_DAMPING, ARM_ARMATURE = 4000.0, 120.0, 1.0
@@ -43,20 +44,22 @@ gain is not small beside the inertia, what a hand holds is thrown ahead of it (9
 CONTACT_TIME = 0.012
 """Time constant in which soft contacts push back [s], three time steps: held things sink 1 mm into a pad."""
 PIN_STIFFNESS, PIN_DAMPING, PIN_ARMATURE = 20000.0, 500.0, 1.0
-"""Of the seventh joint of an arm that has six."""
+"""The same of the seventh joint of an arm that has six."""
 FINGER_STIFFNESS, FINGER_DAMPING, FINGER_ARMATURE = 10000.0, 200.0, 0.5
-"""N/m, N s/m, kg: stiff enough that a wall of 5 mm is held with the full force."""
+"""Gains [N/m, N s/m] and inertia [kg] of a finger: stiff enough that a wall of 5 mm is held with the full force."""
 FINGER_FORCE = 16.0
 """Largest force of a finger [N], gentle beside the Panda hand's 70 N: our objects are light."""
 PAD_FRICTION = 1.2
-"""Rubber pads on plastic or wood."""
+"""Sliding friction of rubber pads on plastic or wood."""
 LINK_FRICTION = 0.5
+"""Sliding friction of all other links and of the table."""
 HINGE_ARMATURE = 0.02
-"""kg m2: gives a light lid a share in the solver's cost beside the arms, without which its friction is not solved for."""
+"""Inertia added to a hinge [kg m2]: it gives a light lid a share in the solver's cost beside the arms, without which its
+friction is not solved for."""
 HINGE_SOLIMP = (0.99, 0.99, 0.001, 0.5, 2.0)
 """Impedance of a hinge's dry friction: with MuJoCo's default a light lid creeps shut at 4 degrees a second."""
 FARTHEST_MASS = 0.3
-"""A radius of gyration [m] beyond which a link's inertia is taken for a placeholder (RoboTwin's UR5 gripper states
+"""Radius of gyration [m] beyond which a link's inertia is taken for a placeholder (RoboTwin's UR5 gripper states
 1 kg m2 for fingers of 100 g) and that of its collision shapes is used. The same where an inertia is not positive."""
 
 ROBOT_GROUP = {"left": -1, "right": -2}
@@ -73,11 +76,11 @@ class RigidGroup:
     joint: Joint
     mass: float
     center: np.ndarray
-    """[3] m."""
+    """[3] center of mass [m], frame of the joint."""
     inertia: np.ndarray
-    """[3 3] about the center of mass, kg m2."""
+    """[3 3] inertia about the center of mass [kg m2]."""
     hulls: tuple[tuple[str, np.ndarray], ...]
-    """(name, points [k 3])."""
+    """Name and points [k 3] m of each convex piece, frame of the joint."""
 
 
 @lru_cache(maxsize=64)
@@ -134,7 +137,7 @@ def _mass_properties(
 
 
 def solid(mass: float, hulls: Sequence[np.ndarray]) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass [kg], center of mass [3] and inertia about it [3 3] of convex pieces of one density."""
+    """Mass [kg], center of mass [3] m and inertia about it [3 3] kg m2 of convex pieces [k 3] m of one density."""
     return _solid(mass, tuple(np.asarray(points, np.float32).tobytes() for points in hulls))
 
 
@@ -189,7 +192,7 @@ def _add_arm(builder: newton.ModelBuilder, side: str, arm: Arm, path: Path) -> N
 
 
 def _add_body(builder: newton.ModelBuilder, side: str, name: str, group: RigidGroup | None) -> int:
-    """A body with a group's mass and shapes; without a group a speck that only carries the pinned joint."""
+    """Add a body with a group's mass and shapes or, without a group, a speck that only carries the pinned joint."""
     mass, center, inertia = (group.mass, group.center, group.inertia) if group else (0.1, np.zeros(3), np.eye(3) * 1e-4)
     body = builder.add_link(
         mass=mass,
@@ -243,7 +246,7 @@ def _add_pin(builder: newton.ModelBuilder, label: str, parent: int, child: int) 
 def _add_finger_joint(
     builder: newton.ModelBuilder, label: str, parent: int, child: int, group: RigidGroup, closed: float, opened: float
 ) -> int:
-    """A slide whose position is the finger's way from closed, so that both fingers of all robots count alike."""
+    """Add a slide whose position is the finger's way from closed, so that both fingers of all robots count alike."""
     frame = group.parent_to_joint.copy()
     frame[:3, 3] += frame[:3, :3] @ group.joint.axis * closed
     return builder.add_joint_prismatic(
@@ -315,7 +318,7 @@ def _add_free_slot(builder: newton.ModelBuilder, slot: int, thing: SceneObject |
 
 
 def _add_hinge_slot(builder: newton.ModelBuilder, thing: SceneObject | None, scene: Scene) -> None:
-    """A lid on a hinge in the world; where no object has one, a pinned speck below the table."""
+    """Add a lid on a hinge in the world or, where no object has one, a pinned speck below the table."""
     if thing is None or thing.hinge is None:
         parts = (0.1, np.zeros(3), np.eye(3) * 1e-4)
         frame, axis = wp.transform((0, 0.3, 0.3), wp.quat_identity()), (0.0, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""What both physics engines share: worlds to simulate, the motion that comes of them, and the template's coordinates.
+"""Worlds to simulate, the motion that comes of them, and the template's coordinates: what both physics engines share.
 
 Reads  RobotSpec, Scene and canonical commands
 Writes the Newton model of the common template (template.py), actuator targets, and `Motion`s in canonical layout
@@ -16,8 +16,9 @@ from xew.sim_warp.robots import RobotSpec
 from xew.sim_warp.scene import Scene
 
 TIME_STEP = 0.004
-"""s."""
+"""Length of a physics step [s]."""
 STEPS_PER_FRAME = 15
+"""Number of physics steps between stored frames."""
 SOLVER_OPTIONS = {
     "cone": "elliptic",
     "impratio": 5.0,
@@ -31,8 +32,8 @@ JOINTS_PER_SIDE = ARM_JOINTS + 2
 ROBOT_DOFS = 2 * JOINTS_PER_SIDE
 FREE_START = ROBOT_DOFS
 HINGE_INDEX = FREE_START + 7 * FREE_SLOTS
-"""Places in the template's joint coordinates: both arms with fingers, the free bodies (xyz and quaternion w x y z),
-the lid."""
+"""First places in the template's joint coordinates of the free bodies (xyz and quaternion wxyz) and of the lid; the arms with
+their fingers come first."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class World:
     robot: RobotSpec
     scene: Scene
     action: np.ndarray
-    """[t 16] canonical commands at every stored frame; the first is where the robot stands when the world begins."""
+    """[t 16] canonical commands at every stored frame [rad; grippers 0 closed, 1 open]; the robot begins at the first."""
 
 
 @dataclass(frozen=True)
@@ -50,32 +51,32 @@ class Motion:
     """What physics made of a world, at every stored frame."""
 
     joint_pos: np.ndarray
-    """[t 16] float32, measured, canonical layout [rad; grippers 0 to 1]."""
+    """[t 16] float32 measured positions, canonical layout [rad; grippers 0 closed, 1 open]."""
     joint_vel: np.ndarray
-    """[t 16] float32 [rad/s; 1/s]."""
+    """[t 16] float32 measured velocities [rad/s; grippers 1/s]."""
     object_pose: np.ndarray
-    """[t o 7] float32, world, quaternion x y z w."""
+    """[t o 7] float32 xyz [m] and quaternion xyzw, world."""
     object_joint: np.ndarray
-    """[t o] float32, hinge angles [rad], 0 without a hinge."""
+    """[t o] float32 hinge angles [rad], 0 without a hinge."""
     contact: np.ndarray
-    """[t 2 o] bool, fingers of the left, right arm on each object."""
+    """[t 2 o] bool, whether fingers of the left, right arm touch each object."""
     penetration: np.ndarray
-    """[t o] float32, how deep each object and anything else are in each other [m]."""
+    """[t o] float32 depth to which each object and anything else are in each other [m]."""
     table_overlap: float
-    """How deep an arm pressed into the table at any stored frame [m]."""
+    """Depth to which an arm pressed into the table at any stored frame [m]."""
     arm_overlap: float
-    """How deep the arms pressed into each other [m]."""
+    """Depth to which the arms pressed into each other at any stored frame [m]."""
     overflow: bool
-    """A contact or constraint buffer was too small, or a number was not finite: the motion must not be used."""
+    """Whether a contact or constraint buffer was too small, or a number not finite: then the motion must not be used."""
 
 
 def finger_strokes(robot: RobotSpec, side: int) -> np.ndarray:
-    """[2] how far each finger of an arm slides from gripper 0 to 1 [m]."""
+    """[2] float64 distance that each finger of an arm slides from gripper 0 to 1 [m]."""
     return np.abs(np.subtract(robot.arms[side].finger_open, robot.arms[side].finger_closed))
 
 
 def template_joints(robot: RobotSpec, action: np.ndarray) -> np.ndarray:
-    """Canonical [t 16] -> the template's robot joints [t 18]: seven arm joints and two fingers a side."""
+    """Canonical joints [t 16] rad, grippers 0 to 1 -> the template's [t 18]: seven arm joints [rad], two fingers [m] a side."""
     sides = [
         np.concatenate([action[:, arm], action[:, gripper, None] * finger_strokes(robot, side)], axis=-1)
         for side, (arm, gripper) in enumerate(ARMS)
@@ -84,7 +85,7 @@ def template_joints(robot: RobotSpec, action: np.ndarray) -> np.ndarray:
 
 
 def canonical_joints(robot: RobotSpec, joints: np.ndarray) -> np.ndarray:
-    """The template's robot joints [t 18], positions or velocities -> canonical [t 16] float32."""
+    """The template's robot joints [t 18] rad and m, or their velocities -> canonical [t 16] float32."""
     result = np.zeros((len(joints), 16), np.float32)
     for side, (arm, gripper) in enumerate(ARMS):
         start = side * JOINTS_PER_SIDE
@@ -96,9 +97,9 @@ def canonical_joints(robot: RobotSpec, joints: np.ndarray) -> np.ndarray:
 
 
 def control_targets(robot: RobotSpec, action: np.ndarray) -> np.ndarray:
-    """[t-1 15 36] actuator targets of every step: position and velocity of each robot joint in turn.
+    """[t-1 15 36] float64 actuator targets of every step: position [rad, m] and velocity [rad/s, m/s] of each robot joint.
 
-    Commands are linear between stored frames; their slope is fed forward as the velocity.
+    The commands [t 16] are linear between stored frames; their slope is fed forward as the velocity.
     """
     joints = template_joints(robot, action)
     share = (np.arange(STEPS_PER_FRAME) + 1) / STEPS_PER_FRAME
@@ -123,7 +124,7 @@ def build_solver(worlds: list[World], device: str, **options: object) -> newton.
 
 
 def initial_joints(world: World) -> np.ndarray:
-    """The template's joint coordinates [40] when a world begins."""
+    """[40] float64 the template's joint coordinates when a world begins [rad, m]."""
     qpos = np.zeros(HINGE_INDEX + 1)
     qpos[:ROBOT_DOFS] = template_joints(world.robot, world.action[:1])[0]
     poses = [thing.pose for thing in world.scene.objects if not thing.is_fixed]
@@ -138,11 +139,11 @@ def initial_joints(world: World) -> np.ndarray:
 
 
 LEFT_FINGERS, RIGHT_FINGERS, FIRST_OBJECT, TABLE, LEFT_ARM_LINKS, RIGHT_ARM_LINKS = 0, 1, 2, -1, -2, -3
-"""What a collision shape belongs to; object i of a scene is `FIRST_OBJECT` + i."""
+"""Owners of collision shapes; object i of a scene is `FIRST_OBJECT` + i."""
 
 
 def shape_owners(labels: list[str]) -> np.ndarray:
-    """[s] int32 owners of collision shapes, by the labels that the template gives them."""
+    """[g] int32 owners of collision shapes, by the labels that the template gives them."""
     return np.array([_owner(label.rsplit("/", 1)[-1]) for label in labels], np.int32)
 
 
@@ -168,7 +169,7 @@ def motion(
     """A `Motion` of the world's own joints and objects.
 
     Args:
-        qpos, qvel: [t 40], [t 37] the template's joint coordinates and velocities.
+        qpos, qvel: [t 40], [t 37] the template's joint coordinates [rad, m] and velocities.
         contact: [t 2 o] bool.
         penetration: [t o] m.
         overlap: [2] m, of an arm and the table, of the arms.

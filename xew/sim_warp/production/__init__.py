@@ -1,6 +1,7 @@
-"""Seeds to episodes in batches: scene, plan, joint commands, physics, pictures, files.
+"""Seeds to episodes in batches, in the order in which a seed goes through the files.
 
-A cell that fails carries its reason; what is written is complete or absent.
+`produce` takes jobs; `cells` plans (with `expert`) and simulates them, `outcome` says why one does not count, `episodes`
+renders and writes them, and `rerender` makes what is on disk again. What is written is complete or absent.
 """
 
-__all__ = ["expert", "produce"]
+__all__ = ["cells", "episodes", "expert", "outcome", "produce", "rerender"]

@@ -1,4 +1,4 @@
-"""Stage 2b: a plan's tool path to joint commands, by inverse kinematics, for any robot.
+"""The expert: joint commands that follow a plan's tool path, by inverse kinematics, for any robot.
 
 Reads  ToolPath, RobotSpec
 Writes `Commands`: canonical joint targets at every stored frame, or the finding that this robot cannot follow
@@ -16,7 +16,7 @@ from xew.sim_warp.robots import RobotSpec
 POSITION_TOLERANCE = 0.003
 """Largest distance between commanded and planned tool [m]."""
 ROTATION_TOLERANCE = 0.03
-"""Largest angle between them [rad]."""
+"""Largest angle between commanded and planned tool [rad]."""
 
 
 @dataclass(frozen=True)
@@ -24,27 +24,27 @@ class Commands:
     """What a robot is told to do."""
 
     action: np.ndarray
-    """[t 16] float32, canonical."""
+    """[t 16] float32 canonical joint targets [rad] and grippers [0 closed, 1 open] at every stored frame."""
     problem: str | None
     """Why this robot cannot follow the plan, in words; None if it can."""
 
 
 def joint_commands(robot: RobotSpec, paths: list[ToolPath]) -> list[Commands]:
-    """Joint commands of one robot for many plans, solved together: each frame near the one before it, from home on."""
+    """Joint commands [t 16] of one robot for many plans, solved together: each frame near the one before it, from home on."""
     longest = max(path.frame_count for path in paths)
-    targets = np.stack([_lengthened(path.pose, longest) for path in paths], 1).reshape(longest, -1, 7)
+    targets = np.stack([_extend_path(path.pose, longest) for path in paths], 1).reshape(longest, -1, 7)
     arms = np.tile([LEFT, RIGHT], len(paths))
     solution = arm_solver(robot).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
     commands = []
     for index, path in enumerate(paths):
         columns, frames = slice(2 * index, 2 * index + 2), slice(path.frame_count)
         action = _action(solution.joint_pos[frames, columns], path.gripper)
-        problem = _out_of_reach(solution.position_error[frames, columns], solution.rotation_error[frames, columns])
-        commands.append(Commands(action.astype(np.float32), problem or _too_fast(robot, action)))
+        problem = _find_unreached(solution.position_error[frames, columns], solution.rotation_error[frames, columns])
+        commands.append(Commands(action.astype(np.float32), problem or _find_too_fast(robot, action)))
     return commands
 
 
-def _lengthened(pose: np.ndarray, frames: int) -> np.ndarray:
+def _extend_path(pose: np.ndarray, frames: int) -> np.ndarray:
     """A path [t 2 7] that stands at its last pose until it has `frames` frames."""
     return np.concatenate([pose, np.repeat(pose[-1:], frames - len(pose), 0)])
 
@@ -58,7 +58,7 @@ def _action(joint_pos: np.ndarray, gripper: np.ndarray) -> np.ndarray:
     return action
 
 
-def _out_of_reach(position: np.ndarray, rotation: np.ndarray) -> str | None:
+def _find_unreached(position: np.ndarray, rotation: np.ndarray) -> str | None:
     """Words for tool errors [t 2] m and rad beyond the tolerance."""
     for arm, side in enumerate(("left", "right")):
         far, turned = position[:, arm].max(), rotation[:, arm].max()
@@ -67,7 +67,8 @@ def _out_of_reach(position: np.ndarray, rotation: np.ndarray) -> str | None:
     return None
 
 
-def _too_fast(robot: RobotSpec, action: np.ndarray) -> str | None:
+def _find_too_fast(robot: RobotSpec, action: np.ndarray) -> str | None:
+    """Words for commands [t 16] that turn a joint faster than its limit."""
     speed = np.abs(np.diff(action, axis=0)) * FRAME_RATE
     limit = np.array(robot.joint_velocity)
     for side, (joints, _) in zip(("left", "right"), ARMS, strict=True):

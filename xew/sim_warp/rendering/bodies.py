@@ -18,7 +18,7 @@ SIDES = ("left", "right")
 def robot_bodies(spec: RobotSpec) -> list[Body]:
     """The robot's visible links, as many and in the order of `robot_pose`. The meshes are shared between calls."""
     links = load_urdf(spec.urdf).links
-    meshes = [links[name].visual for _, name in _shown_links(spec)]
+    meshes = [links[name].visual for _, name in _visible_links(spec)]
     return [Body(mesh, is_robot=True) for mesh in meshes if mesh is not None]
 
 
@@ -32,7 +32,7 @@ def robot_pose(spec: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
         [t b 7] float32, xyz [m] and quaternion xyzw.
     """
     poses = link_poses(spec, joint_pos)
-    return np.stack([poses[copy][link] for copy, link in _shown_links(spec)], 1).astype(np.float32)
+    return np.stack([poses[copy][link] for copy, link in _visible_links(spec)], 1).astype(np.float32)
 
 
 def keypoint_links(spec: RobotSpec) -> list[tuple[int, str, str]]:
@@ -52,11 +52,11 @@ def keypoint_links(spec: RobotSpec) -> list[tuple[int, str, str]]:
 
 def body_names(spec: RobotSpec) -> list[tuple[int, str]]:
     """(copy of the URDF, link) of each body of `robot_bodies`."""
-    return list(_shown_links(spec))
+    return list(_visible_links(spec))
 
 
 @lru_cache(maxsize=32)
-def _shown_links(spec: RobotSpec) -> tuple[tuple[int, str], ...]:
+def _visible_links(spec: RobotSpec) -> tuple[tuple[int, str], ...]:
     urdf = load_urdf(spec.urdf)
     copies = 1 if spec.one_urdf_holds_both_arms else 2
     return tuple((copy, name) for copy in range(copies) for name, link in urdf.links.items() if link.visual is not None)

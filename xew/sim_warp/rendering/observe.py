@@ -1,4 +1,4 @@
-"""Stage 4a: recorded states to what the head camera sees. Everything here is a view of states.
+"""What the head camera sees of recorded states: a pure function of them.
 
 Reads  `Recording`s: a robot, its measured joints, and things with their measured poses
 Writes `Observation`s: RGB, robot mask, keypoints and their visibility, as `xew.episode.States` keeps them
@@ -20,7 +20,7 @@ from xew.sim_warp.rendering.render import Body, Frames, Renderer, World
 from xew.sim_warp.scene import Hinge, Scene
 
 VISIBILITY_MARGIN = 0.02
-"""How far in front of a link's origin something else may be before it hides the link [m]."""
+"""Distance in front of a link's origin beyond which something else hides the link [m]."""
 
 
 @dataclass(frozen=True)
@@ -29,23 +29,23 @@ class Recording:
 
     robot: RobotSpec
     joint_pos: np.ndarray
-    """[t 16] measured canonical joint positions [rad] and grippers."""
+    """[t 16] measured canonical joint positions [rad] and grippers [0 closed, 1 open]."""
     things: Sequence[Body] = ()
     """All bodies that are not the robot; keep the `Mesh` objects of equal things, they are stored once."""
     thing_pose: np.ndarray | None = None
-    """[t o 7] their measured poses, world frame; None if there are none."""
+    """[t o 7] their measured poses, xyz [m] and quaternion xyzw, world; None if there are none."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What the camera sees of one episode; the fields are those of `xew.episode.States`."""
+    """What the camera sees of one episode, as `xew.episode.States` names it."""
 
     rgb: np.ndarray
-    """[t h w 3] uint8."""
+    """[t h w 3] uint8, sRGB."""
     robot_mask: np.ndarray
     """[t h w] bool."""
     keypoints: np.ndarray
-    """[t k 2] float32 [pixels]."""
+    """[t k 2] float32 x right, y down [pixels]."""
     keypoint_visible: np.ndarray
     """[t k] bool."""
 
@@ -58,15 +58,29 @@ def observe(renderer: Renderer, recordings: Sequence[Recording], camera: Camera 
     return [_observation(*seen, camera) for seen in zip(recordings, points, frames, strict=True)]
 
 
+def scene_recording(
+    robot: RobotSpec, scene: Scene, joint_pos: np.ndarray, object_pose: np.ndarray, object_joint: np.ndarray
+) -> Recording:
+    """What the camera looks at, from recorded states.
+
+    Args:
+        joint_pos: [t 16] canonical joint positions [rad] and grippers [0 closed, 1 open].
+        object_pose: [t o 7] xyz [m] and quaternion xyzw, world.
+        object_joint: [t o] hinge angles [rad].
+    """
+    things, thing_pose = scene_things(scene, object_pose, object_joint)
+    return Recording(robot, joint_pos, things, thing_pose)
+
+
 def scene_things(scene: Scene, object_pose: np.ndarray, object_joint: np.ndarray) -> tuple[list[Body], np.ndarray]:
     """The objects of a scene as bodies with poses, lids as bodies of their own.
 
     Args:
-        object_pose: [t o 7] recorded poses of the objects, world frame.
+        object_pose: [t o 7] recorded poses of the objects, xyz [m] and quaternion xyzw, world.
         object_joint: [t o] recorded hinge angles [rad].
 
     Returns:
-        The bodies, and their poses [t b 7].
+        The bodies, and their poses [t b 7], world.
     """
     bodies = [Body(thing.shape.mesh, is_robot=False) for thing in scene.objects]
     poses = [object_pose]
@@ -93,7 +107,7 @@ def keypoint_names(robot: RobotSpec) -> tuple[str, ...]:
 
 
 def keypoint_positions(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
-    """Origins [t k 3] of the moving links at canonical joint positions [t 16], world frame [m]."""
+    """[t k 3] float64 origins of the moving links [m], world, at canonical joint positions [t 16] rad."""
     poses = link_poses(robot, joint_pos)
     return np.stack([poses[copy][link][:, :3] for copy, link, _ in keypoint_links(robot)], 1)
 
@@ -105,7 +119,7 @@ def keypoint_visibility(robot: RobotSpec, points: np.ndarray, frames: Frames, ca
     one that a joint joins to it, or where what the pixel shows is no more than `VISIBILITY_MARGIN` in front of it.
 
     Args:
-        points: [t k 3] keypoints in the world, as given to the renderer with the frames.
+        points: [t k 3] keypoints [m], world, as given to the renderer with the frames.
     """
     _, depth = project(camera, points)
     shown = frames.point_body
@@ -117,7 +131,7 @@ def keypoint_visibility(robot: RobotSpec, points: np.ndarray, frames: Frames, ca
 
 
 def _own_table(robot: RobotSpec) -> np.ndarray:
-    """[k b+1] bool: is a body the link of a keypoint, or next to it? The last column, body -1, is False."""
+    """[k b+1] bool, whether a body is the link of a keypoint or next to it; the last column, body -1, is False."""
     urdf = load_urdf(robot.urdf)
     bodies = body_names(robot)
     table = np.zeros((len(keypoint_links(robot)), len(bodies) + 1), bool)

@@ -36,15 +36,17 @@ class World:
 
 @dataclass(frozen=True)
 class FrameTable:
-    """All frames of all worlds in order: where their geometry and poses are. Host arrays, one entry a frame."""
+    """All frames of all worlds in order: where their geometry and poses are."""
 
     world: np.ndarray
-    """Index into the packed geometry's distinct worlds."""
+    """[t] int32 index of each frame's world among the packed geometry's distinct worlds."""
     pose: np.ndarray
+    """[t] int32 index of the frame's first body in the packed poses."""
     next_pose: np.ndarray
-    """Row of the first body in the packed poses, at this frame and at the next (the last frame's next is itself)."""
+    """[t] int32 the same of the world's next frame; the last frame's next is itself."""
 
-    def rows(self, chunk: slice) -> "FrameTable":
+    def select(self, chunk: slice) -> "FrameTable":
+        """Some of the frames."""
         return FrameTable(self.world[chunk], self.pose[chunk], self.next_pose[chunk])
 
 
@@ -54,11 +56,13 @@ class PackedGeometry:
 
     arrays: kernels.Geometry
     vertex_counts: np.ndarray
+    """[w] int64 vertices of each distinct world."""
     triangle_counts: np.ndarray
+    """[w] int64 triangles of each distinct world."""
 
 
 def check_world(world: World) -> None:
-    """Raise ValueError where poses do not fit the bodies."""
+    """Raise ValueError where poses or points do not fit the bodies and frames, or are not finite."""
     shape = np.shape(world.pose)
     if len(shape) != 3 or shape[1:] != (len(world.bodies), 7):
         raise ValueError(f"pose has shape {shape}, expected (frames, {len(world.bodies)}, 7): one pose for each of the bodies.")
@@ -94,12 +98,12 @@ def pack_geometry(kinds: Sequence[Sequence[Body]], device: wp.Device) -> PackedG
     local_body = [index for bodies in kinds for index in range(len(bodies))]
     vertices = [len(mesh.vertices) for mesh in meshes]
     triangles = [len(mesh.triangles) for mesh in meshes]
-    packed.vertex = wp.array(_joined([m.vertices for m in meshes], (3,), np.float32), dtype=wp.vec3, device=device)
+    packed.vertex = wp.array(_concatenate([m.vertices for m in meshes], (3,), np.float32), dtype=wp.vec3, device=device)
     packed.vertex_body = wp.array(np.repeat(local_body, vertices).astype(np.int32), dtype=int, device=device)
     packed.triangle = wp.array(_local_triangles(kinds), dtype=wp.vec3i, device=device)
     packed.triangle_body = wp.array(np.repeat(local_body, triangles).astype(np.int32), dtype=int, device=device)
-    packed.normal = wp.array(_joined([m.normals for m in meshes], (3, 3), np.float32), dtype=wp.vec3, device=device)
-    albedo = linear_from_srgb(_joined([m.colors for m in meshes], (3,), np.uint8)).astype(np.float32)
+    packed.normal = wp.array(_concatenate([m.normals for m in meshes], (3, 3), np.float32), dtype=wp.vec3, device=device)
+    albedo = linear_from_srgb(_concatenate([m.colors for m in meshes], (3,), np.uint8)).astype(np.float32)
     packed.albedo = wp.array(albedo, dtype=wp.vec3, device=device)
     is_robot = np.array([body.is_robot for bodies in kinds for body in bodies], np.int32)
     packed.body_is_robot = wp.array(is_robot, dtype=int, device=device)
@@ -120,10 +124,10 @@ def _local_triangles(kinds: Sequence[Sequence[Body]]) -> np.ndarray:
         for body in bodies:
             shifted.append(body.mesh.triangles + offset)
             offset += len(body.mesh.vertices)
-    return _joined(shifted, (3,), np.int32)
+    return _concatenate(shifted, (3,), np.int32)
 
 
-def _joined(arrays: list[np.ndarray], tail: tuple[int, ...], dtype: type) -> np.ndarray:
+def _concatenate(arrays: list[np.ndarray], tail: tuple[int, ...], dtype: type) -> np.ndarray:
     return np.concatenate([np.zeros((0, *tail), dtype), *arrays]).astype(dtype)
 
 
@@ -134,7 +138,11 @@ def _ranges(counts: np.ndarray) -> np.ndarray:
 
 
 def pack_frames(worlds: Sequence[World], kind: Sequence[int]) -> tuple[FrameTable, np.ndarray]:
-    """The table of all frames, and all poses [p 7] float32 that its rows point into."""
+    """The table of all frames, and all poses [p 7] float32 xyz [m] and quaternion xyzw, world, that it points into.
+
+    Args:
+        kind: for each world, its index among the distinct worlds.
+    """
     columns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     first = 0
     for world, index in zip(worlds, kind, strict=True):
@@ -143,17 +151,17 @@ def pack_frames(worlds: Sequence[World], kind: Sequence[int]) -> tuple[FrameTabl
         after = np.minimum(frame + 1, count - 1)
         columns.append((np.full(count, index), first + frame * bodies, first + after * bodies))
         first += count * bodies
-    poses = _joined([np.reshape(world.pose, (-1, 7)) for world in worlds], (7,), np.float32)
+    poses = _concatenate([np.reshape(world.pose, (-1, 7)) for world in worlds], (7,), np.float32)
     return FrameTable(*(np.concatenate(column).astype(np.int32) for column in zip(*columns, strict=True))), poses
 
 
 def pack_points(worlds: Sequence[World]) -> np.ndarray:
-    """[t k 3] float64 of all frames; worlds with fewer points are filled up with NaN."""
+    """[t k 3] float64 points of all frames [m], world frame; worlds with fewer points are filled up with NaN."""
     most = max((world.points.shape[1] for world in worlds if world.points is not None), default=0)
-    rows = []
+    padded_worlds = []
     for world in worlds:
         padded = np.full((len(world.pose), most, 3), np.nan)
         if world.points is not None:
             padded[:, : world.points.shape[1]] = world.points
-        rows.append(padded)
-    return np.concatenate(rows)
+        padded_worlds.append(padded)
+    return np.concatenate(padded_worlds)

@@ -1,11 +1,11 @@
-"""Stage 4: posed bodies to images, for observe.py (what the camera sees) and streams.py (what commands tell).
+"""The renderer: posed bodies to images, for observe.py (what the camera sees) and streams.py (what commands say).
 
 Reads  `World`s: meshes and their poses; a camera; the stage
 Writes `Frames`: RGB, robot mask, depth, bodies, optical flow
 
-Two kinds of frame are made. With the stage (table, wall, ground, shadows) it is what the head camera sees of an
-episode. Without it, it is the bodies alone on white. The kernels (raster_kernels.py, then shading_kernels.py) are the
-same on CPU and GPU, and a frame's bytes do not depend on what else is rendered with it.
+It makes two kinds of frame: with the stage (table, wall, ground, shadows) what the head camera sees of an episode, without
+it the bodies alone on white. The kernels (raster_kernels.py, then shading_kernels.py) are the same on CPU and GPU, and a
+frame's bytes do not depend on what else is rendered with it.
 """
 
 from collections.abc import Sequence
@@ -39,11 +39,11 @@ FLOW_LIMIT = 25.0
 SHADOW_SIZE = 512
 """Side of a shadow map [texels], about 3.5 mm each on the table: less than two pixels of the head camera."""
 FRAMES_PER_CHUNK = {"cpu": 4, "cuda": 512}
-"""Frames in flight; one takes about 6 MB."""
+"""Number of frames that are on the device at once; one takes about 6 MB."""
 STRIPES = {"cpu": 1, "cuda": 8}
-"""Threads that share a triangle's rows, so that one large triangle does not hold up a GPU."""
+"""Number of threads that share a triangle's rows, so that one large triangle does not hold up a GPU."""
 STAGES_KEPT = 16
-"""Cameras whose lit stage is kept, about 10 MB each."""
+"""Number of cameras whose lit stage is kept, about 10 MB each."""
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -58,18 +58,18 @@ class Frames:
     rgb: np.ndarray
     """[t h w 3] uint8, sRGB, anti-aliased."""
     robot_mask: np.ndarray
-    """[t h w] bool, the first thing that the ray through the pixel's center meets is the robot."""
+    """[t h w] bool, whether the first thing that the ray through the pixel's center meets is the robot."""
     depth: np.ndarray = field(default_factory=_nothing)
-    """[t h w] float32, along the optical axis at the pixel's center [m], 0 where nothing is."""
+    """[t h w] float32 depth along the optical axis at the pixel's center [m], 0 where nothing is."""
     body: np.ndarray = field(default_factory=_nothing)
-    """[t h w] int16, index of the body at the pixel's center, -1 where there is none."""
+    """[t h w] int16 index of the body at the pixel's center, -1 where there is none."""
     optical_flow: np.ndarray = field(default_factory=_nothing)
-    """[t h w 2] float32, motion (x right, y down) [pixels] from this frame to the next of the robot's surface point
+    """[t h w 2] float32 motion (x right, y down) [pixels] from this frame to the next of the robot's surface point
     under the pixel's center, no longer than `FLOW_LIMIT`; zero off the robot and in the last frame."""
     point_body: np.ndarray = field(default_factory=_nothing)
-    """[t k] int32, index of the body seen in the pixel of each of the world's points, -1 none, -2 outside the image."""
+    """[t k] int32 index of the body seen in the pixel of each of the world's points, -1 none, -2 outside the image."""
     point_depth: np.ndarray = field(default_factory=_nothing)
-    """[t k] float32, depth of what is seen there [m], 0 where nothing is."""
+    """[t k] float32 depth of what is seen there [m], 0 where nothing is."""
 
 
 class Renderer:
@@ -91,7 +91,7 @@ class Renderer:
         ramp = stage.srgb_from_linear(np.linspace(0, 1, shading.COLORS))
         self._srgb = wp.array(ramp, dtype=wp.uint8, device=self.device)
         self._pinned = wp.empty(0, dtype=wp.uint8, device="cpu")
-        self._stages: dict[tuple[bytes, int, int], shading.Stage] = {}
+        self._stages: dict[tuple[bytes, int, int], shading.LitStage] = {}
 
     def render(
         self,
@@ -105,7 +105,12 @@ class Renderer:
         body: bool = False,
         optical_flow: bool = False,
     ) -> Frames:
-        """Render one world: a batch of one, see `render_batch`. pose [t b 7], points [t k 3], world frame."""
+        """Render one world, a batch of one; arguments as of `World` and `render_batch`.
+
+        Args:
+            pose: [t b 7] xyz [m] and quaternion xyzw of each body, world.
+            points: [t k 3] points to look up [m], world.
+        """
         worlds = [World(bodies, pose, points)]
         return self.render_batch(worlds, camera, ground, depth=depth, body=body, optical_flow=optical_flow)[0]
 
@@ -132,10 +137,10 @@ class Renderer:
             check_world(world)
         if not worlds:
             return []
-        wishes = {"depth": depth, "body": body, "optical_flow": optical_flow}
-        wanted = frozenset(name for name, wish in wishes.items() if wish)
+        optional = {"depth": depth, "body": body, "optical_flow": optical_flow}
+        wanted = frozenset(name for name, asked_for in optional.items() if asked_for)
         with PARSING:  # threads take turns at the device, whose buffers and modules are shared; the latter are parsed
-            return _split(self._render_worlds(worlds, camera, ground, wanted), worlds)
+            return _split_by_world(self._render_worlds(worlds, camera, ground, wanted), worlds)
 
     def _render_worlds(
         self, worlds: Sequence[World], camera: Camera, ground: bool, wanted: frozenset[str]
@@ -143,7 +148,7 @@ class Renderer:
         """Images of all frames of all worlds on the host, by the names of `Frames`."""
         kinds, kind = distinct_worlds(worlds)
         table, pose = pack_frames(worlds, kind)
-        job = _Job(
+        call = _Call(
             geometry=pack_geometry(kinds, self.device),
             pose=wp.array(pose, dtype=wp.transform, device=self.device),
             camera=camera,
@@ -156,7 +161,7 @@ class Renderer:
         chunks = [slice(i, i + self._frames_per_chunk) for i in range(0, len(table.world), self._frames_per_chunk)]
         host: dict[str, np.ndarray] = {}
         for chunk in chunks:
-            for name, image in self._render_chunk(job, table.rows(chunk), pixel[chunk]).items():
+            for name, image in self._render_chunk(call, table.select(chunk), pixel[chunk]).items():
                 self._fetch(image, host, name, chunk, len(table.world))
         return host
 
@@ -178,84 +183,87 @@ class Renderer:
             host[name] = np.empty((count, *values.shape[1:]), values.dtype)
         host[name][chunk] = values
 
-    def _render_chunk(self, job: "_Job", rows: FrameTable, pixel: np.ndarray) -> dict[str, wp.array]:
+    def _render_chunk(self, call: "_Call", frames: FrameTable, pixel: np.ndarray) -> dict[str, wp.array]:
         """Images of some frames on the device, by the names of `Frames`."""
-        chunk = _Chunk(self.device, job.geometry, rows)
-        drawn = self._draw(job, chunk)
-        images = {"rgb": self._shade(job, chunk, drawn)} | self._measure(job, chunk, drawn)
+        chunk = _Chunk(self.device, call.geometry, frames)
+        drawn = self._draw(call, chunk)
+        images = {"rgb": self._shade(call, chunk, drawn)} | self._measure(call, chunk, drawn)
         if pixel.shape[1]:
-            images |= self._probe(job, chunk, drawn, pixel)
+            images |= self._probe(call, chunk, drawn, pixel)
         return images
 
-    def _draw(self, job: "_Job", chunk: "_Chunk") -> "_Drawn":
+    def _draw(self, call: "_Call", chunk: "_Chunk") -> "_Drawn":
         """Visibility of a chunk's frames and, if there are shadows, their shadow maps."""
-        count, lights = chunk.count, job.shadows
+        count, lights = chunk.count, call.shadows
         drawn = _Drawn(
             vertex=self._zeros((count, chunk.vertex_count), wp.vec3),
             shadow_vertex=self._zeros((count, lights, chunk.vertex_count), wp.vec3),
-            key=self._zeros((count, raster.SAMPLES, job.camera.height, job.camera.width), wp.uint64),
+            key=self._zeros((count, raster.SAMPLES, call.camera.height, call.camera.width), wp.uint64),
             shadow_map=self._zeros((count, lights, SHADOW_SIZE, SHADOW_SIZE), wp.uint32),
             shadow_tile=self._zeros((count, lights, SHADOW_SIZE // raster.TILE, SHADOW_SIZE // raster.TILE), wp.uint32),
         )
         self._launch(
             raster.place_vertices,
             (count, chunk.vertex_count),
-            [job.geometry.arrays, chunk.world, chunk.pose, job.pose, job.view, self._lights],
+            [call.geometry.arrays, chunk.world, chunk.pose, call.pose, call.view, self._lights],
             [drawn.vertex, drawn.shadow_vertex],
         )
         self._launch(
             raster.draw_triangles,
             (count, chunk.triangle_count, self._stripes),
-            [job.geometry.arrays, chunk.world, job.view, drawn.vertex, self._stripes],
+            [call.geometry.arrays, chunk.world, call.view, drawn.vertex, self._stripes],
             [drawn.key],
         )
         self._launch(
             raster.draw_shadows,
             (count, lights, chunk.triangle_count),
-            [job.geometry.arrays, chunk.world, drawn.shadow_vertex],
+            [call.geometry.arrays, chunk.world, drawn.shadow_vertex],
             [drawn.shadow_map, drawn.shadow_tile],
         )
         return drawn
 
-    def _shade(self, job: "_Job", chunk: "_Chunk", drawn: "_Drawn") -> wp.array:
-        height, width = job.camera.height, job.camera.width
-        posed = [job.geometry.arrays, chunk.world, chunk.pose, job.pose, job.view]
+    def _shade(self, call: "_Call", chunk: "_Chunk", drawn: "_Drawn") -> wp.array:
+        """Colors of a chunk's frames."""
+        height, width = call.camera.height, call.camera.width
+        posed = [call.geometry.arrays, chunk.world, chunk.pose, call.pose, call.view]
         seen = [drawn.vertex, drawn.key, drawn.shadow_map, drawn.shadow_tile]
         rgb = self._empty((chunk.count, height, width, 3), wp.uint8)
         self._launch(
             shading.shade_pixels,
             (chunk.count, height, width),
-            [*posed, self._lights, self._shading, job.stage, self._srgb, *seen],
+            [*posed, self._lights, self._shading, call.stage, self._srgb, *seen],
             [rgb],
         )
         return rgb
 
-    def _measure(self, job: "_Job", chunk: "_Chunk", drawn: "_Drawn") -> dict[str, wp.array]:
-        shape = (chunk.count, job.camera.height, job.camera.width)
-        posed = [job.geometry.arrays, chunk.world, chunk.pose, chunk.next_pose, job.pose, job.view]
+    def _measure(self, call: "_Call", chunk: "_Chunk", drawn: "_Drawn") -> dict[str, wp.array]:
+        """Mask, bodies, depth and optical flow of a chunk's frames, as far as wanted."""
+        shape = (chunk.count, call.camera.height, call.camera.width)
+        posed = [call.geometry.arrays, chunk.world, chunk.pose, chunk.next_pose, call.pose, call.view]
         images = {"robot_mask": self._empty(shape, wp.bool)}
         for name, dtype in (("body", wp.int16), ("depth", wp.float32), ("optical_flow", wp.vec2)):
-            images[name] = self._empty(shape if name in job.wanted else (0, 0, 0), dtype)
+            images[name] = self._empty(shape if name in call.wanted else (0, 0, 0), dtype)
         self._launch(
             shading.measure_pixels,
             shape,
-            [*posed, job.stage, FLOW_LIMIT, drawn.key],
+            [*posed, call.stage, FLOW_LIMIT, drawn.key],
             list(images.values()),
         )
         return {name: image for name, image in images.items() if image.size}
 
-    def _probe(self, job: "_Job", chunk: "_Chunk", drawn: "_Drawn", pixel: np.ndarray) -> dict[str, wp.array]:
+    def _probe(self, call: "_Call", chunk: "_Chunk", drawn: "_Drawn", pixel: np.ndarray) -> dict[str, wp.array]:
+        """What is seen at pixels [t k 2] x y of a chunk's frames."""
         shape = pixel.shape[:2]
         images = {"point_body": self._empty(shape, int), "point_depth": self._empty(shape, float)}
         self._launch(
             shading.probe_pixels,
             shape,
-            [job.geometry.arrays, chunk.world, job.stage, wp.array(pixel, dtype=wp.vec2i, device=self.device), drawn.key],
+            [call.geometry.arrays, chunk.world, call.stage, wp.array(pixel, dtype=wp.vec2i, device=self.device), drawn.key],
             list(images.values()),
         )
         return images
 
-    def _stage(self, camera: Camera, ground: bool) -> shading.Stage:
+    def _stage(self, camera: Camera, ground: bool) -> shading.LitStage:
         """What never moves as this camera sees it; drawn and lit at first use. Nothing looks the same from anywhere."""
         view = camera.intrinsics.tobytes() + camera.extrinsics.tobytes() if ground else b""
         key = (view, camera.width, camera.height)
@@ -265,20 +273,20 @@ class Renderer:
             self._stages[key] = self._lit_stage(camera, ground)
         return self._stages[key]
 
-    def _lit_stage(self, camera: Camera, ground: bool) -> shading.Stage:
+    def _lit_stage(self, camera: Camera, ground: bool) -> shading.LitStage:
         bodies = [Body(stage.stage_mesh(), False)] if ground else []
-        rows, pose = pack_frames([World(bodies, np.tile(IDENTITY, (1, len(bodies), 1)))], [0])
-        job = _Job(
+        table, pose = pack_frames([World(bodies, np.tile(IDENTITY, (1, len(bodies), 1)))], [0])
+        call = _Call(
             geometry=pack_geometry([bodies], self.device),
             pose=wp.array(pose, dtype=wp.transform, device=self.device),
             camera=camera,
             view=_camera_view(camera),
-            stage=shading.Stage(),
+            stage=shading.LitStage(),
         )
-        chunk = _Chunk(self.device, job.geometry, rows)
-        drawn = self._draw(job, chunk)
+        chunk = _Chunk(self.device, call.geometry, table)
+        drawn = self._draw(call, chunk)
         height, width, lights = camera.height, camera.width, len(stage.LIGHTS) if ground else 0
-        lit = shading.Stage()
+        lit = shading.LitStage()
         lit.key = drawn.key[0]
         lit.ambient = self._zeros((height, width), wp.vec3)
         lit.direct = self._zeros((lights, height, width), wp.vec3)
@@ -286,7 +294,7 @@ class Renderer:
         self._launch(
             shading.light_stage,
             (height, width),
-            [job.geometry.arrays, job.view, self._lights, self._shading, drawn.vertex, drawn.key, wp.vec3(*stage.SKY)],
+            [call.geometry.arrays, call.view, self._lights, self._shading, drawn.vertex, drawn.key, wp.vec3(*stage.SKY)],
             [lit.ambient, lit.direct, lit.shadow_texel],
         )
         return lit
@@ -302,33 +310,33 @@ class Renderer:
 
 
 @dataclass(frozen=True)
-class _Job:
-    """What is the same for all frames of a call."""
+class _Call:
+    """What is the same for all frames of a call of the renderer."""
 
     geometry: PackedGeometry
     pose: wp.array
     camera: Camera
     view: raster.View
-    stage: shading.Stage
+    stage: shading.LitStage
     shadows: int = 0
     wanted: frozenset[str] = frozenset()
 
 
 class _Chunk:
-    """The frames in flight, as device arrays."""
+    """The frames that are on the device at once."""
 
-    def __init__(self, device: wp.Device, geometry: PackedGeometry, rows: FrameTable) -> None:
-        self.count = len(rows.world)
-        self.vertex_count = int(geometry.vertex_counts[rows.world].max())
-        self.triangle_count = int(geometry.triangle_counts[rows.world].max())
+    def __init__(self, device: wp.Device, geometry: PackedGeometry, frames: FrameTable) -> None:
+        self.count = len(frames.world)
+        self.vertex_count = int(geometry.vertex_counts[frames.world].max())
+        self.triangle_count = int(geometry.triangle_counts[frames.world].max())
         self.world, self.pose, self.next_pose = (
-            wp.array(column, dtype=int, device=device) for column in (rows.world, rows.pose, rows.next_pose)
+            wp.array(column, dtype=int, device=device) for column in (frames.world, frames.pose, frames.next_pose)
         )
 
 
 @dataclass(frozen=True)
 class _Drawn:
-    """What `_draw` leaves for the passes after it; layouts in raster_kernels.py."""
+    """What `_draw` leaves for the kernels after it, as they describe it in raster_kernels.py."""
 
     vertex: wp.array
     shadow_vertex: wp.array
@@ -337,8 +345,8 @@ class _Drawn:
     shadow_tile: wp.array
 
 
-def _split(images: dict[str, np.ndarray], worlds: Sequence[World]) -> list[Frames]:
-    """Images of all frames -> frames by world."""
+def _split_by_world(images: dict[str, np.ndarray], worlds: Sequence[World]) -> list[Frames]:
+    """Images of all frames [t ...] -> frames by world."""
     ends = np.cumsum([len(world.pose) for world in worlds])
     frames = []
     for world, end in zip(worlds, ends, strict=True):

@@ -1,7 +1,8 @@
-"""Warp kernels, second half: from what each sample shows (raster_kernels.py) to colors, masks, depth and optical flow.
+"""Warp kernels that make colors, masks, depth and optical flow of what each sample shows (raster_kernels.py).
 
 A pixel's color is made once per triangle that it shows, at the mean of that triangle's samples, in linear light. The
-light on what never moves is kept per camera and source; a frame only multiplies it with its shadows.
+light on what never moves is kept per camera and source; a frame only multiplies it with its shadows. Frames of reference
+and letters of shapes are those of raster_kernels.py; k counts points to look up in a frame.
 """
 
 # Warp does not know any().
@@ -23,22 +24,22 @@ from xew.sim_warp.rendering.raster_kernels import (
     Light,
     View,
     bits,
-    in_view,
-    on_screen,
+    to_screen,
+    to_view,
     vec5,
 )
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})  # why: see raster_kernels.py
 
 SHADOW_BIAS = wp.constant(0.0015)
-"""How far behind a surface a point is still lit [m]."""
+"""Distance behind a surface up to which a point is still lit [m]."""
 COLORS = wp.constant(8192)
-"""Entries of the table from linear light to sRGB."""
+"""Number of entries of the table from linear light to sRGB."""
 
 
 @wp.struct
 class Shading:
-    """How surfaces answer light; see stage.py."""
+    """The constants by which surfaces answer light; stage.py says what each is."""
 
     ambient: float
     sky_share: float
@@ -49,13 +50,13 @@ class Shading:
 
 
 @wp.struct
-class Stage:
-    """What never moves, seen by one camera: keys of its samples and, per pixel, its light without shadows."""
+class LitStage:
+    """The stage (what never moves) as one camera sees it: keys of its samples and, per pixel, its light without shadows."""
 
-    key: wp.array3d(dtype=wp.uint64)
-    ambient: wp.array2d(dtype=wp.vec3)
-    direct: wp.array3d(dtype=wp.vec3)
-    shadow_texel: wp.array3d(dtype=wp.vec3)
+    key: wp.array3d(dtype=wp.uint64)  # [s h w] uint64
+    ambient: wp.array2d(dtype=wp.vec3)  # [h w 3] float32 linear RGB
+    direct: wp.array3d(dtype=wp.vec3)  # [l h w 3] float32 linear RGB, by light
+    shadow_texel: wp.array3d(dtype=wp.vec3)  # [l h w 3] float32 x y [texels] and nearness of the pixel's center
 
 
 # ---- shadows
@@ -75,8 +76,8 @@ def lit_share(
     reach: float,
     frame: int,
     light: int,
-    map_in: wp.array4d(dtype=wp.uint32),
-    tile_in: wp.array4d(dtype=wp.uint32),
+    map_in: wp.array4d(dtype=wp.uint32),  # [n l m m] uint32 bits of nearness
+    tile_in: wp.array4d(dtype=wp.uint32),  # [n l q q] uint32 bits of nearness
 ) -> float:
     """Share of the light that arrives: nine texels round the point, each with bilinear weights (16 comparisons)."""
     size = float(map_in.shape[2])
@@ -106,10 +107,10 @@ def lit_share(
 class Surface:
     """A point of a triangle that a pixel sees."""
 
-    point: wp.vec3
-    normal: wp.vec3
-    to_eye: wp.vec3
-    albedo: wp.vec3
+    point: wp.vec3  # m, world
+    normal: wp.vec3  # unit vector, world
+    to_eye: wp.vec3  # unit vector, world
+    albedo: wp.vec3  # linear RGB
 
 
 @wp.func
@@ -124,6 +125,7 @@ def corner_weights(a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3) -> wp.vec3:
 
 @wp.func
 def pixel_ray(camera: View, x: float, y: float) -> wp.vec3:
+    """The ray through a pixel, as its point at a depth of 1 m in the camera's frame."""
     return wp.vec3((x - camera.center[0]) / camera.focal[0], (y - camera.center[1]) / camera.focal[1], 1.0)
 
 
@@ -135,7 +137,7 @@ def surface_at(
     camera: View,
     seen: wp.vec3,
     frame: int,
-    vertex_in: wp.array2d(dtype=wp.vec3),
+    vertex_in: wp.array2d(dtype=wp.vec3),  # [n v 3] float32 m, camera's frame
 ) -> Surface:
     """The point `seen` (camera's frame) of a triangle: point and shading normal in the world, color."""
     corner = geometry.triangle[packed]
@@ -153,13 +155,14 @@ def surface_at(
 
 @wp.func
 def ambient_light(surface: Surface, shading: Shading) -> wp.vec3:
+    """Light from everywhere, less of it on what faces down: linear RGB."""
     strength = shading.ambient * (1.0 - shading.sky_share * 0.5 * (1.0 - surface.normal[2]))
     return surface.albedo * (strength * shading.exposure)
 
 
 @wp.func
 def direct_light(surface: Surface, light: Light, shading: Shading) -> wp.vec3:
-    """Lambert's diffuse and Blinn-Phong's highlight (to the power of 32) of one light, without shadow."""
+    """Lambert's diffuse light and Blinn-Phong's highlight (power 32) of one light, without shadow: linear RGB."""
     to_light = light.to_light
     intensity = light.intensity
     if light.view.parallel == 0:
@@ -180,8 +183,8 @@ def direct_light(surface: Surface, light: Light, shading: Shading) -> wp.vec3:
 
 
 @wp.func
-def toned(light: float, shading: Shading) -> float:
-    """Bright light bends towards a ceiling below white, so that a lit white robot keeps its shape on a white ground."""
+def compress_highlight(light: float, shading: Shading) -> float:
+    """Bend bright light towards a ceiling below white, so that a lit white robot keeps its shape on a white ground."""
     above = light - shading.knee
     if above <= 0.0:
         return light
@@ -190,12 +193,16 @@ def toned(light: float, shading: Shading) -> float:
 
 
 @wp.func
-def toned_color(light: wp.vec3, shading: Shading) -> wp.vec3:
-    return wp.vec3(toned(light[0], shading), toned(light[1], shading), toned(light[2], shading))
+def compress_highlights(light: wp.vec3, shading: Shading) -> wp.vec3:
+    """`compress_highlight` of each channel of linear RGB."""
+    return wp.vec3(
+        compress_highlight(light[0], shading), compress_highlight(light[1], shading), compress_highlight(light[2], shading)
+    )
 
 
 @wp.func
 def nearness_of(key: wp.uint64) -> float:
+    """1 / depth [1/m] of a key, 0 where nothing is seen."""
     return wp.cast(wp.uint32(key >> wp.uint64(32)), float)
 
 
@@ -217,18 +224,20 @@ def owner(key: wp.uint64, stage_key: wp.uint64) -> int:
 
 @wp.kernel
 def light_stage(
+    # In:
     geometry: Geometry,
     camera: View,
-    lights: wp.array(dtype=Light),
+    lights: wp.array(dtype=Light),  # [l] lights with the views of their shadow maps
     shading: Shading,
-    vertex_in: wp.array2d(dtype=wp.vec3),
-    key_in: wp.array4d(dtype=wp.uint64),
-    sky: wp.vec3,
-    ambient_out: wp.array2d(dtype=wp.vec3),
-    direct_out: wp.array3d(dtype=wp.vec3),
-    shadow_texel_out: wp.array3d(dtype=wp.vec3),
+    vertex_in: wp.array2d(dtype=wp.vec3),  # [1 v 3] float32 m, camera's frame
+    key_in: wp.array4d(dtype=wp.uint64),  # [1 s h w] uint64, see `draw_triangles`
+    sky: wp.vec3,  # linear RGB where nothing is
+    # Out:
+    ambient_out: wp.array2d(dtype=wp.vec3),  # [h w 3] float32 linear RGB
+    direct_out: wp.array3d(dtype=wp.vec3),  # [l h w 3] float32 linear RGB, without shadows
+    shadow_texel_out: wp.array3d(dtype=wp.vec3),  # [l h w 3] float32 x y [texels] and nearness on each shadow map
 ):
-    """Light on the stage, once per camera: by source, so that a frame only has to multiply with its shadows."""
+    """Light the stage, once per camera and by source, so that a frame only has to multiply with its shadows."""
     row, column = wp.tid()
     ambient = wp.vec3(0.0, 0.0, 0.0)
     for sample in range(SAMPLES):
@@ -244,7 +253,7 @@ def light_stage(
                 ambient += ambient_light(surface, shading) * 0.25
             for i in range(direct_out.shape[0]):
                 if sample == CENTER:
-                    shadow_texel_out[i, row, column] = on_screen(lights[i].view, in_view(lights[i].view, surface.point))
+                    shadow_texel_out[i, row, column] = to_screen(lights[i].view, to_view(lights[i].view, surface.point))
                 else:
                     direct_out[i, row, column] += direct_light(surface, lights[i], shading) * 0.25
     ambient_out[row, column] = ambient
@@ -254,21 +263,26 @@ def light_stage(
 
 
 @wp.func
-def encoded(light: float, srgb: wp.array(dtype=wp.uint8)) -> wp.uint8:
+def to_srgb(
+    light: float,
+    srgb: wp.array(dtype=wp.uint8),  # [8192] uint8 sRGB of evenly spaced linear light
+) -> wp.uint8:
+    """The sRGB value of linear light, clipped to 0 to 1."""
     return srgb[int(wp.clamp(light, 0.0, 1.0) * float(COLORS - 1) + 0.5)]
 
 
 @wp.func
 def stage_light(
-    stage: Stage,
-    lights: wp.array(dtype=Light),
+    stage: LitStage,
+    lights: wp.array(dtype=Light),  # [l]
     shading: Shading,
     frame: int,
     row: int,
     column: int,
-    map_in: wp.array4d(dtype=wp.uint32),
-    tile_in: wp.array4d(dtype=wp.uint32),
+    map_in: wp.array4d(dtype=wp.uint32),  # [n l m m] uint32 bits of nearness
+    tile_in: wp.array4d(dtype=wp.uint32),  # [n l q q] uint32 bits of nearness
 ) -> wp.vec3:
+    """Light of the stage in a pixel, with a frame's shadows: linear RGB."""
     total = stage.ambient[row, column]
     if stage.direct.shape[0] == 0:
         return total
@@ -278,32 +292,33 @@ def stage_light(
             texel = stage.shadow_texel[i, row, column]
             share = lit_share(texel, shadow_reach(texel, lights[i].view.parallel), frame, i, map_in, tile_in)
         total += stage.direct[i, row, column] * share
-    return toned_color(total, shading)
+    return compress_highlights(total, shading)
 
 
 @wp.func
 def surface_light(
     surface: Surface,
-    lights: wp.array(dtype=Light),
+    lights: wp.array(dtype=Light),  # [l]
     shading: Shading,
     frame: int,
-    map_in: wp.array4d(dtype=wp.uint32),
-    tile_in: wp.array4d(dtype=wp.uint32),
+    map_in: wp.array4d(dtype=wp.uint32),  # [n l m m] uint32 bits of nearness
+    tile_in: wp.array4d(dtype=wp.uint32),  # [n l q q] uint32 bits of nearness
 ) -> wp.vec3:
+    """Light of a surface, with a frame's shadows: linear RGB."""
     total = ambient_light(surface, shading)
     for i in range(lights.shape[0]):
         light = lights[i]
         arriving = direct_light(surface, light, shading)
         if map_in.shape[1] > 0 and arriving[0] + arriving[1] + arriving[2] > 0.0:
-            texel = on_screen(light.view, in_view(light.view, surface.point))
+            texel = to_screen(light.view, to_view(light.view, surface.point))
             arriving = arriving * lit_share(texel, shadow_reach(texel, light.view.parallel), frame, i, map_in, tile_in)
         total += arriving
-    return toned_color(total, shading)
+    return compress_highlights(total, shading)
 
 
 @wp.func
-def shown_before(shown: wp.vec4i, sample: int) -> bool:
-    """Did an earlier sample show the same triangle?"""
+def is_shown_before(shown: wp.vec4i, sample: int) -> bool:
+    """Whether an earlier sample shows the same triangle."""
     for earlier in range(sample):
         if shown[earlier] == shown[sample]:
             return True
@@ -312,29 +327,31 @@ def shown_before(shown: wp.vec4i, sample: int) -> bool:
 
 @wp.kernel
 def shade_pixels(
+    # In:
     geometry: Geometry,
-    frame_world: wp.array(dtype=int),
-    frame_pose: wp.array(dtype=int),
-    pose: wp.array(dtype=wp.transform),
+    frame_world: wp.array(dtype=int),  # [n] int32 index of the frame's world among the distinct worlds
+    frame_pose: wp.array(dtype=int),  # [n] int32 index into `pose` of the frame's first body
+    pose: wp.array(dtype=wp.transform),  # [P 7] float32 xyz [m] and quaternion xyzw of bodies, world
     camera: View,
-    lights: wp.array(dtype=Light),
+    lights: wp.array(dtype=Light),  # [l] lights with the views of their shadow maps
     shading: Shading,
-    stage: Stage,
-    srgb: wp.array(dtype=wp.uint8),
-    vertex_in: wp.array2d(dtype=wp.vec3),
-    key_in: wp.array4d(dtype=wp.uint64),
-    map_in: wp.array4d(dtype=wp.uint32),
-    tile_in: wp.array4d(dtype=wp.uint32),
-    rgb_out: wp.array4d(dtype=wp.uint8),
+    stage: LitStage,
+    srgb: wp.array(dtype=wp.uint8),  # [8192] uint8 sRGB of evenly spaced linear light
+    vertex_in: wp.array2d(dtype=wp.vec3),  # [n v 3] float32 m, camera's frame
+    key_in: wp.array4d(dtype=wp.uint64),  # [n s h w] uint64, see `draw_triangles`
+    map_in: wp.array4d(dtype=wp.uint32),  # [n l m m] uint32 bits of nearness, see `draw_shadows`
+    tile_in: wp.array4d(dtype=wp.uint32),  # [n l q q] uint32 bits of nearness
+    # Out:
+    rgb_out: wp.array4d(dtype=wp.uint8),  # [n h w 3] uint8 sRGB
 ):
-    """Color: each triangle among a pixel's four samples is lit once, at the mean of its samples."""
+    """Color pixels: each triangle among a pixel's four samples is lit once, at the mean of its samples."""
     frame, row, column = wp.tid()
     drawn = key_in[frame, 0, row, column] | key_in[frame, 1, row, column]
     drawn = drawn | key_in[frame, 2, row, column] | key_in[frame, 3, row, column]
     if drawn == wp.uint64(0):
         plain = stage_light(stage, lights, shading, frame, row, column, map_in, tile_in)
         for channel in range(3):
-            rgb_out[frame, row, column, channel] = encoded(plain[channel], srgb)
+            rgb_out[frame, row, column, channel] = to_srgb(plain[channel], srgb)
         return
     first_triangle = geometry.triangle_range[frame_world[frame]][0]
     shown = wp.vec4i(-1, -1, -1, -1)
@@ -343,7 +360,7 @@ def shade_pixels(
     total = wp.vec3(0.0, 0.0, 0.0)
     for s in range(4):
         triangle = shown[s]
-        if not shown_before(shown, s):
+        if not is_shown_before(shown, s):
             place = vec5(0.0, 0.0, 0.0, 0.0, 0.0)
             for other in range(s, 4):
                 if shown[other] == triangle:
@@ -360,20 +377,20 @@ def shade_pixels(
                 surface = surface_at(geometry, packed, body_pose, camera, ray * (count / place[3]), frame, vertex_in)
                 total += surface_light(surface, lights, shading, frame, map_in, tile_in) * (0.25 * count)
     for channel in range(3):
-        rgb_out[frame, row, column, channel] = encoded(total[channel], srgb)
+        rgb_out[frame, row, column, channel] = to_srgb(total[channel], srgb)
 
 
 @wp.func
-def moved(from_pose: wp.transform, to_pose: wp.transform, point: wp.vec3) -> wp.vec3:
-    """Where a point of a body goes when the body goes from one pose to another; all in the world."""
+def carry_point(from_pose: wp.transform, to_pose: wp.transform, point: wp.vec3) -> wp.vec3:
+    """The place [m] to which a point of a body goes when the body goes from one pose to another; all in the world."""
     return wp.transform_point(to_pose, wp.transform_point(wp.transform_inverse(from_pose), point))
 
 
 @wp.func
-def motion_on_screen(camera: View, seen: wp.vec3, after: wp.vec3, limit: float) -> wp.vec2:
+def screen_motion(camera: View, seen: wp.vec3, after: wp.vec3, limit: float) -> wp.vec2:
     """Motion in pixels between two points of the camera's frame, no longer than `limit`."""
-    now = on_screen(camera, seen)
-    later = on_screen(camera, wp.vec3(after[0], after[1], wp.max(after[2], NEAR)))
+    now = to_screen(camera, seen)
+    later = to_screen(camera, wp.vec3(after[0], after[1], wp.max(after[2], NEAR)))
     motion = wp.vec2(later[0] - now[0], later[1] - now[1])
     length = wp.length(motion)
     if length > limit:
@@ -383,21 +400,23 @@ def motion_on_screen(camera: View, seen: wp.vec3, after: wp.vec3, limit: float) 
 
 @wp.kernel
 def measure_pixels(
+    # In:
     geometry: Geometry,
-    frame_world: wp.array(dtype=int),
-    frame_pose: wp.array(dtype=int),
-    frame_next_pose: wp.array(dtype=int),
-    pose: wp.array(dtype=wp.transform),
+    frame_world: wp.array(dtype=int),  # [n] int32 index of the frame's world among the distinct worlds
+    frame_pose: wp.array(dtype=int),  # [n] int32 index into `pose` of the frame's first body
+    frame_next_pose: wp.array(dtype=int),  # [n] int32 the same of the episode's next frame
+    pose: wp.array(dtype=wp.transform),  # [P 7] float32 xyz [m] and quaternion xyzw of bodies, world
     camera: View,
-    stage: Stage,
-    flow_limit: float,
-    key_in: wp.array4d(dtype=wp.uint64),
-    mask_out: wp.array3d(dtype=wp.bool),
-    body_out: wp.array3d(dtype=wp.int16),
-    depth_out: wp.array3d(dtype=float),
-    flow_out: wp.array3d(dtype=wp.vec2),
+    stage: LitStage,
+    flow_limit: float,  # longest optical flow [pixels]
+    key_in: wp.array4d(dtype=wp.uint64),  # [n s h w] uint64, see `draw_triangles`
+    # Out:
+    mask_out: wp.array3d(dtype=wp.bool),  # [n h w] bool, True on the robot
+    body_out: wp.array3d(dtype=wp.int16),  # [n h w] int16 index of the body, -1 for none; or [0 0 0]
+    depth_out: wp.array3d(dtype=float),  # [n h w] float32 m, 0 where nothing is; or [0 0 0]
+    flow_out: wp.array3d(dtype=wp.vec2),  # [n h w 2] float32 pixels to the next frame, x right, y down; or [0 0 0 2]
 ):
-    """Geometry at the pixel's center; outputs of shape zero are left out."""
+    """Measure what is at each pixel's center; outputs without elements are left out."""
     frame, row, column = wp.tid()
     world = frame_world[frame]
     body = -1
@@ -412,8 +431,8 @@ def measure_pixels(
         if flow_out.shape[0] > 0 and robot == 1 and frame_next_pose[frame] != frame_pose[frame]:
             seen = pixel_ray(camera, float(column), float(row)) / nearness_of(key)
             point = wp.transpose(camera.rotation) * (seen - camera.translation)
-            after = moved(pose[frame_pose[frame] + body], pose[frame_next_pose[frame] + body], point)
-            flow = motion_on_screen(camera, seen, in_view(camera, after), flow_limit)
+            after = carry_point(pose[frame_pose[frame] + body], pose[frame_next_pose[frame] + body], point)
+            flow = screen_motion(camera, seen, to_view(camera, after), flow_limit)
     mask_out[frame, row, column] = robot == 1
     if body_out.shape[0] > 0:
         body_out[frame, row, column] = wp.int16(body)
@@ -425,15 +444,17 @@ def measure_pixels(
 
 @wp.kernel
 def probe_pixels(
+    # In:
     geometry: Geometry,
-    frame_world: wp.array(dtype=int),
-    stage: Stage,
-    pixel: wp.array2d(dtype=wp.vec2i),
-    key_in: wp.array4d(dtype=wp.uint64),
-    body_out: wp.array2d(dtype=int),
-    depth_out: wp.array2d(dtype=float),
+    frame_world: wp.array(dtype=int),  # [n] int32 index of the frame's world among the distinct worlds
+    stage: LitStage,
+    pixel: wp.array2d(dtype=wp.vec2i),  # [n k 2] int32 x y of the pixels to look up
+    key_in: wp.array4d(dtype=wp.uint64),  # [n s h w] uint64, see `draw_triangles`
+    # Out:
+    body_out: wp.array2d(dtype=int),  # [n k] int32 index of the body, -1 for none, -2 outside the image
+    depth_out: wp.array2d(dtype=float),  # [n k] float32 m, 0 where nothing is
 ):
-    """Body (-1 none, -2 outside the image) and depth at the centers of a few pixels (x, y) of every frame."""
+    """Look up body and depth at the centers of a few pixels of every frame."""
     frame, k = wp.tid()
     column = pixel[frame, k][0]
     row = pixel[frame, k][1]

@@ -1,4 +1,4 @@
-"""Stage 4b: what a model may know in advance: images that follow from a robot and its commands alone.
+"""Images that follow from a robot and its commands alone: what a model may know in advance.
 
 Reads  a robot, or its name, and canonical commands [t 16]; never a recorded state, so that no condition sees the future
 Writes the robot-only render with mask and exact optical flow, ray map, and task-independent views of the robot
@@ -24,19 +24,19 @@ from xew.sim_warp.robots import get_robot
 
 VIEW_COUNT = 9
 CLIP_FRAMES = 17
-"""Views and frames of the paper's specifications of a robot."""
+"""Numbers of views and of frames in the paper's specifications of a robot."""
 VIEW_ELEVATION = 25.0
 """Height of the cameras of reference views over the horizon [deg]."""
 FIT_MARGIN = 1.05
 """Room round the robot in reference views, as a factor of the distance."""
 SWEEP = 0.6
-"""How far the articulation clip moves a joint from home to either side, where its limits allow [rad]."""
+"""Angle by which the articulation clip moves a joint from home to either side, where its limits allow [rad]."""
 STILL = 0.5
-"""Shorter optical flow is drawn as none [pixels]."""
+"""Length below which optical flow is drawn as none [pixels]."""
 AXIS_LENGTH = 0.1
-"""Of the tool's axes in the ray map [m]."""
+"""Length of the tool's axes in the ray map [m]."""
 MARKER_RADIUS, AXIS_WIDTH = 50 / 512, 8 / 512
-"""Of the base marker and of the axes' lines, as shares of the image's width."""
+"""Radius of the base marker and width of the axes' lines, as shares of the image's width."""
 RAY_MAP_GROUND: Color = (128, 128, 128)
 AXIS_COLORS: tuple[Color, ...] = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
 GRIPPER_COLORS: tuple[tuple[Color, Color], ...] = (((229, 245, 224), (0, 68, 27)), ((254, 224, 210), (103, 0, 13)))
@@ -52,7 +52,7 @@ class CommandStreams:
     mask: np.ndarray
     """[t h w] bool."""
     optical_flow: np.ndarray
-    """[t h w 2] float32, motion from this frame to the next [pixels], see `Frames.optical_flow`."""
+    """[t h w 2] float32 motion from this frame to the next [pixels], see `Frames.optical_flow`."""
 
 
 @cache
@@ -62,7 +62,7 @@ def default_renderer() -> Renderer:
 
 
 def command_streams(robot: str | RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> CommandStreams:
-    """Render, mask and exact optical flow of commands [t 16].
+    """Render [t h w 3] uint8, mask [t h w] and exact optical flow [t h w 2] pixels of canonical commands [t 16].
 
     Raises:
         ConfigError: there is no such robot.
@@ -90,7 +90,7 @@ def command_renders(
 def _worlds(commands: Sequence[tuple[str | RobotSpec, np.ndarray]]) -> list[World]:
     robots = [get_robot(robot) for robot, _ in commands]
     return [
-        World(robot_bodies(robot), robot_pose(robot, _checked(action)))
+        World(robot_bodies(robot), robot_pose(robot, _check_action(action)))
         for robot, (_, action) in zip(robots, commands, strict=True)
     ]
 
@@ -102,7 +102,7 @@ def flow_to_rgb(flow: np.ndarray, clip: float = FLOW_LIMIT) -> np.ndarray:
     as many frames as the RGB beside it.
 
     Args:
-        flow: [t h w 2] motion from each frame to the next [pixels].
+        flow: [t h w 2] float32 motion from each frame to the next [pixels].
         clip: length of full saturation [pixels]; the paper's 25, FlowWAM's WorldArena script has 20.
 
     Returns:
@@ -127,7 +127,7 @@ def color_wheel() -> np.ndarray:
 
 
 def ray_map(robot: str | RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> np.ndarray:
-    """The commanded tool frames drawn into the image: [t h w 3] uint8.
+    """The tool frames of canonical commands [t 16] drawn into the image: [t h w 3] uint8.
 
     On gray, each tool has a base marker, a disc at the origin of its frame whose color goes with the gripper, and over it
     its x (approach), y (along which the fingers open) and z axes in red, green and blue, 0.1 m long, in the proportions of
@@ -135,7 +135,7 @@ def ray_map(robot: str | RobotSpec, action: np.ndarray, camera: Camera = HEAD_CA
     camera is left out.
     """
     robot = get_robot(robot)
-    action = _checked(action)
+    action = _check_action(action)
     canvas = np.full((len(action), camera.height, camera.width, 3), RAY_MAP_GROUND, np.uint8)
     tools = [_tool_points(robot, arm, action) for arm in range(len(ARMS))]
     projected = [project(camera, points) for points in tools]
@@ -176,7 +176,7 @@ def nine_views(robot: str | RobotSpec) -> np.ndarray:
     """The robot at home from nine azimuths 40 degrees apart, [9 h w 3] uint8, the first from the front."""
     robot = get_robot(robot)
     bodies, pose = robot_bodies(robot), robot_pose(robot, home_action(robot)[None])
-    cameras = _fitted_cameras(bodies, pose, [index * 360 / VIEW_COUNT for index in range(VIEW_COUNT)])
+    cameras = _fit_cameras(bodies, pose, [index * 360 / VIEW_COUNT for index in range(VIEW_COUNT)])
     return np.concatenate([default_renderer().render(bodies, pose, camera, ground=False).rgb for camera in cameras])
 
 
@@ -185,12 +185,12 @@ def articulation_clip(robot: str | RobotSpec) -> np.ndarray:
     uint8."""
     robot = get_robot(robot)
     bodies, pose = robot_bodies(robot), robot_pose(robot, articulation_action(robot))
-    camera = _fitted_cameras(bodies, pose, [0.0])[0]
+    camera = _fit_cameras(bodies, pose, [0.0])[0]
     return default_renderer().render(bodies, pose, camera, ground=False).rgb
 
 
 def articulation_action(robot: RobotSpec) -> np.ndarray:
-    """[17 16] commands that move all joints to both sides of home, within the limits of experts, close and open the
+    """[17 16] float64 commands that move all joints to both sides of home, within the limits of experts, close and open the
     grippers and end where they began. The outer three joints swing twice while the others swing once."""
     home = home_action(robot)
     swing = 2 * np.pi * np.arange(CLIP_FRAMES) / (CLIP_FRAMES - 1)
@@ -206,7 +206,7 @@ def articulation_action(robot: RobotSpec) -> np.ndarray:
 
 
 def home_action(robot: RobotSpec) -> np.ndarray:
-    """[16] canonical joint positions at rest [rad], grippers open."""
+    """[16] float64 canonical joint positions at home [rad], grippers open (1)."""
     action = np.zeros(16)
     for (joints, gripper), arm in zip(ARMS, robot.arms, strict=True):
         action[joints.start : joints.start + len(arm.home)] = arm.home
@@ -214,7 +214,7 @@ def home_action(robot: RobotSpec) -> np.ndarray:
     return action
 
 
-def _fitted_cameras(bodies: Sequence[Body], pose: np.ndarray, azimuths: Sequence[float]) -> list[Camera]:
+def _fit_cameras(bodies: Sequence[Body], pose: np.ndarray, azimuths: Sequence[float]) -> list[Camera]:
     """Cameras round the robot, equally far from its middle, so near that poses [t b 7] just fit into every image.
 
     Azimuth 0 [deg] looks the robot in the face; from there it goes round towards the robot's left hand.
@@ -225,12 +225,12 @@ def _fitted_cameras(bodies: Sequence[Body], pose: np.ndarray, azimuths: Sequence
     ]
     points = np.concatenate([vertices.reshape(-1, 3) for vertices in placed])
     center = (points.min(0) + points.max(0)) / 2
-    cameras = [look_at(center + _toward(azimuth), center) for azimuth in azimuths]
+    cameras = [look_at(center + _view_direction(azimuth), center) for azimuth in azimuths]
     distance = FIT_MARGIN * max(_fitting_distance(camera, points) for camera in cameras)
-    return [look_at(center + distance * _toward(azimuth), center) for azimuth in azimuths]
+    return [look_at(center + distance * _view_direction(azimuth), center) for azimuth in azimuths]
 
 
-def _toward(azimuth: float) -> np.ndarray:
+def _view_direction(azimuth: float) -> np.ndarray:
     """[3] unit vector from the robot to a camera at an azimuth [deg]."""
     turn, rise = np.radians(azimuth), np.radians(VIEW_ELEVATION)
     return np.array([-np.sin(turn) * np.cos(rise), np.cos(turn) * np.cos(rise), np.sin(rise)])
@@ -243,8 +243,8 @@ def _fitting_distance(camera: Camera, points: np.ndarray) -> float:
     return float((np.abs(seen[:, :2]) / half_view - (seen[:, 2:] - 1)).max())
 
 
-def _checked(action: np.ndarray) -> np.ndarray:
-    """The action as float64 [t 16]."""
+def _check_action(action: np.ndarray) -> np.ndarray:
+    """The action as float64 [t 16]. Raises ValueError for another shape."""
     action = np.asarray(action, float)
     if action.ndim != 2 or action.shape[1] != 16:
         raise ValueError(f"action has shape {action.shape}, expected (frames, 16): the canonical layout of xew.protocol.")

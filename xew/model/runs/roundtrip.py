@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from xew.config import ConfigError
-from xew.model.runs.checkpoint import load_run
+from xew.model.runs.folder import load_run
 from xew.model.video.frames import to_camera_size, to_model_size
 
 

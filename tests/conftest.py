@@ -1,0 +1,139 @@
+"""The session that all tests share: strict arrays, checked shapes, few threads, and programs that are compiled once.
+
+Strictness is the default. What needs an exception asks for it by name and with its reason:
+`pytestmark = pytest.mark.loose_types("Flax adds float32 and int32 in ...")`, or a line of `filterwarnings` in pyproject.toml.
+"""
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from jaxtyping import install_import_hook
+
+XEW = Path(__file__).parents[1] / "xew"
+CHECKED_ROOMS = ("metrics", "model")
+"""Rooms whose annotated modules are checked at run time."""
+CHECK_SHAPES = os.environ.get("XEW_CHECK_SHAPES", "1") != "0"
+"""Whether shapes and types of arrays are checked at every call; benchmarks of tests turn it off by XEW_CHECK_SHAPES=0."""
+LOOSE = (("loose_types", "jax_numpy_dtype_promotion", "standard"), ("loose_ranks", "jax_numpy_rank_promotion", "allow"))
+"""Mark, option of JAX, and its value under the mark."""
+SLOW = (
+    "tests/analysis/reports/",
+    "tests/analysis/studies/test_study_debug.py",
+    "tests/analysis/test_report.py",
+    "tests/analysis/test_study.py::test_cells_run_as_tasks_on_a_ray_cluster",
+    "tests/analysis/test_study.py::test_steps_run_as_tasks_on_a_ray_cluster",
+    "tests/legacy/",
+    "tests/metrics/estimators/test_sam2.py",
+    "tests/metrics/grading/test_resume.py",
+    "tests/metrics/test_calibrate.py",
+    "tests/metrics/test_evaluate.py",
+    "tests/metrics/test_page.py::test_examples_print_what_they_say",
+    "tests/metrics/test_perceptual.py",
+    "tests/metrics/test_states.py",
+    "tests/model/codecs/",
+    "tests/model/devices/test_many_devices.py",
+    "tests/model/network/test_dit.py",
+    "tests/model/network/test_dit_parity.py",
+    "tests/model/network/test_mechanisms.py",
+    "tests/model/test_export.py",
+    "tests/model/test_latents.py::test_latents_from_states_are_those_from_video",
+    "tests/model/test_latents.py::test_only_what_is_needed_is_read",
+    "tests/model/test_pipeline.py",
+    "tests/model/test_rollout.py",
+    "tests/model/test_systems.py",
+    "tests/model/test_train_vae.py",
+    "tests/model/text/",
+    "tests/model/training/test_training.py",
+    "tests/sim_warp/assets/",
+    "tests/sim_warp/production/test_produce.py",
+    "tests/sim_warp/tasks/",
+    "tests/sim_warp/test_benchmarks.py",
+    "tests/sim_warp/test_generate.py",
+    "tests/sim_warp/test_kill.py::test_kills_change_no_byte",
+    "tests/sim_warp/test_scene.py",
+    "tests/test_adding.py",
+    "tests/test_docs.py::test_a_page_does_what_it_says",
+)
+"""Beginnings of the names of tests that make test-fast leaves out: whole commands, trainings, simulations, and parity with
+other people's networks. Taken from --durations; a test is slow, too, when it bears the mark."""
+CACHE_DAYS = 14
+"""Number of days for which a compiled program that no session has written again is kept."""
+
+
+def annotated_modules() -> list[str]:
+    """Modules of the checked rooms that import jaxtyping, by their full names."""
+    files = (path for room in CHECKED_ROOMS for path in sorted((XEW / room).rglob("*.py")))
+    names = (".".join(path.relative_to(XEW.parent).with_suffix("").parts) for path in files if "jaxtyping" in path.read_text())
+    return [name.removesuffix(".__init__") for name in names]
+
+
+for pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(pool, "1")  # before NumPy loads: two workers with a pool of threads each only wait for one another
+if CHECK_SHAPES:
+    install_import_hook(annotated_modules(), "beartype.beartype")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Name the marks, and share one folder of compiled programs between workers, subprocesses and sessions."""
+    config.addinivalue_line("markers", "loose_types(reason): arrays of different types may meet; says whose code needs that")
+    config.addinivalue_line("markers", "loose_ranks(reason): arrays of different rank may meet; says whose code needs that")
+    folder = Path(os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(config.rootpath / ".pytest_cache" / "jax")))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # most of the time is compiling, and little is computed
+    if not hasattr(config, "workerinput"):
+        remove_old_files(folder)
+
+
+def remove_old_files(folder: Path) -> None:
+    """Remove the files of a folder that are older than CACHE_DAYS."""
+    for path in folder.glob("*"):
+        if path.is_file() and time.time() - path.stat().st_mtime > CACHE_DAYS * 86_400:
+            path.unlink(missing_ok=True)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the slow tests; files that have some go first, so that no worker is left with a long file at the end."""
+    for item in items:
+        if item.nodeid.startswith(SLOW):
+            item.add_marker(pytest.mark.slow)
+    slow_files = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow_files)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def strict_arrays() -> Iterator[None]:
+    """JAX neither converts types nor adds axes silently, in fixtures of any scope and in threads too."""
+    import jax
+
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+    jax.config.update("jax_numpy_rank_promotion", "raise")
+    packbits = jax.numpy.packbits
+
+    def packbits_with_promotion(*arguments: Any, **named: Any) -> jax.Array:
+        with jax.numpy_rank_promotion("allow"):  # JAX's own code shifts [... 8 n] by [8 1]
+            return packbits(*arguments, **named)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax.numpy, "packbits", packbits_with_promotion)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def named_exceptions(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Tests marked loose_types or loose_ranks run as JAX does by default; the mark gives the reason."""
+    import jax
+
+    loosened = {}
+    for mark, option, loose in LOOSE:
+        found = request.node.get_closest_marker(mark)
+        if found is not None:
+            assert found.args and isinstance(found.args[0], str), f"@pytest.mark.{mark} needs a reason"
+            loosened[option] = getattr(jax.config, option)
+            jax.config.update(option, loose)
+    yield
+    for option, strict in loosened.items():
+        jax.config.update(option, strict)

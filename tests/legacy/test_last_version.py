@@ -1,0 +1,107 @@
+"""What version 0.1.0 wrote is read by today's code: episodes, latents, a run, rollouts, scores with their bundle, a ledger.
+
+The archive was written by that version's commands on synthetic episodes of five frames: `latents`, `train` (four steps of the
+size `tiny`), `rollout`, `evaluate`, and records of a study's steps with these products.
+"""
+
+import json
+import shutil
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.commands import run_command
+from xew.rollout import read_rollout_video
+
+ARCHIVE = Path(__file__).with_name("version_0_1_0.tar.xz")
+EPISODE = Path("place_empty_cup/1000000/piper")
+ROUNDING = 0.5
+"""Mean difference of 8-bit pixels that another order of sums may make after two steps of sampling."""
+
+pytestmark = pytest.mark.loose_types("Optax raises its decays to an int32 count of steps")
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The archive, unpacked; not to be written to."""
+    folder = tmp_path_factory.mktemp("version_0_1_0")
+    with tarfile.open(ARCHIVE) as archive:
+        archive.extractall(folder, filter="data")
+    return folder
+
+
+@pytest.fixture
+def old(unpacked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the archive's files, which is the working folder: configs name their data relative to it."""
+    folder = tmp_path / "old"
+    shutil.copytree(unpacked, folder)
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def test_episodes_are_whole(old: Path) -> None:
+    said = run_command("xew.sim_warp.inspect", "data", "--verify")
+    assert "2 episodes" in said or "2 of 2" in said or "damaged" not in said, said
+
+
+def test_a_run_goes_on_from_its_checkpoint_and_latents(old: Path) -> None:
+    before = (old / "runs/tiny/metrics.jsonl").read_text()
+    run_command("xew.model.train", "config.yaml", "--resume", "--train.steps", "6")
+    after = (old / "runs/tiny/metrics.jsonl").read_text()
+    assert after.startswith(before) and json.loads(after.splitlines()[-1])["step"] == 6
+    assert (old / "runs/tiny/checkpoints/6").is_dir()
+
+
+def test_rollouts_come_out_as_before(old: Path) -> None:
+    run_command("xew.model.rollout", "runs/tiny", "--data", "data", "--split", "test", "--out", "again")
+    before, again = (read_rollout_video(old / name / EPISODE) for name in ("rollouts", "again"))
+    assert before.shape == again.shape == (5, 240, 320, 3)
+    assert np.abs(before.astype(int) - again).mean() < ROUNDING
+    headers = [json.loads((old / name / EPISODE / "rollout.json").read_text()) for name in ("rollouts", "again")]
+    for key in ("model", "condition", "source_hash", "frame_count", "checkpoint_step", "checkpoint_saved"):
+        assert headers[0][key] == headers[1][key], key
+
+
+def test_rollouts_that_are_done_are_not_made_again(old: Path) -> None:
+    before = (old / "rollouts" / EPISODE / "rgb.mkv").stat().st_mtime_ns
+    run_command("xew.model.rollout", "runs/tiny", "--data", "data", "--split", "test", "--out", "rollouts")
+    assert (old / "rollouts" / EPISODE / "rgb.mkv").stat().st_mtime_ns == before
+
+
+def test_the_bundle_agrees_with_the_scores_and_with_grading_anew(old: Path) -> None:
+    run_command("xew.metrics.evaluate", "--check", "scores.bundle.json")
+    run_command("xew.metrics.evaluate", "rollouts", "--data", "data", "--check", "scores.bundle.json", "--regrade", "1")
+
+
+def test_grades_that_are_done_are_kept(old: Path) -> None:
+    before = pd.read_parquet(old / "scores.parquet")
+    cells = {path: path.stat().st_mtime_ns for path in (old / "scores.cells").rglob("*") if path.is_file()}
+    metrics = ("--metrics", "psnr", "mask_iou", "pck")
+    run_command("xew.metrics.evaluate", "rollouts", "--data", "data", "--out", "scores.parquet", *metrics)
+    pd.testing.assert_frame_equal(pd.read_parquet(old / "scores.parquet"), before)
+    assert {path: path.stat().st_mtime_ns for path in cells} == cells
+
+
+def test_scores_become_a_report(old: Path) -> None:
+    run_command("xew.analysis.report", "scores.parquet", "--data", "data", "--rollouts", "rollouts", "--out", "report")
+    page = (old / "report" / "index.html").read_text()
+    assert "tiny" in page and "mask_iou" in page
+
+
+def test_steps_of_a_study_that_are_done_are_known(old: Path) -> None:
+    """Keys and digests of products are made as before, else a study would begin anew."""
+    from xew.analysis.studies.ledger import Ledger
+    from xew.analysis.studies.plan import Step
+
+    products = {"generate": "data", "latents": "data-latents", "train": "runs/tiny", "rollout": "rollouts"}
+    ledger, needs = Ledger(old / "study"), ()
+    for kind, product in (products | {"evaluate": "scores.parquet"}).items():
+        variant = "" if kind in ("generate", "latents") else "tiny"
+        step = Step(kind, variant, ("module",), needs, {"made of": "the last version"}, Path(product))
+        assert ledger.find_done(step), f"{step.name}: {ledger.record(step)}"
+        needs = (step.name,)
+    changed = Step("train", "tiny", ("module",), ("latents",), {"made of": "today's"}, Path("runs/tiny"))
+    assert not ledger.find_done(changed)

@@ -1,0 +1,95 @@
+"""A metric, a robot, a condition and a task from a module outside go through every command, to a report that shows them."""
+
+import importlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from tests.commands import run_command
+from xew.metrics import METRICS
+
+pytestmark = [pytest.mark.slow, pytest.mark.loose_types("Optax raises its decays to an int32 count of steps")]
+
+MODULE = '''"""One of each kind."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tests.sim_warp import small
+from xew.metrics.metric import Metric
+from xew.model.conditions import Command, Condition
+from xew.protocol import Split
+from xew.sim_warp.robots import ROBOTS
+from xew.sim_warp.scene import Scene
+from xew.sim_warp.tasks.task import Task
+
+
+@jax.jit
+def brightness_error(prediction, target):
+    means = [video.astype(jnp.float32).mean(axis=(1, 2, 3)) for video in (prediction, target)]
+    return jnp.abs(means[0] - means[1])
+
+
+def half_way(command: Command) -> np.ndarray:
+    return command.action / 2
+
+
+def sample(rng: np.random.Generator, seed: int) -> Scene:
+    return replace(small.sample(rng, seed), task="additions:TASK")
+
+
+METRIC = Metric(brightness_error, brightness_error, "visual", "levels", (0, 255), False, "video", "difference of means")
+ROBOT = replace(ROBOTS["piper"], title="An added robot")
+CONDITION = Condition("half_way", "joints", half_way)
+TASK = Task("added", "close both hands", sample, small.plan, small.success)
+SPLIT = Split(("additions:ROBOT",), ())
+'''
+CONFIG = """
+data: data
+out: runs/added
+split: additions:SPLIT
+clip: {frames: 5, height: 64, width: 80}
+codec: {spatial_factor: 8, channels: 4}
+model: {size: tiny, action: "additions:CONDITION"}
+train: {steps: 1, batch: 1, sample_every: 0}
+rollout: {steps: 1, batch: 1, max_frames: 5}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with the module, importable here and in processes started from here; the metric is in its registry."""
+    (tmp_path / "additions.py").write_text(MODULE)
+    (tmp_path / "config.yaml").write_text(CONFIG)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path(__file__).parents[1]}")
+    monkeypatch.setitem(METRICS, "brightness_error", importlib.import_module("additions").METRIC)
+    yield tmp_path
+    sys.modules.pop("additions", None)
+
+
+def test_what_is_added_goes_the_whole_way(folder: Path) -> None:
+    made = ("--tasks", "additions:TASK", "--robots", "additions:ROBOT", "--train-seeds", "1", "--test-seeds", "1")
+    run_command("xew.sim_warp.generate", *made, "--device", "cpu", "--workers", "1", "--out", "data")
+    run_command("xew.model.latents", "config.yaml")
+    run_command("xew.model.train", "config.yaml")
+    run_command("xew.model.rollout", "runs/added", "--data", "data", "--split", "test", "--out", "rollouts")
+    graded = ("--metrics", "psnr", "brightness_error", "--out", "scores.parquet")
+    run_command("xew.metrics.evaluate", "rollouts", "--data", "data", *graded)
+    scores = pd.read_parquet(folder / "scores.parquet")
+    assert set(scores["metric"]) == {"psnr", "brightness_error"}
+    assert set(scores["task"]) == {"additions:TASK"} and set(scores["robot"]) == {"additions:ROBOT"}
+    assert "half_way" in set(scores["condition"])
+    values = scores[scores["metric"] == "brightness_error"].set_index("model")["value"]
+    assert values["ground_truth"] == 0 < values["tiny"]
+    run_command("xew.analysis.report", "scores.parquet", "--data", "data", "--rollouts", "rollouts", "--out", "report")
+    page = (folder / "report" / "index.html").read_text()
+    for shown in ("brightness_error", "additions:ROBOT", "half_way"):
+        assert shown in page or shown.replace("_", " ") in page.lower(), f"the report does not show {shown}"

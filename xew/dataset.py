@@ -1,0 +1,136 @@
+"""Data sets: the index of a folder of episodes, read once a process and refreshed where the folder has changed.
+
+A data set of the paper's size has 8,750 headers. `read_dataset` lists the folder each time, but opens only headers that are
+new or whose file has changed since this process read them last.
+"""
+
+import os
+import time
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from xew.episode import TEMPORARY, EpisodeError, Record, read_record
+from xew.protocol import seed_split
+
+Episode = tuple[Path, Record]
+"""Folder and header of one cell."""
+Signature = tuple[int, int, int, int]
+"""Inode, size, time of change and of status change [ns] of a header's file."""
+
+UNSETTLED_NS = 100_000_000
+"""Age [ns] under which a header is read again next time: two writes within one tick of a file system's clock look alike."""
+
+_READ: dict[Path, dict[Path, tuple[Signature, Record]]] = {}
+"""Headers that this process has read, by the data set's absolute path and the episode's folder in it."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """The cells of a data set as they were when it was read."""
+
+    root: Path
+    cells: tuple[Episode, ...]
+    """All cells with their headers, accepted or not, sorted by task, seed and robot."""
+
+    @cached_property
+    def accepted(self) -> tuple[Episode, ...]:
+        """Episodes of seeds in which every robot tried has succeeded: the paired data set.
+
+        Raises EpisodeError if there is none, and says what to do.
+        """
+        # Where somebody failed the others have no pictures, also if the run was stopped before it wrote who had failed.
+        failed = {(record.task, record.seed) for _, record in self.cells if not record.success or not record.hashes}
+        accepted = tuple((folder, record) for folder, record in self.cells if (record.task, record.seed) not in failed)
+        if not accepted:
+            raise explain_missing(self.root, "accepted episode")
+        return accepted
+
+    @property
+    def robots(self) -> list[str]:
+        """Robots of accepted episodes, sorted."""
+        return sorted({record.robot for _, record in self.accepted})
+
+    def select(
+        self, *, robots: Collection[str] | None = None, tasks: Collection[str] | None = None, split: str | None = None
+    ) -> list[Episode]:
+        """Accepted episodes of these robots, tasks and seed family, each of which may be left open; possibly none.
+
+        Raises EpisodeError if the data set has no accepted episode at all.
+        """
+        return [
+            (folder, record)
+            for folder, record in self.accepted
+            if (robots is None or record.robot in robots)
+            and (tasks is None or record.task in tasks)
+            and split in (None, seed_split(record.seed))
+        ]
+
+
+def read_dataset(data: Path, problems: list[str] | None = None) -> Dataset:
+    """Read the index of a data set, or refresh what this process has of it.
+
+    Args:
+        data: root of the data set.
+        problems: list to which one message is added for each damaged header, which is then left out.
+
+    Raises:
+        EpisodeError: a header is damaged, and no list of problems was given.
+    """
+    root = Path(data).absolute()
+    before = _READ.get(root, {})
+    found: dict[Path, tuple[Signature, Record]] = {}
+    cells: list[Episode] = []
+    for folder in find_folders(data):
+        name = folder.relative_to(data)
+        try:
+            signature, known = _sign(folder), before.get(name)
+            record = known[1] if known is not None and known[0] == signature else read_record(folder)
+        except FileNotFoundError:
+            continue  # a cell that goes while they are read, because it is being replaced
+        except EpisodeError as error:
+            if isinstance(error.__cause__, FileNotFoundError):
+                continue
+            if problems is None:
+                raise
+            problems.append(str(error))
+            continue
+        cells.append((folder, record))
+        if time.time_ns() - signature[3] > UNSETTLED_NS:
+            found[name] = signature, record
+    _READ[root] = found
+    return Dataset(Path(data), tuple(cells))
+
+
+def _sign(folder: Path) -> Signature:
+    status = os.stat(folder / "episode.json")
+    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def find_folders(data: Path) -> list[Path]:
+    """Folders of all cells of a data set, sorted by task, seed, robot."""
+    folders = (path.parent for path in Path(data).glob("*/*/*/episode.json"))
+    return sorted(folder for folder in folders if not folder.name.startswith(TEMPORARY))
+
+
+def find_records(data: Path) -> Iterator[Episode]:
+    """All cells of a data set with their headers, accepted or not. Raises EpisodeError at a damaged header."""
+    return iter(read_dataset(data).cells)
+
+
+def find_accepted(data: Path) -> list[Episode]:
+    """Episodes of seeds in which every robot tried has succeeded: the paired data set.
+
+    Raises EpisodeError if there is none, and says what to do.
+    """
+    return list(read_dataset(data).accepted)
+
+
+def explain_missing(data: Path, what: str = "episode") -> EpisodeError:
+    """The error for a folder without episodes: it says how to make some or, inside of a data set, names the data set."""
+    for levels, pattern in enumerate(("*/*/episode.json", "*/episode.json", "episode.json")):
+        if next(Path(data).glob(pattern), None):
+            root = Path(data).absolute().parents[levels]
+            return EpisodeError(f"{data} lies inside of a data set; name the whole of it: {root}.")
+    return EpisodeError(f"no {what} under {data}; make some: python -m xew.sim_warp.generate --out {data}")

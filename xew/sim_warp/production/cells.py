@@ -1,0 +1,109 @@
+"""Cells, one (task, seed, robot) each, from their jobs to what physics made of them.
+
+Reads  `Job`s: (task, seed) and robots
+Writes `Cell`s: first with scene, plan and joint commands (`plan_cells`), then with their motion (`simulate_cells`)
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from xew.sim_warp.kinematics.forward import tool_poses
+from xew.sim_warp.physics import Motion, World, simulate
+from xew.sim_warp.plan import ToolPath
+from xew.sim_warp.production.expert import Commands, joint_commands
+from xew.sim_warp.production.outcome import find_failure
+from xew.sim_warp.rendering.observe import Recording, scene_recording
+from xew.sim_warp.robots import RobotSpec, get_robot
+from xew.sim_warp.scene import Scene, scene_rng
+from xew.sim_warp.tasks import Task, get_task
+
+
+@dataclass(frozen=True)
+class Job:
+    """One scene, and the robots that do not have it yet."""
+
+    task: str
+    """Key of the registry or module:NAME."""
+    seed: int
+    robots: tuple[str, ...]
+    rejected: bool = False
+    """Whether another robot has failed on it already; then nothing is rendered."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One (task, seed, robot): planned, and simulated where the robot can follow the plan."""
+
+    task_name: str
+    """Key of the registry or module:NAME, as asked for."""
+    task: Task
+    scene: Scene
+    path: ToolPath
+    robot_name: str
+    robot: RobotSpec
+    commands: Commands
+    motion: Motion | None = None
+    """What physics made of the commands; None before, and where the robot cannot follow the plan."""
+
+    @property
+    def moved(self) -> Motion:
+        """The motion of a cell that is known to have one."""
+        assert self.motion is not None, f"{self.robot.key} cannot follow the plan of {self.scene.task}/{self.scene.seed}"
+        return self.motion
+
+    @cached_property
+    def tool_pose(self) -> np.ndarray:
+        """[t 2 7] float32 measured tool poses, xyz [m] and quaternion xyzw, world."""
+        return measured_tools(self.robot, self.moved.joint_pos)
+
+    @cached_property
+    def failure(self) -> tuple[str, str] | None:
+        """Why the cell does not count: one of `episode.FAILURES` and a sentence; None if it succeeded."""
+        if self.commands.problem is not None:
+            return "plan", self.commands.problem
+        return find_failure(self.task, self.scene, self.path, self.commands.action, self.moved, self.tool_pose)
+
+    @property
+    def recording(self) -> Recording:
+        """What the camera looks at."""
+        motion = self.moved
+        return scene_recording(self.robot, self.scene, motion.joint_pos, motion.object_pose, motion.object_joint)
+
+
+def plan_cells(jobs: Sequence[Job], data: Path | None = None) -> list[list[Cell]]:
+    """Scene, plan and commands of every cell, by job; the commands of all cells of a robot are solved together.
+
+    Args:
+        data: data set whose own robots count too.
+    """
+    tasks = [get_task(job.task) for job in jobs]
+    scenes = [task.sample(scene_rng(job.task, job.seed), job.seed) for job, task in zip(jobs, tasks, strict=True)]
+    paths = [task.plan(scene).path() for task, scene in zip(tasks, scenes, strict=True)]
+    seeds: list[list[Cell]] = [[] for _ in jobs]
+    for name in dict.fromkeys(robot for job in jobs for robot in job.robots):
+        mine = [index for index, job in enumerate(jobs) if name in job.robots]
+        robot = get_robot(name, data)
+        for index, commands in zip(mine, joint_commands(robot, [paths[index] for index in mine]), strict=True):
+            seeds[index].append(Cell(jobs[index].task, tasks[index], scenes[index], paths[index], name, robot, commands))
+    return seeds
+
+
+def simulate_cells(seeds: list[list[Cell]], device: str | None = None, batch: int | None = None) -> list[list[Cell]]:
+    """The same cells with their motion, where the robot can follow the plan.
+
+    Args:
+        device, batch: as for `physics.simulate`.
+    """
+    cells = [cell for cells in seeds for cell in cells if cell.commands.problem is None]
+    worlds = [World(cell.robot, cell.scene, cell.commands.action) for cell in cells]
+    motions = {id(cell): motion for cell, motion in zip(cells, simulate(worlds, device, batch), strict=True)}
+    return [[replace(cell, motion=motions.get(id(cell))) for cell in cells] for cells in seeds]
+
+
+def measured_tools(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
+    """[t 2 7] float32 tool poses, xyz [m] and quaternion xyzw, world, at canonical joint positions [t 16] rad."""
+    return tool_poses(robot, joint_pos).astype(np.float32)

@@ -1,0 +1,97 @@
+"""Simulated cells to episodes on disk: pictures, states, header.
+
+Reads  `Cell`s with their motion
+Writes episodes as `xew/episode.py` defines them; of a cell whose seed is rejected only the header
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+import xew
+from xew.config import ConfigError
+from xew.episode import Record, States, read_record, write_episode
+from xew.sim_warp.geometry.camera import HEAD_CAMERA
+from xew.sim_warp.production.cells import Cell
+from xew.sim_warp.rendering.observe import Observation, keypoint_names, observe
+from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.rendering.streams import command_renders
+from xew.sim_warp.scene import Scene, scene_hash
+from xew.sim_warp.tasks import Task
+
+Pixels = tuple[Observation, np.ndarray]
+"""What the camera sees, and the robot alone [t h w 3] uint8."""
+
+
+def render_cells(cells: Sequence[Cell], renderer: Renderer) -> list[Pixels]:
+    """What the camera sees of each cell, and the robot alone by its commands [t h w 3] uint8."""
+    views = observe(renderer, [cell.recording for cell in cells])
+    renders = command_renders([(cell.robot, cell.commands.action) for cell in cells], renderer=renderer)
+    return list(zip(views, renders, strict=True))
+
+
+def write_cell(cell: Cell, pixels: Pixels | None, out: Path, device: wp.Device, videos: bool = True) -> Record:
+    """Write a cell, with its episode if there are pixels, and return the header as it is on disk."""
+    record = header(cell, device)
+    if pixels is None:
+        return read_record(write_episode(out, record))
+    view, render = pixels
+    return read_record(write_episode(out, record, _states(cell, view), view.rgb, render, videos=videos))
+
+
+def header(cell: Cell, device: wp.Device) -> Record:
+    """What is known of a cell but its hashes: who, how long, success or the reason of failure."""
+    reason, detail = cell.failure or (None, "")
+    return Record(
+        task=cell.task_name,
+        seed=cell.scene.seed,
+        robot=cell.robot_name,
+        success=reason is None,
+        failure=reason,
+        failure_detail=detail,
+        instruction=fill_instruction(cell.task, cell.scene),
+        frame_count=cell.path.frame_count,
+        object_names=cell.scene.names,
+        keypoint_names=keypoint_names(cell.robot),
+        scene_hash=scene_hash(cell.scene),
+        versions=_versions(),
+        device=device.name,
+    )
+
+
+def fill_instruction(task: Task, scene: Scene) -> str:
+    """What the robot is told to do in this scene. Raises ConfigError where the scene has no word for a slot."""
+    try:
+        return task.instruction.format(**scene.words)
+    except (KeyError, IndexError, ValueError) as error:
+        raise ConfigError(
+            f"the instruction of {scene.task}, {task.instruction!r}, cannot be filled ({error}) from the words of its scene "
+            f"({', '.join(scene.words) or 'none'}); add to Scene.words what it has in braces."
+        ) from error
+
+
+@cache
+def _versions() -> dict[str, str]:
+    return {"xew": xew.__version__} | {name: version(name) for name in ("newton", "mujoco", "mujoco-warp", "warp-lang")}
+
+
+def _states(cell: Cell, view: Observation) -> States:
+    return States(
+        action=cell.commands.action,
+        joint_pos=cell.moved.joint_pos,
+        joint_vel=cell.moved.joint_vel,
+        tool_pose=cell.tool_pose,
+        object_pose=cell.moved.object_pose,
+        object_joint=cell.moved.object_joint,
+        contact=cell.moved.contact,
+        penetration=cell.moved.penetration,
+        keypoints=view.keypoints,
+        keypoint_visible=view.keypoint_visible,
+        robot_mask=view.robot_mask,
+        intrinsics=HEAD_CAMERA.intrinsics,
+        extrinsics=HEAD_CAMERA.extrinsics,
+    )

@@ -1,0 +1,85 @@
+"""Episodes on disk, made again: their pixels from recorded states, their videos on demand, and a check of their motion.
+
+Reads  <data>/<task>/<seed>/<robot>/
+Writes pixels whose hashes agree with the recorded ones and, where asked, the videos of an episode without any
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from xew.episode import (
+    EpisodeError,
+    Record,
+    array_hash,
+    data_folder,
+    demand_known,
+    read_record,
+    read_states,
+    states_hash,
+    write_episode,
+)
+from xew.sim_warp.physics.plausibility import find_implausible
+from xew.sim_warp.rendering.observe import observe, scene_recording
+from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.rendering.streams import command_renders
+from xew.sim_warp.robots import get_robot
+from xew.sim_warp.scene import Scene, scene_hash, scene_rng
+from xew.sim_warp.tasks import get_task
+
+
+def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarray]:
+    """Make an episode's pixels, mask and keypoints anew from its recorded joints, objects and commands.
+
+    Returns:
+        The head camera's and the robot's video [t h w 3] uint8, whose hashes agree with the recorded ones.
+
+    Raises:
+        EpisodeError: the scene or anything rendered differs from what is recorded.
+    """
+    demand_known(folder, "joint_pos", "object_pose")
+    record, states = read_record(folder), read_states(folder)
+    robot = get_robot(record.robot, data_folder(folder))
+    scene = _sample_again(folder, record)
+    view = observe(renderer, [scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)])[0]
+    render = command_renders([(robot, states.action)], renderer=renderer)[0]
+    again = replace(states, keypoints=view.keypoints, keypoint_visible=view.keypoint_visible, robot_mask=view.robot_mask)
+    found = {"states": states_hash(again), "rgb": array_hash(view.rgb), "robot": array_hash(render)}
+    found["scene"] = scene_hash(scene)
+    for name, expected in (record.hashes | {"scene": record.scene_hash}).items():
+        if found[name] != expected:
+            raise EpisodeError(
+                f"{folder}: rendered again on {renderer.device.name}, {name} has hash {found[name][:12]}, recorded on "
+                f"{record.device} was {expected[:12]}; with the same device and versions they must agree."
+            )
+    return view.rgb, render
+
+
+def add_videos(folder: Path, renderer: Renderer) -> None:
+    """Make and store the videos of an episode that was written without. Raises EpisodeError as `render_again`."""
+    record = read_record(folder)
+    if not record.videos:
+        rgb, robot = render_again(folder, renderer)
+        write_episode(data_folder(folder), replace(record, videos=True), read_states(folder), rgb, robot)
+
+
+def demand_plausible(folder: Path) -> None:
+    """Raise EpisodeError if an accepted episode's states hold what could not have happened (plausibility.py)."""
+    record, states = read_record(folder), read_states(folder)
+    scene = _sample_again(folder, record)
+    holds = get_task(record.task).plan(scene).path().holds
+    problem = find_implausible(scene, holds, states.object_pose, states.penetration, states.tool_pose, record.frame_rate)
+    if problem:
+        raise EpisodeError(f"{folder}: {problem}; delete it and run generate again.")
+
+
+def _sample_again(folder: Path, record: Record) -> Scene:
+    """The scene of an episode. Raises EpisodeError if its task has other objects now."""
+    scene = get_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
+    if scene.names != record.object_names:
+        raise EpisodeError(
+            f"{folder} has the objects {', '.join(record.object_names)}, {record.task} makes {', '.join(scene.names)} of its "
+            "seed now: the task has changed. Use the xew that made the episode, or delete it and run generate again."
+        )
+    return scene
