@@ -164,7 +164,7 @@ def experiment_of(args: Args, streams: int, batch: int, remat: str, residual: st
 def forward_flops(experiment: Any, samples: int, **options: Any) -> float:
     from xew.model.network.dit import MODELS, flops, token_grid
 
-    grid = token_grid((1, *experiment.latent_shape))
+    grid = token_grid((1, *experiment.inputs.latent_shape))
     streams = 1 + len(experiment.conditions)
     return flops(MODELS[experiment.model.size], [grid] * streams, batch=samples, **options)
 
@@ -197,14 +197,15 @@ def xew_train_step(args: Args, experiment: Any, batch: int) -> dict[str, Any]:
 
     from xew.model.devices.sharding import make_mesh, place_batch
     from xew.model.training.data import fake_batch
-    from xew.model.training.step import init_train_state, make_train_step
+    from xew.model.training.step import make_learner
 
     devices = jax.devices()[: args.mesh.data * args.mesh.fsdp]
     mesh = make_mesh(experiment.mesh, devices)
-    graph, state = init_train_state(experiment, mesh)
+    learner = make_learner(experiment.learning, mesh)
+    state = learner.init_state()
     check_size(args, sum(leaf.size for leaf in jax.tree.leaves(state.params)))
-    step = make_train_step(experiment, graph, mesh)
-    samples = place_batch(fake_batch(experiment, batch * len(devices)), mesh)
+    step = learner.compile_step()
+    samples = place_batch(fake_batch(experiment.inputs, batch * len(devices)), mesh)
     seconds = []
     for _ in range(WARMUP + ROUNDS):
         begin = time.perf_counter()
@@ -233,7 +234,7 @@ def xew_denoise(args: Args) -> Iterator[dict[str, Any]]:
         step = jax.jit(lambda p, b, c, s, g=graph: nnx.merge(g, p)(b.latents, b.conditions, s, b.text, c))
         for samples in args.batches:
             row = {"side": "xew", "streams": streams, "samples": samples, "visibility": visibility}
-            batch, sigma, cache = jax.device_put(fake_batch(experiment, samples)), jnp.full(samples, 0.5), None
+            batch, sigma, cache = jax.device_put(fake_batch(experiment.inputs, samples)), jnp.full(samples, 0.5), None
             if visibility == "one_way":
                 seconds = timed(fill, params, batch, wait=jax.block_until_ready)
                 yield row | {"case": "condition cache, once a clip", "seconds": seconds}

@@ -26,7 +26,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "statistics": set(),
     "sim_warp": set(),
     "model": {"sim_warp", "metrics"},
-    "metrics": {"sim_warp", "model"},
+    "metrics": {"sim_warp"},
     "exchange": {"sim_warp"},
     "analysis": {"sim_warp"},
 }
@@ -35,7 +35,6 @@ LAZILY = {
     ("model", "sim_warp"): ("conditions", "latents", "cache", "episodes", "video"),
     ("model", "metrics"): ("train_vae", "codecs.ceiling"),
     ("metrics", "sim_warp"): ("calibrate", "calibration"),
-    ("metrics", "model"): ("calibrate", "calibration"),
 }
 """Modules and packages of the first room that may import the second, and inside functions alone: the room loads without it."""
 FORBIDDEN = {

@@ -1,14 +1,16 @@
-"""Files, for all rooms: there whole or not at all; and where between runs is kept what can be made again."""
+"""Files, for all rooms: written whole or not at all, digests of their content, and the user's folder for what is kept."""
 
+import hashlib
+import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A name beside `path` to write to, which becomes `path` when the block ends well.
+    """Give a name beside `path` to write to, which becomes `path` when the block ends well.
 
     Who reads `path` finds the old file or the new one. What a failed block has left is removed; folders are made.
 
@@ -22,6 +24,35 @@ def replacing(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's content, in hexadecimal digits. Raises OSError if it cannot be read."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def digest_files(paths: Sequence[Path]) -> str:
+    """SHA-256 of one file's content; of several, that of their digests in order. Raises OSError if one cannot be read."""
+    digests = [file_digest(path) for path in paths]
+    return digests[0] if len(digests) == 1 else hashlib.sha256(b"".join(map(bytes.fromhex, digests))).hexdigest()
+
+
+def digest_tree(path: Path) -> str:
+    """SHA-256 of a file's content; of a folder, that of its files' names and digests."""
+    if not path.is_dir():
+        return file_digest(path)
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    lines = [f"{file_digest(file)} {file.relative_to(path).as_posix()}" for file in files]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+def checkpoint_time(run: Path, step: int) -> int | None:
+    """When a run's checkpoint was begun [ns], which tells it from another of the same step; None if there is none."""
+    try:
+        return json.loads((run / "checkpoints" / str(step) / "_CHECKPOINT_METADATA").read_text())["init_timestamp_nsecs"]
+    except (OSError, ValueError, KeyError):
+        return None
 
 
 def cache_folder(name: str) -> Path:

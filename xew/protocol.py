@@ -17,6 +17,14 @@ Arms of six joints leave their seventh at zero."""
 LEFT_ARM, LEFT_GRIPPER, RIGHT_ARM, RIGHT_GRIPPER = slice(0, 7), 7, slice(8, 15), 15
 ARMS = ((LEFT_ARM, LEFT_GRIPPER), (RIGHT_ARM, RIGHT_GRIPPER))
 
+DIMENSION_TITLES = {
+    "visual": "Visual quality",
+    "morphology": "Robot morphology",
+    "kinematics": "Robot kinematics",
+    "objects": "Object dynamics",
+}
+"""What a group of metrics speaks of; dimensions are reported side by side, never as one number."""
+
 FRAME_RATE = 1000 / 60
 """Stored frames a second: one every 15 physics steps of 4 ms."""
 TASK_COUNT = 25
@@ -44,7 +52,7 @@ SHOTS = (1, 2, 3)
 """M: training episodes of each task that a model is adapted with; the first accepted seeds."""
 FORGETTING_ROBOT = "ur5_wsg"
 """On its test episodes, the same for every adapted model, forgetting is measured."""
-BASELINES = ("copy_first_frame", "ground_truth")
+BASELINES = COPY_FIRST_FRAME, GROUND_TRUTH = ("copy_first_frame", "ground_truth")
 """Rows of a score table that no model made, with the empty variant: a score of nothing, and the estimators' own error."""
 
 

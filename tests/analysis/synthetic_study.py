@@ -8,7 +8,7 @@ import pandas as pd
 
 from xew.analysis.paper import AXES, Paper, read_paper
 from xew.analysis.statistics.grades import SEEN, row_keys
-from xew.analysis.tables.layouts import PAPER_METRICS
+from xew.analysis.tables.labels import PAPER_METRICS
 from xew.metrics import METRICS
 from xew.protocol import HELD_OUT_ROBOTS, PARTS, ROBOT_NAMES, TEST_SEED_START, VARIANTS, Variant
 

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from tests.analysis.test_distance import stick
-from xew.analysis.distance_command import Args, main
+from xew.analysis.distance import Args, main
 from xew.protocol import ROBOT_NAMES
 
 OF_ANY_URDF = {"dof", "links", "reach", "volume", "floor", "kinematic", "arm_base", "arm_alone"}

@@ -7,7 +7,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from xew.analysis.correlation import leave_one_out, loeo_correlation, pearson
-from xew.analysis.paper import AXES, mean_distance_cells, read_paper, rebuild, recompute_changes
+from xew.analysis.paper import AXES, read_paper
+from xew.analysis.tables.recompute import rebuild, recompute_changes, recompute_mean_distances
 from xew.protocol import ROBOT_NAMES
 
 PAPER = read_paper()
@@ -132,7 +133,7 @@ def test_a_figure_that_does_not_belong_is_found() -> None:
 
 
 def test_mean_distances_are_those_of_the_matrices() -> None:
-    cells = mean_distance_cells(PAPER)
+    cells = recompute_mean_distances(PAPER)
     assert len(cells) == 10 and all(cell.agrees for cell in cells)
 
 

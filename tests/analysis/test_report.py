@@ -147,7 +147,7 @@ def test_a_rollout_is_shown_as_it_was_graded(frame_zero: str) -> None:
     for size in ((24, 32), (12, 16), (48, 64)):
         first = 0 if frame_zero == "given" else 1
         video = np.stack([cv2.resize(frame, size[::-1]) for frame in (*truth[first:], truth[0])])
-        assert np.array_equal(pictures.as_graded(video, truth, frame_zero), truth)
+        assert np.array_equal(pictures.fit_to_episode(video, truth, frame_zero), truth)
 
 
 def test_a_report_shows_rollouts_of_another_size_that_begin_with_frame_1(study: Study, tmp_path: Path) -> None:

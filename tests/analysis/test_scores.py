@@ -10,9 +10,9 @@ from tests.analysis.synthetic_study import write_study
 from xew.analysis.scores import (
     COPY,
     TRUTH,
-    describe_cells,
+    describe_scores,
+    find_missing_scores,
     merge_scores,
-    missing_cells,
     read_scores,
     write_scores,
 )
@@ -106,18 +106,18 @@ def test_a_table_that_does_not_describe_a_metric_is_none_of_ours(tmp_path: Path)
 
 def test_missing_cells_are_found_against_the_others() -> None:
     rows = graded()
-    assert missing_cells(rows).empty
+    assert find_missing_scores(rows).empty
     gone = rows.drop(index=[0, len(rows) - 1])
-    found = missing_cells(gone)
+    found = find_missing_scores(gone)
     assert list(found.columns) == ["model", "condition", "task", "seed", "robot", "metric"]
-    assert describe_cells(found) == "flow open_laptop 1000000 ur5_wsg lpips; ground_truth lift_pot 1000000 piper pck"
+    assert describe_scores(found) == "flow open_laptop 1000000 ur5_wsg lpips; ground_truth lift_pot 1000000 piper pck"
     # A robot that a model was never asked for is not missing; an episode that nobody graded cannot be known.
-    assert missing_cells(rows[~((rows["model"] == "flow") & (rows["robot"] == "piper"))]).empty
-    assert missing_cells(rows[rows["task"] == "lift_pot"]).empty
+    assert find_missing_scores(rows[~((rows["model"] == "flow") & (rows["robot"] == "piper"))]).empty
+    assert find_missing_scores(rows[rows["task"] == "lift_pot"]).empty
 
 
 def test_long_lists_are_cut_and_counted() -> None:
-    assert describe_cells(graded(), most=1) == "flow open_laptop 1000000 ur5_wsg lpips; and 23 more"
+    assert describe_scores(graded(), most=1) == "flow open_laptop 1000000 ur5_wsg lpips; and 23 more"
 
 
 def test_merging_names_variants_and_keeps_baselines_once(tmp_path: Path) -> None:
@@ -166,7 +166,7 @@ def test_a_study_that_was_graded_in_parts_is_the_whole_again(tmp_path: Path) -> 
 def test_missing_cells_of_a_study_are_by_variant(tmp_path: Path) -> None:
     rows = graded(baselines=False)
     tables = [("a", written(tmp_path / "a.parquet", rows)), ("b", written(tmp_path / "b.parquet", rows.drop(index=3)))]
-    assert describe_cells(missing_cells(merge_scores(tables).rows)) == "b flow open_laptop 1000000 piper pck"
+    assert describe_scores(find_missing_scores(merge_scores(tables).rows)) == "b flow open_laptop 1000000 piper pck"
 
 
 @pytest.mark.parametrize(

@@ -15,17 +15,19 @@ import pytest
 from tests.synthetic import write_synthetic_data
 from xew.analysis import study as runner
 from xew.analysis.studies import ledger as study_ledger
-from xew.analysis.studies.cell import last_lines, start_cell
 from xew.analysis.studies.config import Study, load_study
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import Machines, RayCluster, ThisMachine, open_machines, visible_gpus
-from xew.analysis.studies.plan import Cell
+from xew.analysis.studies.plan import Step
+from xew.analysis.studies.processes import last_lines, start_step
+from xew.analysis.studies.runner import StudyRunner, complete_command
+from xew.analysis.studies.status import exit_with_failures
 from xew.config import ConfigError
 
 ROOT = Path(__file__).parents[2]
 STEPS = "tests.analysis.steps"
 CHAIN = (("data", ""), ("left", "data"), ("right", "data"), ("end", "left right"))
-"""Cells and what each needs."""
+"""Steps and what each needs."""
 
 
 @pytest.fixture(autouse=True)
@@ -35,8 +37,8 @@ def at_the_root(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def outcomes_of_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cells here make one file each, whatever stage they claim to be."""
-    monkeypatch.setattr(study_ledger, "read_outcome", lambda cell: study_ledger._of_file(cell.product))
+    """Steps here make one file each, whatever stage they claim to be."""
+    monkeypatch.setattr(study_ledger, "digest_product", lambda step: study_ledger._digest_file(step.product))
 
 
 @pytest.fixture
@@ -44,31 +46,31 @@ def study(tmp_path: Path) -> Study:
     return load_study(ROOT / "configs" / "study_debug.yaml", ["--out", str(tmp_path)])
 
 
-def chain(out: Path, **changes: tuple[str, ...]) -> dict[str, Cell]:
-    """The cells of CHAIN; `changes` are more arguments of single ones."""
-    cells = [
-        Cell("train", name, (STEPS, str(out / name), name, *changes.get(name, ())), tuple(f"train/{n}" for n in needs.split()),
+def chain(out: Path, **changes: tuple[str, ...]) -> dict[str, Step]:
+    """The steps of CHAIN; `changes` are more arguments of single ones."""
+    steps = [
+        Step("train", name, (STEPS, str(out / name), name, *changes.get(name, ())), tuple(f"train/{n}" for n in needs.split()),
              list(changes.get(name, ())), out / name)
         for name, needs in CHAIN
     ]  # fmt: skip
-    return {cell.name: cell for cell in cells}
+    return {step.name: step for step in steps}
 
 
 def begun(out: Path) -> dict[str, int]:
-    """How often each cell was started."""
+    """How often each step was started."""
     return {path.stem: len(path.read_text().splitlines()) for path in out.glob("*.begun")}
 
 
-def run(study: Study, cells: dict[str, Cell], machines: Machines | None = None) -> dict[str, str]:
-    """One pass over the cells; what failed."""
+def run(study: Study, steps: dict[str, Step], machines: Machines | None = None) -> dict[str, str]:
+    """One pass over the steps; what failed."""
     machines = machines or ThisMachine((), 2, {})
-    return runner.Run(study, cells, Ledger(study.out), machines, dict.fromkeys(cells, 1.0)).to_the_end()
+    return StudyRunner(study, steps, Ledger(study.out), machines, dict.fromkeys(steps, 1.0)).run()
 
 
 def test_what_is_done_is_not_done_again(study: Study) -> None:
-    cells = chain(study.out)
-    assert run(study, cells) == {}
-    assert run(study, cells) == {}
+    steps = chain(study.out)
+    assert run(study, steps) == {}
+    assert run(study, steps) == {}
     assert begun(study.out) == dict.fromkeys(("data", "left", "right", "end"), 1)
     assert (study.out / "end").read_text() == "end"
 
@@ -88,35 +90,35 @@ def test_a_change_is_carried_on_and_no_further(study: Study) -> None:
 
 
 def test_a_failing_cell_is_named_and_the_others_go_on(study: Study, capsys: pytest.CaptureFixture[str]) -> None:
-    cells, ledger = chain(study.out, left=("--fail",)), Ledger(study.out)
-    failed = run(study, cells)
+    steps, ledger = chain(study.out, left=("--fail",)), Ledger(study.out)
+    failed = run(study, steps)
     assert failed == {"train/left": "exit status 1", "train/end": "needs train/left"}
     assert begun(study.out) == {"data": 1, "left": 1, "right": 1}
     with pytest.raises(SystemExit) as stop:
-        runner.tell_failures(failed, ledger, cells)
+        exit_with_failures(failed, ledger, steps)
     said = capsys.readouterr().err
     assert stop.value.code == 1
     assert f"log: {study.out / 'logs' / 'train' / 'left.log'}" in said and "the disk is made of cheese" in said
-    assert "1 cells failed, 1 could not be made for it" in said
+    assert "1 steps failed, 1 could not be made for it" in said
     assert run(study, chain(study.out)) == {}
     assert begun(study.out) == {"data": 1, "left": 2, "right": 1, "end": 1}
 
 
 def test_a_command_that_makes_nothing_has_failed(study: Study) -> None:
-    cells = chain(study.out)
-    cells = {"train/data": cells["train/data"], "train/left": cells["train/left"]}
-    cells["train/left"] = Cell("train", "left", (STEPS, str(study.out / "elsewhere"), "x"), (), None, study.out / "left")
-    assert run(study, cells) == {"train/left": f"it made no {study.out / 'left'}"}
+    steps = chain(study.out)
+    steps = {"train/data": steps["train/data"], "train/left": steps["train/left"]}
+    steps["train/left"] = Step("train", "left", (STEPS, str(study.out / "elsewhere"), "x"), (), None, study.out / "left")
+    assert run(study, steps) == {"train/left": f"it made no {study.out / 'left'}"}
 
 
 def test_the_analysis_is_of_whatever_was_graded(study: Study) -> None:
-    cells = chain(study.out, left=("--fail",))
-    end = cells.pop("train/end")
+    steps = chain(study.out, left=("--fail",))
+    end = steps.pop("train/end")
     for name in ("left", "right"):
-        cell = cells.pop(f"train/{name}")
-        cells[f"evaluate/{name}"] = Cell("evaluate", name, cell.command, cell.needs, None, cell.product)
-    analyse = Cell("analyse", "", end.command, ("evaluate/left", "evaluate/right"), None, end.product)
-    assert list(run(study, cells | {"analyse": analyse})) == ["evaluate/left"]
+        step = steps.pop(f"train/{name}")
+        steps[f"evaluate/{name}"] = Step("evaluate", name, step.command, step.needs, None, step.product)
+    analyse = Step("analyse", "", end.command, ("evaluate/left", "evaluate/right"), None, end.product)
+    assert list(run(study, steps | {"analyse": analyse})) == ["evaluate/left"]
     assert (study.out / "logs" / "analyse.log").read_text().splitlines()[0].endswith(f"{study.out / 'end'} end right")
 
 
@@ -129,7 +131,7 @@ def write_checkpoint(run: Path) -> None:
 
 def test_a_training_goes_on_from_its_own_checkpoint_only(study: Study) -> None:
     run = study.out / "run"
-    first, second = (Cell("train", "a", (), (), inputs, run) for inputs in ("first", "second"))
+    first, second = (Step("train", "a", (), (), inputs, run) for inputs in ("first", "second"))
     ledger = Ledger(study.out)
     assert not ledger.begin(first)
     run.mkdir()
@@ -137,29 +139,29 @@ def test_a_training_goes_on_from_its_own_checkpoint_only(study: Study) -> None:
     assert not ledger.begin(first) and not run.exists()
     write_checkpoint(run)
     assert ledger.begin(first) and run.exists()
-    assert runner.command_of(first, True, {}) == ("--resume",)
-    assert runner.command_of(first, False, {}) == ()
+    assert complete_command(first, True, {}) == ("--resume",)
+    assert complete_command(first, False, {}) == ()
     assert not ledger.begin(second) and not run.exists()
 
 
 def test_rollouts_of_another_training_are_removed(study: Study) -> None:
     product = study.out / "rollouts"
-    cell = Cell("rollout", "a", (), (), "first", product)
+    step = Step("rollout", "a", (), (), "first", product)
     ledger = Ledger(study.out)
-    ledger.begin(cell)
+    ledger.begin(step)
     product.mkdir()
-    ledger.begin(cell)
+    ledger.begin(step)
     assert product.exists()
-    ledger.begin(Cell("rollout", "a", (), (), "second", product))
+    ledger.begin(Step("rollout", "a", (), (), "second", product))
     assert not product.exists()
 
 
 def test_a_damaged_record_is_no_record(study: Study) -> None:
-    cells, ledger = chain(study.out), Ledger(study.out)
-    run(study, cells)
+    steps, ledger = chain(study.out), Ledger(study.out)
+    run(study, steps)
     (study.out / "state" / "train" / "data.json").write_text('{"status": "do')
-    assert ledger.record(cells["train/data"]) == {}
-    assert run(study, cells) == {}
+    assert ledger.record(steps["train/data"]) == {}
+    assert run(study, steps) == {}
     assert begun(study.out)["data"] == 2
 
 
@@ -172,7 +174,7 @@ def wait_for(happened: Callable[[], bool], seconds: float = 60.0) -> None:
 
 
 def alive(name: Path) -> bool:
-    """Whether a process holds the lock that cells hold."""
+    """Whether a process holds the lock that steps hold."""
     return subprocess.run(["flock", "--nonblock", str(name), "true"]).returncode != 0
 
 
@@ -183,14 +185,14 @@ from tests.analysis.test_study import ROOT, chain, load_study, run, runner
 
 if __name__ == "__main__":
     study = load_study(ROOT / "configs" / "study_debug.yaml", ["--out", sys.argv[1]])
-    with runner.alone(study.out), runner.stoppable():
+    with runner.lock_study(study.out), runner.stop_on_sigterm():
         run(study, chain(study.out, data=("--wait", "300")))
 """
 
 
 @pytest.fixture
 def waiting_study(study: Study) -> Iterator[subprocess.Popen[bytes]]:
-    """Another process that runs a chain whose first cell takes long."""
+    """Another process that runs a chain whose first step takes long."""
     (study.out / "script.py").write_text(SCRIPT)
     arguments = [sys.executable, study.out / "script.py", study.out]
     process = subprocess.Popen(arguments, env=os.environ | {"PYTHONPATH": str(ROOT)})
@@ -203,13 +205,13 @@ def waiting_study(study: Study) -> Iterator[subprocess.Popen[bytes]]:
 def test_killed_studies_leave_nobody_behind(study: Study, waiting_study: subprocess.Popen[bytes]) -> None:
     lock = study.out / "logs" / "train" / "data.lock"
     assert alive(lock)
-    with pytest.raises(ConfigError, match="another process runs the study"), runner.alone(study.out):
+    with pytest.raises(ConfigError, match="another process runs the study"), runner.lock_study(study.out):
         pass
     waiting_study.kill()
     waiting_study.wait()
     wait_for(lambda: not alive(lock))
     assert json.loads((study.out / "state" / "train" / "data.json").read_text())["status"] == "begun"
-    with runner.alone(study.out):
+    with runner.lock_study(study.out):
         assert run(study, chain(study.out)) == {}
 
 
@@ -221,11 +223,11 @@ def test_sigterm_stops_a_study_and_its_cells(study: Study, waiting_study: subpro
 
 def test_two_of_one_cell_never_run_at_once(study: Study) -> None:
     """The second waits until the first has gone, as after a kill that was not noticed yet."""
-    log = study.out / "cell.log"
+    log = study.out / "step.log"
     command = (STEPS, str(study.out / "file"), "text", "--wait", "0.5")
-    first = start_cell(command, log, {})
+    first = start_step(command, log, {})
     wait_for((study.out / "file.begun").exists)
-    second = start_cell(command, log, {})
+    second = start_step(command, log, {})
     assert begun(study.out) == {"file": 1}
     first.join()
     second.join()
@@ -235,7 +237,7 @@ def test_two_of_one_cell_never_run_at_once(study: Study) -> None:
 
 @pytest.mark.parametrize(("arguments", "code"), [(["--fail"], 1), (["--unknown-number", "x"], 0), (["--wait", "x"], 2)])
 def test_exit_statuses_are_those_of_the_command(tmp_path: Path, arguments: list[str], code: int) -> None:
-    process = start_cell((STEPS, str(tmp_path / "file"), "text", *arguments), tmp_path / "cell.log", {})
+    process = start_step((STEPS, str(tmp_path / "file"), "text", *arguments), tmp_path / "step.log", {})
     process.join()
     assert process.exitcode == code
 
@@ -250,25 +252,25 @@ def test_the_end_of_a_log_has_no_progress_bars(tmp_path: Path) -> None:
 
 def test_a_launcher_starts_the_command(tmp_path: Path) -> None:
     """As srun would; here env, which also sets a variable."""
-    process = start_cell(
-        ("json.tool", "--help"), tmp_path / "cell.log", {}, method="spawn", launcher=("env", "PYTHONIOENCODING=utf-8")
+    process = start_step(
+        ("json.tool", "--help"), tmp_path / "step.log", {}, method="spawn", launcher=("env", "PYTHONIOENCODING=utf-8")
     )
     process.join()
     assert process.exitcode == 0
-    assert (tmp_path / "cell.log").read_text().startswith("$ env PYTHONIOENCODING=utf-8 python -m json.tool")
+    assert (tmp_path / "step.log").read_text().startswith("$ env PYTHONIOENCODING=utf-8 python -m json.tool")
 
 
 def test_gpus_are_shared_out(study: Study) -> None:
     machine = ThisMachine(("2", "5", "7"), 1, {})
-    one, two = Cell("rollout", "a", (), (), None, study.out), Cell("train", "b", (), (), None, study.out, gpus=2)
-    assert machine.slots == 3 and machine.room_for(two)
-    for cell in (two, one):
-        machine.start(cell, (STEPS, str(study.out / cell.variant), "x", "--wait", "0.2"), study.out / f"{cell.variant}.log")
+    one, two = Step("rollout", "a", (), (), None, study.out), Step("train", "b", (), (), None, study.out, gpus=2)
+    assert machine.slots == 3 and machine.has_room_for(two)
+    for step in (two, one):
+        machine.start(step, (STEPS, str(study.out / step.variant), "x", "--wait", "0.2"), study.out / f"{step.variant}.log")
     assert machine._running["train/b"].slots == ("2", "5") and machine._running["rollout/a"].slots == ("7",)
-    assert not machine.room_for(one)
+    assert not machine.has_room_for(one)
     while machine._running:
         machine.wait()
-    assert machine.room_for(Cell("train", "c", (), (), None, study.out, gpus=3))
+    assert machine.has_room_for(Step("train", "c", (), (), None, study.out, gpus=3))
 
 
 def test_gpus_that_are_not_there(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -279,11 +281,30 @@ def test_gpus_that_are_not_there(study: Study, monkeypatch: pytest.MonkeyPatch) 
         open_machines(asked)
 
 
+def test_help_lists_what_may_be_overridden(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        runner.main([str(ROOT / "configs" / "study_debug.yaml"), "--help"])
+    said = capsys.readouterr().out
+    assert stop.value.code == 0
+    assert all(option in said for option in ("--dry-run", "--redo", "--train-seeds", "--machine.gpus-per-training"))
+
+
+def test_overrides_and_options_go_in_any_order() -> None:
+    config = str(ROOT / "configs" / "study_debug.yaml")
+    args = runner.read_arguments(
+        [config, "--parts", "few_shot", "forgetting", "--redo", "a", "b", "--train-seeds", "2", "--dry-run"]
+    )
+    assert (args.redo, args.dry_run, args.study.parts) == (("a", "b"), True, ("few_shot", "forgetting"))
+    assert args.study == load_study(
+        ROOT / "configs" / "study_debug.yaml", ["--parts", "few_shot", "forgetting", "--train-seeds", "2"]
+    )
+
+
 def test_redo_names_cells(study: Study) -> None:
-    cells = chain(study.out)
-    assert [cell.name for cell in runner.chosen(cells, ["train/*t"])] == ["train/left", "train/right"]
-    with pytest.raises(ConfigError, match="matches no cell"):
-        runner.chosen(cells, ["evaluate/*"])
+    steps = chain(study.out)
+    assert [step.name for step in runner.select_steps(steps, ["train/*t"])] == ["train/left", "train/right"]
+    with pytest.raises(ConfigError, match="matches no step"):
+        runner.select_steps(steps, ["evaluate/*"])
 
 
 def test_grades_made_anew_do_not_go_on_from_old_ones(study: Study) -> None:
@@ -291,7 +312,7 @@ def test_grades_made_anew_do_not_go_on_from_old_ones(study: Study) -> None:
     (scores / "a.cells").mkdir(parents=True)
     for name in ("a.parquet", "a.curves.parquet", "b.parquet"):
         (scores / name).touch()
-    Ledger(study.out).forget(Cell("evaluate", "a", (), (), None, scores / "a.parquet"))
+    Ledger(study.out).forget(Step("evaluate", "a", (), (), None, scores / "a.parquet"))
     assert [path.name for path in scores.iterdir()] == ["b.parquet"]
 
 
@@ -299,15 +320,15 @@ def test_data_beyond_the_study_is_an_error(study: Study) -> None:
     """Its models would learn from it, and be graded on it."""
     write_synthetic_data(study.data_folder, tasks=("place_empty_cup", "open_laptop"), seeds=(0, 1, 1_000_000), frames=3)
     only = replace(study, robots=("ur5_wsg", "aloha_agilex", "arx_x5", "piper"))
-    said = runner.Run(only, {}, Ledger(study.out), ThisMachine((), 1, {}), {})._check_data()
+    said = StudyRunner(only, {}, Ledger(study.out), ThisMachine((), 1, {}), {})._check_data()
     assert "also holds open_laptop, franka_panda, 1 more train seeds a task" in said
     fitting = replace(study, tasks=("place_empty_cup", "open_laptop"), train_seeds=2)
-    assert runner.Run(fitting, {}, Ledger(study.out), ThisMachine((), 1, {}), {})._check_data() == ""
+    assert StudyRunner(fitting, {}, Ledger(study.out), ThisMachine((), 1, {}), {})._check_data() == ""
 
 
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="choose another --out"), runner.alone(tmp_path / "file" / "study"):
+    with pytest.raises(ConfigError, match="choose another --out"), runner.lock_study(tmp_path / "file" / "study"):
         pass
 
 
@@ -332,7 +353,7 @@ def test_experiments_that_the_model_does_not_take_are_said_before_anything_start
 
 
 def test_cells_run_as_tasks_on_a_ray_cluster(study: Study) -> None:
-    """Two nodes of one core each: two cells that wait for one another run at once, so on both; a failure is told."""
+    """Two nodes of one core each: two steps that wait for one another run at once, so on both; a failure is told."""
     pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 

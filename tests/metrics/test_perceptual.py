@@ -11,7 +11,8 @@ import pytest
 
 from xew.metrics import lpips, lpips_features, lpips_from_features, region_lpips, region_lpips_frames
 from xew.metrics.networks import alexnet
-from xew.metrics.networks.alexnet import _package_file, read_alexnet, read_arrays
+from xew.metrics.networks.alexnet import ADMITTED, _package_file, read_alexnet
+from xew.metrics.networks.pickles import read_arrays
 from xew.metrics.perceptual import SMALLEST_SIDE, union_box
 
 rng = np.random.default_rng(3)
@@ -38,9 +39,9 @@ def test_the_weights_are_those_of_version_0_1() -> None:
 
 def test_a_weight_file_that_asks_for_more_than_arrays_is_refused() -> None:
     with pytest.raises(pickle.UnpicklingError, match="print"):
-        read_arrays(io.BytesIO(pickle.dumps(print)))
+        read_arrays(io.BytesIO(pickle.dumps(print)), ADMITTED)
     with pytest.raises(pickle.UnpicklingError, match="numpy"):
-        read_arrays(io.BytesIO(pickle.dumps(np.random.default_rng)))
+        read_arrays(io.BytesIO(pickle.dumps(np.random.default_rng)), ADMITTED)
 
 
 def test_torchs_files_hold_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

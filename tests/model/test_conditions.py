@@ -29,7 +29,7 @@ from xew.model.conditions import (
     tool_deltas,
     tool_poses,
 )
-from xew.model.latents import episode_command
+from xew.model.episodes.commands import episode_command
 from xew.protocol import ACTION_DIM, ROBOT_NAMES
 from xew.sim_warp.robots import ROBOTS, keep_robot
 

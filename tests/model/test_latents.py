@@ -11,10 +11,11 @@ import pytest
 from tests import synthetic
 from xew.episode import EpisodeError, read_record, write_video
 from xew.model import latents
+from xew.model.cache.clips import needed_pixels
+from xew.model.cache.encode import encode_many
 from xew.model.codecs.codec import PatchCodec
 from xew.model.conditions import Command
 from xew.model.experiment import load_experiment
-from xew.model.latents import encode_many, needed_pixels
 from xew.model.video.pixels import stored_pixels
 
 CONFIG = """
@@ -101,10 +102,10 @@ def test_video_that_is_not_as_long_as_its_episode_is_told(tmp_path: Path, capsys
 
 def test_only_what_is_needed_is_read(simulated: Path) -> None:
     experiment = load_experiment(simulated / "config.yaml")
-    assert needed_pixels(experiment, ["rgb", "action", "embodiment"]) == ["rgb", "robot"]
-    assert needed_pixels(experiment, ["action"]) == []
+    assert needed_pixels(experiment.conditions, ["rgb", "action", "embodiment"]) == ["rgb", "robot"]
+    assert needed_pixels(experiment.conditions, ["action"]) == []
     joints = load_experiment(simulated / "config.yaml", ["--model.action", "joints", "--model.embodiment", "none"])
-    assert needed_pixels(joints, ["rgb", "joints"]) == ["rgb"]
+    assert needed_pixels(joints.conditions, ["rgb", "joints"]) == ["rgb"]
 
 
 def test_a_render_at_hand_is_not_read_again() -> None:

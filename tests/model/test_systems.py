@@ -14,16 +14,19 @@ from xew.config import ConfigError
 from xew.dataset import find_accepted
 from xew.episode import read_record, read_states, read_video, write_episode
 from xew.model import latents, rollout, train
-from xew.model.conditions import ACTIONS, System
+from xew.model.cache.codecs import load_codec
+from xew.model.cache.keys import scales_path
+from xew.model.cache.scales import load_scales
+from xew.model.conditions import ACTIONS
+from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import create_model, load_experiment
-from xew.model.latents import LatentCache, load_codec, load_scales, scales_path, training_episodes
 from xew.model.sampling.predict import Predictor
 from xew.model.training.data import ClipSource, fake_batch
 from xew.rollout import find_rollouts
 
 FRAMES = 9
 ROBOTS = ("aloha_agilex", "arx_x5", "piper")
-SYSTEMS = [name for name, entry in ACTIONS.items() if isinstance(entry, System) and entry.conditions]
+SYSTEMS = [name for name, entry in ACTIONS.items() if isinstance(entry, tuple)]
 BASELINES = Path(__file__).parents[2] / "configs" / "baselines"
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}
@@ -64,9 +67,9 @@ def test_a_system_is_trained_and_rolled_out(world: Path, name: str) -> None:
 def test_what_is_cached_has_the_declared_shapes(world: Path, name: str) -> None:
     latents.main([str(world / f"{name}.yaml")])
     experiment = load_experiment(world / f"{name}.yaml")
-    episodes = training_episodes(experiment)
-    source = ClipSource(LatentCache(experiment, load_codec(experiment, episodes)), episodes)
-    fake = fake_batch(experiment, 1).conditions
+    episodes = training_episodes(experiment.choice)
+    source = ClipSource.open(experiment.encoding, experiment.instructions, episodes)
+    fake = fake_batch(experiment.inputs, 1).conditions
     assert {key: (1, *value.shape) for key, value in source[0].conditions.items()} == {k: v.shape for k, v in fake.items()}
     for stream, condition in experiment.conditions.items():
         assert condition.scale != "percentiles" or np.abs(source[0].conditions[stream]).max() <= 1
@@ -79,13 +82,14 @@ def test_a_rollout_s_history_is_its_own(world: Path, tmp_path: Path) -> None:
     """
     experiment = load_experiment(world / "ctrl_world.yaml")
     latents.main([str(world / "ctrl_world.yaml")])
-    episodes = training_episodes(experiment)
+    episodes = training_episodes(experiment.choice)
     graph, params = nnx.split(create_model(experiment), nnx.Param)
     leaves, tree = jax.tree.flatten(params)
     keys = jax.random.split(jax.random.key(1), len(leaves))
     drawn = [0.2 * jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
-    codec, scales = load_codec(experiment, episodes), load_scales(experiment, episodes)
-    predictor = Predictor(experiment, codec, graph, jax.tree.unflatten(tree, drawn), scales)
+    codec, scales = load_codec(experiment.encoding, episodes), load_scales(experiment.encoding, episodes)
+    drawn_params = jax.tree.unflatten(tree, drawn)
+    predictor = Predictor(experiment.inputs, experiment.instructions, experiment.sampling, codec, graph, drawn_params, scales)
     folder, record = next((f, r) for f, r in find_accepted(world / "data") if r.robot == "piper" and r.seed)
     before = predictor.predict([(folder, record)], FRAMES)
 
@@ -98,8 +102,7 @@ def test_a_rollout_s_history_is_its_own(world: Path, tmp_path: Path) -> None:
 
     np.testing.assert_array_equal(before, recorded(1))
     assert (recorded(0) != before).any()
-    forgetful = replace(experiment.model, history=(-1, -1, -1, -1, -1, -1))
-    other = replace(predictor, experiment=replace(experiment, model=forgetful))
+    other = replace(predictor, inputs=replace(predictor.inputs, history=(-1, -1, -1, -1, -1, -1)))
     changed = other.predict([(folder, record)], FRAMES) != before
     assert not changed[:, :5].any() and changed[:, 5:].any()
 
@@ -108,7 +111,7 @@ def test_what_a_system_needs_and_lacks_is_told(world: Path, tmp_path: Path, caps
     config = world / "bwm.yaml"
     latents.main([str(config)])
     experiment = load_experiment(config)
-    scales_path(experiment, training_episodes(experiment)).unlink()
+    scales_path(experiment.encoding, training_episodes(experiment.choice)).unlink()
     with pytest.raises(SystemExit) as stop:
         train.main([str(config), "--out", str(tmp_path / "run")])
     said = capsys.readouterr().err

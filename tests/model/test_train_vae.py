@@ -12,10 +12,11 @@ from tests import synthetic
 from xew.dataset import find_accepted
 from xew.episode import EpisodeError, read_video
 from xew.model import latents, train_vae
+from xew.model.cache.store import open_cache
 from xew.model.codecs.codec import CodecSettings, WanVaeCodec
+from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import load_experiment
-from xew.model.latents import LatentCache, load_codec
-from xew.model.train_vae import init_vae_state, load_vae_experiment, make_vae_step, training_episodes
+from xew.model.train_vae import init_vae_state, load_vae_experiment, make_vae_step
 from xew.model.training.vae_data import Cut, make_dataset, random_clips, read_frames, video_files
 from xew.model.video.frames import to_model_size
 from xew.protocol import seed_split
@@ -81,7 +82,7 @@ def test_what_is_written_is_a_codec(run: Path) -> None:
     codec = WanVaeCodec.prepare(settings, list)
     assert codec.hash == report["hash"]
     experiment = load_vae_experiment(run / "config.yaml")
-    files = video_files(experiment.streams, training_episodes(experiment), experiment.cache_folder)
+    files = video_files(experiment.streams, training_episodes(experiment.choice), experiment.cache_folder)
     clips = [random_clips(*file, experiment.cut(whole=True), np.random.default_rng(1))[0] for file in files]
     encoded = np.concatenate([codec.encode(clip).reshape(-1, codec.channels) for clip in clips])
     assert np.abs(encoded.mean(0)).max() < 0.3
@@ -100,9 +101,10 @@ train: {{steps: 1, batch: 1}}
 """)
     latents.main([str(config)])
     experiment = load_experiment(config)
-    episodes = latents.training_episodes(experiment)
-    codec = load_codec(experiment, episodes)
-    stored = LatentCache(experiment, codec).read(episodes[0][1], "rgb", 0)
+    episodes = training_episodes(experiment.choice)
+    cache = open_cache(experiment.encoding, episodes)
+    codec = cache.codec
+    stored = cache.read(episodes[0][1], "rgb", 0)
     clip = to_model_size(read_video(episodes[0][0] / "rgb.mkv")[:5], 64, 80)
     np.testing.assert_allclose(stored, codec.encode(clip), atol=0.01)
     header = json.loads((experiment.cache_folder / "header.json").read_text())
@@ -116,7 +118,7 @@ def test_steps_learn(world: Path) -> None:
     experiment = load_vae_experiment(world / "vae.yaml", ["--train.steps", "100", "--train.lpips", "0.2"])
     graph, statistics, state = init_vae_state(experiment)
     step = make_vae_step(graph, statistics, experiment)
-    files = video_files(("rgb",), training_episodes(experiment), experiment.cache_folder)
+    files = video_files(("rgb",), training_episodes(experiment.choice), experiment.cache_folder)
     pictures = next(iter(make_dataset(files, experiment.cut(), 2, 0)))
     psnr, perceptual = [], []
     for _ in range(25):
@@ -131,7 +133,7 @@ def test_steps_learn(world: Path) -> None:
 
 def test_only_training_robots_and_seeds_are_seen(world: Path) -> None:
     experiment = load_vae_experiment(world / "vae.yaml")
-    chosen = training_episodes(experiment)
+    chosen = training_episodes(experiment.choice)
     everything = find_accepted(experiment.data)
     robots = {record.robot for _, record in chosen}
     assert robots == set(experiment.robots.train_robots) and len(chosen) == 3 < len(everything)

@@ -2,17 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import permutations, product
+from itertools import permutations
 
 import numpy as np
 from scipy.stats import rankdata
 
+from xew.statistics import every_draw, interval
+
 FOLDS = 5
 ORDERS = np.array(list(permutations(range(FOLDS))))
 """All pairings of five distances with five scores [120 5]."""
-RESAMPLES = np.array([drawn for drawn in product(range(FOLDS), repeat=FOLDS) if len(set(drawn)) > 2])
+ROBOT_DRAWS = every_draw(FOLDS, least=3)
 """All draws of five robots with replacement [2820 5] but those of one or two robots, where r is undefined or always +-1."""
-LEVEL = 0.95
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Correlation:
     spearman: float
     """The same of ranks: it asks for order only. Not in the paper."""
     bootstrap_low: float
-    """2.5 % of r over all resamples of the robots. Not in the paper."""
+    """2.5 % of r over all draws of the robots. Not in the paper."""
     bootstrap_high: float
     """97.5 % of them."""
 
@@ -100,9 +101,8 @@ def permutation_p(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _bootstrap(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Percentile interval of r over all resamples; those in which something does not vary have no r."""
-    low, high = np.nanquantile(pearson(x[RESAMPLES], y[RESAMPLES]), [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return float(low), float(high)
+    """Interval of r over all draws of the robots; those in which something does not vary have no r."""
+    return interval(np.concatenate([pearson(x, y)[None], pearson(x[ROBOT_DRAWS], y[ROBOT_DRAWS])]))
 
 
 def _folds(distance: Sequence[float], score: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Stage 11 of 11: report. A score table to one page that opens without a network.
+"""A score table to one page that opens without a network.
 
 Reads  scores.parquet and its curves; the data set and the rollouts for pictures
 Writes <out>/index.html (self-contained), report.md with figures/, tables/ (LaTeX, CSV) and summary.csv; of a study findings.csv
@@ -22,6 +22,7 @@ from typing import Annotated
 import numpy as np
 import pandas as pd
 import tyro
+from markupsafe import Markup
 from tqdm import tqdm
 
 from xew.analysis.paper import read_paper
@@ -30,17 +31,16 @@ from xew.analysis.reports import paper as paper_report
 from xew.analysis.reports import study as report_study
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study_charts import run_chart
-from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, missing_cells, read_scores
-from xew.analysis.statistics.grades import MIN_SCENES
-from xew.analysis.statistics.summary import METRIC_TITLES, RobotTable, Row, finding, flat_summary, robot_table, robot_title
+from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, find_missing_scores, read_scores
+from xew.analysis.statistics.summary import RobotTable, Row, finding, flat_summary, robot_table, robot_title
 from xew.analysis.tables import formats
-from xew.analysis.tables.layouts import Block, Cell, Table, interval_text, metric_columns, number
-from xew.analysis.tables.layouts import Row as TableRow
+from xew.analysis.tables.table import Table, TableCell, TableRow, TableSection, format_interval, format_number, metric_columns
 from xew.config import ConfigError, user_errors
 from xew.dataset import find_records
 from xew.episode import Record, episode_folder, read_video
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
+from xew.statistics import MIN_SCENES
 
 TITLE = "Can the model render a robot that it has never seen?"
 STRIP_METRIC = "lpips"
@@ -81,7 +81,7 @@ class Picture:
     name: str
     image: bytes
     """PNG."""
-    html: str
+    html: Markup
 
 
 @user_errors
@@ -100,8 +100,8 @@ def main(args: Args) -> None:
 def _report_paper(args: Args) -> None:
     if args.scores or args.data or args.rollouts or args.distances:
         raise ConfigError("--paper reports on the paper's own figures; leave out scores, --data, --rollouts and --distances.")
-    report = paper_report.build(read_paper(), _footer({}))
-    _write(args.out, report.html, (report.markdown, report.files), report.summary)
+    report = paper_report.build(read_paper(), _format_footer({}))
+    _write_report(args.out, report.html, (report.markdown, report.files), report.summary)
 
 
 def _report_study(args: Args, scores: Scores) -> None:
@@ -111,8 +111,8 @@ def _report_study(args: Args, scores: Scores) -> None:
         )
     if args.data and not any(find_records(args.data)):
         raise ConfigError(f"{args.data} holds no episode; make some: python -m xew.sim_warp.generate --out {args.data}")
-    report = report_study.build(scores, args.data, args.rollouts, args.distances, _footer(scores.versions))
-    _write(args.out, report.html, (report.markdown, report.files), report.summary)
+    report = report_study.build(scores, args.data, args.rollouts, args.distances, _format_footer(scores.versions))
+    _write_report(args.out, report.html, (report.markdown, report.files), report.summary)
 
 
 def _report_scores(args: Args, scores: Scores) -> None:
@@ -127,10 +127,10 @@ def _report_scores(args: Args, scores: Scores) -> None:
     records = [record for _, record in find_records(args.data)] if args.data else []
     if args.data and not records:
         raise ConfigError(f"{args.data} holds no episode; make some: python -m xew.sim_warp.generate --out {args.data}")
-    held_out, seen = _tables(scores, records, args.held_out)
-    missing = missing_cells(scores.rows)
-    strips = _strips(scores, args) if args.data and args.rollouts else []
-    curves = _curves(scores, args.held_out)
+    held_out, seen = _make_tables(scores, records, args.held_out)
+    missing = find_missing_scores(scores.rows)
+    strips = _make_strips(scores, args) if args.data and args.rollouts else []
+    curves = _curve_chart(scores, args.held_out)
     sheets = [_contact_sheet(args.data, records)] if args.data and any(record.success for record in records) else []
     sections = [
         *map(page.note, report_study.missing_note(missing)),
@@ -142,20 +142,22 @@ def _report_scores(args: Args, scores: Scores) -> None:
         _method_section(scores, args),
     ]
     sentences = finding(held_out, seen, scores.metrics)
-    html = page.page(TITLE, sentences, [text for text in sections if text], _footer(scores.versions))
-    notes = [*report_study.missing_note(missing), *_caution(held_out)]
-    text, files = _markdown(sentences, notes, held_out, seen, scores, [*strips, *sheets], chart_files(curves))
+    html = page.page(TITLE, sentences, [part for part in sections if part], _format_footer(scores.versions))
+    notes = [*report_study.missing_note(missing), *_caution_notes(held_out)]
+    text, files = _write_markdown(sentences, notes, held_out, seen, scores, [*strips, *sheets], chart_files(curves))
     if len(missing):
         files["missing.csv"] = missing.to_csv(index=False).encode()
-    _write(args.out, html, (text, files), flat_summary(held_out + seen))
+    _write_report(args.out, html, (text, files), flat_summary(held_out + seen))
 
 
-def _tables(scores: Scores, records: Sequence[Record], held_out: Sequence[str]) -> tuple[list[RobotTable], list[RobotTable]]:
+def _make_tables(
+    scores: Scores, records: Sequence[Record], held_out: Sequence[str]
+) -> tuple[list[RobotTable], list[RobotTable]]:
     """A table for each held-out robot, never averaged over them; one for the seen robots pooled, as in the paper."""
     present = set(scores.rows["robot"])
 
     def build(title: str, robots: Sequence[str]) -> RobotTable:
-        return robot_table(scores, title, robots, _expected(records, robots) if records else None)
+        return robot_table(scores, title, robots, _count_expected(records, robots) if records else None)
 
     apart = [build(robot_title(robot), [robot]) for robot in held_out if robot in present]
     rest = [robot for robot in ROBOT_NAMES if robot in present and robot not in held_out]
@@ -163,14 +165,14 @@ def _tables(scores: Scores, records: Sequence[Record], held_out: Sequence[str]) 
     return apart, pooled
 
 
-def _expected(records: Sequence[Record], robots: Sequence[str]) -> int:
+def _count_expected(records: Sequence[Record], robots: Sequence[str]) -> int:
     """Test episodes of these robots in seeds that all robots have mastered: what a complete table has."""
     failed = {(record.task, record.seed) for record in records if not record.success}
     tests = [record for record in records if seed_split(record.seed) == "test" and (record.task, record.seed) not in failed]
     return sum(record.robot in robots for record in tests)
 
 
-def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> str:
+def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> Markup:
     if not tables:
         return page.section("Robots never seen in training", page.note("No held-out robot has been graded yet."))
     return page.section(
@@ -180,12 +182,12 @@ def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo
             "frame, paired by episode: ▲ better, ▼ worse, ≈ not resolved. The ceiling is the true video graded in the model's "
             "place: what it lacks is the estimators' own error, and a smaller difference is not resolved."
         ),
-        *map(page.note, _caution(tables)),
+        *map(page.note, _caution_notes(tables)),
         *(page.table(run_table(table, metrics)) for table in tables),
     )
 
 
-def _caution(tables: Sequence[RobotTable]) -> list[str]:
+def _caution_notes(tables: Sequence[RobotTable]) -> list[str]:
     """What to say of few episodes; none where there are enough."""
     few = min((table.count for table in tables), default=np.inf)
     if few < MIN_SCENES:
@@ -193,9 +195,9 @@ def _caution(tables: Sequence[RobotTable]) -> list[str]:
     return ["Fewer than ten episodes a robot: intervals and verdicts are rough."] if few < 10 else []
 
 
-def _seen_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> str:
+def _seen_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> Markup | None:
     if not tables:
-        return ""
+        return None
     text = "The same model on robots that it was trained on, at test seeds: what is missing here is not embodiment."
     return page.section("Robots seen in training", page.paragraph(text), *(page.table(run_table(t, metrics)) for t in tables))
 
@@ -215,19 +217,19 @@ def run_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> Table:
         f"{of[0].upper()}{of[1:]}.",
         ("model",),
         metric_columns({metric.name: metric for metric in shown}, [metric.name for metric in shown]),
-        (Block("", tuple(rows), "" if table.complete else f"Incomplete: {of} are scored."),),
+        (TableSection("", tuple(rows), "" if table.complete else f"Incomplete: {of} are scored."),),
     )
 
 
-def _run_cell(row: Row, metric: MetricInfo) -> Cell:
+def _run_cell(row: Row, metric: MetricInfo) -> TableCell:
     score = row.scores.get(metric.name)
     if score is None:
-        return Cell()
+        return TableCell()
     if row.model == TRUTH and metric.name == "psnr":
-        return Cell("exact", episodes=score.count)  # all frames are equal to the truth
-    return Cell(
-        number(score.mean, metric),
-        interval_text((score.low, score.high), metric),
+        return TableCell("exact", episodes=score.count)  # all frames are equal to the truth
+    return TableCell(
+        format_number(score.mean, metric),
+        format_interval((score.low, score.high), metric),
         verdict=row.verdicts.get(metric.name, ""),
         value=score.mean,
         low=score.low,
@@ -236,7 +238,7 @@ def _run_cell(row: Row, metric: MetricInfo) -> Cell:
     )
 
 
-def _strip_section(strips: Sequence[Picture]) -> str:
+def _strip_section(strips: Sequence[Picture]) -> Markup:
     if not strips:
         return page.section(
             "What it looks like", page.note("No pictures: name the data and the rollouts (--data, --rollouts).")
@@ -248,16 +250,16 @@ def _strip_section(strips: Sequence[Picture]) -> str:
     return page.section("What it looks like", page.paragraph(text), *(strip.html for strip in strips))
 
 
-def _data_section(sheets: Sequence[Picture], records: Sequence[Record]) -> str:
+def _data_section(sheets: Sequence[Picture], records: Sequence[Record]) -> Markup | None:
     if not sheets:
-        return ""
+        return None
     accepted = sum(record.success for record in records)
     text = f"{len(records)} cells were tried, {accepted} succeeded. A seed counts when every robot has mastered it."
     return page.section("The paired data", page.paragraph(text), *(sheet.html for sheet in sheets))
 
 
-def _method_section(scores: Scores, args: Args) -> str:
-    definitions = {METRIC_TITLES.get(metric.name, metric.name): metric.reference for metric in scores.metrics}
+def _method_section(scores: Scores, args: Args) -> Markup:
+    definitions = {metric.title: metric.reference for metric in scores.metrics}
     notes = (
         f"Every metric is a mean over the predicted frames; {FRAME_ZERO[scores.frame_zero]}. Masks in predicted video are "
         "estimated with the help of the true episode, by the same estimator for every row."
@@ -268,18 +270,18 @@ def _method_section(scores: Scores, args: Args) -> str:
     return page.section("How it was measured", page.paragraph(notes), page.definitions(definitions), page.definitions(made))
 
 
-def _strips(scores: Scores, args: Args) -> list[Picture]:
+def _make_strips(scores: Scores, args: Args) -> list[Picture]:
     """Up to three strips for each held-out robot and model."""
     assert args.data is not None
     rollouts = {(r.model, r.condition, r.task, r.seed, r.robot): r for root in args.rollouts for r in find_rollouts(root)}
     rows = scores.rows[(scores.rows["metric"] == STRIP_METRIC) & scores.rows["robot"].isin(args.held_out)]
     rows = rows[~rows["model"].isin([COPY, TRUTH])]
-    chosen = [pair for _, group in rows.groupby(["robot", "model", "condition"]) for pair in _ranked(group)]
+    chosen = [pair for _, group in rows.groupby(["robot", "model", "condition"]) for pair in _rank_episodes(group)]
     shown = tqdm(chosen, desc="strips", unit="strip", disable=None)
-    return [_strip(row, word, rollouts, args.data, scores.frame_zero) for word, row in shown]
+    return [_make_strip(row, word, rollouts, args.data, scores.frame_zero) for word, row in shown]
 
 
-def _ranked(group: pd.DataFrame) -> list[tuple[str, pd.Series]]:
+def _rank_episodes(group: pd.DataFrame) -> list[tuple[str, pd.Series]]:
     """Best, median and worst row by the ranking metric (lower is better); fewer where there are fewer."""
     if len(group) == 1:
         return [("the only episode", group.iloc[0])]
@@ -288,26 +290,24 @@ def _ranked(group: pd.DataFrame) -> list[tuple[str, pd.Series]]:
     return [(word, ordered.iloc[place]) for place, word in sorted(places.items())]
 
 
-def _strip(
+def _make_strip(
     row: pd.Series, word: str, rollouts: dict[tuple[str, str, str, int, str], Rollout], data: Path, frame_zero: str
 ) -> Picture:
     key = (row["model"], row["condition"], row["task"], int(row["seed"]), row["robot"])
     if key not in rollouts:
         raise ConfigError(f"the rollout {' '.join(map(str, key))} is graded but not under --rollouts; name its tree too.")
     observed = read_video(episode_folder(data, *key[2:]) / "rgb.mkv")
-    predicted = pictures.as_graded(read_rollout_video(rollouts[key]), observed, frame_zero)
+    predicted = pictures.fit_to_episode(read_rollout_video(rollouts[key]), observed, frame_zero)
     times = pictures.strip_times(int(row["frames"]))
-    image = pictures.png(pictures.strip(observed, predicted, times))
-    caption = (
-        f"<b>{page.escape(robot_title(row['robot']))}, {page.escape(row['task'])}</b>, seed {row['seed']} · "
-        f"{page.escape(' · '.join(filter(None, key[:2])))} · {word}, LPIPS {row['value']:.3f}"
-    )
+    image = pictures.encode_png(pictures.strip(observed, predicted, times))
+    title = f"{robot_title(row['robot'])}, {row['task']}"
+    caption = f", seed {row['seed']} · {' · '.join(filter(None, key[:2]))} · {word}, LPIPS {row['value']:.3f}"
     columns = [f"frame {t}" for t in times]
-    html = page.labeled_picture(pictures.data_uri(image), caption, columns, ["observed", "predicted", "difference"])
+    html = page.labeled_picture(pictures.data_uri(image), caption, columns, ["observed", "predicted", "difference"], title)
     return Picture("_".join((*map(str, key[:5]), word)).replace("/", "-") + ".png", image, html)
 
 
-def _curves(scores: Scores, held_out: Sequence[str]) -> Chart:
+def _curve_chart(scores: Scores, held_out: Sequence[str]) -> Chart:
     metrics = [metric for metric in scores.metrics if metric.name in CURVE_METRICS] or list(scores.metrics[:3])
     robots = [robot for robot in held_out if robot in set(scores.rows["robot"])] or sorted(set(scores.rows["robot"]))
     return run_chart(scores.curves, metrics, robots)
@@ -320,7 +320,7 @@ def _contact_sheet(data: Path, records: Sequence[Record]) -> Picture:
     known = dict.fromkeys((*ROBOT_NAMES, *(record.robot for record in accepted)))
     robots = [robot for robot in known if any(record.robot == robot for record in accepted)]
     rows = [_task_row(data, [record for record in accepted if record.task == task], robots) for task in tasks]
-    image = pictures.png(pictures.sheet(rows))
+    image = pictures.encode_png(pictures.sheet(rows))
     caption = "One seed of each task half-way through: the scene is the same for every robot."
     titles = [robot_title(robot) for robot in robots]
     names = [task.replace("_", " ") for task in tasks]
@@ -341,14 +341,14 @@ def _task_row(data: Path, records: Sequence[Record], robots: Sequence[str]) -> l
     return [found.get(robot, blank) for robot in robots]
 
 
-def _footer(graded_with: Mapping[str, str]) -> str:
+def _format_footer(graded_with: Mapping[str, str]) -> str:
     packages = ("xew", "numpy", "scipy", "pandas", "opencv-python-headless")
     versions = {name: metadata.version(name) for name in packages} | dict(graded_with)
     text = " · ".join(f"{name} {version}" for name, version in versions.items())
-    return page.escape(f"{text} · Python {platform.python_version()}")
+    return f"{text} · Python {platform.python_version()}"
 
 
-def _markdown(
+def _write_markdown(
     sentences: Sequence[str],
     notes: Sequence[str],
     held_out: Sequence[RobotTable],
@@ -368,11 +368,11 @@ def _markdown(
     lines += ["", "## Figures", "", *(f"![{name}](figures/{name})" for name in files if name.endswith(".png"))]
     made_tables = [run_table(table, scores.metrics) for table in (*held_out, *seen)]
     written = {f"tables/{table.name}.tex": formats.latex(table).encode() for table in made_tables}
-    written |= {f"tables/{table.name}.csv": formats.frame(table).to_csv(index=False).encode() for table in made_tables}
+    written |= {f"tables/{table.name}.csv": formats.table_frame(table).to_csv(index=False).encode() for table in made_tables}
     return "\n".join(lines) + "\n", written | {f"figures/{name}": content for name, content in files.items()}
 
 
-def _write(out: Path, html: str, markdown: tuple[str, Mapping[str, bytes]], summary: pd.DataFrame) -> None:
+def _write_report(out: Path, html: str, markdown: tuple[str, Mapping[str, bytes]], summary: pd.DataFrame) -> None:
     """The page last, so that where it stands all that it speaks of stands too."""
     text, files = markdown
     try:

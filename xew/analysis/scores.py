@@ -1,9 +1,10 @@
-"""Stage 11 of 11, its input: score tables, read, checked and merged. Cells that are wrong are named, never averaged over.
+"""Score tables, read, checked and merged. Cells that are wrong are named, never averaged over.
 
 A study's table is several runs' tables as one: `merge_scores` adds the column `variant`, which names the trained model of
 each row (xew.protocol.Variant) and is empty for the two baselines, which belong to no model.
 """
 
+import operator
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -14,7 +15,7 @@ import pandas as pd
 
 from xew.config import ConfigError
 from xew.files import replacing
-from xew.protocol import ROBOT_NAMES
+from xew.protocol import BASELINES, ROBOT_NAMES
 
 VARIANT = "variant"
 EPISODE = ["task", "seed", "robot"]
@@ -22,10 +23,12 @@ KEY = ["model", "condition", *EPISODE]
 NAMES = [VARIANT, "model", "condition", "task", "robot", "metric"]
 """Columns of text."""
 COLUMNS = [*KEY, "metric", "value", "frames", "exact_frames"]
-COPY, TRUTH = "copy_first_frame", "ground_truth"
+COPY, TRUTH = BASELINES
 """The two models that every other is read against: a score of nothing, and the ceiling."""
 COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero")
 """What a table says of how it was graded; tables that differ in it do not compare."""
+DEFINITION = ("dimension", "unit", "higher_is_better", "low", "high", "reference")
+"""What a table says of each metric, and has always said."""
 LISTED = 20
 """Cells that an error names of each kind; it counts the others."""
 
@@ -43,6 +46,21 @@ class MetricInfo:
     low: float | None
     high: float | None
     reference: str
+    title: str = ""
+    """What tables and charts call it; its name where the table does not say."""
+    estimated: bool = False
+    """Does it need an estimator, so that even the true video does not get the best score?"""
+    reported: bool = False
+    """Does a study's full table show it, beside the metrics of the paper?"""
+
+    def __post_init__(self) -> None:
+        if not self.title:
+            object.__setattr__(self, "title", self.name)
+
+    @property
+    def best(self) -> float | None:
+        """The best score; None where there is none, as of PSNR."""
+        return self.high if self.higher_is_better else self.low
 
 
 @dataclass(frozen=True)
@@ -108,10 +126,10 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
         raise ConfigError(f"{path} has no {', '.join(missing)}; it is no score table of xew. Make one: {command}")
     if rows.empty:
         raise ConfigError(f"{path} holds no row. Grade some rollouts: {command}")
-    metrics = _described(path, rows.attrs["metrics"])
-    wrong = _wrong_cells(rows, metrics, {*ROBOT_NAMES, *rows.attrs.get("robots", ()), *own_robots})
+    metrics = _read_metric_infos(path, rows.attrs["metrics"])
+    wrong = _find_wrong_rows(rows, metrics, {*ROBOT_NAMES, *rows.attrs.get("robots", ()), *own_robots})
     if wrong:
-        raise ConfigError(f"{path} cannot be averaged over:\n{_listed(wrong)}\nGrade anew: {command} --overwrite")
+        raise ConfigError(f"{path} cannot be averaged over:\n{_format_wrong_rows(wrong)}\nGrade anew: {command} --overwrite")
     return Scores(rows, curves, metrics, rows.attrs)
 
 
@@ -138,18 +156,20 @@ def merge_scores(tables: Sequence[tuple[str, Path]], own_robots: Sequence[str] =
         if not variant or scores.of_study:
             found = f"is a merged table of {scores.rows[VARIANT].nunique()} variants" if variant else "has no variant's name"
             raise ConfigError(f"{path} {found}; expected the score table of one variant, and its name.")
-        new = _without_known_baselines(scores.rows, graded)
-        rows.append(_named(variant, new))
-        curves.append(_compact(_named(variant, _curves_of(scores.curves, new))))
+        new = _drop_known_baselines(scores.rows, graded)
+        rows.append(_add_variant_column(variant, new))
+        curves.append(_compact_names(_add_variant_column(variant, _select_curves(scores.curves, new))))
         attributes.append((path, scores.attributes))
         metrics = metrics or scores.metrics
-    common = _common_attributes(attributes)
+    common = _merge_attributes(attributes)
     merged = pd.concat(rows, ignore_index=True)
-    wrong = _wrong_cells(merged, metrics, set(merged["robot"]))
+    wrong = _find_wrong_rows(merged, metrics, set(merged["robot"]))
     if wrong:
         paths = ", ".join(str(path) for _, path in tables)
-        raise ConfigError(f"the score tables {paths} do not go together:\n{_listed(wrong)}\nGrade them anew from one data set.")
-    return Scores(merged, _stacked(curves), metrics, common)
+        raise ConfigError(
+            f"the score tables {paths} do not go together:\n{_format_wrong_rows(wrong)}\nGrade them anew from one data set."
+        )
+    return Scores(merged, _stack_compact_tables(curves), metrics, common)
 
 
 def write_scores(scores: Scores, path: Path) -> None:
@@ -168,7 +188,7 @@ def write_scores(scores: Scores, path: Path) -> None:
         raise ConfigError(f"cannot write {path}: {error}. Free some space or choose another place.") from error
 
 
-def missing_cells(rows: pd.DataFrame) -> pd.DataFrame:
+def find_missing_scores(rows: pd.DataFrame) -> pd.DataFrame:
     """What some graded and others did not: means over such cells would compare different episodes.
 
     A model (of a variant and condition) that has a score of a robot is expected to have all scores that any other has of
@@ -185,7 +205,7 @@ def missing_cells(rows: pd.DataFrame) -> pd.DataFrame:
     return missing.sort_values(list(missing.columns), ignore_index=True)
 
 
-def describe_cells(cells: pd.DataFrame, most: int = LISTED) -> str:
+def describe_scores(cells: pd.DataFrame, most: int = LISTED) -> str:
     """Such as 'reference flow open_laptop 1000003 piper lpips; …', and how many more there are."""
     columns = [column for column in (VARIANT, *KEY, "metric") if column in cells]
     shown = "; ".join(" ".join(str(part) for part in cell if part != "") for cell in cells[columns].head(most).to_numpy())
@@ -203,16 +223,33 @@ def _read(path: Path, command: str) -> pd.DataFrame:
         raise ConfigError(f"{path} cannot be read ({error}); delete it and make it anew: {command}") from error
 
 
-def _described(path: Path, described: Mapping[str, Mapping[str, Any]]) -> tuple[MetricInfo, ...]:
+def _read_metric_infos(path: Path, described: Mapping[str, Mapping[str, Any]]) -> tuple[MetricInfo, ...]:
     """What a table says of its metrics; more than is asked for here is left alone."""
-    names = [field.name for field in fields(MetricInfo) if field.name != "name"]
     for metric, info in described.items():
-        if missing := [name for name in names if name not in info]:
+        if missing := [name for name in DEFINITION if name not in info]:
             raise ConfigError(f"{path} does not say the {', '.join(missing)} of {metric}; it is no score table of this xew.")
-    return tuple(MetricInfo(name=metric, **{name: info[name] for name in names}) for metric, info in described.items())
+    known = {field.name for field in fields(MetricInfo)}
+    return tuple(
+        MetricInfo(name=metric, **{"estimated": _was_estimated(metric, info)} | {k: v for k, v in info.items() if k in known})
+        for metric, info in described.items()
+    )
 
 
-def _wrong_cells(rows: pd.DataFrame, metrics: Sequence[MetricInfo], robots: set[str]) -> dict[str, pd.DataFrame]:
+def _was_estimated(metric: str, info: Mapping[str, Any]) -> bool:
+    """Of tables that were written before they said so: of whole pictures nothing was estimated."""
+    return info["dimension"] != "visual" and metric != "region_lpips"
+
+
+def _have_same_metrics(one: Mapping[str, Mapping[str, Any]], other: Mapping[str, Mapping[str, Any]]) -> bool:
+    """Do two tables define their metrics alike? Titles and the like do not count, which older tables do not have."""
+
+    def definitions(described: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+        return {metric: {name: info.get(name) for name in DEFINITION} for metric, info in described.items()}
+
+    return definitions(one) == definitions(other)
+
+
+def _find_wrong_rows(rows: pd.DataFrame, metrics: Sequence[MetricInfo], robots: set[str]) -> dict[str, pd.DataFrame]:
     """Rows that cannot be averaged over, by what is wrong with them."""
     # Of a variant, model and condition are no more than names; two of them would be two scores of one cell.
     named = rows.assign(**{VARIANT: rows[VARIANT].where(rows[VARIANT] != "", rows["model"])}) if VARIANT in rows else rows
@@ -233,15 +270,16 @@ def _wrong_cells(rows: pd.DataFrame, metrics: Sequence[MetricInfo], robots: set[
     return {reason: rows[mask] for reason, mask in found.items() if mask.any()}
 
 
-def _listed(wrong: Mapping[str, pd.DataFrame]) -> str:
-    return "\n".join(f"  {reason}, {len(cells)} rows: {describe_cells(cells)}" for reason, cells in wrong.items())
+def _format_wrong_rows(wrong: Mapping[str, pd.DataFrame]) -> str:
+    return "\n".join(f"  {reason}, {len(cells)} rows: {describe_scores(cells)}" for reason, cells in wrong.items())
 
 
-def _common_attributes(tables: Sequence[tuple[Path, Mapping[Hashable, Any]]]) -> dict[Hashable, Any]:
+def _merge_attributes(tables: Sequence[tuple[Path, Mapping[Hashable, Any]]]) -> dict[Hashable, Any]:
     """Attributes that all tables share; versions of packages may differ and are all named."""
     first = tables[0][1]
     for key in COMPARABLE:
-        if any(attributes.get(key) != first.get(key) for _, attributes in tables):
+        same = _have_same_metrics if key == "metrics" else operator.eq
+        if not all(same(attributes.get(key, {}), first.get(key, {})) for _, attributes in tables):
             found = "\n".join(f"  {path}: {attributes.get(key)}" for path, attributes in tables)
             raise ConfigError(
                 f"the score tables differ in {key}, so their numbers do not compare:\n{found}\n"
@@ -254,7 +292,7 @@ def _common_attributes(tables: Sequence[tuple[Path, Mapping[Hashable, Any]]]) ->
     return merged | ({"robots": robots} if robots else {})
 
 
-def _without_known_baselines(rows: pd.DataFrame, graded: set[tuple[object, ...]]) -> pd.DataFrame:
+def _drop_known_baselines(rows: pd.DataFrame, graded: set[tuple[object, ...]]) -> pd.DataFrame:
     """Rows but those of baselines that are in `graded`, to which the others' are added."""
     columns = [*KEY, "metric", "content" if "content" in rows else "value"]
     identities = list(rows[columns].itertuples(index=False, name=None))
@@ -264,7 +302,7 @@ def _without_known_baselines(rows: pd.DataFrame, graded: set[tuple[object, ...]]
     return rows[new]
 
 
-def _curves_of(curves: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame:
+def _select_curves(curves: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame:
     """The curves of baselines that are in a table's rows, and all others."""
     is_baseline = curves["model"].isin((COPY, TRUTH))
     kept = rows.loc[rows["model"].isin((COPY, TRUTH)), [*KEY, "metric"]]
@@ -272,7 +310,7 @@ def _curves_of(curves: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame:
     return own if kept.empty else pd.concat([own, curves[is_baseline].merge(kept, on=[*KEY, "metric"])])
 
 
-def _named(variant: str, table: pd.DataFrame) -> pd.DataFrame:
+def _add_variant_column(variant: str, table: pd.DataFrame) -> pd.DataFrame:
     """A table with its variant in front; baselines have none."""
     own = np.where(table["model"].isin((COPY, TRUTH)), "", variant)
     named = table.assign(**{VARIANT: own})[[VARIANT, *table.columns]]
@@ -280,12 +318,12 @@ def _named(variant: str, table: pd.DataFrame) -> pd.DataFrame:
     return named
 
 
-def _compact(curves: pd.DataFrame) -> pd.DataFrame:
+def _compact_names(curves: pd.DataFrame) -> pd.DataFrame:
     """Names as numbers: a study of the paper's size has a hundred million frames."""
     return curves.astype(dict.fromkeys(NAMES, "category"))
 
 
-def _stacked(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+def _stack_compact_tables(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Compact tables, one below the other, still compact."""
     known = {name: sorted(set().union(*(table[name].cat.categories for table in tables))) for name in NAMES}
     alike = [table.astype({name: pd.CategoricalDtype(known[name]) for name in NAMES}) for table in tables]

@@ -9,7 +9,6 @@ The merged table says in its attribute `study` what was planned, so that whoever
 """
 
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,23 +29,25 @@ class Args:
     study: Annotated[Path, tyro.conf.Positional]
     """Folder of the study."""
     variants: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Those that are graded; all that have scores where left out."""
+    """Variants that are graded; all that have scores where left out."""
     distances: Path | None = None
     """Folder of python -m xew.analysis.distance; without it the report has the paper's distances."""
 
 
 @user_errors
 def main(args: Args) -> None:
-    """Merge, write, report."""
+    """Merge the tables, write the merged one and its report."""
     study = load_study(args.study / "study.yaml")
     study = replace(study, out=args.study)
-    graded = args.variants or tuple(v.name for v in study.planned if (args.study / "scores" / f"{v.name}.parquet").exists())
+    graded = args.variants or tuple(
+        v.name for v in study.planned_variants if (args.study / "scores" / f"{v.name}.parquet").exists()
+    )
     if not graded:
         raise ConfigError(f"{args.study} has no graded variant yet; run python -m xew.analysis.study {args.study}/study.yaml")
     merged = merge_scores([(name, args.study / "scores" / f"{name}.parquet") for name in graded])
     scores = replace(merged, attributes={**merged.attributes, "study": describe(study, merged)})
     write_scores(scores, args.study / "scores.parquet")
-    print(coverage(scores.attributes["study"]))
+    print(format_coverage(scores.attributes["study"]))
     rollouts = tuple(args.study / "rollouts" / name for name in graded)
     table, data, out = args.study / "scores.parquet", study.data_folder, args.study / "report"
     shutil.rmtree(out, ignore_errors=True)  # a larger study's figures would stay
@@ -54,7 +55,7 @@ def main(args: Args) -> None:
 
 
 def describe(study: Study, scores: Scores) -> dict[str, Any]:
-    """What the merged table says of its study, plain JSON.
+    """What the merged table says about its study, as plain JSON.
 
     Returns:
         `parts`, `tasks` (number), `robots`, `train_seeds`, `test_seeds`, `shots`: the extent; `of_paper`: whether it is the
@@ -65,10 +66,10 @@ def describe(study: Study, scores: Scores) -> dict[str, Any]:
     found = episodes.groupby([VARIANT, "robot"]).size().to_dict()
     variants = {
         variant.name: {
-            "expected": study.graded(variant),
-            "found": {robot: int(found.get((variant.name, robot), 0)) for robot in study.graded(variant)},
+            "expected": study.graded_counts(variant),
+            "found": {robot: int(found.get((variant.name, robot), 0)) for robot in study.graded_counts(variant)},
         }
-        for variant in study.planned
+        for variant in study.planned_variants
     }
     return {
         "parts": list(study.parts),
@@ -86,12 +87,12 @@ def describe(study: Study, scores: Scores) -> dict[str, Any]:
 def is_of_paper(study: Study) -> bool:
     """Whether every variant is trained and graded on as many episodes as in the paper."""
     seeds = (study.train_seeds, study.test_seeds) == (TRAIN_SEEDS_PER_TASK, TEST_SEEDS_PER_TASK)
-    counts = all(study.graded(variant) == expected_counts(variant) for variant in study.planned)
+    counts = all(study.graded_counts(variant) == expected_counts(variant) for variant in study.planned_variants)
     return seeds and counts and study.task_count == TASK_COUNT
 
 
-def coverage(described: dict[str, Any]) -> str:
-    """Whether the table is complete, in a line for each variant that is not."""
+def format_coverage(described: dict[str, Any]) -> str:
+    """Text that says whether the table is complete, with a line for each variant that is not."""
     lines = [
         f"{name}: " + ", ".join(f"{robot} {counts['found'][robot]} of {count}" for robot, count in counts["expected"].items())
         for name, counts in described["variants"].items()
@@ -100,12 +101,11 @@ def coverage(described: dict[str, Any]) -> str:
     if not lines:
         return f"all {len(described['variants'])} variants are complete"
     return "\n".join(
-        [f"INCOMPLETE, {len(lines)} of {len(described['variants'])} variants lack scored episodes:", *_indented(lines)]
+        [
+            f"INCOMPLETE, {len(lines)} of {len(described['variants'])} variants lack scored episodes:",
+            *(f"  {line}" for line in lines),
+        ]
     )
-
-
-def _indented(lines: Sequence[str]) -> list[str]:
-    return [f"  {line}" for line in lines]
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What one RoboTwin HDF5 file holds, in our conventions: `read_robotwin(path)`.
+"""Reader of RoboTwin's HDF5 files: `read_robotwin(path)` gives one episode in our conventions.
 
 Reads  the legacy layout (observation/, joint_action/, endpose/) and that of version 1.0 (vision/, state/)
 Writes `Recorded`
@@ -150,7 +150,7 @@ def _resize(image: np.ndarray) -> np.ndarray:
 
 
 def _center_pixels(intrinsics: np.ndarray, scale: float) -> np.ndarray:
-    """RoboTwin counts pixels from the upper left corner of the first, we from its center."""
+    """K [3 3] of pixels that count from the center of the first, as ours do; RoboTwin counts from its upper left corner."""
     found = intrinsics.copy()
     found[:2] /= scale
     found[:2, 2] -= 0.5
@@ -158,8 +158,11 @@ def _center_pixels(intrinsics: np.ndarray, scale: float) -> np.ndarray:
 
 
 def _world_to_camera(reader: "_Reader", name: str) -> np.ndarray:
-    """[4 4], from either direction: of a matrix and its inverse the one under which the camera hangs over the table, sees it
-    and looks as the robot does, to +y. (The head camera's inverse sees the table too, from the other side.)"""
+    """World to camera [4 4] m, of a matrix that is stored in either direction.
+
+    Of the matrix and its inverse it is the one under which the camera hangs over the table, sees it and looks as the robot
+    does, to +y. (The head camera's inverse sees the table too, from the other side.)
+    """
     stored = reader.constant(name, None)
     if stored.shape not in ((3, 4), (4, 4)):
         raise reader.error(f"{name} has shape {stored.shape}", "[3 4] or [4 4]")
@@ -195,6 +198,7 @@ class _Reader:
         return found
 
     def numbers(self, name: str, dimensions: int) -> np.ndarray:
+        """Finite numbers [...] float64 in so many dimensions."""
         stored = self.dataset(name)
         if stored.ndim != dimensions or stored.dtype.kind not in "fiu":
             raise self.error(f"{name} is {stored.dtype} of shape {stored.shape}", f"numbers in {dimensions} dimensions")
@@ -204,14 +208,14 @@ class _Reader:
         return array
 
     def column(self, name: str) -> np.ndarray:
-        """[t] from [t] or [t 1]."""
+        """Numbers [t] that are stored as [t] or [t 1]."""
         array = self.numbers(name, self.dataset(name).ndim)
         if array.ndim != 1 and array.shape[1:] != (1,):
             raise self.error(f"{name} has shape {array.shape}", "[frames 1]: a gripper of one number")
         return array.reshape(len(array))
 
     def constant(self, name: str, shape: tuple[int, ...] | None) -> np.ndarray:
-        """A matrix that is stored once or, the same, for every frame."""
+        """A matrix [r c] that is stored once or, the same, for every frame."""
         stored = self.numbers(name, self.dataset(name).ndim)
         first = stored[0] if stored.ndim == 3 else stored
         if stored.ndim not in (2, 3) or (shape is not None and first.shape != shape):
@@ -221,6 +225,7 @@ class _Reader:
         return first
 
     def pictures(self, name: str, frames: int) -> np.ndarray:
+        """Decoded pictures [t h w 3] uint8 RGB."""
         stored = self.dataset(name)
         if len(stored) != frames:
             raise self.error(f"{name} has {len(stored)} pictures", f"one for each of {frames} frames")
@@ -263,7 +268,7 @@ def _as_text(value: object) -> str:
 
 
 def _first_instruction(text: str) -> str:
-    """Of a JSON list, of RoboTwin's {"seen": […], "unseen": […]}, or plain text."""
+    """The first entry of a JSON list, of RoboTwin's {"seen": […], "unseen": […]}, or plain text."""
     try:
         content = json.loads(text)
     except ValueError:

@@ -75,7 +75,7 @@ class Args:
 
 @dataclass(frozen=True)
 class Place:
-    """A file of a kind, as LeRobot numbers them."""
+    """Number of a file of its kind, as LeRobot counts chunks and files."""
 
     chunk: int = 0
     file: int = 0
@@ -208,7 +208,7 @@ class _Tables:
             self.writer.close()
 
     def add(self, columns: dict[str, np.ndarray]) -> Place:
-        """Append an episode; where it is."""
+        """Append the rows of an episode, arrays [t n] or [t] by feature; returns the file that has them."""
         rows = _arrow(columns)
         if self.writer is not None and self.bytes + rows.nbytes > LARGEST_DATA * 1e6:
             self.writer.close()
@@ -237,7 +237,7 @@ class _Films:
         self._close()
 
     def add(self, video: np.ndarray) -> dict[str, Any]:
-        """Append an episode [t h w 3] uint8 RGB; the columns that say where it is."""
+        """Append the video of an episode [t h w 3] uint8 RGB; returns the columns that say where it is."""
         if self.container is not None and self.bytes > LARGEST_VIDEO * 1e6:
             self._close()
             self.place = self.place.next_place()
@@ -293,11 +293,13 @@ class _Totals:
     frames: int = 0
 
     def add(self, columns: dict[str, np.ndarray]) -> None:
+        """Take in the numbers of an episode, [t n] or [t] by feature."""
         for name, values in columns.items():
             self.columns.setdefault(name, []).append(values)
         self.frames += len(columns["index"])
 
     def add_colors(self, key: str, counts: np.ndarray) -> None:
+        """Take in how often each value occurs in a video [3 256]."""
         self.colors[key] = self.colors.get(key, 0) + counts
 
     def statistics(self) -> dict[str, dict[str, Any]]:
@@ -306,7 +308,7 @@ class _Totals:
 
 
 def _statistics(values: np.ndarray) -> dict[str, list[Any]]:
-    """Of [t n] or [t] over the frames: lists of n numbers."""
+    """Statistics over the frames of numbers [t n] or [t], as lists of n numbers."""
     rows = values.reshape(len(values), -1).astype(np.float64)
     found = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
     found |= {name: np.quantile(rows, share, axis=0) for name, share in QUANTILES.items()}

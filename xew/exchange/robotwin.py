@@ -156,7 +156,7 @@ def fit_bases(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
 
 
 def _middle_pose(poses: np.ndarray) -> np.ndarray:
-    """Of poses [t 7] the one nearest to their median, so that it is a pose."""
+    """The pose [7] of poses [t 7] that is nearest to their median."""
     aligned = np.concatenate([poses[:, :3], poses[:, 3:] * np.where(poses[:, 3:] @ poses[0, 3:] < 0, -1, 1)[:, None]], 1)
     return poses[int(np.argmin(np.linalg.norm(aligned - np.median(aligned, axis=0), axis=1)))]
 
@@ -183,7 +183,7 @@ def _robot(path: Path, recorded: Recorded, args: Args) -> tuple[str, RobotSpec |
 
 
 def _embodiment(path: Path) -> str:
-    """Our key of the robot that the names of the folders tell."""
+    """Our key of the robot that a folder above the file is named after."""
     for part in reversed(path.absolute().parts[:-1]):
         for theirs, ours in EMBODIMENTS.items():
             if theirs.lower().replace("-", "_") in part.lower().replace("-", "_"):
@@ -212,7 +212,7 @@ def _seed(path: Path) -> int:
 def _build_states(
     robot: RobotSpec | None, action: np.ndarray, recorded: Recorded
 ) -> tuple[States, tuple[str, ...], np.ndarray | None]:
-    """States, names of keypoints and the robot-only video, as far as they can be known."""
+    """States, names of keypoints and the robot-only video [t h w 3] of commands [t 16], as far as they can be known."""
     frames, height, width = recorded.rgb.shape[:3]
     camera = Camera(recorded.intrinsics, recorded.extrinsics)
     names: tuple[str, ...] = ()

@@ -7,7 +7,6 @@ To add one: its file, and one line in MASKERS, TRACKERS or FLOWS; from outside t
     masks = masker(prediction, target, target_mask)
 """
 
-import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from xew.config import ConfigError, pick
+from xew.files import digest_tree
 from xew.metrics.estimators.cotracker import open_cotracker
 from xew.metrics.estimators.flow import dis_flow, open_raft
 from xew.metrics.estimators.masks import Appearance, estimate_masks, learn_appearance
@@ -85,17 +85,7 @@ def identity(name: str, checkpoint: Path | None = None) -> str:
 
     The same bytes give the same text wherever they lie.
     """
-    return name if checkpoint is None else f"{name} {checkpoint.name} sha256:{checkpoint_digest(checkpoint)[:16]}"
-
-
-def checkpoint_digest(path: Path) -> str:
-    """SHA-256 of a file; of a folder, that of its files' names and digests."""
-    if not path.is_dir():
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    files = sorted(file for file in path.rglob("*") if file.is_file())
-    lines = [f"{checkpoint_digest(file)} {file.relative_to(path).as_posix()}" for file in files]
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+    return name if checkpoint is None else f"{name} {checkpoint.name} sha256:{digest_tree(checkpoint)[:16]}"
 
 
 T = TypeVar("T")

@@ -11,6 +11,7 @@ masks and points stands beside what it makes of the true ones.
     python -m xew.metrics.calibrate --data data --codec runs/fixed --out calibration
 """
 
+import importlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, zip_longest
@@ -57,6 +58,8 @@ class Args:
     """Folder of the tables."""
     codec: Path | None = None
     """A run of `xew.model.train`, through whose codec the true videos go."""
+    codec_opener: str = "xew.model.runs.roundtrip:open_roundtrip"
+    """Function that opens it, as module:NAME: of the run's folder to a function of video to video, [t h w 3] uint8."""
     seeds: tuple[int, ...] = ()
     """Only episodes of these seeds; all others serve as another seed's."""
     episodes: int = 0
@@ -86,7 +89,7 @@ class Estimators:
 def main(args: Args) -> None:
     """Grade, write, and print both tables."""
     estimators = Estimators(open_masker(args.masks, args.masks_checkpoint), open_tracker(args.tracks, args.tracks_checkpoint))
-    through_codec = None if args.codec is None else open_codec(args.codec)
+    through_codec = None if args.codec is None else open_codec(args.codec, args.codec_opener)
     episodes = find_accepted(args.data)
     tables = {name: pd.DataFrame() for name in ("references", "wrong", "frames")}
     text = ""
@@ -171,25 +174,20 @@ def another(episodes: Sequence[Episode], record: Record, differs: str) -> Path |
     return None if following == own else folders[following]
 
 
-def open_codec(run: Path) -> Callable[[np.ndarray], np.ndarray]:
-    """What a run's codec leaves of a video uint8 [t h w 3]. Raises ConfigError if there is no such run."""
-    # Only here: the metrics load without the model.
-    from xew.model.runs.checkpoint import load_run
-    from xew.model.video.frames import to_camera_size, to_model_size
+def open_codec(run: Path, opener: str) -> Callable[[np.ndarray], np.ndarray]:
+    """A function of video [t h w 3] uint8 to what a run's codec leaves of it.
 
+    The metrics do not know the model: the function that opens its runs is named, as anybody's can be.
+
+    Raises:
+        ConfigError: the run or the opener does not exist.
+    """
+    module, _, name = opener.partition(":")
     try:
-        experiment, codec = load_run(run)
-    except FileNotFoundError as error:
-        raise ConfigError(
-            f"{run} is no run with a codec ({error.filename}); name a folder that xew.model.train wrote."
-        ) from error
-
-    def through(video: np.ndarray) -> np.ndarray:
-        filled = np.concatenate([video, np.repeat(video[-1:], -(len(video) - 1) % 4, axis=0)])  # it takes 4 k + 1 frames
-        small = to_model_size(filled, experiment.clip.height, experiment.clip.width)
-        return to_camera_size(codec.decode(codec.encode(small)))[: len(video)]
-
-    return through
+        found: Callable[[Path], Callable[[np.ndarray], np.ndarray]] = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"cannot import the opener of codecs {opener!r}: {error}; expected module:NAME.") from error
+    return found(run)
 
 
 def true_grades(shown: WrongVideo, truth: Truth) -> Grades:

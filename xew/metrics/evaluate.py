@@ -24,6 +24,7 @@ import pandas as pd
 import tyro
 from tqdm import tqdm
 
+from xew.compilation import keep_compiled_programs
 from xew.config import ConfigError, pick, suggestion, user_errors
 from xew.episode import EpisodeError, verify_episode
 from xew.metrics import METRICS
@@ -33,7 +34,7 @@ from xew.metrics.grading.bundle import demand_none, differences, disagreements, 
 from xew.metrics.grading.jobs import BASELINES, Job, plan, prediction_of, shown_of
 from xew.metrics.grading.scores import CellStore, beside, check_out, describe, write_diagnostics, write_tables, write_whole
 from xew.metrics.grading.summary import summarize, to_markdown
-from xew.metrics.grading.workers import Bench, compile_cache, not_needed, opener, worker_count
+from xew.metrics.grading.workers import Bench, not_needed, opener, worker_count
 from xew.metrics.truth import Truth, read_truth
 from xew.protocol import HELD_OUT_ROBOTS
 from xew.rollout import RolloutError
@@ -104,7 +105,7 @@ WRITTEN = {
 @user_errors
 def main(args: Args) -> None:
     """Grade, write, and print what came out; or check a bundle."""
-    compile_cache()
+    keep_compiled_programs()
     cv2.setNumThreads(1)  # episodes are shared out to threads; OpenCV's own would only get in their way
     if args.check is not None:
         check(args, args.check)

@@ -20,18 +20,10 @@ from xew.metrics.truth import Truth, inside
 FRAME_BLOCK = 16
 """On a CPU; on a GPU as many frames as it takes at once."""
 POINT_BLOCK = 8
-WHOLE_VIDEO = ("psnr",)
-"""Metrics in which a frame's score depends on the others (the cap of exact frames); all others are computed block by block."""
-
 OF_WHOLE_FRAMES = {"region_lpips": "lpips"}
 """Metrics of the robot's box, and what they are where that is the whole frame, which it often is over an episode."""
-WHOLE_PATH = ("ndtw",)
-"""Metrics of tracks that say nothing of a single frame."""
 DIAGNOSTICS = {"contact_f1": contact_f1}
 """What is computed if asked and is no part of the reported suite."""
-
-ESTIMATED = ("mask", "track")
-"""Inputs that have to be estimated in a prediction, so that even the true video does not get the best score."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +165,7 @@ def _grade_tracks(name: str, arrays: Arrays) -> tuple[float, np.ndarray | None]:
     """A score and its curve. What is filled up is not valid, which no metric of tracks looks at."""
     padded = [_fill(_fill(array, 0, FRAME_BLOCK, 0), 1, POINT_BLOCK, 0) for array in arrays]
     value = float(METRICS[name].function(*padded))
-    return value, None if name in WHOLE_PATH else np.asarray(_frame_by_frame(METRICS[name])(*padded))[: len(arrays[0])]
+    return value, None if METRICS[name].whole else np.asarray(_frame_by_frame(METRICS[name])(*padded))[: len(arrays[0])]
 
 
 @functools.cache
@@ -189,7 +181,7 @@ def _curve(name: str, arrays: Arrays) -> np.ndarray:
     count = len(arrays[0])
     block = FRAME_BLOCK if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK
     padded = [_fill(array, 0, block, "last") for array in arrays]
-    size = len(padded[0]) if name in WHOLE_VIDEO else block
+    size = len(padded[0]) if METRICS[name].whole else block
     blocks = [curve(*(array[i : i + size] for array in padded)) for i in range(0, len(padded[0]), size)]
     return np.concatenate(jax.device_get(blocks))[:count].astype(np.float32)
 

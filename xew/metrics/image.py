@@ -1,4 +1,4 @@
-"""Metrics, visual quality without a network: PSNR and SSIM. (prediction, target) -> one value a frame.
+"""Visual quality without a network: PSNR and SSIM, one value a frame.
 
 uint8 goes through integers: sums of squares and window moments are exact, so that flat bright images lose nothing to
 float32 and results agree with a float64 reference to about 1e-7. Floating input in [0, 1] is for use as a loss.
@@ -6,20 +6,24 @@ float32 and results agree with a float64 reference to about 1e-7. Floating input
 
 import functools
 import math
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Bool
 
-from xew.metrics.metric import check_videos, map_frames
+from xew.metrics.mergeable.sums import Mean, Mergeable, empty_mean, mean_of, merge_means, to_float
+from xew.metrics.metric import ByFrame, Scalar, Video, check_first, check_videos, map_frames
 
 SSIM_WINDOW = 7
 SSIM_C1, SSIM_C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
 
 
 @functools.partial(jax.jit, static_argnames="chunk")
-def psnr(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) -> jax.Array:
+@check_first(check_videos)
+def psnr(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFrame:
     """Peak signal-to-noise ratio of each frame [dB], higher is better.
 
     Exact frames have no finite PSNR. As in the paper they are capped at the largest finite value among the frames they
@@ -35,7 +39,6 @@ def psnr(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) 
     Returns:
         [t] float32.
     """
-    check_videos(prediction, target)
     error = mean_squared_error(prediction, target, chunk)
     finite = finite_psnr(error)
     largest = jnp.max(jnp.where(error > 0, finite, -jnp.inf))
@@ -43,29 +46,30 @@ def psnr(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) 
     return jnp.where(error > 0, finite, cap)
 
 
-def finite_psnr(error: jax.Array) -> jax.Array:
-    """[dB] of mean squared errors in levels of 255; 48.13, of an error of 1, where there is none."""
+def finite_psnr(error: ByFrame) -> ByFrame:
+    """[t] float32 [dB] of mean squared errors [t] in levels of 255; 48.13, of an error of 1, where there is none."""
     return -10 * jnp.log10(jnp.where(error > 0, error, 1) / 255**2)
 
 
-def attainable_psnr(shape: tuple[int, ...]) -> jax.Array:
-    """[dB], the most that an inexact frame of a video [t h w 3] can have: one channel of one pixel off by one level."""
+def attainable_psnr(shape: tuple[int, ...]) -> Scalar:
+    """Scalar float32 [dB], the most that an inexact frame of [t h w 3] can have: one channel of one pixel off by one level."""
     return 10 * jnp.log10(jnp.float32(255**2 * math.prod(shape[1:])))
 
 
 @jax.jit
-def exact_frames(prediction: jax.Array, target: jax.Array) -> jax.Array:
+@check_first(check_videos)
+def exact_frames(prediction: Video, target: Video) -> Bool[jax.Array, " t"]:
     """[t] bool, which frames equal the target in every pixel: those whose PSNR is a cap.
 
     Args:
         prediction, target: [t h w 3] uint8, or floating in [0, 1].
     """
-    check_videos(prediction, target)
     return jnp.all(prediction == target, axis=(1, 2, 3))
 
 
-def mean_squared_error(prediction: jax.Array, target: jax.Array, chunk: int | None = None) -> jax.Array:
-    """[t] float32, mean over a frame of the squared difference in levels of 255; exact up to its last rounding."""
+def mean_squared_error(prediction: Video, target: Video, chunk: int | None = None) -> ByFrame:
+    """[t] float32, mean over a frame of two videos [t h w 3] of the squared difference in levels of 255; exact up to its last
+    rounding."""
     return map_frames(lambda pair: _frame_error(*pair), (prediction, target), chunk)
 
 
@@ -80,7 +84,8 @@ def _frame_error(x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 @functools.partial(jax.jit, static_argnames="chunk")
-def ssim(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) -> jax.Array:
+@check_first(check_videos, smallest_side=SSIM_WINDOW)
+def ssim(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFrame:
     """Structural similarity of each frame in [-1, 1], higher is better.
 
     The definition of scikit-image's `structural_similarity(channel_axis=-1, data_range=255)`: uniform 7x7 windows that
@@ -96,7 +101,6 @@ def ssim(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) 
     Raises:
         ValueError: shapes differ or a side is under 7 pixels.
     """
-    check_videos(prediction, target, smallest_side=SSIM_WINDOW)
     return map_frames(lambda pair: _frame_ssim(*pair), (prediction, target), chunk)
 
 
@@ -120,7 +124,7 @@ def _stabilized(total: jax.Array, size: int, constant: float) -> jax.Array:
     return total.astype(jnp.float32) / size + constant
 
 
-def _levels(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, float]:
+def _levels(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, int | float]:
     """Both as [h w*3] in levels of 255 less an offset: integers as they are, floats centered to keep their squares small."""
     x, y = (image.reshape(len(image), -1) for image in (x, y))
     if x.dtype == jnp.uint8:
@@ -137,3 +141,58 @@ def _window_sum(image: jax.Array) -> jax.Array:
     for window, dilation in (((SSIM_WINDOW, 1), (1, 1)), ((1, SSIM_WINDOW), (1, 3))):
         image = lax.reduce_window(image, zero, lax.add, window, (1, 1), "valid", window_dilation=dilation)
     return image
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class CappedMean:
+    """The mean of PSNR: exact frames count as the largest finite value, which is not known before all parts are there."""
+
+    finite: Mean
+    """Mean of the finite values, in dB."""
+    exact: jax.Array
+    """int32, number of exact frames."""
+    largest: jax.Array
+    """float32 [dB], the largest finite value; -inf where there is none."""
+    attainable: jax.Array
+    """float32 [dB], what exact frames count as where no frame is inexact."""
+
+    @property
+    def value(self) -> jax.Array:
+        """float32 [dB], as the mean of `psnr` over all frames of the video."""
+        cap = jnp.where(self.finite.count > 0, self.largest, self.attainable)
+        finite = jnp.where(self.finite.count > 0, to_float(self.finite.total), 0)
+        return (finite + jnp.where(self.exact > 0, self.exact * cap, 0)) / (self.finite.count + self.exact)
+
+
+def _empty_capped() -> CappedMean:
+    nothing = jnp.float32(-jnp.inf)
+    return CappedMean(empty_mean(), jnp.int32(0), nothing, nothing)
+
+
+@check_first(check_videos)
+def _update_capped(state: CappedMean, prediction: Video, target: Video, *, chunk: int | None = None) -> CappedMean:
+    error = mean_squared_error(prediction, target, chunk)
+    values = finite_psnr(error)
+    return _merge_capped(
+        state,
+        CappedMean(
+            finite=mean_of(values, error > 0),
+            exact=jnp.sum(error == 0, dtype=jnp.int32),
+            largest=jnp.max(jnp.where(error > 0, values, -jnp.inf)),
+            attainable=attainable_psnr(np.shape(target)),
+        ),
+    )
+
+
+def _merge_capped(a: CappedMean, b: CappedMean) -> CappedMean:
+    return CappedMean(
+        finite=merge_means(a.finite, b.finite),
+        exact=a.exact + b.exact,
+        largest=jnp.maximum(a.largest, b.largest),
+        attainable=jnp.maximum(a.attainable, b.attainable),
+    )
+
+
+PSNR_STATE = Mergeable(_empty_capped, _update_capped, _merge_capped, lambda state: state.value)
+"""States of `psnr`."""

@@ -1,4 +1,4 @@
-"""Metrics, robot morphology by masks: IoU and boundary F1. bool masks -> one value a frame.
+"""Robot morphology by masks: IoU and boundary F1, one value a frame.
 
 Masks are packed, eight pixels of a column in a byte: contours and discs are then a few dozen operations on bytes, and
 counting is population count. All counts are integers, so the scores do not depend on the machine. Each step is a program
@@ -14,15 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from xew.metrics.metric import check_masks
+from xew.metrics.metric import ByFrame, Masks, check_first, check_masks
 
 BYTE = 8
-"""Pixels that are packed together."""
+"""Number of pixels that are packed together."""
 SQUARE = (1, 1)
-"""A pixel and its eight neighbors: half heights of the columns at distance 0 and 1."""
+"""Shape of a pixel and its eight neighbors: half heights of the columns at distance 0 and 1."""
 
 
-def mask_iou(prediction: jax.Array, target: jax.Array) -> jax.Array:
+@check_first(check_masks)
+def mask_iou(prediction: Masks, target: Masks) -> ByFrame:
     """Intersection over union of each frame in [0, 1], higher is better; it punishes missed and invented pixels alike.
 
     Args:
@@ -31,12 +32,12 @@ def mask_iou(prediction: jax.Array, target: jax.Array) -> jax.Array:
     Returns:
         [t] float32; 1 where both masks are empty, 0 where one is.
     """
-    check_masks(prediction, target)
     p, t = _packed(prediction), _packed(target)
     return _iou(p, t, p & t)
 
 
-def boundary_f1(prediction: jax.Array, target: jax.Array, tolerance: float = 2) -> jax.Array:
+@check_first(check_masks)
+def boundary_f1(prediction: Masks, target: Masks, tolerance: int | float = 2) -> ByFrame:
     """F1 of contour pixels matched within a tolerance, each frame in [0, 1], higher is better.
 
     Pinned, because each choice moves the value by up to 0.2: a contour pixel belongs to the mask and has one of its
@@ -54,14 +55,13 @@ def boundary_f1(prediction: jax.Array, target: jax.Array, tolerance: float = 2) 
         ValueError: shapes differ, or the tolerance is negative.
         TypeError: a mask is not bool.
     """
-    check_masks(prediction, target)
     p, t = _packed(prediction), _packed(target)
     return _f1(p, t, np.shape(target)[1], _disc(tolerance))
 
 
-def mask_scores(prediction: jax.Array, target: jax.Array, tolerance: float = 2) -> tuple[jax.Array, jax.Array]:
-    """`mask_iou` and `boundary_f1` of the same masks, each of which is packed once."""
-    check_masks(prediction, target)
+@check_first(check_masks)
+def mask_scores(prediction: Masks, target: Masks, tolerance: int | float = 2) -> tuple[ByFrame, ByFrame]:
+    """`mask_iou` and `boundary_f1`, [t] float32 each, of the same masks [t h w] bool, each of which is packed once."""
     p, t = _packed(prediction), _packed(target)
     return _iou(p, t, p & t), _f1(p, t, np.shape(target)[1], _disc(tolerance))
 
@@ -117,7 +117,7 @@ def _matched(edge_p: jax.Array, edge_t: jax.Array, disc: tuple[int, ...]) -> lis
     return [edge_p & _grown(edge_t, disc), edge_t & _grown(edge_p, disc)]
 
 
-def _disc(radius: float) -> tuple[int, ...]:
+def _disc(radius: int | float) -> tuple[int, ...]:
     """Half heights of a disc's columns at distances 0, 1, ... from its center."""
     if not radius >= 0:
         raise ValueError(f"the tolerance is {radius}, expected a radius of at least 0 pixels.")

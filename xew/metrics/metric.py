@@ -1,48 +1,117 @@
-"""Metrics, ground: what a metric is, what all of them share: checks on arrays, frames by the chunk. Imports nothing of ours."""
+"""What a metric is, and what all metrics share: checks on arrays, and frames by the chunk."""
 
+import functools
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from xew.metrics.mergeable.sums import Mergeable
+
+AnyArray: TypeAlias = jax.Array | np.ndarray
+Video: TypeAlias = UInt8[AnyArray, "t h w 3"] | Float[AnyArray, "t h w 3"]
+"""RGB, uint8 or floating in [0, 1]."""
+Masks: TypeAlias = Bool[AnyArray, "t h w"]
+Tracks: TypeAlias = Float[AnyArray, "t k 2"]
+"""Points in pixels, x right, y down; NaN where a prediction lost one."""
+Valid: TypeAlias = Bool[AnyArray, "t k"]
+"""Which points can be seen in the target."""
+Contacts: TypeAlias = Bool[AnyArray, "t c"]
+"""Which pairs of bodies touch."""
+ByFrame: TypeAlias = Float32[jax.Array, " t"]
+"""One value for each frame."""
+Scalar: TypeAlias = Float32[jax.Array, ""]
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 INPUTS = ("video", "mask", "region", "track")
-"""video: two [t h w 3]. mask: two [t h w]. region: two videos and the target's mask. track: two [t k 2], valid [t k]."""
-
+"""Kinds of what a metric compares. video: two [t h w 3]. mask: two [t h w]. region: two videos and the target's mask.
+track: two [t k 2], valid [t k]."""
+ESTIMATED_INPUTS = ("mask", "track")
+"""Inputs that have to be estimated in a prediction."""
 
 ACCELERATOR_CHUNK = 64
-"""Frames computed at once on a GPU or TPU; one is fastest on a CPU, where a frame's intermediates then stay in its cache."""
+"""Number of frames computed at once on a GPU or TPU; one is fastest on a CPU, where a frame's intermediates then stay in its
+cache."""
 
 
 @dataclass(frozen=True)
 class Metric:
-    """One entry of the registry `METRICS`: all that a table or a figure needs to know of a metric."""
+    """One entry of the registry `METRICS`: all that grading, a table or a figure needs to know of a metric."""
 
     function: Callable[..., jax.Array]
-    """Pure and jitted, as users call it."""
+    """Metric as users call it: pure and jitted."""
     curve: Callable[..., jax.Array] | None
-    """The same before the mean over frames, [t]; None where a frame has no value of its own."""
+    """Function of the same inputs before the mean over frames, [t]; None for metrics of tracks, whose frames are graded by
+    `function`."""
     dimension: str
-    """visual, morphology, kinematics or objects: reported side by side, never collapsed."""
+    """Group of metrics, a key of `xew.protocol.DIMENSION_TITLES` or one of your own: reported side by side, never collapsed."""
     unit: str
-    """'' where the number has none."""
-    range: tuple[float, float]
+    """Unit of the number, '' where it has none."""
+    range: tuple[int | float, int | float]
+    """Least and largest value."""
     higher_is_better: bool
+    """Direction of the metric."""
     inputs: str
-    """What the functions compare, one of `INPUTS`."""
+    """Kind of what the functions compare, one of `INPUTS`."""
     reference: str
-    """Where the definition comes from."""
+    """Source of the definition, as the report prints it."""
+    title: str = ""
+    """Short title in tables and charts; the registry's key where left out."""
+    reported: bool = True
+    """Whether a study's full tables show it; False for companions of other metrics."""
+    whole: bool = False
+    """Whether its values by frame need the whole video, so that frames are never graded in blocks (PSNR, by its cap); of a
+    metric of tracks, whether a frame has no value of its own (nDTW)."""
+    parts: Callable[..., tuple[jax.Array, jax.Array]] | None = None
+    """Function of the same inputs to the values that the metric is the mean of, and which of them count."""
+    state: Mergeable | None = None
+    """Mergeable states; left out, they are the mean of `parts`, or else of the values by frame."""
+
+    @property
+    def estimated(self) -> bool:
+        """Does it need an estimator, so that even the true video does not get the best score?"""
+        return self.inputs in ESTIMATED_INPUTS
 
 
-def check_videos(prediction: jax.Array, target: jax.Array, smallest_side: int = 1) -> None:
+def check_first(check: Callable[..., None], **options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorate a metric with a check of its arguments, whose one-line message is what a user sees of a wrong array.
+
+    It stands above the function and so runs before anything that checks the function's annotations, as tests do.
+
+    Args:
+        check: takes some of the function's parameters, by the same names.
+        options: further arguments of the check.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        signature = inspect.signature(function)
+        names = [name for name in inspect.signature(check).parameters if name in signature.parameters]
+
+        @functools.wraps(function)
+        def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+            given = signature.bind(*args, **kwargs).arguments
+            check(**{name: given[name] for name in names if name in given}, **options)
+            return function(*args, **kwargs)
+
+        return checked
+
+    return decorate
+
+
+def check_videos(prediction: Any, target: Any, smallest_side: int = 1) -> None:
     """Raise ValueError or TypeError unless both are [t h w 3], of one shape, uint8 or floating in [0, 1].
 
     Args:
         prediction, target: the two videos.
-        smallest_side: the metric is not defined on frames of a side under this.
+        smallest_side: least side of a frame [pixels] for which the metric is defined.
     """
     if np.shape(prediction) != np.shape(target):
         raise ValueError(
@@ -60,7 +129,7 @@ def check_videos(prediction: jax.Array, target: jax.Array, smallest_side: int = 
         raise TypeError(f"videos have dtype {' and '.join(found)}, expected both uint8, or both floating in [0, 1].")
 
 
-def check_masks(prediction: jax.Array, target: jax.Array) -> None:
+def check_masks(prediction: Any, target: Any) -> None:
     """Raise ValueError or TypeError unless both are bool [t h w] of one shape."""
     if np.shape(prediction) != np.shape(target) or np.ndim(target) != 3:
         raise ValueError(f"masks are {np.shape(prediction)} and {np.shape(target)}, expected one shape [t h w].")
@@ -68,12 +137,13 @@ def check_masks(prediction: jax.Array, target: jax.Array) -> None:
         check_bool(name, mask)
 
 
-def check_bool(name: str, array: jax.Array) -> None:
+def check_bool(name: str, array: Any) -> None:
+    """Raise TypeError unless an array [...] is bool."""
     if jnp.result_type(array) != jnp.bool_:
         raise TypeError(f"{name} has dtype {jnp.result_type(array)}, expected bool; compare with a threshold first.")
 
 
-def check_tracks(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> None:
+def check_tracks(prediction: Any, target: Any, valid: Any) -> None:
     """Raise ValueError or TypeError unless tracks are floating [t k 2] of one shape and valid is bool [t k]."""
     if np.shape(prediction) != np.shape(target) or np.ndim(target) != 3 or np.shape(target)[-1] != 2:
         raise ValueError(f"tracks are {np.shape(prediction)} and {np.shape(target)}, expected one shape [t k 2].")
@@ -82,7 +152,7 @@ def check_tracks(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> 
     check_bool("valid", valid)
 
 
-def check_contacts(prediction: jax.Array, target: jax.Array) -> None:
+def check_contacts(prediction: Any, target: Any) -> None:
     """Raise ValueError or TypeError unless both are bool [t c] of one shape."""
     if np.shape(prediction) != np.shape(target) or np.ndim(target) != 2:
         raise ValueError(f"contacts are {np.shape(prediction)} and {np.shape(target)}, expected one shape [t c].")

@@ -1,28 +1,29 @@
-"""Metrics, visual quality and morphology by a network: LPIPS (AlexNet, v0.1) on frames and on the robot's region.
+"""Visual quality and morphology by a network: LPIPS (AlexNet, v0.1) on frames and on the robot's region.
 
 R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018. Convolutions are those of
-float32 everywhere: TF32, the default of some GPUs, changes the fourth digit. (xew/metrics/networks/convolution.py)
+float32 everywhere: TF32, the default of some GPUs, changes the fourth digit (`networks.convolution`).
 """
 
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from xew.metrics.metric import check_masks, check_videos, map_chunks
+from xew.metrics.metric import AnyArray, ByFrame, Masks, Scalar, Video, check_first, check_masks, check_videos, map_chunks
 from xew.metrics.networks.alexnet import read_alexnet
 from xew.metrics.networks.convolution import convolve
 
 SMALLEST_SIDE = 31
-"""Below it the second pooling has no window and the mean over nothing would be NaN."""
+"""Least side [pixels]: below it the second pooling has no window and the mean over nothing would be NaN."""
 
 SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 SCALE = np.array([0.458, 0.448, 0.450], np.float32)
-"""The input scaling of LPIPS, on RGB in [-1, 1]."""
+"""Input scaling of LPIPS, on RGB in [-1, 1]."""
 
 CONVOLUTIONS = ((4, 2, False), (1, 2, True), (1, 1, True), (1, 1, False), (1, 1, False))
 """Stride, zero padding, and whether a 3x3 pooling of stride 2 comes first. torchvision's AlexNet up to its fifth ReLU."""
@@ -45,10 +46,11 @@ class Features:
     box: Box
     """The part of the frames that is compared."""
     shape: tuple[int, ...] = field(metadata={"static": True})
-    """Of the video, [t h w 3]."""
+    """Shape of the video, [t h w 3]."""
 
 
-def lpips(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None) -> jax.Array:
+@check_first(check_videos, smallest_side=SMALLEST_SIDE)
+def lpips(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFrame:
     """Learned perceptual distance of each frame, 0 for equal frames, lower is better.
 
     Agrees with `lpips.LPIPS(net="alex", version="0.1")` to 1e-6.
@@ -64,13 +66,19 @@ def lpips(prediction: jax.Array, target: jax.Array, *, chunk: int | None = None)
         ValueError: shapes differ or a side is under 31 pixels.
         FileNotFoundError: the weights are not installed.
     """
-    check_videos(prediction, target, SMALLEST_SIDE)
     return _box_distance(_weights(), prediction, target, _whole(target), chunk)
 
 
+def check_region(prediction: Any, target: Any, target_mask: Any) -> None:
+    """Raise ValueError or TypeError unless videos are [t h w 3], alike and large enough, and masks bool [t h w] with them."""
+    check_videos(prediction, target, SMALLEST_SIDE)
+    _check_mask(target, target_mask)
+
+
+@check_first(check_region)
 def region_lpips(
-    prediction: jax.Array, target: jax.Array, target_mask: jax.Array, *, box: Box | None = None, chunk: int | None = None
-) -> jax.Array:
+    prediction: Video, target: Video, target_mask: Masks, *, box: Box | None = None, chunk: int | None = None
+) -> Scalar:
     """LPIPS inside the bounding box of the union over time of the target's robot masks, mean over frames.
 
     The box is one for the whole video, and is cut out before the network, as if the video were no larger. Under a jit of
@@ -91,16 +99,24 @@ def region_lpips(
     return jnp.mean(region_lpips_frames(prediction, target, target_mask, box=box, chunk=chunk))
 
 
+@check_first(check_region)
 def region_lpips_frames(
-    prediction: jax.Array, target: jax.Array, target_mask: jax.Array, *, box: Box | None = None, chunk: int | None = None
-) -> jax.Array:
-    """`region_lpips` before the mean over frames: [t] float32."""
-    check_videos(prediction, target, SMALLEST_SIDE)
-    box = _mask_box(target, target_mask) if box is None else box
+    prediction: Video, target: Video, target_mask: Masks, *, box: Box | None = None, chunk: int | None = None
+) -> ByFrame:
+    """`region_lpips` before the mean over frames, [t] float32, of videos [t h w 3] and masks [t h w] bool."""
+    box = _mask_box(target_mask) if box is None else box
     return _box_distance(_weights(), prediction, target, box, chunk)
 
 
-def lpips_features(target: jax.Array, target_mask: jax.Array | None = None, *, chunk: int | None = None) -> Features:
+def check_target(target: Any, target_mask: Any = None) -> None:
+    """Raise ValueError or TypeError unless a video is [t h w 3] and large enough, and its mask None or bool [t h w]."""
+    check_videos(target, target, SMALLEST_SIDE)
+    if target_mask is not None:
+        _check_mask(target, target_mask)
+
+
+@check_first(check_target)
+def lpips_features(target: Video, target_mask: Masks | None = None, *, chunk: int | None = None) -> Features:
     """What `lpips_from_features` needs of a target; half of the work of `lpips`, done once for all predictions.
 
     Args:
@@ -112,12 +128,19 @@ def lpips_features(target: jax.Array, target_mask: jax.Array | None = None, *, c
         ValueError: as in `lpips` and `region_lpips`.
         FileNotFoundError: the weights are not installed.
     """
-    check_videos(target, target, SMALLEST_SIDE)
-    box = _whole(target) if target_mask is None else _mask_box(target, target_mask)
+    box = _whole(target) if target_mask is None else _mask_box(target_mask)
     return Features(_box_features(_weights(), target, box, chunk), box, np.shape(target))
 
 
-def lpips_from_features(prediction: jax.Array, target: Features, *, chunk: int | None = None) -> jax.Array:
+def check_with_features(prediction: Any, target: Features) -> None:
+    """Raise ValueError or TypeError unless a video is [t h w 3], of the shape that the features are of."""
+    check_videos(prediction, prediction, SMALLEST_SIDE)
+    if np.shape(prediction) != target.shape:
+        raise ValueError(f"prediction is {np.shape(prediction)}, the features are of a target {target.shape}.")
+
+
+@check_first(check_with_features)
+def lpips_from_features(prediction: Video, target: Features, *, chunk: int | None = None) -> ByFrame:
     """`lpips`, or `region_lpips_frames`, of a prediction and a target that is given by its features.
 
     Args:
@@ -131,14 +154,11 @@ def lpips_from_features(prediction: jax.Array, target: Features, *, chunk: int |
     Raises:
         ValueError: the prediction has another size than the target.
     """
-    check_videos(prediction, prediction, SMALLEST_SIDE)
-    if np.shape(prediction) != target.shape:
-        raise ValueError(f"prediction is {np.shape(prediction)}, the features are of a target {target.shape}.")
     return _distance_from_features(_weights(), prediction, target.layers, target.box, chunk)
 
 
 @jax.jit
-def union_box(mask: jax.Array) -> Box:
+def union_box(mask: Masks) -> Box:
     """Bounding box (top, left, height, width) int32 [pixels] of all that [t h w] covers at any time; zeros if nothing."""
     covered = jnp.any(mask, axis=0)
     rows, columns = jnp.any(covered, axis=1), jnp.any(covered, axis=0)
@@ -148,14 +168,17 @@ def union_box(mask: jax.Array) -> Box:
     return top, left, height, width
 
 
-def _whole(video: jax.Array) -> Box:
+def _whole(video: AnyArray) -> Box:
     height, width = np.shape(video)[1:3]
     return jnp.int32(0), jnp.int32(0), jnp.int32(height), jnp.int32(width)
 
 
-def _mask_box(target: jax.Array, target_mask: jax.Array) -> Box:
+def _check_mask(target: Any, target_mask: Any) -> None:
+    check_masks(target_mask, np.zeros(np.shape(target)[:3], bool))
+
+
+def _mask_box(target_mask: AnyArray) -> Box:
     """The box of the masks. Raises ValueError where it is too small, unless its size is not known yet, under a jit."""
-    check_masks(target_mask, jnp.zeros(np.shape(target)[:3], bool))
     box = union_box(target_mask)
     if not isinstance(box[2], jax.core.Tracer):
         height, width = int(box[2]), int(box[3])

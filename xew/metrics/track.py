@@ -1,20 +1,26 @@
-"""Metrics, robot kinematics and object dynamics by tracked points in the image plane.
+"""Robot kinematics and object dynamics by tracked points in the image plane.
 
 Tracks are float [t k 2] pixels (x right, y down), validity bool [t k]: the point is visible in the target. A prediction
 that lost a point holds NaN there: a miss for PCK, left out of the errors, so look at coverage beside them.
 """
 
 import functools
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Bool, Float32
 
-from xew.metrics.metric import check_contacts, check_tracks
+from xew.metrics.mergeable.sums import Mean, Mergeable, empty_mean, mean_of, merge_means
+from xew.metrics.metric import AnyArray, ByFrame, Contacts, Scalar, Tracks, Valid, check_contacts, check_first, check_tracks
+
+PointValues: TypeAlias = Float32[jax.Array, "t k"]
 
 
 @jax.jit
-def pck(prediction: jax.Array, target: jax.Array, valid: jax.Array, alpha: float | jax.Array = 0.1) -> jax.Array:
+@check_first(check_tracks)
+def pck(prediction: Tracks, target: Tracks, valid: Valid, alpha: float | jax.Array = 0.1) -> Scalar:
     """Percentage of correct keypoints: the share in [0, 1] that lie nearer than alpha x d_t, higher is better.
 
     d_t is the diagonal of the bounding box of the frame's valid target points (the paper's definition). A frame whose
@@ -31,13 +37,22 @@ def pck(prediction: jax.Array, target: jax.Array, valid: jax.Array, alpha: float
 
 
 @jax.jit
-def pck_05(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Array:
-    """`pck` at alpha = 0.05, the second tolerance of the paper's evaluator."""
+@check_first(check_tracks)
+def pck_05(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
+    """`pck` at alpha = 0.05, the second tolerance of the paper's evaluator.
+
+    Args:
+        prediction, target: [t k 2] pixels. valid: [t k] bool.
+
+    Returns:
+        Scalar float32; NaN where no point counts.
+    """
     return pck(prediction, target, valid, alpha=0.05)
 
 
 @jax.jit
-def coverage(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Array:
+@check_first(check_tracks)
+def coverage(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
     """Share in [0, 1] of the valid points that the prediction has, higher is better.
 
     Stands beside every error: an error over few points that were found says little.
@@ -52,7 +67,8 @@ def coverage(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.
 
 
 @jax.jit
-def keypoint_error(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Array:
+@check_first(check_tracks)
+def keypoint_error(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
     """Mean distance [pixels] over the valid points that the prediction has, lower is better.
 
     Args:
@@ -65,7 +81,8 @@ def keypoint_error(prediction: jax.Array, target: jax.Array, valid: jax.Array) -
 
 
 @jax.jit
-def trajectory_error(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Array:
+@check_first(check_tracks)
+def trajectory_error(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
     """Distance [pixels] of tracked objects, mean over each object's valid frames, then over objects; lower is better.
 
     Args:
@@ -79,7 +96,8 @@ def trajectory_error(prediction: jax.Array, target: jax.Array, valid: jax.Array)
 
 
 @functools.partial(jax.jit, static_argnames="tolerance")
-def contact_f1(prediction: jax.Array, target: jax.Array, tolerance: int = 0) -> jax.Array:
+@check_first(check_contacts)
+def contact_f1(prediction: Contacts, target: Contacts, tolerance: int = 0) -> Scalar:
     """F1 of frames in contact, over all pairs of bodies; a diagnostic outside the suite, higher is better.
 
     The paper computes one and does not report it, because its calibration found contact timing in predicted video too
@@ -93,7 +111,6 @@ def contact_f1(prediction: jax.Array, target: jax.Array, tolerance: int = 0) -> 
     Returns:
         Scalar float32 in [0, 1]; 1 where neither has any contact, 0 where one has none.
     """
-    check_contacts(prediction, target)
     counts = jnp.sum(prediction), jnp.sum(target)
     hits = jnp.sum(prediction & _widened(target, tolerance)), jnp.sum(target & _widened(prediction, tolerance))
     precision, recall = (hit / jnp.maximum(count, 1) for hit, count in zip(hits, counts, strict=True))
@@ -102,14 +119,15 @@ def contact_f1(prediction: jax.Array, target: jax.Array, tolerance: int = 0) -> 
     return jnp.where(counts[0] + counts[1] > 0, score, 1).astype(jnp.float32)
 
 
-def _widened(contact: jax.Array, frames: int) -> jax.Array:
+def _widened(contact: AnyArray, frames: int) -> jax.Array:
     """[t c] true within so many frames of a true one."""
     shifted = jnp.pad(contact, ((frames, frames), (0, 0)))
     return functools.reduce(jnp.logical_or, (shifted[i : i + len(contact)] for i in range(2 * frames + 1)))
 
 
 @jax.jit
-def ndtw(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Array:
+@check_first(check_tracks)
+def ndtw(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
     """Normalized dynamic time warping of each keypoint's path, mean over keypoints; lower is better, 0 is best.
 
     Classic DTW with Euclidean cost, over the frames in which the point is valid and found, divided by the sum of the two
@@ -125,34 +143,32 @@ def ndtw(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> jax.Arra
 
 
 @jax.jit
-def hits(
-    prediction: jax.Array, target: jax.Array, valid: jax.Array, alpha: float | jax.Array = 0.1
-) -> tuple[jax.Array, jax.Array]:
-    """What `pck` is the mean of: [t k] float32, 1 where a point is near enough, and [t k] bool, which count."""
-    check_tracks(prediction, target, valid)
+@check_first(check_tracks)
+def hits(prediction: Tracks, target: Tracks, valid: Valid, alpha: float | jax.Array = 0.1) -> tuple[PointValues, Valid]:
+    """What `pck` of tracks [t k 2] is the mean of: [t k] float32, 1 where one is near enough, and [t k] bool, which count."""
     diagonal = box_diagonal(target, valid)
     correct = _distance(prediction, target) < alpha * diagonal[:, None]
     return correct.astype(jnp.float32), valid & (diagonal > 0)[:, None]
 
 
 @jax.jit
-def presence(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """What `coverage` is the mean of: [t k] float32, 1 where the prediction has the point, and [t k] bool, which count."""
-    check_tracks(prediction, target, valid)
+@check_first(check_tracks)
+def presence(prediction: Tracks, target: Tracks, valid: Valid) -> tuple[PointValues, Valid]:
+    """What `coverage` of tracks [t k 2] is the mean of: [t k] float32, 1 where one was found, and [t k] bool, which count."""
     return _found(prediction).astype(jnp.float32), valid
 
 
 @jax.jit
-def distances(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """What the errors are means of: [t k] float32 pixels, infinite where lost, and [t k] bool, which count."""
-    check_tracks(prediction, target, valid)
+@check_first(check_tracks)
+def distances(prediction: Tracks, target: Tracks, valid: Valid) -> tuple[PointValues, Valid]:
+    """What errors of tracks [t k 2] are means of: [t k] float32 pixels, infinite where lost, and [t k] bool, which count."""
     return _distance(prediction, target), valid & _found(prediction)
 
 
 @jax.jit
-def warpings(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """What `ndtw` is the mean of: [k] float32, and [k] bool, which count."""
-    check_tracks(prediction, target, valid)
+@check_first(check_tracks)
+def warpings(prediction: Tracks, target: Tracks, valid: Valid) -> tuple[Float32[jax.Array, " k"], Bool[jax.Array, " k"]]:
+    """What `ndtw` of tracks [t k 2] is the mean of: [k] float32, and [k] bool, which count."""
     tracked = valid & _found(prediction)
     diagonal = jnp.broadcast_to(box_diagonal(target, valid)[:, None], valid.shape)
     scale = _masked_mean(diagonal, tracked, axis=0)
@@ -162,15 +178,19 @@ def warpings(prediction: jax.Array, target: jax.Array, valid: jax.Array) -> tupl
     return cost / jnp.where(counts, 2 * length.astype(jnp.float32) * scale, 1), counts
 
 
-def box_diagonal(points: jax.Array, valid: jax.Array) -> jax.Array:
-    """[t] diagonal of the bounding box of each frame's valid points [pixels]; 0 where there is none."""
+def box_diagonal(points: Tracks, valid: Valid) -> ByFrame:
+    """[t] float32, diagonal [pixels] of the bounding box of each frame's valid points; 0 where there is none.
+
+    Args:
+        points: [t k 2] pixels. valid: [t k] bool.
+    """
     low = jnp.min(jnp.where(valid[..., None], points, jnp.inf), axis=1)
     high = jnp.max(jnp.where(valid[..., None], points, -jnp.inf), axis=1)
     extent = jnp.where(jnp.any(valid, axis=1)[:, None], high - low, 0)
     return _norm(extent)
 
 
-def _path_cost(prediction: jax.Array, target: jax.Array, tracked: jax.Array) -> jax.Array:
+def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray) -> jax.Array:
     """DTW cost of two paths [t 2] over the tracked frames.
 
     Tracked frames come first, in order, so that the cost of the paths is the cell (n - 1, n - 1) of the whole table,
@@ -198,13 +218,13 @@ def _path_cost(prediction: jax.Array, target: jax.Array, tracked: jax.Array) -> 
     return table[2 * end, end]
 
 
-def _distance(prediction: jax.Array, target: jax.Array) -> jax.Array:
+def _distance(prediction: AnyArray, target: AnyArray) -> jax.Array:
     """[t k] Euclidean distance; infinite where the prediction has no point."""
     found = _found(prediction)
     return jnp.where(found, _norm(jnp.where(found[..., None], prediction, target) - target), jnp.inf)
 
 
-def _found(points: jax.Array) -> jax.Array:
+def _found(points: AnyArray) -> jax.Array:
     return jnp.all(jnp.isfinite(points), axis=-1)
 
 
@@ -214,6 +234,19 @@ def _norm(vector: jax.Array) -> jax.Array:
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0).astype(jnp.float32)
 
 
-def _masked_mean(values: jax.Array, keep: jax.Array, axis: int | None = None) -> jax.Array:
+def _masked_mean(values: jax.Array, keep: AnyArray, axis: int | None = None) -> jax.Array:
     """Mean of the kept values; NaN where none is."""
     return jnp.sum(jnp.where(keep, values, 0), axis=axis) / jnp.sum(keep, axis=axis).astype(jnp.float32)
+
+
+def _update_objects(state: Mean, prediction: Tracks, target: Tracks, valid: Valid) -> Mean:
+    return merge_means(state, mean_of(*distances(prediction, target, valid)))
+
+
+def _mean_over_objects(state: Mean) -> jax.Array:
+    seen = state.count > 0
+    return jnp.sum(jnp.where(seen, state.value, 0)) / jnp.sum(seen)
+
+
+TRAJECTORY_STATE = Mergeable(lambda objects: empty_mean((objects,)), _update_objects, merge_means, _mean_over_objects)
+"""States of `trajectory_error`: one mean for each object."""

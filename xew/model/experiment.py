@@ -1,4 +1,8 @@
-"""The config of a world-model experiment: what configs/*.yaml hold. Fields without a default must be given."""
+"""The config of a world-model experiment: what configs/*.yaml hold, and the parts that it is resolved into.
+
+Fields without a default must be given. Functions elsewhere take the part that they need (`Experiment.network`, `.inputs`,
+`.instructions`, `.encoding`, `.choice`, `.learning`, `.sampling`) and not the whole experiment.
+"""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -6,13 +10,11 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
 from xew.config import ConfigError, load, pick
-from xew.files import cache_folder
 from xew.model.codecs.codec import CodecSettings, codec_class, latent_frames
 from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition, list_conditions
 from xew.model.devices.sharding import MeshSettings
@@ -152,6 +154,111 @@ class RolloutSettings:
 
 
 @dataclass(frozen=True)
+class Network:
+    """What the network is: everything that `create` needs."""
+
+    size: ModelSize
+    channels: int
+    """Channels of the latents."""
+    streams: tuple[str, ...]
+    """Streams and mechanisms beside RGB."""
+    words: int
+    """Rows of the table of words that the network learns; 0 where a frozen encoder is used."""
+    seed: int
+    settings: ModelSettings
+
+    def create(self) -> WorldModel:
+        """Make the network at its random start; wrap in `nnx.eval_shape` for shapes only."""
+        settings = self.settings
+        return WorldModel(
+            self.size,
+            self.channels,
+            self.streams,
+            dtype=jnp.dtype(settings.dtype),
+            residual=jnp.dtype(settings.residual),
+            remat=settings.remat,
+            unroll=settings.unroll,
+            attention=settings.attention,
+            visibility=settings.visibility,
+            time=settings.time,
+            history=tuple(frame / TEMPORAL_FACTOR for frame in settings.history),
+            words=self.words,
+            rngs=nnx.Rngs(self.seed),
+        )
+
+
+@dataclass(frozen=True)
+class ClipInputs:
+    """What the network is given of a clip: how it is cut, and which conditions go with it."""
+
+    clip: Clip
+    chunks: int
+    """Consecutive clips of a training sample."""
+    history: tuple[int, ...]
+    """Earlier frames, counted from the clip's first."""
+    conditions: dict[str, Condition]
+    """Conditions by the stream or mechanism that each feeds; `.name` is a condition's name in the cache."""
+    shapes: dict[str, tuple[int, ...]]
+    """Shapes of a clip's arrays by stream or mechanism, rgb and text included: latents [t h w c], numbers [t n], text [l e] or
+    [l]."""
+
+    @property
+    def latent_shape(self) -> tuple[int, ...]:
+        """Shape [t h w c] of one RGB clip."""
+        return self.shapes["rgb"]
+
+
+@dataclass(frozen=True)
+class Instructions:
+    """How instructions become what the network takes."""
+
+    encoder: TextEncoder
+    source: TextSource
+    prefix: str
+
+    def encode(self, instructions: Iterable[str]) -> dict[str, np.ndarray]:
+        """Every distinct instruction as the network takes it: [l] int32 where the table is learned, else [l e] float32."""
+        return encode_instructions(self.encoder, self.source, instructions, self.prefix)
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How episodes become latents, and where these are kept: everything that the latent cache depends on."""
+
+    inputs: ClipInputs
+    codec: CodecSettings
+    folder: Path
+    data: Path
+    start_from: Path | None
+    """Run whose codec and scales are used, in an adaptation."""
+
+    @property
+    def remedy(self) -> str:
+        """What to do where the cache lacks something."""
+        return f"run `python -m xew.model.latents CONFIG --data {self.data}`, with the other choices of this command too"
+
+
+@dataclass(frozen=True)
+class EpisodeChoice:
+    """Which episodes of a data set a training reads."""
+
+    data: Path
+    split: Split
+    adapt: AdaptSettings = AdaptSettings()
+    replay: tuple[str, ...] = ()
+    """Robots whose training episodes are replayed, in an adaptation with replay."""
+
+
+@dataclass(frozen=True)
+class Learning:
+    """What is learned, and how: the network, the optimizer and the loss."""
+
+    network: Network
+    settings: TrainSettings
+    lora_rank: int = 0
+
+
+@dataclass(frozen=True)
 class Experiment:
     data: Path
     """Episodes, made by `python -m xew.sim_warp.generate`."""
@@ -179,49 +286,84 @@ class Experiment:
 
     @property
     def conditions(self) -> dict[str, Condition]:
-        """What the network is told beside rgb, by the stream or mechanism that each feeds; `.name` is its name in the cache."""
-        return {condition.stream: condition for condition in chosen_conditions(self.model)}
-
-    @property
-    def size(self) -> ModelSize:
-        """Of the network; the width of the text is its encoder's."""
-        size, width = pick(MODELS, self.model.size, "model size"), self.text_encoder.width
-        return replace(size, text_dim=width) if width else size
+        """Conditions by the stream or mechanism that each feeds; `.name` is a condition's name in the cache."""
+        return {condition.stream: condition for condition in pick_conditions(self.model)}
 
     @property
     def text_encoder(self) -> TextEncoder:
         return pick(TEXT_ENCODERS, self.model.text, "text encoder")
 
-    def encode_instructions(self, instructions: Iterable[str]) -> dict[str, np.ndarray]:
-        """Every distinct instruction as the network takes it: int32 [l] where the table is learned, else float32 [l e]."""
-        settings = self.model
-        source = TextSource(self.size.text_tokens, settings.text_weights, settings.text_tokenizer, self.cache_folder / "text")
-        return encode_instructions(self.text_encoder, source, instructions, settings.text_prefix)
-
-    def condition_shape(self, stream: str) -> tuple[int, ...]:
-        """Of what one stream or mechanism is told of a clip: latents [t h w c] or numbers [t n]."""
-        condition, history = self.conditions[stream], len(self.model.history)
-        frames, *picture = self.latent_shape
-        width = ACTION_DIM if stream == "joints" else MECHANISMS[stream].width if stream in MECHANISMS else 0
-        if width:
-            return frames + (history if condition.with_history else 0), width
-        return history if condition.make is None else frames, *picture
+    @property
+    def size(self) -> ModelSize:
+        """Size of the network; the width of the text is its encoder's."""
+        size, width = pick(MODELS, self.model.size, "model size"), self.text_encoder.width
+        return replace(size, text_dim=width) if width else size
 
     @property
-    def latent_shape(self) -> tuple[int, int, int, int]:
-        """Of one RGB clip [t h w c]."""
-        factor = self.codec.spatial_factor
-        return latent_frames(self.clip.frames), self.clip.height // factor, self.clip.width // factor, self.codec.channels
+    def network(self) -> Network:
+        words = VOCABULARY if self.text_encoder.learned else 0
+        return Network(self.size, self.codec.channels, tuple(self.conditions), words, self.train.seed, self.model)
+
+    @property
+    def inputs(self) -> ClipInputs:
+        history, conditions, size = self.model.history, self.conditions, self.size
+        shapes = {"rgb": _latent_shape(self.clip, self.codec)}
+        shapes |= {name: _condition_shape(shapes["rgb"], condition, len(history)) for name, condition in conditions.items()}
+        shapes["text"] = (size.text_tokens,) if self.text_encoder.learned else (size.text_tokens, size.text_dim)
+        return ClipInputs(self.clip, self.train.chunks, history, conditions, shapes)
+
+    @property
+    def instructions(self) -> Instructions:
+        settings, folder = self.model, self.cache_folder / "text"
+        source = TextSource(self.size.text_tokens, settings.text_weights, settings.text_tokenizer, folder)
+        return Instructions(self.text_encoder, source, settings.text_prefix)
+
+    @property
+    def encoding(self) -> Encoding:
+        return Encoding(self.inputs, self.codec, self.cache_folder, self.data, self.adapt.start_from)
+
+    @property
+    def choice(self) -> EpisodeChoice:
+        """Which episodes are read. Raises ConfigError if the run that is replayed has gone."""
+        start, replay = self.adapt.start_from, tuple[str, ...]()
+        if start is not None and self.adapt.replay:
+            source = load_experiment(start / "config.yaml").robots.train_robots
+            replay = tuple(robot for robot in source if robot not in self.adapt.robots)
+        return EpisodeChoice(self.data, self.robots, self.adapt, replay)
+
+    @property
+    def learning(self) -> Learning:
+        return Learning(self.network, self.train, self.adapt.lora_rank)
+
+    @property
+    def sampling(self) -> RolloutSettings:
+        """How rollouts are sampled, with the shift of training where none of its own is given."""
+        return replace(self.rollout, shift=self.rollout.shift or self.train.shift)
+
+
+def _latent_shape(clip: Clip, codec: CodecSettings) -> tuple[int, ...]:
+    """Shape [t h w c] of one clip's latents."""
+    factor = codec.spatial_factor
+    return latent_frames(clip.frames), clip.height // factor, clip.width // factor, codec.channels
+
+
+def _condition_shape(latents: tuple[int, ...], condition: Condition, history: int) -> tuple[int, ...]:
+    """Shape of what a condition says of a clip of latents [t h w c]: latents [t h w c], or numbers [t n]."""
+    stream, (frames, *picture) = condition.stream, latents
+    width = ACTION_DIM if stream == "joints" else MECHANISMS[stream].width if stream in MECHANISMS else 0
+    if width:
+        return frames + (history if condition.with_history else 0), width
+    return history if condition.make is None else frames, *picture
 
 
 def beside(data: Path, ending: str) -> Path:
-    """The folder next to the data that is called as they are, with an ending; also where they are "." or ".."."""
+    """Name the folder next to the data that is called as they are, with an ending; also where they are "." or ".."."""
     named = data.resolve() if data.name in ("", "..") else data
     return named.with_name(f"{named.name}-{ending}")
 
 
-def chosen_conditions(settings: ModelSettings) -> list[Condition]:
-    """The action's, the embodiment's and the history's. Raises ConfigError for a name that does not exist."""
+def pick_conditions(settings: ModelSettings) -> list[Condition]:
+    """Look up the conditions of action, embodiment and history. Raises ConfigError for a name that does not exist."""
     action, embodiment = pick(ACTIONS, settings.action, "action"), pick(CONDITIONS, settings.embodiment, "embodiment")
     return [*list_conditions(action), *list_conditions(embodiment), *([HISTORY] if settings.history else [])]
 
@@ -252,7 +394,7 @@ LEAST = {
 def load_experiment(path: Path | str, overrides: list[str] | None = None) -> Experiment:
     """Read and check a config. Raises ConfigError with every choice that does not exist or does not fit."""
     experiment = load(Experiment, path, overrides or [])
-    demand_at_least(LEAST, experiment, str(path))
+    check_least(LEAST, experiment, str(path))
     codec_class(experiment.codec).check(experiment.codec)
     pick(SAMPLERS, experiment.rollout.sampler, "sampler")
     pick(SCHEDULES, experiment.rollout.grid, "noise schedule")
@@ -264,7 +406,7 @@ def load_experiment(path: Path | str, overrides: list[str] | None = None) -> Exp
     return experiment
 
 
-def demand_at_least(least: Mapping[str, float], settings: Any, source: str) -> None:
+def check_least(least: Mapping[str, float], settings: Any, source: str) -> None:
     """Raise ConfigError where a number of some settings, named as "train.batch", is under the least that it may be."""
     for name, smallest in least.items():
         value = attrgetter(name)(settings)
@@ -274,7 +416,7 @@ def demand_at_least(least: Mapping[str, float], settings: Any, source: str) -> N
 
 def _check_conditions(experiment: Experiment, source: str) -> None:
     feeders: dict[str, str] = {}
-    for condition in chosen_conditions(experiment.model):
+    for condition in pick_conditions(experiment.model):
         if condition.stream == "rgb" or condition.stream not in {**STREAMS, **MECHANISMS}:
             known = ", ".join(name for name in (*STREAMS, *MECHANISMS) if name != "rgb")
             raise ConfigError(f"{source}: the condition {condition.name} feeds {condition.stream!r}; conditions feed {known}.")
@@ -311,14 +453,14 @@ def _check_training(experiment: Experiment, source: str) -> None:
         return
     if not adapt.robots or adapt.episodes < 1:
         raise ConfigError(f"{source}: adapt needs the robots to adapt to and at least one episode of each task and robot.")
-    if not 0 <= adapt.replay < 1 or (adapt.replay and replayed(train.batch, adapt.replay) >= train.batch):
+    if not 0 <= adapt.replay < 1 or (adapt.replay and count_replayed(train.batch, adapt.replay) >= train.batch):
         raise ConfigError(
             f"{source}: adapt.replay is {adapt.replay:g} of a batch of {train.batch}; it is a part that leaves room for others."
         )
 
 
-def replayed(batch: int, replay: float) -> int:
-    """How many samples of a batch are replayed: the nearest whole number, at least one where any are asked for."""
+def count_replayed(batch: int, replay: float) -> int:
+    """Number of samples of a batch that are replayed: the nearest whole one, at least one where any are asked for."""
     return max(1, round(batch * replay)) if replay else 0
 
 
@@ -336,26 +478,5 @@ def _check_history(experiment: Experiment, source: str) -> None:
 
 
 def create_model(experiment: Experiment) -> WorldModel:
-    """The network of an experiment at its random start; wrap in `nnx.eval_shape` for shapes only."""
-    settings = experiment.model
-    return WorldModel(
-        experiment.size,
-        experiment.codec.channels,
-        tuple(experiment.conditions),
-        dtype=jnp.dtype(settings.dtype),
-        residual=jnp.dtype(settings.residual),
-        remat=settings.remat,
-        unroll=settings.unroll,
-        attention=settings.attention,
-        visibility=settings.visibility,
-        time=settings.time,
-        history=tuple(frame / TEMPORAL_FACTOR for frame in settings.history),
-        words=VOCABULARY if experiment.text_encoder.learned else 0,
-        rngs=nnx.Rngs(experiment.train.seed),
-    )
-
-
-def compile_cache() -> None:
-    """Keep compiled programs between runs in the user's cache folder, unless JAX was told otherwise."""
-    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder("jax")))
+    """Make the network of an experiment at its random start; wrap in `nnx.eval_shape` for shapes only."""
+    return experiment.network.create()

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 from flax import nnx
 
 from xew.config import ConfigError, user_errors
-from xew.model.experiment import create_model
 from xew.model.network.dit import parameter_count
 from xew.model.network.dit_layouts import Naming, save_dit, wan_layout
 from xew.model.network.tokens import WAVELENGTH_BASE
-from xew.model.runs.checkpoint import load_run_config, restore_params
+from xew.model.runs.folder import load_run_config
+from xew.model.runs.start import restore_params
 from xew.model.weights.tensors import checkpoint_shapes
 
 
@@ -32,7 +32,7 @@ def export(run: Path, out: Path, naming: Naming = "diffusers", dtype: str = "flo
     experiment = load_run_config(run)
     if out.exists() and (out.is_file() or any(out.iterdir())):
         raise ConfigError(f"{out} exists already; choose another --out.")
-    graph, shapes = nnx.split(nnx.eval_shape(lambda: create_model(experiment)), nnx.Param)
+    graph, shapes = nnx.split(nnx.eval_shape(experiment.network.create), nnx.Param)
     here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), shapes)
     params, step = restore_params(run, like, step)

@@ -23,10 +23,12 @@ import numpy as np
 from tqdm import tqdm
 
 from xew.config import ConfigError, user_errors
+from xew.dataset import Episode
 from xew.episode import Record, read_video
 from xew.model.conditions import Command
-from xew.model.latents import Episode, episode_command
-from xew.model.rollout import RolloutWriter, check_out, common_header, is_done, select_episodes
+from xew.model.episodes.choice import select_episodes
+from xew.model.episodes.commands import episode_command
+from xew.model.rollout import RolloutWriter, check_out, common_header, is_done
 from xew.protocol import LEFT_GRIPPER, RIGHT_GRIPPER
 
 

@@ -11,33 +11,37 @@ import argparse
 import json
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from flax import nnx
+from jax.sharding import Mesh
 from tqdm import tqdm
 
-from xew.config import CONVERTER, ConfigError, suggestion, user_errors
-from xew.dataset import find_accepted
-from xew.episode import EpisodeError, Record, episode_folder
-from xew.model.cache.scales import load_run_scales
-from xew.model.codecs.codec import codec_class
+from xew.compilation import keep_compiled_programs
+from xew.config import CONVERTER, ConfigError, user_errors
+from xew.dataset import Episode
+from xew.episode import Record, episode_folder
+from xew.files import checkpoint_time
+from xew.model.cache.codecs import load_codec
+from xew.model.cache.scales import Scale, load_run_scales
+from xew.model.codecs.codec import Codec, codec_class
 from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
-from xew.model.experiment import Experiment, compile_cache, create_model, load_experiment
-from xew.model.latents import Episode, load_codec, training_episodes
+from xew.model.episodes.choice import select_episodes, training_episodes
+from xew.model.experiment import Experiment, load_experiment
 from xew.model.network.dit import cast_params
 from xew.model.network.dit_layouts import load_dit_params
-from xew.model.runs.checkpoint import load_run, restore_params, saved_at
+from xew.model.runs.folder import load_run
+from xew.model.runs.start import restore_params
 from xew.model.sampling.predict import Prediction, Predictor
 from xew.model.training.step import random_params
 from xew.model.video.frames import to_camera_size
-from xew.protocol import seed_split
 from xew.rollout import write_rollout
 
 Item = tuple[Episode, dict[str, Any]]
@@ -48,11 +52,20 @@ WAITING = 16
 """Videos that may wait for a writer before predicting waits too."""
 
 
-def load_predictor(run: Path, step: int | None = None, overrides: Sequence[str] = ()) -> tuple[Predictor, int | None]:
-    """A model, a copy of it on each device, and the step of its checkpoint.
+class LoadedModel(NamedTuple):
+    """A model that is ready to predict."""
+
+    predictor: Predictor
+    experiment: Experiment
+    step: int | None
+    """Step of the run's checkpoint; None of published weights."""
+
+
+def load_predictor(run: Path, step: int | None = None, overrides: Sequence[str] = ()) -> LoadedModel:
+    """Load a model, with a copy of it on each device.
 
     Args:
-        run: folder of a trained run; or a config, whose `model.weights` are then taken as they are (the step is None).
+        run: folder of a trained run; or a config, whose `model.weights` are then taken as they are.
         step: of the run's checkpoint; the latest where left out.
         overrides: such as --rollout.steps 20. Of a run only what begins with --rollout can still be chosen.
 
@@ -60,17 +73,25 @@ def load_predictor(run: Path, step: int | None = None, overrides: Sequence[str] 
         ConfigError: there is no such run, checkpoint or weights, or an override would make it another model.
     """
     if is_config(run):
-        return load_published(load_experiment(run, list(overrides)), run), None
+        experiment = load_experiment(run, list(overrides))
+        return LoadedModel(load_published(experiment, run), experiment, None)
     experiment, codec = load_run(run)
     _check_overrides(overrides)
-    chosen = load_experiment(run / "config.yaml", list(overrides)).rollout
+    experiment = replace(experiment, rollout=load_experiment(run / "config.yaml", list(overrides)).rollout)
     mesh = make_mesh(MeshSettings())
-    graph, shapes = nnx.split(nnx.eval_shape(lambda: create_model(experiment)), nnx.Param)
+    graph, shapes = nnx.split(nnx.eval_shape(experiment.network.create), nnx.Param)
     like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=replicated_sharding(mesh)), shapes)
     params, step = restore_params(run, like, step)
+    scales = load_run_scales(experiment.conditions, run)
+    return LoadedModel(_make_predictor(experiment, codec, graph, params, mesh, scales), experiment, step)
+
+
+def _make_predictor(
+    experiment: Experiment, codec: Codec, graph: nnx.GraphDef, params: Any, mesh: Mesh, scales: Mapping[str, Scale]
+) -> Predictor:
     params = jax.jit(cast_params, static_argnums=0)(graph, params)
     codec = jax.device_put(codec, replicated_sharding(mesh))
-    return Predictor(replace(experiment, rollout=chosen), codec, graph, params, load_run_scales(experiment, run)), step
+    return Predictor(experiment.inputs, experiment.instructions, experiment.sampling, codec, graph, params, scales)
 
 
 def is_config(run: Path) -> bool:
@@ -96,33 +117,16 @@ def load_published(experiment: Experiment, source: Path) -> Predictor:
     if scaled:
         raise ConfigError(f"{source}: {', '.join(scaled)} is scaled by training episodes; train a run and roll that out.")
     mesh = make_mesh(MeshSettings())
-    graph, params = random_params(experiment, mesh)
+    graph, params = random_params(experiment.network, mesh)
     params = load_dit_params(graph, params, experiment.model.weights)
-    kind = codec_class(experiment.codec)
-    fitted = kind.fitted
-    codec = load_codec(experiment, training_episodes(experiment)) if fitted else kind.prepare(experiment.codec, list)
-    params = jax.jit(cast_params, static_argnums=0)(graph, params)
-    return Predictor(experiment, jax.device_put(codec, replicated_sharding(mesh)), graph, params)
+    episodes = training_episodes(experiment.choice) if codec_class(experiment.codec).fitted else ()
+    return _make_predictor(experiment, load_codec(experiment.encoding, episodes), graph, params, mesh, {})
 
 
 def _check_overrides(overrides: Sequence[str]) -> None:
     wrong = [word for word in overrides if word.startswith("--") and not word.startswith("--rollout.")]
     if wrong:
         raise ConfigError(f"{' '.join(wrong)}: of a trained run only --rollout.… can be chosen anew (see --help for the rest).")
-
-
-def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None) -> list[Episode]:
-    """Accepted episodes of a seed family and of the given robots, or of all. Raises ConfigError if there is none."""
-    accepted = find_accepted(data)
-    known = sorted({record.robot for _, record in accepted})
-    for robot in robots or ():
-        if robot not in known:
-            raise ConfigError(f"unknown robot {robot!r};{suggestion(robot, known)} {data} has: {', '.join(known)}.")
-    chosen = [(f, r) for f, r in accepted if seed_split(r.seed) == split and (robots is None or r.robot in robots)]
-    if not chosen:
-        asked = f"{split} episode of {', '.join(robots)}" if robots else f"{split} episode"
-        raise EpisodeError(f"{data} has no {asked}; run python -m xew.sim_warp.generate --out {data}")
-    return chosen
 
 
 def check_out(out: Path, data: Path) -> None:
@@ -135,7 +139,7 @@ def rollout_header(experiment: Experiment, step: int | None, saved: int | None, 
     """rollout.json: what was predicted, from what, with what. How many were predicted at once is no part of it.
 
     Args:
-        step, saved: of the checkpoint and when it was saved (`checkpoint.saved_at`), which tells it from that of another
+        step, saved: of the checkpoint and when it was saved (`checkpoint_time`), which tells it from that of another
             training of the same config; None of published weights.
     """
     _, record = episode
@@ -231,7 +235,7 @@ class _Begun:
 
 def predict_and_write(predictor: Predictor, pending: Sequence[Item], writer: RolloutWriter) -> None:
     """Roll out episodes and write each as long as its header says; reads one batch ahead of the devices."""
-    size = max(min(predictor.experiment.rollout.batch, len(pending)), 1)
+    size = max(min(predictor.settings.batch, len(pending)), 1)
     begun: _Begun | None = None
     for items in batches(pending, size):
         longest = max(header["frame_count"] for _, header in items)
@@ -253,16 +257,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--robots", nargs="+", metavar="ROBOT", help="default: all of the data")
     parser.add_argument("--out", type=Path, help="default: rollouts/<name of the run>")
     args, overrides = parser.parse_known_args(arguments)
-    compile_cache()
-    predictor, step = load_predictor(args.run, args.checkpoint, overrides)
-    experiment = predictor.experiment
+    keep_compiled_programs()
+    predictor, experiment, step = load_predictor(args.run, args.checkpoint, overrides)
     data, out = args.data or experiment.data, args.out or Path("rollouts") / name_of(args.run)
     check_out(out, data)
     episodes = select_episodes(data, args.split, args.robots)
-    saved = None if step is None else saved_at(args.run, step)
+    saved = None if step is None else checkpoint_time(args.run, step)
     headers = [(episode, rollout_header(experiment, step, saved, episode)) for episode in episodes]
     pending = [item for item in headers if not is_done(out, *item)]
-    experiment.encode_instructions([record.instruction for (_, record), _ in pending])  # all at once, where that costs
+    experiment.instructions.encode([record.instruction for (_, record), _ in pending])  # all at once, where that costs
     with (
         tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
         RolloutWriter(out, progress.update) as writer,

@@ -11,9 +11,8 @@ import argparse
 import functools
 import json
 import sys
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -24,22 +23,24 @@ import optax
 from flax import nnx
 from tqdm import tqdm
 
+from xew.compilation import keep_compiled_programs
 from xew.config import ConfigError, load, pick, user_errors
-from xew.dataset import find_accepted
+from xew.dataset import Episode
 from xew.episode import read_video
 from xew.model.codecs.ceiling import Ceiling, choose_evenly, measure_ceiling
 from xew.model.codecs.codec import WanVaeCodec, to_signed
 from xew.model.codecs.vae import VAES, LatentStatistic, VaeSize, VideoVae
 from xew.model.codecs.vae_layouts import save_vae
-from xew.model.experiment import Clip, TrainSettings, beside, compile_cache, demand_at_least
-from xew.model.latents import Episode, test_episodes
-from xew.model.runs.checkpoint import TrainState, claim_run, open_checkpoints, restore_state, save_state
-from xew.model.train import STOPPED, StopSignal
+from xew.model.episodes.choice import test_episodes, training_episodes
+from xew.model.experiment import Clip, EpisodeChoice, TrainSettings, beside, check_least
+from xew.model.runs.checkpoint import TrainState, restore_state
+from xew.model.runs.folder import claim_run
+from xew.model.training.loop import STOPPED, Meter, Timetable, open_session, run_steps
 from xew.model.training.optimizer import learning_rate, make_optimizer
 from xew.model.training.samples import strip
 from xew.model.training.tensorboard import RunLog
 from xew.model.training.vae_data import Cut, check_streams, make_dataset, random_clips, video_files
-from xew.protocol import SPLITS, Split, seed_split
+from xew.protocol import SPLITS, Split
 
 CEILING_CLIPS = 16
 SMALLEST_DEVIATION = 1e-3
@@ -107,6 +108,10 @@ class VaeExperiment:
         return pick(SPLITS, self.split, "split")
 
     @property
+    def choice(self) -> EpisodeChoice:
+        return EpisodeChoice(self.data, self.robots)
+
+    @property
     def cache_folder(self) -> Path:
         return self.cache or beside(self.data, "frames")
 
@@ -148,7 +153,7 @@ LEAST = {
 def load_vae_experiment(path: Path | str, overrides: list[str] | None = None) -> VaeExperiment:
     """Read and check a config. Raises ConfigError with what does not exist or does not fit."""
     experiment = load(VaeExperiment, path, overrides or [])
-    demand_at_least(LEAST, experiment, str(path))
+    check_least(LEAST, experiment, str(path))
     check_streams(experiment.streams)
     _ = experiment.robots
     factor, clip, train = experiment.size.spatial_factor, experiment.clip, experiment.train
@@ -176,11 +181,13 @@ class Losses(NamedTuple):
     psnr: jax.Array
     """Decibels, of the batch."""
     gradient_norm: jax.Array
+    finite: jax.Array
+    """Whether the loss and the gradients are finite."""
 
 
 def vae_losses(vae: VideoVae, frames: jax.Array, key: jax.Array, settings: VaeTrainSettings) -> Losses:
     """The loss of frames [b t h w 3] in [-1, 1], with latents drawn from what the encoder gives."""
-    from xew.metrics import lpips  # only here: the model room does without metrics
+    from xew.metrics import lpips
 
     mean, log_variance = vae.moments(frames)
     latents = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
@@ -192,7 +199,7 @@ def vae_losses(vae: VideoVae, frames: jax.Array, key: jax.Array, settings: VaeTr
     kl = 0.5 * (jnp.square(mean) + jnp.exp(log_variance) - 1 - log_variance).mean()
     psnr = -10 * jnp.log10(jnp.square(made - true).mean() + 1e-10)
     total = l1 + settings.lpips * perceptual + settings.kl * kl
-    return Losses(total, l1, perceptual, kl, psnr, jnp.float32(0))
+    return Losses(total, l1, perceptual, kl, psnr, jnp.float32(0), jnp.isfinite(total))
 
 
 def make_vae_step(graph: nnx.GraphDef, statistics: Any, experiment: VaeExperiment) -> Callable[..., tuple[TrainState, Losses]]:
@@ -213,7 +220,8 @@ def make_vae_step(graph: nnx.GraphDef, statistics: Any, experiment: VaeExperimen
         # The average of few steps is over those alone; else the random start would stay in it.
         decay = jnp.minimum(settings.ema_decay, (1 + state.step) / (10 + state.step))
         ema = optax.incremental_update(params, state.ema, 1 - decay)
-        losses = losses._replace(gradient_norm=optax.tree.norm(gradients))
+        norm = optax.tree.norm(gradients)
+        losses = losses._replace(gradient_norm=norm, finite=losses.finite & jnp.isfinite(norm))
         return TrainState(state.step + 1, params, optimizer_state, ema), losses
 
     return step
@@ -249,7 +257,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     existing.add_argument("--overwrite", action="store_true", help="replace the run in --out")
     args, overrides = parser.parse_known_args(arguments)
     experiment = load_vae_experiment(args.config, overrides)
-    compile_cache()
+    keep_compiled_programs()
     if not train_vae(experiment, resume=args.resume, overwrite=args.overwrite):
         sys.exit(STOPPED)
 
@@ -260,87 +268,39 @@ def train_vae(experiment: VaeExperiment, *, resume: bool = False, overwrite: boo
     Returns:
         Whether the last step was reached.
     """
-    settings = experiment.train
-    episodes = training_episodes(experiment)
+    settings, rates = experiment.train, learning_rate(experiment.optimizer)
+    episodes = training_episodes(experiment.choice)
     files = video_files(experiment.streams, episodes, experiment.cache_folder)
     batches = iter(make_dataset(files, experiment.cut(), settings.batch, settings.seed))
     claim_run(experiment.out, experiment, load_vae_experiment, resume=resume, overwrite=overwrite)
 
     graph, statistics, state = init_vae_state(experiment)
-    checkpoints = open_checkpoints(experiment.out, settings.keep_checkpoints)
-    if checkpoints.latest_step() is not None:
-        state, position = restore_state(checkpoints, state)
-        batches.set_state(position)
-    step = make_vae_step(graph, statistics, experiment)
-    begin = int(state.step)
-    log, stop = RunLog(experiment.out, begin), StopSignal()
     sample = sample_clip(experiment, episodes)
+    timetable = Timetable(settings.steps, settings.log_every, settings.save_every, settings.sample_every, rates)
+    with open_session(experiment.out, settings.keep_checkpoints) as session:
+        log = session.log
+        assert log is not None, "autoencoders are trained by one process"
+        if session.step:
+            state, position = restore_state(session.checkpoints, state)
+            batches.set_state(position)
 
-    meter, schedule = Meter(), learning_rate(experiment.optimizer)
-    progress = tqdm(range(begin, settings.steps), desc="train", initial=begin, total=settings.steps, file=sys.stderr)
-    for number in (done + 1 for done in progress):
-        last = number == settings.steps
-        pictures = meter.wait(batches)
-        state, losses = step(state, pictures)
-        meter.losses.append(losses)
-        saves = number % settings.save_every == 0 or last or stop.received
-        if number % settings.log_every == 0 or saves:
-            values = meter.take() | {"train/learning_rate": float(schedule(number - 1))}
-            log.scalars(number, values)
-            progress.set_postfix(psnr=f"{values['train/psnr']:.2f}")
-            if not np.isfinite([values["train/loss"], values["train/gradient_norm"]]).all():
-                sys.exit(f"error: the loss is not finite by step {number}; nothing of it was saved. Lower train.learning_rate.")
-        if saves:
-            save_state(checkpoints, state, batches.get_state())
-        if settings.sample_every and (number % settings.sample_every == 0 or last):
+        def draw_samples(state: TrainState, step: int) -> None:
             codec = WanVaeCodec.from_vae(nnx.merge(graph, state.ema, statistics))
-            log.image(number, "sample/unseen", strip(sample, codec.decode(codec.encode(sample))))
-        if stop.received and not last:
-            progress.write(f"stopped at step {number} of {settings.steps} and saved; continue with --resume", file=sys.stderr)
-            break
-    stop.release()
-    checkpoints.close()
-    ended = int(state.step) >= settings.steps
-    if ended:
-        finish(experiment, nnx.merge(graph, state.ema, statistics), files, log)
-    log.close()
+            log.image(step, "sample/unseen", strip(sample, codec.decode(codec.encode(sample))))
+
+        take_step = make_vae_step(graph, statistics, experiment)
+        state = run_steps(timetable, session, Meter(summarize, settings.batch), take_step, state, batches, draw_samples)
+        ended = int(state.step) >= settings.steps
+        if ended:
+            finish(experiment, nnx.merge(graph, state.ema, statistics), files, log)
     return ended
 
 
-@dataclass
-class Meter:
-    """What has happened since the last log line."""
-
-    losses: list[Losses] = field(default_factory=list)
-    wait_s: float = 0.0
-    since: float = field(default_factory=time.perf_counter)
-
-    def wait(self, batches: Any) -> np.ndarray:
-        """The next batch; notes how long it was waited for."""
-        asked = time.perf_counter()
-        batch = next(batches)
-        self.wait_s += time.perf_counter() - asked
-        return batch
-
-    def take(self) -> dict[str, float]:
-        """Means for a log line; begins anew."""
-        parts = [np.asarray(jax.device_get(losses)) for losses in self.losses]
-        means = dict(zip(Losses._fields, np.mean(parts, axis=0).tolist(), strict=True))
-        count, seconds = len(parts), time.perf_counter() - self.since
-        values = {"train/loss": means.pop("total")} | {f"train/{name}": value for name, value in means.items()}
-        values |= {"time/step_s": seconds / count, "time/data_wait_s": self.wait_s / count}
-        self.losses, self.wait_s, self.since = [], 0.0, time.perf_counter()
-        return values
-
-
-def training_episodes(experiment: VaeExperiment) -> list[Episode]:
-    """Accepted episodes of training seeds and training robots. Raises ConfigError if there are none."""
-    robots = experiment.robots.train_robots
-    chosen = [(f, r) for f, r in find_accepted(experiment.data) if r.robot in robots and seed_split(r.seed) == "train"]
-    if not chosen:
-        command = f"python -m xew.sim_warp.generate --robots {' '.join(robots)} --out {experiment.data}"
-        raise ConfigError(f"{experiment.data} has no training episode of {', '.join(robots)}; make some: {command}")
-    return chosen
+def summarize(results: Sequence[Losses]) -> dict[str, float]:
+    """Means of the parts of the loss over some steps."""
+    names = [name for name in Losses._fields if name != "finite"]
+    means = {name: float(np.mean([getattr(result, name) for result in results])) for name in names}
+    return {"train/loss": means.pop("total")} | {f"train/{name}": value for name, value in means.items()}
 
 
 def report_episodes(experiment: VaeExperiment) -> dict[str, list[Episode]]:

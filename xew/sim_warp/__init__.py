@@ -1,1 +1,1 @@
-"""(task, seed) -> episodes: scenes, experts, physics and rendering on Newton and Warp. Never imports JAX."""
+"""Simulation: (task, seed) to episodes, by scenes, experts, physics and rendering on Newton and Warp. It never imports JAX."""

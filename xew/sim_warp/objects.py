@@ -44,11 +44,12 @@ def merge(*shapes: Shape) -> Shape:
 
 
 def move(shape: Shape, xyz: tuple[float, float, float]) -> Shape:
+    """The shape moved by `xyz` [m]."""
     return Shape(shape.mesh.transformed(xyz), tuple(h + np.array(xyz, np.float32) for h in shape.hulls))
 
 
 def darken(color: Color, share: float) -> Color:
-    """A color at `share` of its brightness."""
+    """The color at `share` of its brightness."""
     red, green, blue = color
     return int(share * red), int(share * green), int(share * blue)
 
@@ -112,6 +113,7 @@ def _wall_hulls(outer: np.ndarray, inner: np.ndarray) -> list[np.ndarray]:
 
 
 def _ring(radius: float, low: float, high: float) -> np.ndarray:
+    """[k 3] m, corners of an upright prism about z between two heights [m]."""
     angle = np.arange(WALL_SEGMENTS) * 2 * np.pi / WALL_SEGMENTS
     circle = radius * np.stack([np.cos(angle), np.sin(angle)], -1)
     return np.concatenate([np.column_stack([circle, np.full(WALL_SEGMENTS, z)]) for z in (low, high)]).astype(np.float32)

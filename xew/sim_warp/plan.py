@@ -1,4 +1,4 @@
-"""Stage 2a: an expert's plan: waypoints of both tool frames on a common clock. It knows no robot.
+"""Plans of experts: waypoints of both tool frames on a common clock. A plan knows no robot.
 
 Reads  a Scene (through a task's `plan` function)
 Writes `Timeline`, and by `Timeline.path` both tools' poses and grippers at every stored frame
@@ -36,11 +36,11 @@ class Tool:
     rotation: Rotation
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Tool":
-        """Shifted along world axes [m]."""
+        """The tool shifted along world axes [m]."""
         return Tool(self.position + np.array([x, y, z]), self.rotation)
 
     def backed(self, distance: float) -> "Tool":
-        """Drawn back against the approach direction [m]."""
+        """The tool drawn back against the approach direction by a distance [m]."""
         return Tool(self.position - distance * self.rotation.apply([1, 0, 0]), self.rotation)
 
     def carried(self, start: Point, goal: Point, turn: float = 0.0) -> "Tool":
@@ -105,12 +105,13 @@ class ToolPath:
 
     @property
     def frame_count(self) -> int:
+        """Number of stored frames t."""
         return len(self.gripper)
 
 
 @dataclass
 class Timeline:
-    """Written by a task, from time 0 at which both arms are home with open grippers."""
+    """Moves, grips and waits in order, as a task writes them; at time 0 both arms are home with open grippers."""
 
     time: float = 0.0
     """Time now [s]."""
@@ -145,6 +146,7 @@ class Timeline:
         self.time += seconds
 
     def wait(self, seconds: float) -> None:
+        """Let time pass while the tools stand still."""
         self.time += seconds
 
     def hold(self, arm: int, name: str) -> None:
@@ -160,13 +162,14 @@ class Timeline:
 
 
 def _duration(start: Tool, end: Tool) -> float:
+    """Time of a move [s]."""
     distance = np.linalg.norm(end.position - start.position)
     angle = (start.rotation.inv() * end.rotation).magnitude()
     return max(SHORTEST_MOVE, float(distance / TOOL_SPEED + angle / TURN_SPEED))
 
 
 def minimum_jerk(share: np.ndarray) -> np.ndarray:
-    """Progress in [0, 1] that starts and ends at rest without jerk, for a share of the time in [0, 1]."""
+    """Progress [t] from 0 to 1 that starts and ends at rest without jerk, at shares of the time [t] from 0 to 1."""
     share = np.clip(share, 0, 1)
     return np.clip(share**3 * (10 - 15 * share + 6 * share**2), 0, 1)
 
@@ -182,6 +185,7 @@ def _sample(home: Tool, segments: list[_Segment], times: np.ndarray) -> np.ndarr
 
 
 def _interpolate_waypoints(waypoints: tuple[Tool, ...], progress: np.ndarray) -> np.ndarray:
+    """[t 7] poses at progress [t] from 0 to 1 through waypoints that are evenly spaced in it."""
     knots = np.linspace(0, 1, len(waypoints))
     positions = np.stack([waypoint.position for waypoint in waypoints])
     position = np.stack([np.interp(progress, knots, positions[:, axis]) for axis in range(3)], -1)

@@ -1,4 +1,4 @@
-"""Stage 1: a scene from (task, seed). It knows no robot.
+"""Scenes: what stands on the table for a (task, seed). A scene knows no robot.
 
 Reads  nothing but a counter-based random stream
 Writes `Scene`: objects with poses, masses, hinges; the same bytes for every robot
@@ -126,7 +126,7 @@ def scene_hash(scene: Scene) -> str:
 
 
 def _plain_numbers(thing: SceneObject) -> tuple[object, ...]:
-    """The numbers of an object without its shapes."""
+    """Numbers of an object without its shapes, as `scene_hash` reads them."""
     hinge = thing.hinge
     numbers = {f.name: None if f.name == "lid" else getattr(hinge, f.name) for f in fields(hinge)} if hinge else None
     return (thing.name, thing.pose, thing.mass, thing.friction, thing.grasp, numbers)
@@ -141,7 +141,7 @@ def upright(xy: Point, z: float, yaw: float = 0.0) -> Pose:
 def draw(
     rng: np.random.Generator, low: Sequence[float], high: Sequence[float], accept: Callable[[np.ndarray], bool]
 ) -> np.ndarray:
-    """A uniform point of a box that `accept` takes, by rejection."""
+    """A uniform point [d] of the box from `low` [d] to `high` [d] that `accept` takes, found by rejection."""
     for _ in range(10_000):
         point = rng.uniform(low, high)
         if accept(point):

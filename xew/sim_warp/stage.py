@@ -1,6 +1,6 @@
-"""What never moves: table, wall, ground and lights, as plain data. The scene, the physics and the renderer read it here.
+"""The stage: table, wall, ground and lights, which never move, as plain data for scenes, physics and renderer.
 
-Reads nothing, writes nothing. Sizes and lights are RoboTwin 2.0's (`demo_clean`); meters, world frame.
+Sizes and lights are RoboTwin 2.0's (`demo_clean`); meters, world frame.
 To change the place where everything happens, change these constants.
 """
 
@@ -80,13 +80,13 @@ def stage_mesh() -> Mesh:
 
 
 def linear_from_srgb(color: np.ndarray) -> np.ndarray:
-    """sRGB values 0 to 255 of any shape -> linear light 0 to 1, float64 (IEC 61966-2-1)."""
+    """Linear light [...] float64, 0 to 1, of sRGB values [...] from 0 to 255 (IEC 61966-2-1)."""
     value = np.asarray(color, np.float64) / 255
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
 def srgb_from_linear(light: np.ndarray) -> np.ndarray:
-    """Linear light, clipped to 0 to 1, of any shape -> sRGB uint8 (IEC 61966-2-1)."""
+    """sRGB values [...] uint8 of linear light [...], clipped to 0 to 1 (IEC 61966-2-1)."""
     light = np.clip(np.asarray(light, np.float64), 0, 1)
     value = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
     return np.round(value * 255).astype(np.uint8)

@@ -12,7 +12,7 @@ from tests.analysis.test_report import Page
 from xew.analysis.paper import read_paper
 from xew.analysis.report import Args, main
 from xew.analysis.reports import paper as paper_report
-from xew.analysis.tables.distances import signed
+from xew.analysis.tables.distances import format_signed
 from xew.analysis.tables.paper import frame_distances, frame_results
 
 
@@ -41,9 +41,9 @@ def test_every_printed_figure_stands_beside_ours(written: Path) -> None:
     page, markdown = (written / "index.html").read_text(), (written / "report.md").read_text()
     for metric in read_paper().metrics.values():
         for of in (metric.appearance, metric.kinematic):
-            low, high = signed(of.low), signed(of.high)
+            low, high = format_signed(of.low), format_signed(of.high)
             assert f">{low} to {high}<" in page and f"(paper {low} to {high}) ✓" in markdown
-            assert f">{signed(of.r)}<" in page
+            assert f">{format_signed(of.r)}<" in page
     # Ten rows of five cells, two p, five robots with two means, 28 percentages.
     assert page.count('class="agrees"') == markdown.count(") ✓ ") == 10 * 5 + 2 + 5 * 2 + 28
     assert 'class="differs"' not in page
@@ -70,7 +70,7 @@ def test_the_papers_claims_are_asked_of_its_own_figures(written: Path) -> None:
     papers = found[found["where"] != "ours"]
     assert len(papers) > 20 and not (papers["verdict"] == "fails").any()
     text = (written / "index.html").read_text()
-    assert f"of the paper&#x27;s {len(papers)} claims: hold {(papers['verdict'] == 'holds').sum()}, fail 0," in text
+    assert f"of the paper&#39;s {len(papers)} claims: hold {(papers['verdict'] == 'holds').sum()}, fail 0," in text
 
 
 def test_the_summary_has_a_row_for_each_figure(written: Path) -> None:
@@ -93,7 +93,7 @@ def test_the_frame_of_workspaces_is_named_and_what_it_changes(written: Path) -> 
     assert summary["lpips", "arm_base", "r"] == pytest.approx(summary["lpips", "appearance", "r"], abs=0.05)
     assert summary["keypoint_error", "kinematic", "r"] < 0 < summary["keypoint_error", "arm_alone", "low"]
     text = (written / "index.html").read_text()
-    assert "as the text defines it, in the arm&#x27;s base frame (our clouds, its scores), LPIPS has r = +0.8" in text
+    assert "as the text defines it, in the arm&#39;s base frame (our clouds, its scores), LPIPS has r = +0.8" in text
     assert "By workspaces of the arm alone, in that frame (ours), LPIPS has r = +0.5" in text
 
 

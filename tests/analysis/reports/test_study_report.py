@@ -19,6 +19,7 @@ from xew.analysis.reports import page
 from xew.analysis.scores import read_scores
 from xew.analysis.statistics.grades import PaperGrades, StudyGrades
 from xew.analysis.tables import formats
+from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import (
     correlation_table,
     distance_tables,
@@ -26,7 +27,9 @@ from xew.analysis.tables.distances import (
     printed_distances,
     read_distances,
 )
-from xew.analysis.tables.layouts import PAPER_METRICS, Builder, Table, build_tables
+from xew.analysis.tables.labels import PAPER_METRICS
+from xew.analysis.tables.layouts import build_tables
+from xew.analysis.tables.table import Table
 from xew.episode import episode_folder, read_video
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, SEEN_ROBOTS, TEST_SEED_START, VARIANTS
 from xew.rollout import write_rollout
@@ -112,17 +115,17 @@ def test_the_finding_comes_first(folder: Path) -> None:
 def test_tables_are_those_of_the_paper_with_our_means_and_its_values_beside(
     tables: dict[str, Table], rows: pd.DataFrame
 ) -> None:
-    block = {b.title: b for b in tables["actions_full"].blocks}
+    section = {b.title: b for b in tables["actions_full"].sections}
     for title, robots in (("Seen pool", SEEN_ROBOTS), ("Held-out Franka", ("franka_panda",)), ("Held-out Piper", ("piper",))):
-        found = next(b for name, b in block.items() if name.startswith(title))
+        found = next(b for name, b in section.items() if name.startswith(title))
         flow = next(row for row in found.rows if row.labels == ("Optical flow",))
         for metric, cell in zip(PAPER_METRICS, flow.cells, strict=True):
             assert cell.value == pytest.approx(mean(rows, "fixed-optical_flow-none", robots, metric))
             assert cell.low < cell.value < cell.high and cell.text != "–"
-    piper = next(b for name, b in block.items() if "Piper" in name)
+    piper = next(b for name, b in section.items() if "Piper" in name)
     assert [cell.published for cell in piper.rows[0].cells][:3] == ["18.554", "0.837", "0.228"]
     # Five rows of conditions, four representations, six adaptations, four systems: as in the paper.
-    models = {name: [row for b in t.blocks for row in b.rows if not row.baseline] for name, t in tables.items()}
+    models = {name: [row for b in t.sections for row in b.rows if not row.baseline] for name, t in tables.items()}
     counts = {name: len(found) for name, found in models.items()}
     assert counts["actions"] == 4 * 2 and counts["actions_full"] == 4 * 3 and counts["ladder"] == 5 * 2
     assert counts["ladder_full"] == 5 * 3 and counts["few_shot"] == 3 * 2 and counts["few_shot_full"] == 1 + 4 * 2
@@ -134,7 +137,7 @@ def test_tables_are_those_of_the_paper_with_our_means_and_its_values_beside(
 
 def test_every_table_of_scores_has_its_noise_floor(tables: dict[str, Table], rows: pd.DataFrame) -> None:
     floors = {
-        name: [row for b in t.blocks for row in b.rows if row.baseline and "frozen" not in row.labels[0]]
+        name: [row for b in t.sections for row in b.rows if row.baseline and "frozen" not in row.labels[0]]
         for name, t in tables.items()
     }
     counts = {name: len(found) for name, found in floors.items()}
@@ -144,7 +147,7 @@ def test_every_table_of_scores_has_its_noise_floor(tables: dict[str, Table], row
     assert tables["few_shot"].columns[-1].title == "true video, graded"
     truth = rows[(rows["model"] == "ground_truth") & (rows["metric"] == "mask_iou") & (rows["robot"] == "piper")]
     assert floors["actions"][1].cells[2].value == pytest.approx(truth["value"].mean())
-    assert tables["few_shot"].blocks[1].rows[0].cells[-1].value == pytest.approx(truth["value"].mean())
+    assert tables["few_shot"].sections[1].rows[0].cells[-1].value == pytest.approx(truth["value"].mean())
     without = builder_of(rows[rows["model"] != "ground_truth"])
     assert not any("true video" in str(table) for table in build_tables(without))
 
@@ -152,25 +155,25 @@ def test_every_table_of_scores_has_its_noise_floor(tables: dict[str, Table], row
 def test_no_column_or_block_averages_the_held_out_robots(tables: dict[str, Table], rows: pd.DataFrame) -> None:
     names = [name for name, variant in VARIANTS.items() if set(HELD_OUT_ROBOTS) <= set(variant.graded_robots)]
     both = {mean(rows, name, HELD_OUT_ROBOTS, metric) for name in names for metric in PAPER_METRICS}
-    values = {cell.value for t in tables.values() for b in t.blocks for row in b.rows for cell in row.cells}
+    values = {cell.value for t in tables.values() for b in t.sections for row in b.rows for cell in row.cells}
     assert not any(np.isclose(a, b, rtol=1e-9) for a in both for b in values if not np.isnan(a + b))
 
 
 def test_best_and_marks_follow_the_paired_differences(tables: dict[str, Table]) -> None:
-    ladder = tables["ladder"].blocks[0]
+    ladder = tables["ladder"].sections[0]
     render, flow = ladder.rows[4], ladder.rows[0]
     assert [cell.best for cell in render.cells] == [True] * 3 and [cell.verdict for cell in render.cells] == ["better"] * 3
     assert all(not cell.verdict for cell in flow.cells)
     assert "unresolved" in {cell.verdict for row in ladder.rows[1:4] for cell in row.cells}
-    forgetting = tables["forgetting_full"].blocks[0].rows
+    forgetting = tables["forgetting_full"].sections[0].rows
     lpips = PAPER_METRICS.index("lpips")
     assert {row.cells[lpips].verdict for row in forgetting[1:7]} == {"worse"}
 
 
 def test_what_is_missing_is_said_in_the_table_in_every_format(folder: Path, tables: dict[str, Table]) -> None:
-    note = tables["actions_full"].blocks[1].note
+    note = tables["actions_full"].sections[1].note
     assert note.startswith("Incomplete") and "Not run: Mask" in note and "12 of 500 episodes: Joint pose" in note
-    mask = tables["actions_full"].blocks[1].rows[2]
+    mask = tables["actions_full"].sections[1].rows[2]
     assert [cell.text for cell in mask.cells] == ["–"] * 10 and mask.cells[0].published == "18.376"
     report = folder / "report"
     for name in ("index.html", "report.md", "tables/actions_full.tex", "tables/actions_full.csv"):
@@ -229,8 +232,8 @@ def test_markdown_latex_and_csv_hold_the_same_cells(tables: dict[str, Table]) ->
         assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {width + 1}
         tex = formats.latex(table)
         assert_well_formed(tex, width)
-        frame = formats.frame(table)
-        assert len(frame) == sum(len(row.cells) for b in table.blocks for row in b.rows)
+        frame = formats.table_frame(table)
+        assert len(frame) == sum(len(row.cells) for b in table.sections for row in b.rows)
         for text in frame["text"]:
             assert text in formats.markdown(table) and formats._escape(text) in tex and page.escape(text) in page.table(table)
 
@@ -295,15 +298,15 @@ def test_measured_distances_take_the_place_of_the_printed(folder: Path, tmp_path
     distances = read_distances(tmp_path)
     made = {table.name: table for table in distance_tables(distances)}
     assert "the paper's figures" not in made["distances"].caption and made["distances"].columns[-1].title.endswith("(ours)")
-    assert [cell.text for row in made["distances"].blocks[1].rows for cell in row.cells] == ["4.000"] * 3 + ["5.000"] * 3
-    matrix = formats.frame(made["matrices"])
+    assert [cell.text for row in made["distances"].sections[1].rows for cell in row.cells] == ["4.000"] * 3 + ["5.000"] * 3
+    matrix = formats.table_frame(made["matrices"])
     assert matrix[matrix["value"] == 0.5]["paper"].tolist() == [0.034, 0.034]
     grades = builder(folder / "scores.parquet").ours
     correlated, [own] = correlation_table(grades, distances, read_paper()), own_correlation_tables(grades, distances)
     assert (len(correlated.columns), len(own.columns)) == (2 * 2 + 1, 3)
-    assert all(cell.text != "–" for table in (correlated, own) for row in table.blocks[0].rows for cell in row.cells)
+    assert all(cell.text != "–" for table in (correlated, own) for row in table.sections[0].rows for cell in row.cells)
     scores = [mean.value for r in ROBOT_NAMES if (mean := grades.mean("loeo", f"loeo_{r}", r, "lpips"))]
-    lpips = next(row for row in own.blocks[0].rows if row.labels == ("LPIPS",))
+    lpips = next(row for row in own.sections[0].rows if row.labels == ("LPIPS",))
     assert lpips.cells[0].value == pytest.approx(np.corrcoef(distances.of("perceptual"), scores)[0, 1])
     assert own_correlation_tables(grades, printed_distances(read_paper())) == []
 

@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 
 from xew.analysis.scores import MetricInfo
-from xew.analysis.statistics.summary import Interval, RobotTable, Row, finding, mean_interval, progress, verdict
-from xew.analysis.tables.layouts import number
+from xew.analysis.statistics.summary import Interval, RobotTable, Row, finding, mean_interval, progress, verdict_on_copy
+from xew.analysis.tables.table import format_number
 
 rng = np.random.default_rng(0)
 
@@ -20,7 +20,7 @@ def episodes(values: object, robots: tuple[str, ...] = ("piper",)) -> pd.Series:
 
 
 def info(name: str, unit: str = "", higher: bool = False) -> MetricInfo:
-    return MetricInfo(name, "visual", unit, higher, None, None, "")
+    return MetricInfo(name, "visual", unit, higher, None, None, "", name.upper())
 
 
 def test_the_interval_is_close_to_the_normal_one_for_many_values() -> None:
@@ -42,16 +42,16 @@ def test_verdicts_are_paired(shift: float, higher: bool, expected: str) -> None:
     """Episodes differ by far more than the models do, so that only pairing can tell them apart."""
     copy = episodes(rng.normal(0, 50, 20))
     model = copy + shift + np.tile([-0.5, 0.5], 10)
-    assert verdict(model.sample(frac=1, random_state=1), copy, higher) == expected
+    assert verdict_on_copy(model.sample(frac=1, random_state=1), copy, higher) == expected
 
 
 def test_fewer_than_six_scenes_resolve_nothing() -> None:
     """Of five all differences have one sign by chance in 6 % of cases; a study's tables ask for as many."""
     high, low, pooled = [9.0, 8.0, 9.5, 8.5, 9.1, 8.9], [1.0, 2.0, 1.5, 1.2, 1.8, 1.1], ("aloha_agilex", "arx_x5", "ur5_wsg")
-    assert verdict(episodes(high), episodes(low), True) == "better"
-    assert verdict(episodes(high[:5]), episodes(low[:5]), True) == "unresolved"
-    assert verdict(episodes(high), episodes(low).iloc[1:], True) == "unresolved"
-    assert verdict(episodes(high, pooled), episodes(low, pooled), True) == "unresolved"  # three robots in two scenes
+    assert verdict_on_copy(episodes(high), episodes(low), True) == "better"
+    assert verdict_on_copy(episodes(high[:5]), episodes(low[:5]), True) == "unresolved"
+    assert verdict_on_copy(episodes(high), episodes(low).iloc[1:], True) == "unresolved"
+    assert verdict_on_copy(episodes(high, pooled), episodes(low, pooled), True) == "unresolved"  # three robots in two scenes
     assert np.isnan(mean_interval(episodes(high[:5])).low) and mean_interval(episodes(high)).low < 8.9
 
 
@@ -64,8 +64,14 @@ def test_robots_in_one_scene_are_resampled_together() -> None:
 
 def test_a_difference_inside_the_noise_floor_is_not_resolved() -> None:
     model, copy = episodes(0.53 + 0.001 * np.arange(8)), episodes(0.5 + 0.001 * np.arange(8))
-    assert verdict(model, copy, True, floor=0.02) == "better" and verdict(model, copy, True, floor=0.04) == "unresolved"
-    assert verdict(copy, model, True, floor=0.02) == "worse" and verdict(copy, model, True, floor=0.04) == "unresolved"
+    assert (
+        verdict_on_copy(model, copy, True, floor=0.02) == "better"
+        and verdict_on_copy(model, copy, True, floor=0.04) == "unresolved"
+    )
+    assert (
+        verdict_on_copy(copy, model, True, floor=0.02) == "worse"
+        and verdict_on_copy(copy, model, True, floor=0.04) == "unresolved"
+    )
 
 
 def table(title: str, model: float, copy: float = 0.4) -> RobotTable:
@@ -99,6 +105,6 @@ def test_the_finding_says_better_worse_and_how_far() -> None:
 
 
 def test_numbers_have_the_digits_that_mean_something() -> None:
-    assert number(21.23456, info("psnr", "dB")) == "21.23"
-    assert number(3.14159, info("keypoint_error", "px")) == "3.1"
-    assert number(0.123456, info("lpips")) == "0.123"
+    assert format_number(21.23456, info("psnr", "dB")) == "21.23"
+    assert format_number(3.14159, info("keypoint_error", "px")) == "3.1"
+    assert format_number(0.123456, info("lpips")) == "0.123"

@@ -1,15 +1,25 @@
 """Studies before they start: configs, variants, the graph, keys, costs."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
 
-from xew.analysis.studies.config import Study, experiment_of, load_study, merged
-from xew.analysis.studies.cost import corrected, cost_table, duration, estimate, longest_ways, steps_of, wall_seconds
+import xew
+from xew.analysis.studies.config import Study, build_experiment, load_study, merge_settings
+from xew.analysis.studies.cost import (
+    correct_by_ledger,
+    count_optimizer_steps,
+    critical_paths,
+    estimate,
+    estimate_wall_seconds,
+    format_costs,
+    format_duration,
+)
 from xew.analysis.studies.ledger import Ledger
-from xew.analysis.studies.plan import Cell, in_order, key_of, plan
+from xew.analysis.studies.plan import Step, plan, sort_steps, source_digest, step_key
 from xew.config import ConfigError
 from xew.protocol import PAPER_PARTS, PARTS, VARIANTS
 
@@ -34,18 +44,18 @@ def test_the_configs_plan_every_variant_of_their_parts(name: str) -> None:
     wanted = {
         variant.name for part in PAPER_PARTS for variant in PARTS[part] if not variant.target or variant.shots in study.shots
     }
-    assert wanted <= {variant.name for variant in study.planned}
-    cells = plan(study)
-    assert len(cells) == 3 + 4 * len(study.planned)
+    assert wanted <= {variant.name for variant in study.planned_variants}
+    steps = plan(study)
+    assert len(steps) == 3 + 4 * len(study.planned_variants)
     assert set(study.parts) >= set(PAPER_PARTS)
 
 
 def test_the_paper_is_planned_at_its_size() -> None:
     study = load_study(CONFIGS / "study_paper.yaml")
-    assert sum(study.graded(VARIANTS["fixed-optical_flow-none"]).values()) == 2500
+    assert sum(study.graded_counts(VARIANTS["fixed-optical_flow-none"]).values()) == 2500
     adapted = VARIANTS["few_shot-piper-3"]
-    assert (study.trained(adapted), study.graded(adapted)) == (75, {"ur5_wsg": 500, "piper": 500})
-    settings = experiment_of(study, adapted)
+    assert (study.training_count(adapted), study.graded_counts(adapted)) == (75, {"ur5_wsg": 500, "piper": 500})
+    settings = build_experiment(study, adapted)
     assert settings["adapt"] == {
         "start_from": "studies/paper/runs/fixed-optical_flow-nine_views",
         "robots": ["piper"],
@@ -56,26 +66,26 @@ def test_the_paper_is_planned_at_its_size() -> None:
 
 
 def test_an_adaptation_waits_for_what_it_starts_from(study: Study) -> None:
-    cells = plan(study)
-    order = [cell.name for cell in in_order(cells)]
-    for cell in cells.values():
-        assert all(order.index(need) < order.index(cell.name) for need in cell.needs)
-    assert "train/fixed-optical_flow-nine_views" in cells["latents/few_shot-piper-1"].needs
-    assert "train/fixed-optical_flow-nine_views" in cells["adapt/few_shot-piper-1"].needs
+    steps = plan(study)
+    order = [step.name for step in sort_steps(steps)]
+    for step in steps.values():
+        assert all(order.index(need) < order.index(step.name) for need in step.needs)
+    assert "train/fixed-optical_flow-nine_views" in steps["latents/few_shot-piper-1"].needs
+    assert "train/fixed-optical_flow-nine_views" in steps["adapt/few_shot-piper-1"].needs
     assert order[0] == "generate" and order[-1] == "analyse"
 
 
 def test_baselines_are_graded_once_and_over_all_robots(study: Study) -> None:
-    graded = [cell for cell in plan(study).values() if "--baselines" in cell.command]
-    assert [cell.name for cell in graded] == ["evaluate/fixed-optical_flow-none"]
+    graded = [step for step in plan(study).values() if "--baselines" in step.command]
+    assert [step.name for step in graded] == ["evaluate/fixed-optical_flow-none"]
 
 
 def test_a_subset_keeps_what_it_starts_from(study: Study) -> None:
-    names = [variant.name for variant in replace(study, variants=("few_shot-piper-*",)).planned]
+    names = [variant.name for variant in replace(study, variants=("few_shot-piper-*",)).planned_variants]
     assert names == ["fixed-optical_flow-nine_views", "few_shot-piper-1"]
-    without_panda = replace(study, robots=("aloha_agilex", "arx_x5", "ur5_wsg", "piper")).planned
+    without_panda = replace(study, robots=("aloha_agilex", "arx_x5", "ur5_wsg", "piper")).planned_variants
     assert not any("franka" in variant.name for variant in without_panda)
-    assert replace(study, robots=("ur5_wsg", "piper")).graded(VARIANTS["fixed-irasim"]) == {"ur5_wsg": 1, "piper": 1}
+    assert replace(study, robots=("ur5_wsg", "piper")).graded_counts(VARIANTS["fixed-irasim"]) == {"ur5_wsg": 1, "piper": 1}
 
 
 @pytest.mark.parametrize(
@@ -106,7 +116,7 @@ def test_a_key_that_does_not_exist_is_said(tmp_path: Path) -> None:
 
 def test_settings_are_laid_over_one_another() -> None:
     below = {"train": {"steps": 3, "batch": 2}, "split": "fixed"}
-    assert merged(below, {"train": {"steps": 0, "epochs": 1}}) == {
+    assert merge_settings(below, {"train": {"steps": 0, "epochs": 1}}) == {
         "train": {"steps": 0, "batch": 2, "epochs": 1},
         "split": "fixed",
     }
@@ -115,92 +125,124 @@ def test_settings_are_laid_over_one_another() -> None:
 
 def test_trainings_may_be_launched_on_other_machines(study: Study) -> None:
     launched = replace(study, machine=replace(study.machine, train_launcher="srun --nodes=2"))
-    cell = plan(launched)["train/fixed-joints-none"]
-    assert cell.launcher == ("srun", "--nodes=2") and "--distributed" in cell.command
+    step = plan(launched)["train/fixed-joints-none"]
+    assert step.launcher == ("srun", "--nodes=2") and "--distributed" in step.command
     assert plan(launched)["rollout/fixed-joints-none"].launcher == plan(study)["train/fixed-joints-none"].launcher == ()
 
 
 def test_systems_and_remedies_have_their_settings() -> None:
     study = replace(load_study(CONFIGS / "study_small.yaml"), parts=(*PAPER_PARTS, "remedies"))
-    assert experiment_of(study, VARIANTS["fixed-ctrl_world"])["model"]["history"] == [-60, -50, -40, -30, -20, -10]
-    assert "history" not in experiment_of(study, VARIANTS["fixed-irasim"])["model"]
-    assert experiment_of(study, VARIANTS["few_shot-piper-1-lora"])["adapt"]["lora_rank"] == 16
-    assert experiment_of(study, VARIANTS["few_shot-piper-1-replay"])["adapt"]["replay"] == 0.25
+    assert build_experiment(study, VARIANTS["fixed-ctrl_world"])["model"]["history"] == [-60, -50, -40, -30, -20, -10]
+    assert "history" not in build_experiment(study, VARIANTS["fixed-irasim"])["model"]
+    assert build_experiment(study, VARIANTS["few_shot-piper-1-lora"])["adapt"]["lora_rank"] == 16
+    assert build_experiment(study, VARIANTS["few_shot-piper-1-replay"])["adapt"]["replay"] == 0.25
 
 
 def test_a_training_does_not_depend_on_where_it_lies_nor_on_rollouts(study: Study) -> None:
-    moved = replace(study, out=Path("elsewhere"), settings=merged(study.settings, {"rollout": {"steps": 9}}))
+    moved = replace(study, out=Path("elsewhere"), settings=merge_settings(study.settings, {"rollout": {"steps": 9}}))
     name = "fixed-optical_flow-nine_views"
     assert plan(moved)[f"train/{name}"].inputs == plan(study)[f"train/{name}"].inputs
     assert plan(moved)["adapt/few_shot-piper-1"].inputs == plan(study)["adapt/few_shot-piper-1"].inputs
     assert plan(moved)[f"rollout/{name}"].inputs != plan(study)[f"rollout/{name}"].inputs
-    faster = replace(study, settings=merged(study.settings, {"train": {"learning_rate": 1.0}}))
+    faster = replace(study, settings=merge_settings(study.settings, {"train": {"learning_rate": 1.0}}))
     assert plan(faster)[f"train/{name}"].inputs != plan(study)[f"train/{name}"].inputs
 
 
 def test_keys_depend_on_inputs_and_on_what_came_before() -> None:
-    cell = Cell("train", "a", ("module",), ("latents/a",), {"steps": 1}, Path("a"))
-    keys = {key_of(cell, ["x"]), key_of(cell, ["y"]), key_of(cell, [None]), key_of(replace(cell, inputs={"steps": 2}), ["x"])}
+    step = Step("train", "a", ("module",), ("latents/a",), {"steps": 1}, Path("a"))
+    keys = {
+        step_key(step, ["x"]),
+        step_key(step, ["y"]),
+        step_key(step, [None]),
+        step_key(replace(step, inputs={"steps": 2}), ["x"]),
+    }
     assert len(keys) == 4
-    assert key_of(replace(cell, command=("other",), product=Path("b")), ["x"]) in keys
+    assert step_key(replace(step, command=("other",), product=Path("b")), ["x"]) in keys
+
+
+@pytest.mark.parametrize("path", ["metrics/grading/scores.py", "metrics/networks/added.json", "metrics/metric.py"])
+def test_grades_are_stale_when_a_file_changes_at_any_depth(
+    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
+    """A step that is done needs work again when the code in a sub-folder of its room changes."""
+    root = tmp_path / "xew"
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(CONFIGS.parent / "xew" / "metrics", root / "metrics", ignore=ignored)
+    monkeypatch.setattr(xew, "__path__", [str(root)])
+
+    def plan_grading() -> Step:
+        source_digest.cache_clear()
+        return replace(plan(study)["evaluate/fixed-joints-none"], needs=(), product=tmp_path / "scores.parquet")
+
+    step, ledger = plan_grading(), Ledger(tmp_path / "study")
+    step.product.write_text("scores")
+    ledger.begin(step)
+    assert ledger.finish(step, 0, 1.0) == ""
+    (root / "metrics" / "grading" / "__pycache__").mkdir()
+    (root / "metrics" / "grading" / "__pycache__" / "scores.pyc").write_bytes(b"compiled")
+    assert ledger.find_done(plan_grading())
+    with (root / path).open("a") as file:
+        file.write("# edited")
+    assert not ledger.find_done(plan_grading())
+    source_digest.cache_clear()
 
 
 def test_epochs_are_counted_in_steps() -> None:
     """The paper: 20 passes over 75 episodes of 178 frames; two chunks of 121 cover one, so each is one sample."""
     study = load_study(CONFIGS / "study_paper.yaml")
     variant = VARIANTS["few_shot-piper-3"]
-    assert steps_of(study, variant, experiment_of(study, variant)) == round(20 * 75 / 8)
+    assert count_optimizer_steps(study, variant, build_experiment(study, variant)) == round(20 * 75 / 8)
 
 
-def graph(*edges: tuple[str, str]) -> dict[str, Cell]:
-    """Cells of one slot, from (cell, the cells before it)."""
-    cells = [Cell("train", name, (), tuple(f"train/{need}" for need in needs), None, Path(name)) for name, needs in edges]
-    return {cell.name: cell for cell in cells}
+def graph(*edges: tuple[str, str]) -> dict[str, Step]:
+    """Steps of one slot, from (step, the steps before it)."""
+    steps = [Step("train", name, (), tuple(f"train/{need}" for need in needs), None, Path(name)) for name, needs in edges]
+    return {step.name: step for step in steps}
 
 
 def test_wall_time_by_hand() -> None:
     """a and b side by side, c after both; two more beside: 3 slots need 3 + 4, one slot needs all of it."""
-    cells = graph(("a", ""), ("b", ""), ("c", "ab"), ("d", ""), ("e", ""))
+    steps = graph(("a", ""), ("b", ""), ("c", "ab"), ("d", ""), ("e", ""))
     seconds = {"train/a": 3.0, "train/b": 2.0, "train/c": 4.0, "train/d": 1.0, "train/e": 1.0}
-    assert longest_ways(cells, seconds)["train/a"] == 7.0
-    assert wall_seconds(cells, seconds, (), slots=3) == 7.0
-    assert wall_seconds(cells, seconds, (), slots=1) == 11.0
-    assert wall_seconds(cells, seconds, ("train/a", "train/b"), slots=1) == 6.0
+    assert critical_paths(steps, seconds)["train/a"] == 7.0
+    assert estimate_wall_seconds(steps, seconds, (), slots=3) == 7.0
+    assert estimate_wall_seconds(steps, seconds, (), slots=1) == 11.0
+    assert estimate_wall_seconds(steps, seconds, ("train/a", "train/b"), slots=1) == 6.0
 
 
 def test_a_training_that_takes_all_gpus_runs_alone() -> None:
-    cells = graph(("a", ""), ("b", ""))
-    cells = {name: replace(cell, gpus=8) for name, cell in cells.items()}
-    assert wall_seconds(cells, dict.fromkeys(cells, 5.0), (), slots=8) == 10.0
+    steps = graph(("a", ""), ("b", ""))
+    steps = {name: replace(step, gpus=8) for name, step in steps.items()}
+    assert estimate_wall_seconds(steps, dict.fromkeys(steps, 5.0), (), slots=8) == 10.0
 
 
 def test_the_estimate_adds_up_and_learns(study: Study, tmp_path: Path) -> None:
     study = replace(study, out=tmp_path / "study")
-    cells, rates = plan(study), study.rates
-    costs = estimate(study, cells)
+    steps, rates = plan(study), study.rates
+    costs = estimate(study, steps)
     assert costs["generate"].seconds == rates.start_s + 10 * rates.episode_s
     assert costs["rollout/few_shot-piper-1"].amount == 2
     assert costs["train/fixed-joints-none"].amount == study.settings["train"]["steps"]
     ledger = Ledger(study.out)
-    before = corrected(costs, cells, ledger)
+    before = correct_by_ledger(costs, steps, ledger)
     assert before == {name: cost.seconds for name, cost in costs.items()}
-    table = cost_table(study, cells, costs, before, ledger, slots=2)
+    table = format_costs(study, steps, costs, before, ledger, slots=2)
     assert table.splitlines()[1].split()[:3] == ["generate", "1", "0"] and rates.measured_on in table
 
 
 def test_the_estimate_warns_of_a_full_disk(study: Study, tmp_path: Path) -> None:
     study = replace(study, out=tmp_path, rates=replace(study.rates, episode_mb=1e9))
-    cells = plan(study)
-    costs = estimate(study, cells)
-    table = cost_table(study, cells, costs, corrected(costs, cells, Ledger(tmp_path)), Ledger(tmp_path), slots=1)
+    steps = plan(study)
+    costs = estimate(study, steps)
+    table = format_costs(study, steps, costs, correct_by_ledger(costs, steps, Ledger(tmp_path)), Ledger(tmp_path), slots=1)
     assert "WARNING: 10000000" in table
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(3.2, "3 s"), (600, "10 min"), (12_000, "3 h 20 min")])
 def test_durations_are_told_as_people_do(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
+    assert format_duration(seconds) == text
 
 
 def test_the_experiments_are_files_that_the_model_takes(study: Study) -> None:
-    for variant in study.planned:
-        assert yaml.safe_load(yaml.safe_dump(experiment_of(study, variant))) == experiment_of(study, variant)
+    for variant in study.planned_variants:
+        assert yaml.safe_load(yaml.safe_dump(build_experiment(study, variant))) == build_experiment(study, variant)

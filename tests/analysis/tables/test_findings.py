@@ -10,7 +10,8 @@ from tests.analysis.synthetic_study import TASKS, attributes, paper_axes, write_
 from xew.analysis.paper import read_paper
 from xew.analysis.scores import MetricInfo, Scores, read_scores
 from xew.analysis.statistics.grades import PaperGrades, StudyGrades
-from xew.analysis.tables.findings import CLAIMS, Finding, ask, findings_frame
+from xew.analysis.tables.claims import CLAIMS
+from xew.analysis.tables.findings import Finding, ask, findings_frame
 from xew.protocol import HELD_OUT_ROBOTS, SHOTS
 
 UNRESOLVED_BY_ROUNDING = {"views saturate"}
@@ -40,32 +41,32 @@ def test_the_papers_figures_bear_out_what_it_claims_but_for_what_rounding_hides(
     found = {finding.claim.name: finding for finding in ask(PaperGrades(paper, paper.infos))}
     for name, finding in found.items():
         expected = "unresolved" if name in UNRESOLVED_BY_ROUNDING else "fails" if name in FAILS_ON_THE_PAPER else "holds"
-        assert finding.verdict == ("not measured" if name == "remedies" else expected), name
-    values = {answer.label: answer.value for answer in found["flow gains much"].answers}
+        assert finding.answer == ("not measured" if name == "remedies" else expected), name
+    values = {one.label: one.value for one in found["flow gains much"].comparisons}
     assert [round(100 * value) for value in values.values()] == [29, 57, 25, 116]
-    assert found["catastrophic forgetting"].answers[0].value == pytest.approx((0.073 - 0.043) / 0.043)
-    assert found["views saturate"].answers[1].numbers.startswith("0.0\u00a0%")  # no zero is negative
-    assert found["looks predict"].answers[0].value == pytest.approx(0.8176, abs=1e-3)
-    failing = {a.label for a in found["pixel systems lead in all"].answers if a.verdict == "fails"}
+    assert found["catastrophic forgetting"].comparisons[0].value == pytest.approx((0.073 - 0.043) / 0.043)
+    assert found["views saturate"].comparisons[1].numbers.startswith("0.0\u00a0%")  # no zero is negative
+    assert found["looks predict"].comparisons[0].value == pytest.approx(0.8176, abs=1e-3)
+    failing = {a.label for a in found["pixel systems lead in all"].comparisons if a.answer == "fails"}
     assert failing == {"EnerVerse-AC over Ctrl-World, Franka PCK", "EnerVerse-AC over Ctrl-World, Franka Object error"}
 
 
 def test_a_study_like_the_paper_is_answered_as_the_paper_is(scores: Scores) -> None:
-    found = {f.claim.name: f.verdict for f in ask(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper())))}
-    assert {name for name, verdict in found.items() if verdict == "fails"} <= FAILS_ON_THE_PAPER | UNRESOLVED_BY_ROUNDING
-    assert sum(verdict == "holds" for verdict in found.values()) >= 22
+    found = {f.claim.name: f.answer for f in ask(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper())))}
+    assert {name for name, answer in found.items() if answer == "fails"} <= FAILS_ON_THE_PAPER | UNRESOLVED_BY_ROUNDING
+    assert sum(answer == "holds" for answer in found.values()) >= 22
 
 
 def test_a_claim_fails_where_the_scores_say_the_opposite(scores: Scores) -> None:
     rows, flow = scores.rows, "fixed-optical_flow-none"
-    assert asked(rows, "flow looks best", scores.metrics).verdict == "holds"
+    assert asked(rows, "flow looks best", scores.metrics).answer == "holds"
     worse = changed(rows, flow, "lpips", 3.0, "piper")
     found = asked(worse, "flow looks best", scores.metrics)
-    assert found.verdict == "fails" and {a.verdict for a in found.answers if "Franka" in a.label} == {"holds"}
-    assert asked(changed(rows, flow, "lpips", 0.1, "franka_panda"), "gap", scores.metrics).verdict == "fails"
+    assert found.answer == "fails" and {a.answer for a in found.comparisons if "Franka" in a.label} == {"holds"}
+    assert asked(changed(rows, flow, "lpips", 0.1, "franka_panda"), "gap", scores.metrics).answer == "fails"
     calm = changed(rows, "few_shot-franka_panda-1", "lpips", 0.55, "ur5_wsg")
-    assert asked(calm, "forgetting", scores.metrics).verdict == "fails"
-    assert asked(calm, "catastrophic forgetting", scores.metrics).verdict == "fails"
+    assert asked(calm, "forgetting", scores.metrics).answer == "fails"
+    assert asked(calm, "catastrophic forgetting", scores.metrics).answer == "fails"
 
 
 def test_a_difference_inside_the_noise_floor_is_not_resolved(scores: Scores) -> None:
@@ -76,12 +77,12 @@ def test_a_difference_inside_the_noise_floor_is_not_resolved(scores: Scores) -> 
     keep = ~((rows["variant"] == mask) & (rows["metric"] == "mask_iou") & (rows["robot"] == "piper"))
     with_near = pd.concat([rows[keep], near])
     found = asked(with_near, "mask keeps outlines", scores.metrics)
-    answer = next(a for a in found.answers if a.label == "over optical flow, Piper Mask IoU")
-    assert answer.low > 0 and answer.verdict == "unresolved" and "noise floor of 0.03" in answer.numbers
+    answer = next(a for a in found.comparisons if a.label == "over optical flow, Piper Mask IoU")
+    assert answer.low > 0 and answer.answer == "unresolved" and "noise floor of 0.03" in answer.numbers
     truth = (with_near["model"] == "ground_truth") & (with_near["metric"] == "mask_iou")
     exact = with_near.assign(value=with_near["value"].where(~truth, 1.0))
     found = asked(exact, "mask keeps outlines", scores.metrics)
-    assert next(a for a in found.answers if a.label == answer.label).verdict == "holds"
+    assert next(a for a in found.comparisons if a.label == answer.label).answer == "holds"
 
 
 def test_a_share_of_a_gap_that_is_not_there_is_no_answer(scores: Scores) -> None:
@@ -96,7 +97,7 @@ def test_a_share_of_a_gap_that_is_not_there_is_no_answer(scores: Scores) -> None
         worse = changed(worse, "fixed-optical_flow-robot_render", "region_lpips", 0.2, robot)
     for name in ("rays recover", "returns diminish", "only alignment closes the gap"):
         found = asked(worse, name, scores.metrics)
-        assert found.verdict == "unresolved" and all("no gap to close" in a.numbers for a in found.answers), name
+        assert found.answer == "unresolved" and all("no gap to close" in a.numbers for a in found.comparisons), name
 
 
 def test_a_render_that_gains_nothing_does_not_gain_more_than_views_that_harm(scores: Scores) -> None:
@@ -105,24 +106,24 @@ def test_a_render_that_gains_nothing_does_not_gain_more_than_views_that_harm(sco
         worse = changed(worse, "fixed-optical_flow-nine_views", "region_lpips", 3.0, robot)
         worse = changed(worse, "fixed-optical_flow-robot_render", "region_lpips", 4.0, robot)
     found = asked(worse, "render gains most", scores.metrics)
-    assert {a.verdict for a in found.answers if "Region" in a.label} == {"fails"}
+    assert {a.answer for a in found.comparisons if "Region" in a.label} == {"fails"}
 
 
 def test_few_scenes_resolve_nothing(tmp_path: Path) -> None:
     few = read_scores(write_study(tmp_path / "scores.parquet", tasks=TASKS[:1], seeds=5))
     enough = read_scores(write_study(tmp_path / "more.parquet", tasks=TASKS[:1], seeds=6))
-    assert asked(few.rows, "gap", few.metrics).verdict == "unresolved"
-    assert "fewer than 6 scenes" in asked(few.rows, "gap", few.metrics).answers[0].numbers
-    assert asked(enough.rows, "gap", enough.metrics).verdict == "holds"
+    assert asked(few.rows, "gap", few.metrics).answer == "unresolved"
+    assert "fewer than 6 scenes" in asked(few.rows, "gap", few.metrics).comparisons[0].numbers
+    assert asked(enough.rows, "gap", enough.metrics).answer == "holds"
 
 
 def test_what_was_not_run_is_named_and_not_judged(scores: Scores) -> None:
     rows = scores.rows[scores.rows["variant"] != "fixed-optical_flow-robot_render"]
     found = asked(rows, "render gains most", scores.metrics)
-    assert found.verdict == "not measured" and "robot render" in found.missing and not found.answers
+    assert found.answer == "not measured" and "robot render" in found.missing and not found.comparisons
     without = rows[rows["metric"] != "lpips"]
     infos = tuple(metric for metric in scores.metrics if metric.name != "lpips")
-    assert asked(without, "gap", infos).verdict == "not measured"
+    assert asked(without, "gap", infos).answer == "not measured"
 
 
 def test_cells_that_one_row_lacks_count_for_none(scores: Scores) -> None:
@@ -133,14 +134,14 @@ def test_cells_that_one_row_lacks_count_for_none(scores: Scores) -> None:
     lacking = rows[~(hard & (rows["variant"] == "fixed-joints-none"))]
     full = asked(rows[rows["task"] != TASKS[0]], "pixels beat joints", scores.metrics)
     found = asked(lacking, "pixels beat joints", scores.metrics)
-    assert [a.value for a in found.answers] == pytest.approx([a.value for a in full.answers])
+    assert [a.value for a in found.comparisons] == pytest.approx([a.value for a in full.comparisons])
 
 
 def test_every_claim_says_what_it_tests_and_the_table_holds_every_number(scores: Scores) -> None:
     findings = ask(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper())))
     assert len({claim.name for claim in CLAIMS}) == len(CLAIMS) and all(claim.says and claim.test for claim in CLAIMS)
     frame = findings_frame(findings, "here")
-    assert len(frame) == sum(len(f.answers) or 1 for f in findings) and set(frame["claim"]) == {c.name for c in CLAIMS}
+    assert len(frame) == sum(len(f.comparisons) or 1 for f in findings) and set(frame["claim"]) == {c.name for c in CLAIMS}
     frame = frame.dropna(subset="value")
     assert (frame["low"] <= frame["value"] + 1e-9).all() and (frame["value"] <= frame["high"] + 1e-9).all()
     assert set(attributes()["metrics"]) <= {metric.name for metric in scores.metrics}

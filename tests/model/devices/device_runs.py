@@ -15,12 +15,13 @@ import jax
 
 from xew.model import train
 from xew.model.devices import sharding
+from xew.model.training import loop
 
 
 def run(devices: int, arguments: list[str], kill: bool = False) -> None:
     train.make_mesh = lambda settings: sharding.make_mesh(settings, jax.devices()[:devices])
     if kill:
-        train.save_state = functools.partial(save_and_die, train.save_state)
+        loop.save_state = functools.partial(save_and_die, loop.save_state)
     train.main(arguments)
 
 

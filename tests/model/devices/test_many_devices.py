@@ -20,8 +20,8 @@ from jax.sharding import PartitionSpec
 from tests import synthetic
 from xew.config import ConfigError
 from xew.model import latents
+from xew.model.cache.clips import clip_starts, sample_starts
 from xew.model.devices.sharding import MeshSettings, check_batch, mesh_shape, parameter_spec
-from xew.model.latents import clip_starts, sample_starts
 from xew.model.training.data import shown_frames
 
 HERE = Path(__file__).parent

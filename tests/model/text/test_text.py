@@ -72,7 +72,7 @@ def test_tokens_are_those_of_transformers(files: Path, tokens: int) -> None:
 
 def test_embeddings_are_the_encoders_and_zero_past_the_end(files: Path, tmp_path: Path) -> None:
     asked = umt5(files, tmp_path)
-    found = asked.encode_instructions(TEXTS)
+    found = asked.instructions.encode(TEXTS)
     encoder, tokenizer = Umt5Encoder(UMT5S["tiny"], rngs=nnx.Rngs(0)), load_tokenizer(files)
     for text, embedding in found.items():
         assert embedding.shape == (asked.size.text_tokens, asked.size.text_dim) and embedding.dtype == np.float32
@@ -92,36 +92,36 @@ def test_embeddings_are_computed_once_and_outlive_the_files(
     for name in ("w.safetensors", "tokenizer.json"):
         (copy / name).write_bytes((files / name).read_bytes())
     asked = umt5(copy, tmp_path)
-    first = asked.encode_instructions(TEXTS[:2])
+    first = asked.instructions.encode(TEXTS[:2])
     monkeypatch.setattr("xew.model.text.instructions.load_umt5", None)
-    again = asked.encode_instructions(TEXTS[:2])
+    again = asked.instructions.encode(TEXTS[:2])
     for path in copy.iterdir():
         path.unlink()
     copy.rmdir()
-    without = asked.encode_instructions(TEXTS[:2])
+    without = asked.instructions.encode(TEXTS[:2])
     for text in TEXTS[:2]:
         np.testing.assert_array_equal(first[text], again[text])
         np.testing.assert_array_equal(first[text], without[text])
     with pytest.raises(ConfigError, match="no tokenizer"):
-        asked.encode_instructions(TEXTS)
+        asked.instructions.encode(TEXTS)
 
 
 def test_other_weights_are_another_cache(files: Path, tmp_path: Path) -> None:
-    before = umt5(files, tmp_path).encode_instructions(TEXTS[:1])[TEXTS[0]]
+    before = umt5(files, tmp_path).instructions.encode(TEXTS[:1])[TEXTS[0]]
     other = tmp_path / "other"
     other.mkdir()
     (other / "tokenizer.json").write_bytes((files / "tokenizer.json").read_bytes())
     save_weights(Umt5Encoder(UMT5S["tiny"], rngs=nnx.Rngs(7)), other / "w.safetensors", official_layout(UMT5S["tiny"]))
-    after = umt5(other, tmp_path).encode_instructions(TEXTS[:1])[TEXTS[0]]
+    after = umt5(other, tmp_path).instructions.encode(TEXTS[:1])[TEXTS[0]]
     assert np.abs(before - after).max() > 0.1
 
 
 def test_missing_files_say_what_to_do(files: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"model\.text_weights and model\.text_tokenizer not set"):
-        experiment(tmp_path, "text: umt5").encode_instructions(TEXTS)
+        experiment(tmp_path, "text: umt5").instructions.encode(TEXTS)
     gone = f"text: umt5_tiny, text_weights: {tmp_path / 'none.pth'}, text_tokenizer: {files}"
     with pytest.raises(ConfigError, match=r"none\.pth"):
-        experiment(tmp_path, gone).encode_instructions(TEXTS)
+        experiment(tmp_path, gone).instructions.encode(TEXTS)
     (tmp_path / "tokenizer.json").write_text("{}")
     with pytest.raises(ConfigError, match="is no tokenizer"):
         load_tokenizer(tmp_path)
@@ -129,7 +129,7 @@ def test_missing_files_say_what_to_do(files: Path, tmp_path: Path) -> None:
 
 def test_words_are_rows_of_a_table_that_is_learned(tmp_path: Path) -> None:
     asked = experiment(tmp_path, "text: learned")
-    found = asked.encode_instructions(("Stack three bowls!", "stack the bowls", "a b c d e f g h i j k", ""))
+    found = asked.instructions.encode(("Stack three bowls!", "stack the bowls", "a b c d e f g h i j k", ""))
     stack = found["Stack three bowls!"]
     assert stack.dtype == np.int32 and stack.shape == (asked.size.text_tokens,)
     assert stack[0] == found["stack the bowls"][0] and stack[2] == found["stack the bowls"][2]
@@ -148,6 +148,6 @@ def test_words_are_rows_of_a_table_that_is_learned(tmp_path: Path) -> None:
 
 
 def test_an_instruction_may_have_a_prefix(tmp_path: Path) -> None:
-    plain = experiment(tmp_path, "text: learned").encode_instructions(("the arm lifts",))["the arm lifts"]
-    prefixed = experiment(tmp_path, "text: learned, text_prefix: 'the arm '").encode_instructions(("lifts",))["lifts"]
+    plain = experiment(tmp_path, "text: learned").instructions.encode(("the arm lifts",))["the arm lifts"]
+    prefixed = experiment(tmp_path, "text: learned, text_prefix: 'the arm '").instructions.encode(("lifts",))["lifts"]
     np.testing.assert_array_equal(plain, prefixed)

@@ -18,23 +18,21 @@ from xew.config import ConfigError, save
 from xew.model import latents, train
 from xew.model.devices.sharding import make_mesh, place_batch
 from xew.model.diffusion.flow_matching import sample_losses
+from xew.model.episodes.choice import first_of_each, replay_episodes, sample_episodes, training_episodes
 from xew.model.experiment import Experiment, load_experiment
-from xew.model.latents import LatentCache, first_of_each, load_codec, replay_episodes, training_episodes
 from xew.model.network.lora import apply_lora, init_lora
-from xew.model.runs import checkpoint
+from xew.model.runs import start as run_start
 from xew.model.runs.checkpoint import TrainState
 from xew.model.training import data, memory
 from xew.model.training.data import Batch, ClipSource, fake_batch, make_dataset
 from xew.model.training.memory import estimate_memory
-from xew.model.training.optimizer import learning_rate, with_steps
-from xew.model.training.samples import sample_episodes
+from xew.model.training.optimizer import learning_rate, set_steps
 from xew.model.training.step import (
     abstract_state,
-    cut_rows,
-    estimate,
-    init_train_state,
-    join_rows,
-    make_train_step,
+    cut_samples,
+    estimate_clean,
+    join_samples,
+    make_learner,
     sample_pairs,
 )
 from xew.protocol import HELD_OUT_ROBOTS
@@ -89,7 +87,7 @@ def fails(command: Callable[[list[str]], None], arguments: list[str], capsys: py
 def network(run: Path) -> tuple[Any, int]:
     """Parameters of a run, and of which step they are."""
     experiment = load_experiment(run / "config.yaml")
-    return checkpoint.restore_params(run, train.network_shapes(experiment, make_mesh(experiment.mesh)))
+    return run_start.restore_params(run, make_learner(experiment.learning, make_mesh(experiment.mesh)).network_shapes)
 
 
 def changed(experiment: Experiment, **settings: Any) -> Experiment:
@@ -102,10 +100,11 @@ Step = Callable[[Batch], tuple[TrainState, Any]]
 def first_step(experiment: Experiment, codec: Any = None) -> Step:
     """The first step from parameters that are random throughout: at its own start the network predicts zero."""
     mesh = make_mesh(experiment.mesh)
-    graph, start = init_train_state(experiment, mesh)
+    learner = make_learner(experiment.learning, mesh)
+    start = learner.init_state()
     noise = jax.tree.map(lambda leaf: 0.1 * np.random.default_rng(7).standard_normal(leaf.shape, np.float32), start.params)
     start = jax.device_get(replace(start, params=jax.tree.map(np.add, start.params, noise)))
-    step = make_train_step(experiment, graph, mesh, codec)
+    step = learner.compile_step(codec)
     return lambda batch: step(jax.device_put(start), place_batch(batch, mesh))
 
 
@@ -113,7 +112,7 @@ def first_step(experiment: Experiment, codec: Any = None) -> Step:
 
 
 def test_parts_of_a_batch_make_the_same_step(experiment: Experiment) -> None:
-    batch = fake_batch(experiment, 4)
+    batch = fake_batch(experiment.inputs, 4)
     whole, of_whole = first_step(changed(experiment, batch=4))(batch)
     cut, of_cut = first_step(changed(experiment, batch=4, accumulate=2))(batch)
     np.testing.assert_allclose(of_cut.losses, of_whole.losses, atol=1e-5)
@@ -124,13 +123,13 @@ def test_parts_of_a_batch_make_the_same_step(experiment: Experiment) -> None:
 
 
 def test_rows_of_parts_come_back_in_order() -> None:
-    rows = jnp.arange(24).reshape(12, 2)
-    np.testing.assert_array_equal(join_rows(cut_rows(rows, 3)), rows)
-    np.testing.assert_array_equal(cut_rows(rows, 3)[1, :, 0] // 2, [1, 4, 7, 10])
+    values = jnp.arange(24).reshape(12, 2)
+    np.testing.assert_array_equal(join_samples(cut_samples(values, 3)), values)
+    np.testing.assert_array_equal(cut_samples(values, 3)[1, :, 0] // 2, [1, 4, 7, 10])
 
 
 def test_bfloat16_moment_is_kept_as_such(experiment: Experiment) -> None:
-    _, state = abstract_state(changed(experiment, mu_dtype="bfloat16"))
+    _, state = abstract_state(changed(experiment, mu_dtype="bfloat16").learning)
     assert {str(leaf.dtype) for leaf in jax.tree.leaves(state.optimizer)} == {"int32", "float32", "bfloat16"}
     assert {str(leaf.dtype) for leaf in jax.tree.leaves(state.params)} == {"float32"}
 
@@ -162,7 +161,7 @@ def two_chunks(two: Experiment) -> Step:
 
 
 def test_second_chunk_starts_from_the_prediction_and_not_from_the_truth(two: Experiment, two_chunks: Step) -> None:
-    batch = fake_batch(two, 2)
+    batch = fake_batch(two.inputs, 2)
     _, result = two_chunks(batch)
     assert result.losses.shape == result.sigma.shape == (2, 2)
     np.testing.assert_array_equal(result.weights, 0.5)
@@ -182,14 +181,14 @@ def test_estimate_is_the_clip_where_the_prediction_is_right() -> None:
     """x0 = x_t - sigma v with v = noise - x0; frame 0 is the clean reference and not the perturbed one."""
     latents = jax.random.normal(jax.random.key(0), (3, 4, 2, 2, 5))
     pair = sample_pairs(jax.random.split(jax.random.key(1), 3), latents, 5.0)
-    np.testing.assert_allclose(estimate(latents, pair, pair.velocity), latents, atol=1e-5)
+    np.testing.assert_allclose(estimate_clean(latents, pair, pair.velocity), latents, atol=1e-5)
     assert np.abs(np.asarray(pair.noisy[:, 0] - latents[:, 0])).max() > 1e-3
     assert len(np.unique(pair.sigma)) == 3
 
 
 def test_codec_is_given_the_estimate_of_the_first_chunk(two: Experiment, two_chunks: Step) -> None:
     SEEN.clear()
-    batch = fake_batch(two, 2)
+    batch = fake_batch(two.inputs, 2)
     two_chunks(batch)
     jax.effects_barrier()
     (seen,) = SEEN
@@ -198,7 +197,7 @@ def test_codec_is_given_the_estimate_of_the_first_chunk(two: Experiment, two_chu
 
 
 def test_a_missing_second_chunk_counts_for_nothing(two: Experiment, two_chunks: Step, experiment: Experiment) -> None:
-    batch = fake_batch(two, 2)
+    batch = fake_batch(two.inputs, 2)
     ended = replace(batch, following=replace(batch.following, shown=np.zeros_like(batch.following.shown)))
     state, result = two_chunks(ended)
     np.testing.assert_array_equal(result.weights, [[1, 0], [1, 0]])
@@ -225,10 +224,10 @@ def test_two_chunks_from_latents_to_a_run(world: Path, tmp_path: Path) -> None:
     train.main([*config, "--out", str(tmp_path / "run")])
     assert len(lines(tmp_path / "run", "train/loss")) == 2
     experiment = load_experiment(tmp_path / "run" / "config.yaml")
-    episodes = training_episodes(experiment)
-    source = ClipSource(LatentCache(experiment, load_codec(experiment, episodes)), episodes)
+    episodes = training_episodes(experiment.choice)
+    source = ClipSource.open(experiment.encoding, experiment.instructions, episodes)
     batch = next(iter(make_dataset(source, 3, seed=0)))
-    assert jax.tree.map(np.shape, batch) == jax.tree.map(np.shape, fake_batch(experiment, 3))
+    assert jax.tree.map(np.shape, batch) == jax.tree.map(np.shape, fake_batch(experiment.inputs, 3))
 
 
 # What is not finite, and memory.
@@ -262,10 +261,16 @@ def test_log_lines_hold_what_a_run_is_watched_by(world: Path) -> None:
     assert lines(run, "train/learning_rate") == pytest.approx([1e-3, 1e-3])
 
 
+def estimate(experiment: Experiment, devices: int) -> memory.Memory:
+    """Memory of each device where the state is cut over all of them."""
+    learning = experiment.learning
+    return estimate_memory(learning, abstract_state(learning)[1], experiment.inputs, experiment.codec, devices, devices)
+
+
 def test_projection_is_that_of_the_arithmetic() -> None:
     """5.0e9 parameters on 8 devices: 4 bytes each and 8 for the moments, cut in 8; 2 for the copy; 2 + 4 for gradients."""
     experiment = load_experiment(WAN5B)
-    whole, cut = estimate_memory(experiment, 1, 1).parts, estimate_memory(experiment, 8, 8).parts
+    whole, cut = estimate(experiment, 1).parts, estimate(experiment, 8).parts
     numbers = whole["parameters"] / 4
     assert numbers == pytest.approx(5.0e9, rel=0.01)
     for name, bytes_each in (("parameters", 4), ("optimizer", 8), ("rounded to bfloat16", 2), ("gradients", 6)):
@@ -274,7 +279,7 @@ def test_projection_is_that_of_the_arithmetic() -> None:
     assert whole["activations"] == pytest.approx(8 * cut["activations"])
     assert whole["layers gathered"] == 0 < cut["layers gathered"] < 1e9
     assert 2.8e9 < cut["autoencoder"] < 10e9
-    half = estimate_memory(changed(experiment, mu_dtype="bfloat16", chunks=1), 1, 1).parts
+    half = estimate(changed(experiment, mu_dtype="bfloat16", chunks=1), 1).parts
     assert half["optimizer"] == pytest.approx(6 * numbers, rel=1e-3)
     assert half["gradients"] == pytest.approx(2 * numbers, rel=0.01)
     assert half["autoencoder"] == 0
@@ -316,12 +321,12 @@ def test_step_of_the_full_size_is_made_from_shapes() -> None:
     """The whole program of wan5b, two chunks of 121 frames in three streams, without one of its weights."""
     experiment = load_experiment(WAN5B, ["--model.attention", "xla"])
     mesh = make_mesh(experiment.mesh)
-    graph, shapes = abstract_state(experiment)
-    step = make_train_step(experiment, graph, mesh, LastFrame())
-    batch = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, fake_batch(experiment, 8)))
-    state, result = step.lower(train.placed(shapes, mesh), batch).out_info
+    learner = make_learner(experiment.learning, mesh)
+    step = learner.compile_step(LastFrame())
+    batch = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, fake_batch(experiment.inputs, 8)))
+    state, result = step.lower(learner.shapes, batch).out_info
     assert result.losses.shape == (8, 2)
-    assert jax.tree.map(lambda leaf: leaf.shape, state) == jax.tree.map(lambda leaf: leaf.shape, shapes)
+    assert jax.tree.map(lambda leaf: leaf.shape, state) == jax.tree.map(lambda leaf: leaf.shape, learner.shapes)
 
 
 # Length and settings.
@@ -329,10 +334,10 @@ def test_step_of_the_full_size_is_made_from_shapes() -> None:
 
 def test_epochs_are_passes_over_the_new_samples(experiment: Experiment) -> None:
     passes = changed(experiment, steps=0, epochs=20, batch=8)
-    assert with_steps(passes, 75).train.steps == 188
+    assert set_steps(passes.train, 75).steps == 188
     replaying = replace(passes, adapt=replace(passes.adapt, replay=0.25))
-    assert with_steps(replaying, 75).train.steps == 250
-    assert with_steps(experiment, 75) is experiment
+    assert set_steps(replaying.train, 75, replaying.adapt.replay).steps == 250
+    assert set_steps(experiment.train, 75) is experiment.train
 
 
 @pytest.mark.parametrize(
@@ -368,7 +373,7 @@ def test_the_rate_has_decayed_at_the_last_step(experiment: Experiment) -> None:
 
 def test_arithmetic_that_one_way_streams_save_is_not_counted(experiment: Experiment) -> None:
     one_way = replace(experiment, model=replace(experiment.model, visibility="one_way"))
-    assert memory.flops_of_step(one_way) < memory.flops_of_step(experiment)
+    assert memory.flops_of_step(one_way.learning, one_way.inputs) < memory.flops_of_step(experiment.learning, experiment.inputs)
 
 
 def test_episodes_without_videos_are_told_before_training(
@@ -422,18 +427,19 @@ def adapt(world: Path, out: Path, *options: str) -> list[str]:
 
 def test_adaptation_learns_from_few_episodes_of_the_target(world: Path, experiment: Experiment) -> None:
     adapted = replace(experiment, adapt=replace(experiment.adapt, start_from=world / "run", robots=("piper",), episodes=1))
-    chosen = {(record.task, record.robot, record.seed) for _, record in training_episodes(adapted)}
+    chosen = {(record.task, record.robot, record.seed) for _, record in training_episodes(adapted.choice)}
     assert chosen == {("place_empty_cup", "piper", 0), ("shake_bottle", "piper", 0)}
-    assert replay_episodes(adapted) == []
+    assert replay_episodes(adapted.choice) == []
     with pytest.raises(ConfigError, match=r"adapt.episodes is 3, there are only 2 training episodes of piper"):
-        first_of_each(training_episodes(replace(adapted, adapt=replace(adapted.adapt, episodes=2))), 3)
+        first_of_each(training_episodes(replace(adapted, adapt=replace(adapted.adapt, episodes=2)).choice), 3)
 
 
 def test_adapted_run_starts_from_the_trained_weights(world: Path, tmp_path: Path) -> None:
     arguments = adapt(world, tmp_path / "run")
     train.main([*arguments, "--train.steps", "1", "--resume"])  # of nothing: it begins, and notes where
     adapted = load_experiment(tmp_path / "run" / "config.yaml")
-    start, base = train.start_params(adapted, make_mesh(adapted.mesh)), network(world / "run")[0]
+    learner = make_learner(adapted.learning, make_mesh(adapted.mesh))
+    start, base = train.start_params(adapted, learner), network(world / "run")[0]
     jax.tree.map(np.testing.assert_array_equal, start, base)
     after = network(tmp_path / "run")[0]
     moved = [float(np.abs(np.asarray(a - b)).max()) for a, b in zip(*map(jax.tree.leaves, (after, start)), strict=True)]
@@ -442,7 +448,7 @@ def test_adapted_run_starts_from_the_trained_weights(world: Path, tmp_path: Path
 
 def test_samples_of_an_adapted_run_are_named_by_role(experiment: Experiment) -> None:
     adapted = replace(experiment, adapt=replace(experiment.adapt, start_from=Path("runs/x"), robots=("piper",)))
-    names = sample_episodes(adapted)
+    names = sample_episodes(adapted.choice)
     seen = {"seen/aloha_agilex", "seen/arx_x5", "seen/ur5_wsg"}
     assert set(names) == seen | {"target/piper", "unseen/franka_panda"}
 
@@ -456,14 +462,14 @@ def test_adapting_another_network_is_told(world: Path, tmp_path: Path, capsys: p
 def test_replay_is_a_part_of_every_batch(world: Path, experiment: Experiment) -> None:
     settings = replace(experiment.adapt, start_from=world / "run", robots=("piper",), episodes=2, replay=0.25)
     adapted = replace(experiment, adapt=settings)
-    old, new = replay_episodes(adapted), training_episodes(adapted)
+    old, new = replay_episodes(adapted.choice), training_episodes(adapted.choice)
     assert {record.robot for _, record in old} == {"aloha_agilex", "arx_x5", "ur5_wsg"}
 
     class Names(ClipSource):
         def __getitem__(self, index: int) -> Batch:
             return Batch(np.array(self.samples[index][0].robot == "piper"), {}, np.array(index))
 
-    source = Names(LatentCache(adapted, load_codec(adapted, new)), new, old)
+    source = Names.open(adapted.encoding, adapted.instructions, new, old)
     batches = iter(make_dataset(source, 8, seed=0, replay=0.25))
     drawn = [next(batches) for _ in range(6)]
     assert all(batch.latents.sum() == 6 for batch in drawn)
@@ -473,17 +479,18 @@ def test_replay_is_a_part_of_every_batch(world: Path, experiment: Experiment) ->
 def test_corrections_change_nothing_at_first_and_only_they_are_learned(experiment: Experiment) -> None:
     low_rank = replace(experiment, adapt=replace(experiment.adapt, lora_rank=2))
     mesh = make_mesh(experiment.mesh)
-    _, full = init_train_state(experiment, mesh)
+    full = make_learner(experiment.learning, mesh).init_state()
     start = jax.tree.map(lambda leaf: leaf + 0.1, full.params)  # the head's own start is zero and gives no gradient
     base = jax.device_get(start)
-    graph, state = init_train_state(low_rank, mesh, start)
+    learner = make_learner(low_rank.learning, mesh)
+    state = learner.init_state(start)
     jax.tree.map(np.testing.assert_array_equal, apply_lora(state.base, state.params), base)
     assert len(state.params["blocks"]) == 10, "q, k, v, o of both attentions and both layers of the feed-forward"
     moments = sum(leaf.size for leaf in jax.tree.leaves(state.optimizer))
     assert moments < 2.1 * sum(leaf.size for leaf in jax.tree.leaves(state.params))
-    step = make_train_step(low_rank, graph, mesh)
+    step = learner.compile_step()
     for _ in range(2):
-        state, _ = step(state, place_batch(fake_batch(low_rank, 2), mesh))
+        state, _ = step(state, place_batch(fake_batch(low_rank.inputs, 2), mesh))
     jax.tree.map(np.testing.assert_array_equal, state.base, base)
     assert all(np.abs(np.asarray(leaf["b"])).max() > 0 for leaf in state.params["blocks"].values())
 
@@ -529,9 +536,10 @@ def test_run_with_corrections_resumes_and_is_read(world: Path, tmp_path: Path, c
 
 def test_checkpoint_of_a_step_that_is_not_there_is_told(world: Path) -> None:
     with pytest.raises(ConfigError, match=r"has no checkpoint of step 9; it has 1, 2\."):
-        checkpoint.restore_params(world / "run", network(world / "run")[0], 9)
+        run_start.restore_params(world / "run", network(world / "run")[0], 9)
 
 
 def test_fake_batches_have_a_second_chunk_only_where_asked(experiment: Experiment) -> None:
-    assert data.fake_batch(experiment, 1).following is None
-    assert data.fake_batch(changed(experiment, chunks=2), 1).following.latents.shape == (1, *experiment.latent_shape)
+    assert data.fake_batch(experiment.inputs, 1).following is None
+    two = changed(experiment, chunks=2).inputs
+    assert data.fake_batch(two, 1).following.latents.shape == (1, *two.latent_shape)

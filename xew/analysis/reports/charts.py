@@ -1,4 +1,4 @@
-"""Stage 11 of 11: the report's charts. A chart is panels beside one another, and the numbers that they draw.
+"""The report's charts. A chart is panels beside one another, and the numbers that they draw.
 
 On the page each panel is an SVG of its own, so that they stand one below the other on a narrow screen, and takes its colors
 from the page, light or dark. For Markdown and LaTeX all panels are one PNG and one PDF.
@@ -95,11 +95,11 @@ def panel_svg(chart: Chart, panel: Panel) -> str:
     svg = re.sub(r'<g id="[^"]*">', "<g>", svg)  # the same in every panel; nothing refers to them
     svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg))
     for color in THEME:
-        svg = svg.replace(color, themed(color))
+        svg = svg.replace(color, themed_color(color))
     return svg.replace("<svg ", '<svg aria-hidden="true" ', 1)
 
 
-def themed(color: str) -> str:
+def themed_color(color: str) -> str:
     """The page's variable that stands for a color."""
     return f"var(--{THEME[color]})"
 

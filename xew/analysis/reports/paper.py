@@ -1,4 +1,4 @@
-"""Stage 11 of 11: the paper's figures checked against each other. `report --paper` writes what is made here.
+"""The paper's figures checked against each other. `report --paper` writes what is made here.
 
 Its distance table is rebuilt from its scores and distances, the percentages of its text from its tables, and its claims are
 asked of its own figures. Ours is the question what comes out if workspaces are compared in the frame of the arm's base, as
@@ -12,41 +12,43 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.correlation import Correlation
-from xew.analysis.distance import Frame
+from xew.analysis.distances.workspaces import Frame
 from xew.analysis.paper import (
     AXES,
-    Cell,
+    PAPER_TITLES,
     Paper,
-    RecomputedChange,
-    mean_distance_cells,
-    rebuild,
-    recompute_changes,
 )
 from xew.analysis.reports import page
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study import Report
 from xew.analysis.reports.study_charts import distance_chart
 from xew.analysis.statistics.grades import PaperGrades
-from xew.analysis.statistics.summary import METRIC_TITLES
 from xew.analysis.tables import formats
-from xew.analysis.tables import layouts as tables
-from xew.analysis.tables.distances import Distances, distance_tables, printed_distances, signed
+from xew.analysis.tables.distances import Distances, distance_tables, format_signed, printed_distances
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask, findings_frame
-from xew.analysis.tables.layouts import Table
+from xew.analysis.tables.layouts import build_tables
 from xew.analysis.tables.paper import (
     PrintedBuilder,
     base_table,
     certainty_table,
     change_table,
     claims_table,
-    compared_places,
     correlation_table,
+    describe_change,
+    format_percent,
     frame_distances,
     frame_results,
     frame_table,
-    percent,
     robot_table,
 )
+from xew.analysis.tables.recompute import (
+    RecomputedChange,
+    RecomputedFigure,
+    rebuild,
+    recompute_changes,
+    recompute_mean_distances,
+)
+from xew.analysis.tables.table import Table
 from xew.protocol import ROBOT_NAMES
 
 TITLE = "The paper's figures, rebuilt from one another"
@@ -83,9 +85,9 @@ def build(paper: Paper, footer: str) -> Report:
 
     Args:
         paper: its figures.
-        footer: HTML, versions.
+        footer: text of the footer, versions.
     """
-    cells, means, changes = rebuild(paper), mean_distance_cells(paper), recompute_changes(paper)
+    cells, means, changes = rebuild(paper), recompute_mean_distances(paper), recompute_changes(paper)
     results = {(metric, axis): paper.correlation(metric, axis) for metric in paper.metrics for axis in AXES}
     frames = frame_distances()
     by_frame = {frame: frame_results(paper, frames[frame]) for frame in OWN_FRAMES}
@@ -102,15 +104,15 @@ def build(paper: Paper, footer: str) -> Report:
             "Percentages of the text": [change_table(changes)],
             "The robots": [robot_table(paper, means)],
         },
-        [*tables.build_tables(PrintedBuilder(grades, None)), *distance_tables(printed_distances(paper))[-1:]],
+        [*build_tables(PrintedBuilder(grades, None)), *distance_tables(printed_distances(paper))[-1:]],
         chart,
     )
     summary = _frame([*cells, *means], changes, by_frame)
-    return Report(_html(content, paper, footer), _markdown(content), summary, dict(_files(content)))
+    return Report(_write_html(content, paper, footer), _write_markdown(content), summary, dict(_files(content)))
 
 
 def finding(
-    cells: Sequence[Cell],
+    cells: Sequence[RecomputedFigure],
     results: Mapping[tuple[str, str], Correlation],
     changes: Sequence[RecomputedChange],
     by_frame: Mapping[Frame, Mapping[str, Correlation]],
@@ -119,19 +121,19 @@ def finding(
     """What came out, in sentences."""
     return [
         *_rebuilt_sentences(cells, changes),
-        *(_sentence(axis, results[PRIMARY, axis]) for axis in AXES),
+        *(_correlation_sentence(axis, results[PRIMARY, axis]) for axis in AXES),
         *_certainty_sentences(results),
         *_frame_sentences(results, by_frame),
         _claims_sentence(claims),
     ]
 
 
-def _rebuilt_sentences(cells: Sequence[Cell], changes: Sequence[RecomputedChange]) -> Iterator[str]:
-    outside = [f"{_name(cell.metric, cell.axis)} {cell.quantity}" for cell in cells if not cell.agrees]
+def _rebuilt_sentences(cells: Sequence[RecomputedFigure], changes: Sequence[RecomputedChange]) -> Iterator[str]:
+    outside = [f"{_name_correlation(cell.metric, cell.axis)} {cell.quantity}" for cell in cells if not cell.agrees]
     furthest = max(abs(cell.ours - cell.published) for cell in cells)
     word = f"{len(cells) - len(outside)} of {len(cells)} printed figures come out within what rounding of the inputs allows"
     yield f"{word} (largest difference {furthest:.3f}){': not ' + ', '.join(outside) if outside else ''}."
-    wrong = [f"{percent(change.change.percent, 0)} ({change.change.source})" for change in changes if not change.agrees]
+    wrong = [f"{format_percent(change.change.percent, 0)} ({change.change.source})" for change in changes if not change.agrees]
     follow = f"{len(changes) - len(wrong)} of {len(changes)} percentages of the text follow from the tables"
     yield f"{follow}{': not ' + ', '.join(wrong) if wrong else ''}."
 
@@ -141,7 +143,8 @@ def _certainty_sentences(results: Mapping[tuple[str, str], Correlation]) -> Iter
     counts = " and ".join(f"{sum(stable[axis])} of {len(stable[axis])} metrics against {axis} distance" for axis in AXES)
     yield f"The sign is stable for {counts}."
     key = min(results, key=lambda key: results[key].p_value)
-    yield f"The smallest p of all {len(results)} is {results[key].p_value:.3f} ({_name(*key)}), before any correction."
+    smallest = f"{results[key].p_value:.3f} ({_name_correlation(*key)})"
+    yield f"The smallest p of all {len(results)} is {smallest}, before any correction."
 
 
 def _frame_sentences(
@@ -153,40 +156,41 @@ def _frame_sentences(
         "arm_alone": "By workspaces of the arm alone, in that frame (ours)",
     }
     for frame, start in starts.items():
-        found = by_frame[frame]
-        turned = [METRIC_TITLES[name] for name, one in found.items() if one.r * results[name, "kinematic"].r < 0]
+        found, primary = by_frame[frame], by_frame[frame][PRIMARY]
+        turned = [PAPER_TITLES[name] for name, one in found.items() if one.r * results[name, "kinematic"].r < 0]
         yield (
-            f"{start}, {METRIC_TITLES[PRIMARY]} has r = {signed(found[PRIMARY].r)}, p = {found[PRIMARY].p_value:.3f}; its sign "
-            f"{_survives(found[PRIMARY])}. Against the printed figures r turns its sign for {', '.join(turned) or 'no metric'}."
+            f"{start}, {PAPER_TITLES[PRIMARY]} has r = {format_signed(primary.r)}, p = {primary.p_value:.3f}; its sign "
+            f"{_stability_phrase(primary)}. Against the printed figures r turns its sign for "
+            f"{', '.join(turned) or 'no metric'}."
         )
 
 
 def _claims_sentence(claims: Sequence[Finding]) -> str:
-    own = [one for one in claims if one.claim.where == "ours" and one.verdict != UNMEASURED]
+    own = [one for one in claims if one.claim.where == "ours" and one.answer != UNMEASURED]
     papers = [one for one in claims if one.claim.where != "ours"]
-    return f"On its own figures, of the paper's {_verdicts(papers)}; of stricter ones of ours, {_verdicts(own)}."
+    return f"On its own figures, of the paper's {_count_answers(papers)}; of stricter ones of ours, {_count_answers(own)}."
 
 
-def _verdicts(claims: Sequence[Finding]) -> str:
+def _count_answers(claims: Sequence[Finding]) -> str:
     """Such as '25 claims: 24 hold, 0 fail, 1 not told by the printed digits'."""
-    counts = [sum(one.verdict == word for one in claims) for word in (HOLDS, FAILS, UNRESOLVED)]
+    counts = [sum(one.answer == word for one in claims) for word in (HOLDS, FAILS, UNRESOLVED)]
     return f"{len(claims)} claims: hold {counts[0]}, fail {counts[1]}, not to be told by the printed digits {counts[2]}"
 
 
-def _sentence(axis: str, result: Correlation) -> str:
+def _correlation_sentence(axis: str, result: Correlation) -> str:
     return (
-        f"{METRIC_TITLES[PRIMARY]} against {axis} distance: r = {signed(result.r)}, p = {result.p_value:.3f}; its sign "
-        f"{_survives(result)}."
+        f"{PAPER_TITLES[PRIMARY]} against {axis} distance: r = {format_signed(result.r)}, p = {result.p_value:.3f}; its sign "
+        f"{_stability_phrase(result)}."
     )
 
 
-def _survives(result: Correlation) -> str:
+def _stability_phrase(result: Correlation) -> str:
     word = "survives" if result.stable else "does not survive"
-    return f"{word} leaving out any one robot ({signed(result.low)} to {signed(result.high)})"
+    return f"{word} leaving out any one robot ({format_signed(result.low)} to {format_signed(result.high)})"
 
 
-def _name(metric: str, axis: str) -> str:
-    return f"{METRIC_TITLES[metric]} by {axis}"
+def _name_correlation(metric: str, axis: str) -> str:
+    return f"{PAPER_TITLES[metric]} by {axis}"
 
 
 def _with_own_frames(distances: Distances, frames: Mapping[Frame, np.ndarray]) -> Distances:
@@ -198,12 +202,12 @@ def _with_own_frames(distances: Distances, frames: Mapping[Frame, np.ndarray]) -
 # --- Formats.
 
 
-def _html(content: Content, paper: Paper, footer: str) -> str:
+def _write_html(content: Content, paper: Paper, footer: str) -> str:
     sections = {"Claims": page.section("Claims", page.paragraph(CLAIMS_TEXT), page.claims(content.claims, None))}
     for number, (title, shown) in enumerate(content.shown.items()):
         chart = [page.chart(content.chart)] if number == 0 else []
         sections[title] = page.section(title, *chart, *map(page.table, shown))
-    folded = [page.folded(table.title, page.table(table)) for table in content.folded]
+    folded = [page.details(table.title, page.table(table)) for table in content.folded]
     sections["The scores"] = page.section("The scores", page.paragraph(SCORES_TEXT), *folded)
     sources = {"paper": paper.title, **paper.tables, **{part: rows.source for part, rows in paper.parts.items()}}
     sources = {name.replace("_", " "): text for name, text in sources.items()}
@@ -211,7 +215,7 @@ def _html(content: Content, paper: Paper, footer: str) -> str:
     return page.page(TITLE, content.sentences, [page.contents(list(sections)), *sections.values()], footer)
 
 
-def _markdown(content: Content) -> str:
+def _write_markdown(content: Content) -> str:
     lines = [f"# {TITLE}", "", *(f"- {sentence}" for sentence in content.sentences)]
     lines += ["", "## Claims", "", CLAIMS_TEXT, "", formats.markdown(claims_table(content.claims))]
     for number, (title, shown) in enumerate(content.shown.items()):
@@ -230,14 +234,14 @@ def _files(content: Content) -> Iterator[tuple[str, bytes]]:
     """Tables as LaTeX and CSV, the chart as PNG, PDF and CSV, claims as CSV."""
     for table in [*(table for shown in content.shown.values() for table in shown), *content.folded]:
         yield f"tables/{table.name}.tex", formats.latex(table).encode()
-        yield f"tables/{table.name}.csv", formats.frame(table).to_csv(index=False).encode()
+        yield f"tables/{table.name}.csv", formats.table_frame(table).to_csv(index=False).encode()
     for name, data in chart_files(content.chart).items():
         yield f"figures/{name}", data
     yield "findings.csv", findings_frame(content.claims, "paper").to_csv(index=False).encode()
 
 
 def _frame(
-    cells: Sequence[Cell], changes: Sequence[RecomputedChange], by_frame: Mapping[Frame, Mapping[str, Correlation]]
+    cells: Sequence[RecomputedFigure], changes: Sequence[RecomputedChange], by_frame: Mapping[Frame, Mapping[str, Correlation]]
 ) -> pd.DataFrame:
     """Columns: row axis quantity published ours least most agrees; blank where the paper prints nothing."""
     names = ("published", "ours", "least", "most", "agrees")
@@ -246,7 +250,7 @@ def _frame(
         for cell in cells
     ]
     rows += [
-        {"row": compared_places(found.change), "axis": found.change.source, "quantity": "percent"}
+        {"row": describe_change(found.change), "axis": found.change.source, "quantity": "percent"}
         | {"published": found.change.percent, "ours": found.ours, "least": found.least, "most": found.most}
         | {"agrees": found.agrees}
         for found in changes

@@ -1,4 +1,4 @@
-"""Stage 11 of 11: pictures of the report: strips and sheets, uint8 RGB arrays."""
+"""Pictures of the report: strips and sheets, uint8 RGB arrays."""
 
 import base64
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ def difference_picture(predicted: np.ndarray, observed: np.ndarray) -> np.ndarra
     return cv2.rectangle(picture, (0, 0), (width - 1, height - 1), FRAME, 1)  # else white on white has no edge
 
 
-def as_graded(video: np.ndarray, truth: np.ndarray, frame_zero: str) -> np.ndarray:
+def fit_to_episode(video: np.ndarray, truth: np.ndarray, frame_zero: str) -> np.ndarray:
     """A rollout's video [t h w 3] beside its episode's as it was graded: frame by frame, at the episode's size.
 
     Args:
@@ -65,7 +65,7 @@ def sheet(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
     return page
 
 
-def png(image: np.ndarray) -> bytes:
+def encode_png(image: np.ndarray) -> bytes:
     """An RGB image [h w 3] uint8 as PNG."""
     done, encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 9])
     if not done:

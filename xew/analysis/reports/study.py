@@ -1,4 +1,4 @@
-"""Stage 11 of 11: the report of a study, from a score table with the column `variant`; `report` reads and writes files.
+"""The report of a study, from a score table with the column `variant`; `report` reads and writes files.
 
 What came out stands first, then the claims with their verdicts, then a section for each question of the paper: chart, the
 main table, what it looks like, and all metrics folded away.
@@ -9,30 +9,35 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
+from markupsafe import Markup
 
 from xew.analysis.paper import AXES, read_paper
 from xew.analysis.reports import page, pictures
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study_charts import study_charts
 from xew.analysis.reports.study_strips import Strip, study_strips
-from xew.analysis.scores import Scores, describe_cells, missing_cells
-from xew.analysis.statistics.grades import SEEN, Grades, PaperGrades, StudyGrades, better, interval
-from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.analysis.scores import Scores, describe_scores, find_missing_scores
+from xew.analysis.statistics.grades import SEEN, Grades, PaperGrades, StudyGrades, relative_gain
+from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables import formats
+from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import (
     Distances,
     certainty_table,
     correlate,
     correlation_table,
     distance_tables,
+    format_signed,
     own_correlation_tables,
     printed_distances,
     read_distances,
-    signed,
 )
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask, findings_frame
-from xew.analysis.tables.layouts import ACTIONS, LADDER, MARKS, SHORT_ROBOTS, Builder, Table, build_tables, count_table
+from xew.analysis.tables.labels import ACTIONS, LADDER, SHORT_ROBOTS
+from xew.analysis.tables.layouts import build_tables, count_table
+from xew.analysis.tables.table import MARKS, Table
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
+from xew.statistics import interval
 
 TITLE = "Can the model render a robot that it has never seen?"
 PART_TITLES = {
@@ -94,7 +99,7 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
         data: the data set, for pictures.
         rollouts: trees of rollouts named after their variants, or folders that hold such trees; for pictures.
         distances: folder of the command of distances; the paper's printed ones where None.
-        footer: HTML, versions.
+        footer: text of the footer, versions.
 
     Raises:
         ConfigError: a file that was named cannot be read.
@@ -107,11 +112,11 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
     planned = scores.attributes.get("study", {}).get("variants", {})
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
     tables = [*build_tables(builder), count_table(builder), *distance_tables(known)]
-    if builder.present("loeo"):
+    if builder.has_results("loeo"):
         tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
         tables.append(certainty_table(grades, known, paper))
     findings = ask(grades)
-    missing = missing_cells(scores.rows)
+    missing = find_missing_scores(scores.rows)
     content = Content(
         _sentences(grades, known, findings),
         findings,
@@ -119,11 +124,11 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
         {table.name: table for table in tables},
         study_charts(builder, known, scores.curves),
         strips,
-        [*_lacks(builder, scores), *missing_note(missing)],
+        [*_missing_notes(builder, scores), *missing_note(missing)],
         missing,
     )
-    html = _html(content, scores, footer)
-    return Report(html, _markdown(content), formats.tables_frame(tables), dict(_files(content)))
+    html = _write_html(content, scores, footer)
+    return Report(html, _write_markdown(content), formats.tables_frame(tables), dict(_files(content)))
 
 
 def _sentences(grades: Grades, distances: Distances, findings: Sequence[Finding]) -> list[str]:
@@ -134,12 +139,12 @@ def _sentences(grades: Grades, distances: Distances, findings: Sequence[Finding]
         *_adaptation_sentences(grades),
         *_distance_sentence(grades, distances),
     ]
-    return [_verdict_sentence(findings), *asked]
+    return [_answer_sentence(findings), *asked]
 
 
-def _verdict_sentence(findings: Sequence[Finding]) -> str:
+def _answer_sentence(findings: Sequence[Finding]) -> str:
     claims = [finding for finding in findings if finding.claim.where != "ours"]
-    counts = {word: sum(finding.verdict == word for finding in claims) for word in (HOLDS, FAILS, UNRESOLVED, UNMEASURED)}
+    counts = {word: sum(finding.answer == word for finding in claims) for word in (HOLDS, FAILS, UNRESOLVED, UNMEASURED)}
     measured = len(claims) - counts[UNMEASURED]
     if not measured:
         return f"None of {len(claims)} claims of the paper could be asked of what was graded here."
@@ -147,7 +152,7 @@ def _verdict_sentence(findings: Sequence[Finding]) -> str:
     verbs = {HOLDS: ("holds", "hold"), FAILS: ("fails", "fail"), UNRESOLVED: ("is unresolved", "are unresolved")}
     parts = [f"{counts[word] or 'none'} {verbs[word][counts[word] > 1]}" for word in verbs]
     text = f"Of {len(claims)} claims of the paper {asked} could be asked here: {', '.join(parts)}."
-    failed = [finding.claim.says.strip("… ").rstrip(".") for finding in claims if finding.verdict == FAILS]
+    failed = [finding.claim.says.strip("… ").rstrip(".") for finding in claims if finding.answer == FAILS]
     return text + (f" What fails: {'; '.join(failed)}." if failed else "")
 
 
@@ -157,9 +162,10 @@ def _gap_sentence(grades: Grades) -> Iterator[str]:
     for robot in HELD_OUT_ROBOTS:
         mean = grades.mean("fixed", "fixed", robot, "lpips") if seen else None
         if mean and seen:
-            worse = -better(mean, seen, grades.metrics["lpips"])
+            worse = -relative_gain(mean, seen, grades.metrics["lpips"]).values
             low, high = interval(worse, grades.level)
-            parts.append(f"{_change(worse[0])} on {ROBOT_TITLES[robot]} ({_change(low)} to {_change(high)})")
+            ends = f"{_format_change(low)} to {_format_change(high)}"
+            parts.append(f"{_format_change(worse[0])} on {ROBOT_TITLES[robot]} ({ends})")
     if parts and seen:
         yield f"Told optical flow only, LPIPS is {seen.value:.3f} on robots seen in training; {' and '.join(parts)}."
 
@@ -173,7 +179,8 @@ def _best_sentences(grades: Grades) -> Iterator[str]:
             known = {row: gain for row, gain in gains.items() if gain is not None}
             if known:
                 best = max(known, key=lambda row: known[row])
-                found.append(f"{labels[best].removeprefix('+ ').lower()} on {SHORT_ROBOTS[robot]} ({_change(known[best])})")
+                label = labels[best].removeprefix("+ ").lower()
+                found.append(f"{label} on {SHORT_ROBOTS[robot]} ({_format_change(known[best])})")
         if found:
             yield f"Against {labels[base].lower()}, LPIPS improves most with {' and '.join(found)}."
 
@@ -184,15 +191,15 @@ def _adaptation_sentences(grades: Grades) -> Iterator[str]:
         loss = _gain(grades, "forgetting", f"{robot}-1", "none", FORGETTING_ROBOT)
         if gain is not None and loss is not None:
             yield (
-                f"One demonstration of each task changes LPIPS by {_change(-gain)} on {ROBOT_TITLES[robot]}, and by "
-                f"{_change(-loss)} on {ROBOT_TITLES[FORGETTING_ROBOT]}, which the model had been trained on."
+                f"One demonstration of each task changes LPIPS by {_format_change(-gain)} on {ROBOT_TITLES[robot]}, and by "
+                f"{_format_change(-loss)} on {ROBOT_TITLES[FORGETTING_ROBOT]}, which the model had been trained on."
             )
 
 
 def _distance_sentence(grades: Grades, distances: Distances) -> Iterator[str]:
     found = correlate(grades, distances)
     parts = [
-        f"r = {signed(found['lpips', axis].r)} with {axis} distance (p = {found['lpips', axis].p_value:.3f}, "
+        f"r = {format_signed(found['lpips', axis].r)} with {axis} distance (p = {found['lpips', axis].p_value:.3f}, "
         f"{'stable' if found['lpips', axis].stable else 'unstable'} sign)"
         for axis in AXES
         if ("lpips", axis) in found
@@ -201,7 +208,7 @@ def _distance_sentence(grades: Grades, distances: Distances) -> Iterator[str]:
         yield f"Over the five robots, each held out in turn, LPIPS goes with distance: {'; '.join(parts)}."
 
 
-def _change(share: float) -> str:
+def _format_change(share: float) -> str:
     return f"{100 * share:+z.0f}\u00a0%".replace("-", "−")
 
 
@@ -209,11 +216,11 @@ def _gain(grades: Grades, part: str, row: str, base: str, robot: str) -> float |
     if "lpips" not in grades.metrics:
         return None
     after, before = (grades.mean(part, key, robot, "lpips", shared=True) for key in (row, base))
-    return float(better(after, before, grades.metrics["lpips"])[0]) if after and before else None
+    return relative_gain(after, before, grades.metrics["lpips"]).value if after and before else None
 
 
-def _lacks(builder: Builder, scores: Scores) -> Iterator[str]:
-    absent = [part.replace("_", " ") for part in PAPER_PARTS if not builder.present(part)]
+def _missing_notes(builder: Builder, scores: Scores) -> Iterator[str]:
+    absent = [part.replace("_", " ") for part in PAPER_PARTS if not builder.has_results(part)]
     if absent:
         yield f"Not run in this study: {', '.join(absent)}."
     unknown = set(scores.rows["variant"]) - {variant.name for variants in PARTS.values() for variant in variants} - {""}
@@ -227,20 +234,20 @@ def missing_note(missing: pd.DataFrame) -> list[str]:
         return []
     return [
         f"{len(missing)} scores are missing that other models have; comparisons leave these cells out for all. They are in "
-        f"missing.csv: {describe_cells(missing, 3)}."
+        f"missing.csv: {describe_scores(missing, 3)}."
     ]
 
 
-def _html(content: Content, scores: Scores, footer: str) -> str:
+def _write_html(content: Content, scores: Scores, footer: str) -> str:
     """The page."""
     sections = {"Claims": _claims_section(content)}
     sections |= {PART_TITLES[part]: text for part in SECTIONS if (text := _part_section(content, part))}
     sections["How it was measured"] = _method_section(content, scores)
-    head = page.contents(list(sections)) + "".join(map(page.note, content.lacks))
-    return page.page(TITLE, content.sentences, [head, *sections.values()], footer)
+    head = [page.contents(list(sections)), *map(page.note, content.lacks)]
+    return page.page(TITLE, content.sentences, [*head, *sections.values()], footer)
 
 
-def _claims_section(content: Content) -> str:
+def _claims_section(content: Content) -> Markup:
     text = (
         "Each claim of the paper as an inequality, asked of this study and of the paper's own printed figures. It holds where "
         "every number lies on its side with its whole 95 % interval over scenes (for the paper: with all that prints the "
@@ -250,27 +257,27 @@ def _claims_section(content: Content) -> str:
     return page.section("Claims", page.paragraph(text), page.claims(content.findings, content.printed))
 
 
-def _part_section(content: Content, part: str) -> str:
+def _part_section(content: Content, part: str) -> Markup | None:
     charts, shown, folded = SECTIONS[part]
     if not any(name in content.tables for name in shown):
-        return ""
+        return None
     parts = [page.chart(content.charts[name]) for name in charts if name in content.charts]
     parts += [page.table(content.tables[name]) for name in shown if name in content.tables]
     if part in content.strips:
         strip = content.strips[part]
         source = pictures.data_uri(strip.image)
-        parts.append(page.labeled_picture(source, page.escape(strip.caption), strip.columns, strip.rows))
+        parts.append(page.labeled_picture(source, strip.caption, strip.columns, strip.rows))
     if FRAME_CHARTS.get(part) in content.charts:
         parts.append(page.chart(content.charts[FRAME_CHARTS[part]]))
     hidden = [content.tables[name] for name in folded if name in content.tables]
     if hidden:
-        parts.append(page.folded("; ".join(table.title for table in hidden), *map(page.table, hidden)))
+        parts.append(page.details("; ".join(table.title for table in hidden), *map(page.table, hidden)))
     return page.section(PART_TITLES[part], *parts)
 
 
-def _method_section(content: Content, scores: Scores) -> str:
+def _method_section(content: Content, scores: Scores) -> Markup:
     made = {"scenes graded": str(len(scores.rows[["task", "seed"]].drop_duplicates())), **scores.measured_by}
-    definitions = {METRIC_TITLES.get(metric.name, metric.name): metric.reference for metric in scores.metrics}
+    definitions = {metric.title: metric.reference for metric in scores.metrics}
     return page.section(
         "How it was measured",
         page.paragraph(
@@ -286,7 +293,7 @@ def _method_section(content: Content, scores: Scores) -> str:
     )
 
 
-def _markdown(content: Content) -> str:
+def _write_markdown(content: Content) -> str:
     lines = [
         f"# {TITLE}",
         "",
@@ -317,7 +324,7 @@ def _files(content: Content) -> Iterator[tuple[str, bytes]]:
     """Tables as LaTeX and CSV, charts as PNG, PDF and CSV, strips as PNG, findings as CSV and LaTeX."""
     for name, table in content.tables.items():
         yield f"tables/{name}.tex", formats.latex(table).encode()
-        yield f"tables/{name}.csv", formats.frame(table).to_csv(index=False).encode()
+        yield f"tables/{name}.csv", formats.table_frame(table).to_csv(index=False).encode()
     for chart in content.charts.values():
         for name, data in chart_files(chart).items():
             yield f"figures/{name}", data

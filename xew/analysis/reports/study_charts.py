@@ -1,4 +1,4 @@
-"""Stage 11 of 11: the charts of a study: bars of gains, adaptation against forgetting, distances, error by frame."""
+"""The charts of a study: bars of gains, adaptation against forgetting, distances, error by frame."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,11 +12,14 @@ from matplotlib.axes import Axes
 from xew.analysis.reports import charts
 from xew.analysis.reports.charts import SERIES, SOFT, Chart, Panel, Series
 from xew.analysis.scores import COPY, TRUTH, VARIANT, MetricInfo
-from xew.analysis.statistics.grades import MIN_SCENES, Grades, Mean, PaperGrades, better, find_variant, interval
-from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
+from xew.analysis.statistics.grades import Grades, PaperGrades, find_variant, relative_gain
+from xew.analysis.statistics.summary import ROBOT_TITLES
+from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import AXIS_TITLES, Distances
-from xew.analysis.tables.layouts import ACTIONS, LADDER, REMEDIES, SHORT_ROBOTS, Builder, metric_title
+from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, SHORT_ROBOTS
+from xew.analysis.tables.table import metric_title
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS
+from xew.statistics import Mean
 
 BAR_METRICS = ("lpips", "region_lpips", "mask_iou", "pck")
 CURVE_METRIC = "lpips"
@@ -25,7 +28,7 @@ ROBOT_COLORS = dict(zip(HELD_OUT_ROBOTS, SERIES, strict=False))
 
 
 @dataclass(frozen=True)
-class Steps:
+class GainRows:
     """Rows of a part against the row that they start from."""
 
     part: str
@@ -36,52 +39,56 @@ class Steps:
     """Row and label, of a robot."""
 
 
-STEPS = (
-    Steps("actions", "against joint pose", lambda _: "joints", lambda _: {k: v for k, v in ACTIONS.items() if k != "joints"}),
-    Steps("ladder", "against flow only", lambda _: "none", lambda _: {k: v for k, v in LADDER.items() if k != "none"}),
-    Steps("few_shot", "against M = 0", lambda r: f"{r}-0", lambda r: {f"{r}-{shots}": f"M = {shots}" for shots in SHOTS}),
+def _leave_out(base: str, labels: Mapping[str, str]) -> dict[str, str]:
+    return {row: label for row, label in labels.items() if row != base}
+
+
+GAIN_ROWS = (
+    GainRows("actions", "against joint pose", lambda _: "joints", lambda _: _leave_out("joints", ACTIONS)),
+    GainRows("ladder", "against flow only", lambda _: "none", lambda _: _leave_out("none", LADDER)),
+    GainRows("few_shot", "against M = 0", lambda r: f"{r}-0", lambda r: {f"{r}-{shots}": f"M = {shots}" for shots in SHOTS}),
 )
 
 
 def study_charts(builder: Builder, distances: Distances, curves: pd.DataFrame) -> dict[str, Chart]:
     """All charts for which something was measured, by name."""
-    made = {f"gains_{steps.part}": gain_chart(builder, steps) for steps in STEPS if builder.present(steps.part)}
-    if builder.present("forgetting"):
+    made = {f"gains_{gain.part}": gain_chart(builder, gain) for gain in GAIN_ROWS if builder.has_results(gain.part)}
+    if builder.has_results("forgetting"):
         made["forgetting"] = forgetting_chart(builder)
     scatter = distance_chart(builder.ours, distances)
     if scatter:
         made["distance"] = scatter
     for part, labels in (("actions", ACTIONS), ("ladder", LADDER)):
-        if builder.present(part) and len(curves):
+        if builder.has_results(part) and len(curves):
             made[f"frames_{part}"] = frame_chart(curves, part, labels)
     return made
 
 
-def gain_chart(builder: Builder, steps: Steps) -> Chart:
+def gain_chart(builder: Builder, gain: GainRows) -> Chart:
     """Relative improvement of each row over the base, a panel for each metric, a bar for each held-out robot."""
     metrics = [metric for metric in BAR_METRICS if metric in builder.ours.metrics]
     data = pd.DataFrame(
-        {"metric": metric, "robot": robot, "row": label} | _gain(builder, steps, row, robot, metric)
+        {"metric": metric, "robot": robot, "row": label} | _gain(builder, gain, row, robot, metric)
         for metric in metrics
         for robot in HELD_OUT_ROBOTS
-        for row, label in steps.rows(robot).items()
+        for row, label in gain.rows(robot).items()
     )
 
     def draw(axes: Axes, metric: str) -> None:
-        labels = list(steps.rows(HELD_OUT_ROBOTS[0]).values())
+        labels = list(gain.rows(HELD_OUT_ROBOTS[0]).values())
         groups = []
         for robot in HELD_OUT_ROBOTS:
             chosen = data[(data["metric"] == metric) & (data["robot"] == robot)]
             groups.append((ROBOT_COLORS[robot], chosen[["gain", "low", "high"]].to_numpy(), chosen["paper"].to_numpy()))
-        charts.bars(axes, labels, groups, f"better by [%], {steps.title}")
+        charts.bars(axes, labels, groups, f"better by [%], {gain.title}")
 
-    height = 1.0 + 0.42 * len(steps.rows(HELD_OUT_ROBOTS[0]))
-    panels = [Panel(METRIC_TITLES[metric], partial(draw, metric=metric), height) for metric in metrics]
+    height = 1.0 + 0.42 * len(gain.rows(HELD_OUT_ROBOTS[0]))
+    panels = [Panel(builder.ours.metrics[metric].title, partial(draw, metric=metric), height) for metric in metrics]
     legend = [Series(ROBOT_TITLES[robot], ROBOT_COLORS[robot]) for robot in HELD_OUT_ROBOTS]
-    caption = f"Relative improvement {steps.title}; to the right is better. Lines: 95 % intervals, paired by scene."
+    caption = f"Relative improvement {gain.title}; to the right is better. Lines: 95 % intervals, paired by scene."
     if builder.paper:
         legend.append(Series("the paper", charts.INK, "o"))
-    return Chart(f"gains_{steps.part}", caption, panels, data, legend)
+    return Chart(f"gains_{gain.part}", caption, panels, data, legend)
 
 
 def forgetting_chart(builder: Builder) -> Chart:
@@ -129,14 +136,14 @@ def _adaptation_rows(builder: Builder) -> Iterator[dict[str, object]]:
                 "target": ("few_shot", after, target),
                 "forgetting": ("forgetting", after if shots else "none", FORGETTING_ROBOT),
             }
-            if builder.present("remedies"):
+            if builder.has_results("remedies"):
                 places |= {r: ("forgetting", f"{after}-{r}" if shots else "none", FORGETTING_ROBOT) for r in REMEDIES}
             for line, (part, row, robot) in places.items():
                 for source, grades in sources:
                     if source == "paper" and line in REMEDIES:
                         continue
                     mean = grades.mean(part, row, robot, "lpips")
-                    value, low, high = _numbers(mean, grades.level)
+                    value, low, high = _mean_and_ends(mean, grades.level)
                     yield {
                         "target": target,
                         "shots": shots,
@@ -208,7 +215,7 @@ def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Seque
     shown = curves[curves["robot"].isin(robots) & curves["metric"].isin([metric.name for metric in metrics])]
     # The truth's PSNR is a cap, not a measurement, and would squeeze everything else flat.
     shown = shown[~((shown["model"] == TRUTH) & (shown["metric"] == "psnr"))]
-    shown = shown.assign(row=[_run_label(*key) for key in zip(shown["model"], shown["condition"], strict=True)])
+    shown = shown.assign(row=[_run_title(*key) for key in zip(shown["model"], shown["condition"], strict=True)])
     grouped = shown.groupby(["metric", "robot", "row", "frame"], sort=False)["value"]
     data = pd.DataFrame({"mean": grouped.mean(), "low": grouped.quantile(0.25), "high": grouped.quantile(0.75)}).reset_index()
     own = [row for row in dict.fromkeys(shown["row"]) if row not in BASELINE_STYLES.values()]
@@ -235,29 +242,27 @@ def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Seque
     return Chart("curves", caption, panels, data, styles, columns=len(robots))
 
 
-def _run_label(model: str, condition: str) -> str:
+def _run_title(model: str, condition: str) -> str:
     return BASELINE_STYLES.get(model) or " · ".join(filter(None, (model, condition)))
 
 
-def _gain(builder: Builder, steps: Steps, row: str, robot: str, metric: str) -> dict[str, float]:
-    base = steps.base(robot)
-    values = _relative(builder.ours, steps.part, row, base, robot, metric)
-    printed = _relative(builder.paper, steps.part, row, base, robot, metric) if builder.paper else values * np.nan
+def _gain(builder: Builder, gain: GainRows, row: str, robot: str, metric: str) -> dict[str, float]:
+    base = gain.base(robot)
+    values = _relative_gain(builder.ours, gain.part, row, base, robot, metric)
+    printed = _relative_gain(builder.paper, gain.part, row, base, robot, metric) if builder.paper else values * np.nan
     return {"gain": values[0], "low": values[1], "high": values[2], "paper": printed[0]}
 
 
-def _relative(grades: Grades | PaperGrades, part: str, row: str, base: str, robot: str, metric: str) -> np.ndarray:
+def _relative_gain(grades: Grades | PaperGrades, part: str, row: str, base: str, robot: str, metric: str) -> np.ndarray:
     """Gain over the base and its interval's ends [3] in percent; NaN where one of the two is missing."""
     after, before = (grades.mean(part, key, robot, metric, shared=True) for key in (row, base))
     if after is None or before is None:
         return np.full(3, np.nan)
-    values = better(after, before, grades.metrics[metric])
-    ends = interval(values, grades.level) if min(after.scenes, before.scenes) >= MIN_SCENES else (np.nan, np.nan)
-    return 100 * np.array([values[0], *ends])
+    gain = relative_gain(after, before, grades.metrics[metric])
+    return 100 * np.array([gain.value, *gain.interval(grades.level)])
 
 
-def _numbers(mean: Mean | None, level: float) -> tuple[float, float, float]:
+def _mean_and_ends(mean: Mean | None, level: float) -> tuple[float, float, float]:
     if mean is None:
         return np.nan, np.nan, np.nan
-    ends = interval(mean.values, level) if mean.scenes >= MIN_SCENES else (np.nan, np.nan)
-    return mean.value, *ends
+    return mean.value, *(mean.interval(level) if mean.scenes is not None else (np.nan, np.nan))

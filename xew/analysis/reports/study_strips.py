@@ -1,4 +1,4 @@
-"""Stage 11 of 11: what the variants of a study look like, one scene and moment, robots down and conditions across."""
+"""What the variants of a study look like, one scene and moment, robots down and conditions across."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import pandas as pd
 from xew.analysis.reports import pictures
 from xew.analysis.scores import VARIANT, Scores
 from xew.analysis.statistics.grades import find_variant
-from xew.analysis.tables.layouts import ACTIONS, LADDER, SHORT_ROBOTS
+from xew.analysis.tables.labels import ACTIONS, LADDER, SHORT_ROBOTS
 from xew.config import ConfigError
 from xew.episode import episode_folder, read_video
 from xew.protocol import HELD_OUT_ROBOTS, SHOTS, VARIANTS
@@ -50,7 +50,7 @@ def study_strips(scores: Scores, data: Path, rollouts: Sequence[Path]) -> dict[s
         "ladder": {label: dict.fromkeys(HELD_OUT_ROBOTS, row) for row, label in LADDER.items()},
         "few_shot": adapted,
     }
-    made = {part: _strip(part, columns, scores, data, videos) for part, columns in wanted.items()}
+    made = {part: _make_strip(part, columns, scores, data, videos) for part, columns in wanted.items()}
     return {part: strip for part, strip in made.items() if strip is not None}
 
 
@@ -73,7 +73,9 @@ def _children(folder: Path) -> list[Path]:
     return sorted(child for child in folder.iterdir() if child.is_dir()) if folder.is_dir() else []
 
 
-def _strip(part: str, columns: Mapping[str, Mapping[str, str]], scores: Scores, data: Path, videos: Videos) -> Strip | None:
+def _make_strip(
+    part: str, columns: Mapping[str, Mapping[str, str]], scores: Scores, data: Path, videos: Videos
+) -> Strip | None:
     """Observed frame and all variants of a part, for each held-out robot; None where fewer than two can be shown."""
     names = {
         label: {robot: find_variant(part, row).name for robot, row in by_robot.items()} for label, by_robot in columns.items()
@@ -87,10 +89,10 @@ def _strip(part: str, columns: Mapping[str, Mapping[str, str]], scores: Scores, 
     for robot in robots:
         truth = read_video(episode_folder(data, task, seed, robot) / "rgb.mkv")
         predicted = [read_rollout_video(videos[names[label][robot], task, seed, robot]) for label in labels]
-        shown.append([truth, *(pictures.as_graded(video, truth, scores.frame_zero) for video in predicted)])
+        shown.append([truth, *(pictures.fit_to_episode(video, truth, scores.frame_zero) for video in predicted)])
     moment = min(len(video) for row in shown for video in row) - 1
     caption = f"{task.replace('_', ' ')}, seed {seed}, frame {moment}: the scene whose LPIPS is the median of those shown."
-    image = pictures.png(pictures.sheet([[video[moment] for video in row] for row in shown]))
+    image = pictures.encode_png(pictures.sheet([[video[moment] for video in row] for row in shown]))
     return Strip(image, caption, ["observed", *labels], [SHORT_ROBOTS[robot] for robot in robots])
 
 

@@ -1,4 +1,4 @@
-"""Stage 11 of 11: the means that tables and findings are made of, with other values that they could as well have had.
+"""The means that tables and findings are made of, with other values that they could as well have had.
 
 A mean has an address that is the same for our study and for the paper: (part, row, robots, metric), such as
 ("actions", "optical_flow", "franka_panda", "lpips"). Parts and rows are named as in `paper.py`; robots are one robot, or
@@ -10,8 +10,7 @@ prints the same. Whoever computes a difference or a ratio does it on all these v
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -20,6 +19,7 @@ import pandas as pd
 from xew.analysis.paper import Paper
 from xew.analysis.scores import TRUTH, MetricInfo
 from xew.protocol import MULTI_VIEW, PARTS, ROBOT_NAMES, SPLITS, Variant
+from xew.statistics import DRAWS, LEVEL, Mean, bootstrap_means, noise_floor
 
 TOGETHER = {
     "few_shot": ("few_shot", "remedies"),
@@ -27,33 +27,9 @@ TOGETHER = {
     "baselines": ("baselines", "more_systems"),
 }
 """Parts of the protocol that are ours and stand in a part of the paper's."""
-DRAWS = 2000
-LEVEL = 0.95
-MIN_SCENES = 6
-"""Fewer scenes give no interval: with six, all differences have one sign by chance in 3 % of cases, with five in 6 %.
-
-Percentile intervals of few scenes are too narrow all the same: where there is no difference, 15 % of six scenes leave out 0,
-11 % of ten, 8 % of twenty, 5 % of a hundred (of two it would be 50 %).
-"""
 SEEN = "seen"
 REFERENCE = "reference"
 """The row of the few-shot part that stands for the model before adaptation, on the robots that it was trained on."""
-
-
-@dataclass(frozen=True)
-class Mean:
-    """A mean over episodes."""
-
-    values: np.ndarray
-    """[1 + DRAWS] the mean itself, then what else it could have been."""
-    count: int
-    """Episodes; 0 where they are not known (the paper's)."""
-    scenes: int
-    """Scenes that these episodes are of, by which they are resampled; 0 as above."""
-
-    @property
-    def value(self) -> float:
-        return float(self.values[0])
 
 
 class Grades(Protocol):
@@ -74,27 +50,24 @@ class Grades(Protocol):
     def mean(self, part: str, row: str, robots: str, metric: str, shared: bool = False) -> Mean | None:
         """The mean at an address, None where nothing is measured; `shared`: over the cells that all rows of the part have."""
 
+    def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
+        """The mean paired difference of a row from another, over the cells that all rows of the part have."""
+
     def floor(self, robots: str, metric: str) -> float:
-        """How far the estimators are from the truth on the true video: smaller differences say nothing."""
+        """The metric's noise floor on these robots, NaN where it is not known; a difference that is no larger says nothing."""
 
     def axis(self, name: str) -> np.ndarray:
         """Mean distance of each robot to the other four, 'appearance' or 'kinematic', in the order of ROBOT_NAMES: [5], or
         [1 + DRAWS 5] where it is known to some digits only."""
 
 
-def interval(values: np.ndarray, level: float) -> tuple[float, float]:
-    """Ends of the share `level` of drawn values [1 + n]; the first is the point and does not count.
-
-    Values that do not exist (a resample without any cell) are left out.
-    """
-    return tuple(np.nanquantile(values[1:], [(1 - level) / 2, (1 + level) / 2]).tolist())
-
-
-def better(after: Mean, before: Mean, metric: MetricInfo) -> np.ndarray:
+def relative_gain(after: Mean, before: Mean, metric: MetricInfo) -> Mean:
     """By how much a mean is better than another, of the latter: 0.1 is 10 %; positive is better whatever the metric."""
     sign = 1 if metric.higher_is_better else -1
     with np.errstate(divide="ignore", invalid="ignore"):
-        return sign * (after.values - before.values) / np.abs(before.values)
+        gain = sign * (after.values - before.values) / np.abs(before.values)
+    scenes = [mean.scenes for mean in (after, before) if mean.scenes is not None]
+    return Mean(gain, min(after.count, before.count), min(scenes, default=None))
 
 
 def row_keys(part: str, variant: Variant) -> list[str]:
@@ -129,28 +102,6 @@ def find_variant(part: str, row: str) -> Variant:
 def pooled(variant: Variant, robots: str) -> tuple[str, ...]:
     """The robots behind a name: 'seen' are those that the variant's split trains on."""
     return SPLITS[variant.split].train_robots if robots == SEEN else (robots,)
-
-
-def resample(values: np.ndarray) -> Mean | None:
-    """The mean of scores [s r] of scenes and robots, and of DRAWS resamples of the scenes; NaN where there is no score.
-
-    The same resamples for any two arrays of as many scenes, so that their differences are paired. None without any score.
-    """
-    held = ~np.isnan(values)
-    if not held.any():
-        return None
-    sums, counts = np.where(held, values, 0).sum(axis=1), held.sum(axis=1)
-    weights = _scene_weights(len(values))
-    with np.errstate(invalid="ignore"):
-        means = (weights @ sums) / (weights @ counts)
-    return Mean(means, int(counts.sum()), int((counts > 0).sum()))
-
-
-@lru_cache(maxsize=4)
-def _scene_weights(scenes: int) -> np.ndarray:
-    """How often each scene is drawn [1 + DRAWS s]: once each in the first row, then at random with replacement."""
-    drawn = np.random.default_rng(0).multinomial(scenes, np.full(scenes, 1 / scenes), DRAWS)
-    return np.concatenate([np.ones((1, scenes)), drawn])
 
 
 class StudyGrades:
@@ -205,24 +156,34 @@ class StudyGrades:
         """Mean over all episodes of some robots, or over those that every measured variant of a part has."""
         key = (variant, robots, metric, shared_part)
         if key not in self._cache:
-            values = self._block(variant, robots, metric)
+            values = self._scores(variant, robots, metric)
             if shared_part:
                 values = np.where(self._shared(shared_part, robots, metric), values, np.nan)
-            self._cache[key] = resample(values)
+            self._cache[key] = self._bootstrap(values)
         return self._cache[key]
+
+    def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
+        after, before = (
+            self._scores(variant.name, pooled(variant, robots), metric)
+            for variant in (find_variant(part, row), find_variant(part, base))
+        )
+        shared = self._shared(part, pooled(find_variant(part, row), robots), metric)
+        return self._bootstrap(np.where(shared, after - before, np.nan))
 
     def floor(self, robots: str, metric: str) -> float:
         info = self.metrics[metric]
-        perfect = info.high if info.higher_is_better else info.low
         truth = self.baseline(TRUTH, SPLITS["fixed"].train_robots if robots == SEEN else (robots,), metric)
-        if truth is None or perfect is None or not np.isfinite(perfect):
-            return 0.0
-        return abs(truth.value - perfect)
+        return noise_floor(truth.value if truth else None, info.best, info.estimated)
+
+    def _bootstrap(self, values: np.ndarray) -> Mean | None:
+        """The mean of scores [s r] of all scenes and some robots; None without any score."""
+        scenes, robots = values.shape
+        return next(bootstrap_means(values.reshape(-1, 1), np.repeat(np.arange(scenes), robots), scenes))
 
     def axis(self, name: str) -> np.ndarray:
         return self._axes[name]
 
-    def _block(self, variant: str, robots: tuple[str, ...], metric: str) -> np.ndarray:
+    def _scores(self, variant: str, robots: tuple[str, ...], metric: str) -> np.ndarray:
         """Scores [s r] of all scenes, NaN where there is none."""
         empty = np.full(len(self._cells), np.nan)
         columns = [self._columns.get((variant, robot, metric)) for robot in robots]
@@ -231,8 +192,8 @@ class StudyGrades:
     def _shared(self, part: str, robots: tuple[str, ...], metric: str) -> np.ndarray:
         """Which cells [s r] all variants of a part have that were asked for these robots and have any."""
         asked = [variant for variant in variants_of(part) if set(robots) <= set(variant.graded_robots)]
-        blocks = [~np.isnan(self._block(variant.name, robots, metric)) for variant in asked]
-        measured = [block for block in blocks if block.any()]
+        held = [~np.isnan(self._scores(variant.name, robots, metric)) for variant in asked]
+        measured = [cells for cells in held if cells.any()]
         return np.logical_and.reduce(measured or [np.ones((len(self._cells), len(robots)), bool)])
 
     @cached_property
@@ -268,8 +229,12 @@ class PaperGrades:
             return None
         if key not in self._cache:
             ends = self._rng.choice([-1.0, 1.0], DRAWS) * self._paper.half_digit_of(part, metric)
-            self._cache[key] = Mean(np.concatenate([[printed], printed + ends]), 0, 0)
+            self._cache[key] = Mean(np.concatenate([[printed], printed + ends]), 0, None)
         return self._cache[key]
+
+    def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
+        after, before = (self.mean(part, key, robots, metric) for key in (row, base))
+        return None if after is None or before is None else Mean(after.values - before.values, 0, None)
 
     def print(self, part: str, row: str, robots: str, metric: str) -> str:
         """A value with as many decimals as the paper prints; '' where it prints none."""

@@ -1,31 +1,17 @@
-"""Stage 11 of 11: scores to means, intervals and verdicts, robot by robot."""
+"""The tables of one run: its scores as means, intervals and verdicts, robot by robot."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import pandas as pd
 
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores
-from xew.analysis.statistics.grades import LEVEL, MIN_SCENES, interval, resample
 from xew.sim_warp.robots import ROBOTS
+from xew.statistics import MIN_SCENES, UNRESOLVED, Mean, Units, bootstrap_means, noise_floor, verdict
 
 ROBOT_TITLES = {key: robot.title for key, robot in ROBOTS.items()}
-METRIC_TITLES = {
-    "psnr": "PSNR",
-    "ssim": "SSIM",
-    "lpips": "LPIPS",
-    "mask_iou": "Mask IoU",
-    "boundary_f1": "Boundary F1",
-    "region_lpips": "Region LPIPS",
-    "pck": "PCK",
-    "pck_05": "PCK at 0.05",
-    "keypoint_error": "Keypoint error",
-    "ndtw": "nDTW",
-    "coverage": "Keypoints found",
-    "trajectory_error": "Object error",
-    "object_coverage": "Objects found",
-}
 
 
 @dataclass(frozen=True)
@@ -85,34 +71,41 @@ def robot_title(robot: str) -> str:
     return ROBOT_TITLES.get(robot, robot)
 
 
-def mean_interval(scores: pd.Series) -> Interval:
-    """Mean of episodes' scores and its percentile bootstrap interval; the same at every call.
+def mean_interval(scores: pd.Series, units: Units | None = None) -> Interval:
+    """Mean of episodes' scores and its bootstrap interval; the same at every call.
 
     Args:
-        scores: indexed by task, seed and robot; scenes (task, seed) are resampled, with all robots that they have.
+        scores: indexed by task, seed and robot; scenes (task, seed) are drawn, with all robots that they have.
+        units: scenes of the whole table; those of the scores where left out.
     """
-    mean = resample(scores.unstack("robot").to_numpy(np.float64))
+    mean = _bootstrap(scores, units)
+    return Interval(mean.value, *mean.interval(), mean.count)
+
+
+def verdict_on_copy(
+    model: pd.Series, copy: pd.Series, higher_is_better: bool, floor: float = 0, units: Units | None = None
+) -> str:
+    """Is a model better than the frozen first frame on the episodes that both have? See `xew.statistics.verdict`.
+
+    Args:
+        model, copy: their scores, indexed by task, seed and robot.
+        higher_is_better: of the metric.
+        floor: its noise floor; NaN where it is not known.
+        units: as of `mean_interval`.
+    """
+    difference = (model - copy).dropna()
+    if difference.empty:
+        return UNRESOLVED
+    mean = _bootstrap(difference, units)
+    return verdict(mean.value, mean.interval(), floor, higher_is_better)
+
+
+def _bootstrap(scores: pd.Series, units: Units | None) -> Mean:
+    index = cast(pd.MultiIndex, scores.index)
+    units = units or Units(index.to_frame(index=False))
+    mean = next(bootstrap_means(scores.to_numpy(np.float64)[:, None], units.numbers(index), len(units)))
     assert mean is not None, "no episode"
-    if mean.scenes < MIN_SCENES:
-        return Interval(mean.value, np.nan, np.nan, mean.count)
-    if np.ptp(scores) == 0:
-        return Interval(mean.value, mean.value, mean.value, mean.count)
-    return Interval(mean.value, *interval(mean.values, LEVEL), mean.count)
-
-
-def verdict(model: pd.Series, copy: pd.Series, higher_is_better: bool, floor: float = 0) -> str:
-    """Is a model better than the frozen first frame on the episodes that both have? Series are indexed as above.
-
-    'unresolved' where the interval of the mean paired difference holds 0, where the difference is inside the estimators' noise
-    floor, or where there are fewer than MIN_SCENES scenes.
-    """
-    difference = (model - copy).dropna() * (1 if higher_is_better else -1)
-    if len(difference.unstack("robot")) < MIN_SCENES:
-        return "unresolved"
-    found = mean_interval(difference)
-    if found.low > 0 and found.mean > floor:
-        return "better"
-    return "worse" if found.high < 0 and -found.mean > floor else "unresolved"
+    return mean
 
 
 def robot_table(scores: Scores, title: str, robots: Sequence[str], expected: int | None) -> RobotTable:
@@ -123,7 +116,8 @@ def robot_table(scores: Scores, title: str, robots: Sequence[str], expected: int
     ends = [key for name in (COPY, TRUTH) for key in by_model if key[0] == name]
     order = [key for key in by_model if key[0] not in (COPY, TRUTH)] + ends
     copy, truth = (next((by_model[key] for key in ends if key[0] == name), None) for name in (COPY, TRUTH))
-    built = tuple(_row(key, by_model[key], copy, truth, scores.metrics) for key in order)
+    units = Units(scores.rows)
+    built = tuple(_row(key, by_model[key], copy, truth, scores.metrics, units) for key in order)
     return RobotTable(title, tuple(robots), built, expected)
 
 
@@ -133,23 +127,22 @@ def _row(
     copy: pd.DataFrame | None,
     truth: pd.DataFrame | None,
     metrics: Sequence[MetricInfo],
+    units: Units,
 ) -> Row:
     values = {metric.name: _by_episode(group, metric.name) for metric in metrics}
     verdicts = {}
     if copy is not None and key[0] not in (COPY, TRUTH):
         for metric in metrics:
-            floor = _noise_floor(truth, metric)
+            floor = _noise_floor(truth, metric, units)
             still = _by_episode(copy, metric.name)
-            verdicts[metric.name] = verdict(values[metric.name], still, metric.higher_is_better, floor)
-    intervals = {name: mean_interval(series) for name, series in values.items() if len(series)}
+            verdicts[metric.name] = verdict_on_copy(values[metric.name], still, metric.higher_is_better, floor, units)
+    intervals = {name: mean_interval(series, units) for name, series in values.items() if len(series)}
     return Row(*key, intervals, verdicts)
 
 
-def _noise_floor(truth: pd.DataFrame | None, metric: MetricInfo) -> float:
-    """How far from perfect the true video is graded."""
-    perfect = metric.high if metric.higher_is_better else metric.low
+def _noise_floor(truth: pd.DataFrame | None, metric: MetricInfo, units: Units) -> float:
     graded = _by_episode(truth, metric.name) if truth is not None else pd.Series()
-    return abs(float(graded.mean()) - perfect) if len(graded) and perfect is not None and np.isfinite(perfect) else 0.0
+    return noise_floor(_bootstrap(graded, units).value if len(graded) else None, metric.best, metric.estimated)
 
 
 def _by_episode(rows: pd.DataFrame, metric: str) -> pd.Series:
@@ -164,7 +157,7 @@ def finding(held_out: Sequence[RobotTable], seen: Sequence[RobotTable], metrics:
         twins = [(other, twin) for other in seen for twin in other.rows if _same_model(twin, row)]
         episodes = f"{table.count} episode{'s' if table.count != 1 else ''}"
         sentences.append(
-            f"{table.title} ({episodes}): {row.title} {_compare(row, metrics)}.{_distance_left((table, row), twins)}"
+            f"{table.title} ({episodes}): {row.title} {_compare(row, metrics)}.{_distance_left((table, row), twins, metrics)}"
         )
     return sentences or ["No model has been compared with the frozen first frame yet: grade without --no-baselines."]
 
@@ -173,12 +166,15 @@ def _same_model(a: Row, b: Row) -> bool:
     return (a.model, a.condition) == (b.model, b.condition)
 
 
-def _distance_left(own: tuple[RobotTable, Row], seen: Sequence[tuple[RobotTable, Row]], metric: str = "lpips") -> str:
+def _distance_left(
+    own: tuple[RobotTable, Row], seen: Sequence[tuple[RobotTable, Row]], metrics: Sequence[MetricInfo], metric: str = "lpips"
+) -> str:
     shares = [progress(table, row, metric) for table, row in (own, *seen)]
     if shares[0] is None:
         return ""
+    title = next((info.title for info in metrics if info.name == metric), metric)
     beside = f" (on seen robots {1 - shares[1]:.0%})" if len(shares) > 1 and shares[1] is not None else ""
-    return f" In {METRIC_TITLES[metric]} it is at {1 - shares[0]:.0%} of that frame's distance from the truth{beside}."
+    return f" In {title} it is at {1 - shares[0]:.0%} of that frame's distance from the truth{beside}."
 
 
 def progress(table: RobotTable, row: Row, metric: str) -> float | None:
@@ -195,7 +191,7 @@ def _compare(row: Row, metrics: Sequence[MetricInfo]) -> str:
         return f"cannot be told from a frozen first frame by fewer than {MIN_SCENES} scenes"
     parts = []
     for word, phrase in (("better", "beats"), ("worse", "falls behind"), ("unresolved", "cannot be told from")):
-        names = [METRIC_TITLES.get(m.name, m.name) for m in metrics if row.verdicts.get(m.name) == word]
+        names = [m.title for m in metrics if row.verdicts.get(m.name) == word]
         if names:
             parts.append(f"{phrase} a frozen first frame on {_join(names)}")
     return "; it ".join(parts)

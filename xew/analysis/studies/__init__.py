@@ -1,3 +1,3 @@
 """What a study is, which commands it takes, what of it is done, and where the rest runs."""
 
-__all__ = ["cell", "config", "cost", "ledger", "machines", "plan"]
+__all__ = ["config", "cost", "ledger", "machines", "plan", "step"]

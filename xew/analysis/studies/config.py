@@ -36,132 +36,149 @@ class Rates:
     """Measured speeds and sizes, from which the cost of a study is estimated before it starts."""
 
     measured_on: str
-    """The machine, and where the figures stand."""
+    """Machine that they were measured on, and where the figures stand."""
     episode_s: float
-    """Making one episode."""
+    """Time to make one episode."""
     encode_s: float
-    """Encoding one stream of one episode."""
+    """Time to encode one stream of one episode."""
     step_s: float
-    """One optimizer step of the experiment, on the GPUs that a training has."""
+    """Time of one optimizer step of the experiment, on the GPUs that a training has."""
     rollout_s: float
-    """Predicting one episode."""
+    """Time to predict one episode."""
     grade_s: float
-    """Grading one predicted episode."""
+    """Time to grade one predicted episode."""
     start_s: float
-    """From the start of a command to its first real work, compiling included."""
+    """Time from the start of a command to its first real work, compiling included."""
     episode_mb: float
+    """Size of one episode."""
     stream_mb: float
-    """One encoded stream of one episode."""
+    """Size of one encoded stream of one episode."""
     run_mb: float
-    """All checkpoints that a run keeps."""
+    """Size of all checkpoints that a run keeps."""
     rollout_mb: float
+    """Size of one predicted episode."""
     episode_frames: int = 178
-    """On average; 178 over all tasks."""
+    """Mean number of frames of an episode; 178 over all tasks."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What the cells of a study may use."""
+    """Devices that the steps of a study may use."""
 
     gpus: tuple[int, ...] | None = None
-    """Numbers of the GPUs, one cell on each; those that can be seen where left out; [] is none."""
+    """Numbers of the GPUs, one step on each; all visible ones where left out; [] is none."""
     workers: int = 1
-    """Cells at once where there is no GPU."""
+    """Number of steps at once where there is no GPU."""
     gpus_per_training: int = 1
-    """A training takes as many at once."""
+    """Number of GPUs that a training takes at once."""
     train_launcher: str = ""
-    """Put before a training's command, which then joins the processes that it starts (jax.distributed): srun --nodes=2."""
+    """Launcher put before a training's command, such as srun --nodes=2; the processes it starts join by jax.distributed."""
     ray: str | None = None
     """Address of a Ray cluster whose machines share this folder: auto, or host:port. Its resources are used instead."""
 
 
 @dataclass(frozen=True)
 class Study:
+    """What a study compares, and with what settings."""
+
     out: Path
-    """Everything of the study lies here."""
+    """Folder for everything of the study."""
     experiment: Path
-    """The config of xew.model that all variants are made from."""
+    """Config of xew.model that all variants are made from."""
     rates: Rates
+    """Measured speeds and sizes."""
     parts: tuple[str, ...] = PAPER_PARTS
     """Keys of protocol.PARTS: which tables."""
     variants: tuple[str, ...] = ()
-    """Only variants whose name matches one of these patterns (as `loeo_*`), and what they start from; all where left out."""
+    """Patterns: only variants whose name matches one of them (as `loeo_*`), and what they start from; all where left out."""
     tasks: tuple[str, ...] = ()
-    """All where left out."""
+    """Keys of tasks; all where left out."""
     robots: tuple[str, ...] = ROBOT_NAMES
+    """Keys of robots."""
     shots: tuple[int, ...] = SHOTS
-    """M of the adaptations."""
+    """Numbers of episodes of each task that models are adapted with (M)."""
     train_seeds: int = TRAIN_SEEDS_PER_TASK
+    """Number of training seeds of each task."""
     test_seeds: int = TEST_SEEDS_PER_TASK
+    """Number of test seeds of each task."""
     settings: Settings = field(default_factory=dict)
-    """Laid over the experiment for every variant."""
+    """Settings laid over the experiment for every variant."""
     adaptation: Settings = field(default_factory=dict)
-    """Laid over it for what is adapted."""
+    """Settings laid over it for adaptations."""
     remedies: dict[str, Settings] = field(
         default_factory=lambda: {"replay": {"adapt": {"replay": 0.25}}, "lora": {"adapt": {"lora_rank": 16}}}
     )
-    """Laid over it for an adaptation with replay or LoRA."""
+    """Settings laid over it for adaptations with replay or LoRA."""
     systems: dict[str, Settings] = field(default_factory=dict)
-    """Laid over it for another project's system."""
+    """Settings laid over it for another project's system."""
     generate: tuple[str, ...] = ()
-    """More arguments of `xew.sim_warp.generate`."""
+    """Further arguments of `xew.sim_warp.generate`."""
     evaluate: tuple[str, ...] = ()
-    """More arguments of `xew.metrics.evaluate`, such as --masks sam2."""
+    """Further arguments of `xew.metrics.evaluate`, such as --masks sam2."""
     distances: tuple[str, ...] = ()
-    """More arguments of `xew.analysis.distance`, which runs where the part loeo is planned."""
+    """Further arguments of `xew.analysis.distance`, which runs where the part loeo is planned."""
     environment: dict[str, str] = field(default_factory=dict)
-    """Variables set for every cell."""
+    """Environment variables set for every step."""
     data: Path | None = None
-    """Episodes; <out>/data where left out. What is missing in it is made."""
+    """Folder of the episodes; <out>/data where left out. What is missing in it is made."""
     machine: Machine = Machine()
+    """Devices to run on."""
 
     @property
     def data_folder(self) -> Path:
+        """Folder of the episodes."""
         return self.data or self.out / "data"
 
     @property
     def task_count(self) -> int:
+        """Number of tasks."""
         return len(self.tasks) or TASK_COUNT
 
     @property
-    def planned(self) -> tuple[Variant, ...]:
+    def planned_variants(self) -> tuple[Variant, ...]:
         """The variants of the study in the order of the tables, each once, and what they start from before them."""
-        chosen: dict[str, Variant] = {}
-        for variant in (variant for part in self.parts for variant in PARTS[part] if self._has(variant)):
+        found: dict[str, Variant] = {}
+        for variant in (variant for part in self.parts for variant in PARTS[part] if self._includes(variant)):
             if variant.start is not None:
-                chosen.setdefault(variant.start.name, variant.start)
-            chosen.setdefault(variant.name, variant)
-        return tuple(sorted(chosen.values(), key=lambda variant: variant.target is not None))
+                found.setdefault(variant.start.name, variant.start)
+            found.setdefault(variant.name, variant)
+        return tuple(sorted(found.values(), key=lambda variant: variant.target is not None))
 
-    def _has(self, variant: Variant) -> bool:
+    def _includes(self, variant: Variant) -> bool:
+        """Whether a variant of a part is one of this study."""
         named = not self.variants or any(fnmatch.fnmatch(variant.name, pattern) for pattern in self.variants)
         if variant.target is not None:
             return named and variant.target in self.robots and variant.shots in self.shots
         return named and any(robot in self.robots for robot in SPLITS[variant.split].held_out_robots)
 
-    def graded(self, variant: Variant) -> dict[str, int]:
-        """Episodes of each robot that a variant is graded on."""
+    def graded_counts(self, variant: Variant) -> dict[str, int]:
+        """Number of episodes of each robot that a variant is graded on."""
         return expected_counts(variant, self.task_count, self.test_seeds, self.robots)
 
-    def trained(self, variant: Variant) -> int:
-        """Episodes that a variant learns from."""
+    def training_count(self, variant: Variant) -> int:
+        """Number of episodes that a variant learns from."""
         return sum(training_counts(variant, self.task_count, self.train_seeds, self.robots).values())
 
 
 def load_study(path: Path, overrides: Iterable[str] = ()) -> Study:
-    """Read and check a study's config. Raises ConfigError with every choice that does not exist or does not fit."""
+    """Read a study's config, apply overrides and check it. Raises ConfigError as `check_study` does."""
     study = load(Study, path, list(overrides))
+    check_study(study, path)
+    return study
+
+
+def check_study(study: Study, path: Path) -> None:
+    """Raises ConfigError for a choice that does not exist or does not fit; `path` names the study's config."""
     _check_names(study, path)
-    if not study.planned:
+    if not study.planned_variants:
         raise ConfigError(f"{path}: no variant of the parts {', '.join(study.parts)} is left; widen variants, robots or shots.")
-    shots = max((variant.shots for variant in study.planned), default=0)
+    shots = max((variant.shots for variant in study.planned_variants), default=0)
     if study.train_seeds < max(shots, 1) or study.test_seeds < 1:
         raise ConfigError(
             f"{path}: {study.train_seeds} training and {study.test_seeds} test seeds; expected at least {max(shots, 1)} and 1."
         )
     if study.machine.workers < 1 or study.machine.gpus_per_training < 1:
         raise ConfigError(f"{path}: machine.workers and machine.gpus_per_training must be at least 1.")
-    return study
 
 
 def _check_names(study: Study, path: Path) -> None:
@@ -173,7 +190,7 @@ def _check_names(study: Study, path: Path) -> None:
         ("part", study.parts, tuple(PARTS)),
         ("robot", study.robots, ROBOT_NAMES),
         ("number of shots", shots, known_shots),
-        ("task", study.tasks, study.tasks),  # known: asked above, and may be of one's own
+        ("task", study.tasks, study.tasks),  # known: checked above, and may be outside tasks
     ):
         for name in names:
             if name not in known:
@@ -189,15 +206,15 @@ def _check_names(study: Study, path: Path) -> None:
             )
 
 
-def experiment_of(study: Study, variant: Variant) -> Settings:
-    """The experiment's config of one variant, plain as in a file."""
-    settings = merged(read_yaml(study.experiment), study.settings)
-    settings = merged(settings, study.systems.get(variant.system, {}))
+def build_experiment(study: Study, variant: Variant) -> Settings:
+    """The config of one variant's experiment, plain as in a file."""
+    settings = merge_settings(read_yaml(study.experiment), study.settings)
+    settings = merge_settings(settings, study.systems.get(variant.system, {}))
     if variant.start is not None:
-        settings = merged(settings, study.adaptation)
-        settings = merged(settings, study.remedies.get(variant.remedy, {}))
+        settings = merge_settings(settings, study.adaptation)
+        settings = merge_settings(settings, study.remedies.get(variant.remedy, {}))
         start = {"start_from": str(run_folder(study, variant.start)), "robots": [variant.target], "episodes": variant.shots}
-        settings = merged(settings, {"adapt": start})
+        settings = merge_settings(settings, {"adapt": start})
     given = {
         "data": str(study.data_folder),
         "out": str(run_folder(study, variant)),
@@ -205,17 +222,18 @@ def experiment_of(study: Study, variant: Variant) -> Settings:
         "split": variant.split,
         "model": {"action": variant.action, "embodiment": variant.embodiment},
     }
-    return merged(settings, given)
+    return merge_settings(settings, given)
 
 
 def run_folder(study: Study, variant: Variant) -> Path:
+    """Folder that the training of a variant writes."""
     return study.out / "runs" / variant.name
 
 
-def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> Settings:
-    """Nested settings, those above before those below."""
+def merge_settings(below: Mapping[str, Any], above: Mapping[str, Any]) -> Settings:
+    """Merge nested settings; where both have a key, `above` wins."""
     result = dict(below)
     for key, value in above.items():
         both = isinstance(value, Mapping) and isinstance(result.get(key), Mapping)
-        result[key] = merged(result[key], value) if both else value
+        result[key] = merge_settings(result[key], value) if both else value
     return result

@@ -1,8 +1,8 @@
-"""What of a study is done: a record of each cell beside its product, and the digest that says whether both still hold.
+"""The ledger of a study: a record of each step, and the digests that tell whether record and product still hold.
 
-<out>/state/<stage>/<variant>.json   key, status (begun, done, failed), outcome, seconds, host
+<out>/state/<kind>/<variant>.json   key, status (begun, done, failed), outcome, seconds, host
 
-A cell is done when its record says so, its key is that of the study as it is now (its inputs and what it was made from), and
+A step is done when its record says so, its key is that of the study as it is now (its inputs and what it was made from), and
 its product still has the outcome that was noted. Anything else is made again, from where it was left if the key is the same.
 """
 
@@ -15,91 +15,92 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from xew.analysis.studies.plan import Cell, key_of
+from xew.analysis.studies.plan import Step, step_key
 from xew.config import ConfigError
 from xew.dataset import find_accepted
 from xew.episode import EpisodeError
-from xew.files import replacing
+from xew.files import checkpoint_time, file_digest, replacing
 
 
 class Ledger:
-    """The records of a study's cells."""
+    """The records of a study's steps."""
 
     def __init__(self, out: Path) -> None:
         self.out = out
         self._outcomes: dict[str, str] = {}
 
     def outcome(self, name: str) -> str | None:
-        """Of a cell that was found done, or was done just now; None of others."""
+        """Digest of the product of a step that was found done or was done just now; None for others."""
         return self._outcomes.get(name)
 
-    def log(self, cell: Cell) -> Path:
-        return self.out / "logs" / f"{cell.name}.log"
+    def log(self, step: Step) -> Path:
+        """The file that a step's output goes to."""
+        return self.out / "logs" / f"{step.name}.log"
 
-    def record(self, cell: Cell) -> Mapping[str, Any]:
-        """What is noted of a cell; nothing if that was never begun or its record is damaged."""
+    def record(self, step: Step) -> Mapping[str, Any]:
+        """What is noted of a step; empty if it was never begun or its record is damaged."""
         try:
-            return json.loads(self._path(cell).read_text())
+            return json.loads(self._path(step).read_text())
         except (OSError, ValueError):
             return {}
 
-    def key(self, cell: Cell) -> str:
-        """Of a cell whose needs are done as far as they will be."""
-        return key_of(cell, [self.outcome(name) for name in cell.needs])
+    def key(self, step: Step) -> str:
+        """Key of a step whose needs are done as far as they will be."""
+        return step_key(step, [self.outcome(name) for name in step.needs])
 
-    def find_done(self, cell: Cell) -> bool:
-        """Whether a cell needs no work; its needs must have been asked before it."""
-        record = self.record(cell)
-        if record.get("status") != "done" or record["key"] != self.key(cell):
+    def find_done(self, step: Step) -> bool:
+        """Whether a step needs no work; the steps that it needs must have been looked at before."""
+        record = self.record(step)
+        if record.get("status") != "done" or record["key"] != self.key(step):
             return False
-        found = read_outcome(cell)
+        found = digest_product(step)
         if found is None or found != record["outcome"]:
             return False
-        self._outcomes[cell.name] = found
+        self._outcomes[step.name] = found
         return True
 
-    def begin(self, cell: Cell) -> bool:
-        """Note that a cell is being made; returns whether it goes on from what an earlier try left.
+    def begin(self, step: Step) -> bool:
+        """Note that a step is being made; returns whether it goes on from what an earlier try left.
 
         What was made from other inputs is removed where the command would take it for its own, and so is a run that was
         killed before its first checkpoint, perhaps in the middle of writing its config.
         """
-        key = self.key(cell)
-        goes_on = self.record(cell).get("key") == key
-        if cell.stage in ("train", "adapt"):
-            goes_on = goes_on and _of_run(cell.product) is not None
-        if not goes_on and cell.stage in ("train", "adapt", "rollout"):
-            shutil.rmtree(cell.product, ignore_errors=True)
-        self._write(cell, {"key": key, "status": "begun"})
+        key = self.key(step)
+        goes_on = self.record(step).get("key") == key
+        if step.kind in ("train", "adapt"):
+            goes_on = goes_on and _digest_run(step.product) is not None
+        if not goes_on and step.kind in ("train", "adapt", "rollout"):
+            shutil.rmtree(step.product, ignore_errors=True)
+        self._write(step, {"key": key, "status": "begun"})
         return goes_on
 
-    def finish(self, cell: Cell, exit_code: int, seconds: float) -> str:
-        """Note how a cell ended; returns '' or what was wrong."""
+    def finish(self, step: Step, exit_code: int, seconds: float) -> str:
+        """Note how a step ended; returns what was wrong, or ''."""
         error = "" if exit_code == 0 else f"exit status {exit_code}"
         found = None
         if not error:
             try:
-                found = read_outcome(cell)
-                error = "" if found else f"it made no {cell.product}"
+                found = digest_product(step)
+                error = "" if found else f"it made no {step.product}"
             except EpisodeError as wrong:
                 error = str(wrong)
         status = {"status": "failed", "error": error} if error else {"status": "done", "outcome": found}
-        self._write(cell, {"key": self.key(cell), **status, "seconds": round(seconds, 1), "host": socket.gethostname()})
+        self._write(step, {"key": self.key(step), **status, "seconds": round(seconds, 1), "host": socket.gethostname()})
         if found:
-            self._outcomes[cell.name] = found
+            self._outcomes[step.name] = found
         return error
 
-    def forget(self, cell: Cell) -> None:
-        """Make a cell undone, from nothing; of grades, also what a command would go on from (`scores/<variant>.*`)."""
-        self._path(cell).unlink(missing_ok=True)
-        for path in cell.product.parent.glob(f"{cell.product.stem}.*") if cell.stage == "evaluate" else ():
+    def forget(self, step: Step) -> None:
+        """Have a step made anew; of grades, also remove what a command would go on from (`scores/<variant>.*`)."""
+        self._path(step).unlink(missing_ok=True)
+        for path in step.product.parent.glob(f"{step.product.stem}.*") if step.kind == "evaluate" else ():
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
-    def _path(self, cell: Cell) -> Path:
-        return self.out / "state" / f"{cell.name}.json"
+    def _path(self, step: Step) -> Path:
+        return self.out / "state" / f"{step.name}.json"
 
-    def _write(self, cell: Cell, record: Mapping[str, Any]) -> None:
-        path = self._path(cell)
+    def _write(self, step: Step, record: Mapping[str, Any]) -> None:
+        path = self._path(step)
         try:
             with replacing(path) as temporary:
                 temporary.write_text(json.dumps({**record, "at": time.strftime("%Y-%m-%d %H:%M:%S")}, indent=1) + "\n")
@@ -107,12 +108,13 @@ class Ledger:
             raise ConfigError(f"cannot write {path}: {error}. Free some space, or choose another --out.") from error
 
 
-def read_outcome(cell: Cell) -> str | None:
-    """A digest of what a cell has made, or None if it is not there. Quick: videos and weights are not read."""
-    return _OUTCOMES[cell.stage](cell.product)
+def digest_product(step: Step) -> str | None:
+    """A digest of what a step has made, or None if it is not there. Quick: videos and weights are not read."""
+    return _DIGESTS[step.kind](step.product)
 
 
-def _of_episodes(data: Path) -> str | None:
+def _digest_episodes(data: Path) -> str | None:
+    """Digest of the hashes of all accepted episodes."""
     if not data.is_dir():
         return None
     try:
@@ -122,33 +124,30 @@ def _of_episodes(data: Path) -> str | None:
     return _digest([[r.task, r.seed, r.robot, sorted(r.hashes.items())] for _, r in accepted])
 
 
-def _of_run(run: Path) -> str | None:
-    """Which training a run's latest checkpoint came from: its step and when that was begun."""
+def _digest_run(run: Path) -> str | None:
+    """Digest of a run's latest checkpoint: its step and the time when it was begun."""
     steps = [path for path in (run / "checkpoints").glob("*") if path.name.isdecimal()]
     if not steps:
         return None
     latest = max(steps, key=lambda path: int(path.name))
-    try:
-        begun = json.loads((latest / "_CHECKPOINT_METADATA").read_text())["init_timestamp_nsecs"]
-    except (OSError, ValueError, KeyError):
-        return None
-    return _digest([latest.name, begun])
+    begun = checkpoint_time(run, int(latest.name))
+    return None if begun is None else _digest([latest.name, begun])
 
 
-def _of_rollouts(root: Path) -> str | None:
-    """Headers, names and sizes: a video is lossless, and its header says what it was made from."""
+def _digest_rollouts(root: Path) -> str | None:
+    """Digest of headers, names and sizes: a video is lossless, and its header says what it was made from."""
     files = sorted(path for path in root.glob("*/*/*/*") if path.is_file() and not path.parent.name.startswith("."))
     if not files:
         return None
     return _digest([[str(f.relative_to(root)), f.stat().st_size, f.read_text() if f.suffix == ".json" else ""] for f in files])
 
 
-def _of_file(path: Path) -> str | None:
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16] if path.is_file() else None
+def _digest_file(path: Path) -> str | None:
+    return file_digest(path)[:16] if path.is_file() else None
 
 
-def _of_folder(path: Path) -> str | None:
-    """Of the latent cache, whose files name themselves what they were made from; training says so if one is missing."""
+def _digest_folder(path: Path) -> str | None:
+    """A constant for the latent cache, whose files carry what they were made from in their names."""
     return "there" if path.is_dir() else None
 
 
@@ -156,13 +155,13 @@ def _digest(content: Any) -> str:
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
-_OUTCOMES: dict[str, Callable[[Path], str | None]] = {
-    "generate": _of_episodes,
-    "latents": _of_folder,
-    "train": _of_run,
-    "adapt": _of_run,
-    "rollout": _of_rollouts,
-    "evaluate": _of_file,
-    "distances": _of_file,
-    "analyse": _of_file,
+_DIGESTS: dict[str, Callable[[Path], str | None]] = {
+    "generate": _digest_episodes,
+    "latents": _digest_folder,
+    "train": _digest_run,
+    "adapt": _digest_run,
+    "rollout": _digest_rollouts,
+    "evaluate": _digest_file,
+    "distances": _digest_file,
+    "analyse": _digest_file,
 }

@@ -1,4 +1,4 @@
-"""Where the cells of a study run: on the GPUs (or cores) of this machine, or on a Ray cluster.
+"""Where the steps of a study run: on the GPUs (or cores) of this machine, or on a Ray cluster.
 
 Both start the same commands as processes of their own, with their output in the same logs. A cluster's machines must see the
 study's folder at the same path.
@@ -17,46 +17,50 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Protocol
 
-from xew.analysis.studies.cell import start_cell
 from xew.analysis.studies.config import Study
-from xew.analysis.studies.plan import Cell
+from xew.analysis.studies.plan import Step
+from xew.analysis.studies.processes import start_step
 from xew.config import ConfigError
 
 PATIENCE_S = 120.0
-"""How long cells may take to end after they were asked to; training saves in that time."""
+"""Time that steps have to end after they were asked to [s]; training saves in that time."""
 
 
 class Machines(Protocol):
-    """What the study's loop asks for."""
+    """Where steps can run, as the study's loop uses it."""
 
     slots: int
-    """Cells of one GPU (or core) at once; 0 where it is not known."""
+    """Number of steps of one GPU (or core) that can run at once; 0 where it is not known."""
 
-    def room_for(self, cell: Cell) -> bool: ...
+    def has_room_for(self, step: Step) -> bool:
+        """Whether a step can be started now."""
+        ...
 
-    def start(self, cell: Cell, command: tuple[str, ...], log: Path) -> None: ...
+    def start(self, step: Step, command: tuple[str, ...], log: Path) -> None:
+        """Start a step's command, its output appended to `log`."""
+        ...
 
     def wait(self) -> list[tuple[str, int]]:
-        """Names and exit codes of cells that have ended, at least one."""
+        """Names and exit codes of steps that have ended, at least one."""
         ...
 
     def stop(self) -> None:
-        """Ask all cells to end and wait for them."""
+        """Ask all steps to end and wait for them."""
         ...
 
 
 def open_machines(study: Study) -> Machines:
-    """Those that the config names. Raises ConfigError if they are not there or too small."""
+    """The machines that the config names. Raises ConfigError if they are not there or too small."""
     if study.machine.ray:
         return RayCluster(study.machine.ray, study.environment)
-    gpus = gpus_of(study)
+    gpus = usable_gpus(study)
     needed = study.machine.gpus_per_training
     if gpus and needed > len(gpus):
         raise ConfigError(f"machine.gpus_per_training is {needed}, there are {len(gpus)} GPUs ({', '.join(gpus)}); lower it.")
     return ThisMachine(gpus, study.machine.workers, study.environment)
 
 
-def gpus_of(study: Study) -> tuple[str, ...]:
+def usable_gpus(study: Study) -> tuple[str, ...]:
     """The GPUs of this machine that a study may use, as CUDA_VISIBLE_DEVICES names them."""
     return visible_gpus() if study.machine.gpus is None else tuple(map(str, study.machine.gpus))
 
@@ -64,10 +68,10 @@ def gpus_of(study: Study) -> tuple[str, ...]:
 def visible_gpus() -> tuple[str, ...]:
     """NVIDIA's GPUs that this process may use."""
     try:
-        told = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=True).stdout
+        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=True).stdout
     except (OSError, subprocess.CalledProcessError):
         return ()
-    count = len([line for line in told.splitlines() if line.startswith("GPU ")])
+    count = len([line for line in listed.splitlines() if line.startswith("GPU ")])
     limited = os.environ.get("CUDA_VISIBLE_DEVICES")
     return tuple(map(str, range(count))) if limited is None else tuple(part for part in limited.split(",") if part)
 
@@ -79,7 +83,7 @@ class _Running:
 
 
 class ThisMachine:
-    """GPU by GPU; without one, as many cells at once as there are workers."""
+    """This machine: one step per GPU, or without a GPU as many steps at once as there are workers."""
 
     def __init__(self, gpus: tuple[str, ...], workers: int, environment: Mapping[str, str]) -> None:
         self.gpus, self.environment = gpus, dict(environment)
@@ -88,18 +92,18 @@ class ThisMachine:
         self._running: dict[str, _Running] = {}
         os.environ.update(environment)  # the fork server imports JAX, which reads some of it then
 
-    def room_for(self, cell: Cell) -> bool:
-        return self._needed(cell) <= len(self._free)
+    def has_room_for(self, step: Step) -> bool:
+        return self._count_slots(step) <= len(self._free)
 
-    def _needed(self, cell: Cell) -> int:
-        """Slots; without GPUs every cell takes one."""
-        return max(1, cell.gpus) if self.gpus else 1
+    def _count_slots(self, step: Step) -> int:
+        """Number of slots that a step takes; without GPUs every step takes one."""
+        return max(1, step.gpus) if self.gpus else 1
 
-    def start(self, cell: Cell, command: tuple[str, ...], log: Path) -> None:
-        slots = tuple(self._free.pop(0) for _ in range(self._needed(cell)))
+    def start(self, step: Step, command: tuple[str, ...], log: Path) -> None:
+        slots = tuple(self._free.pop(0) for _ in range(self._count_slots(step)))
         own = {"CUDA_VISIBLE_DEVICES": ",".join(slots)} if self.gpus else {}
-        process = start_cell(command, log, self.environment | own, launcher=cell.launcher)
-        self._running[cell.name] = _Running(process, slots)
+        process = start_step(command, log, self.environment | own, launcher=step.launcher)
+        self._running[step.name] = _Running(process, slots)
 
     def wait(self) -> list[tuple[str, int]]:
         multiprocessing.connection.wait([running.process.sentinel for running in self._running.values()])
@@ -123,7 +127,7 @@ class ThisMachine:
 
 
 class RayCluster:
-    """Every cell a task on an existing cluster; more machines may join it while the study runs."""
+    """An existing Ray cluster, on which every step is a task; more machines may join while the study runs."""
 
     def __init__(self, address: str, environment: Mapping[str, str]) -> None:
         try:
@@ -139,16 +143,16 @@ class RayCluster:
         self.slots = self._gpus or int(ray.cluster_resources().get("CPU", 1))
         self._running: dict[Any, str] = {}
 
-    def room_for(self, cell: Cell) -> bool:
-        """Ray itself lets tasks wait for room."""
+    def has_room_for(self, step: Step) -> bool:
+        """True always, since Ray itself lets tasks wait for room."""
         return True
 
-    def start(self, cell: Cell, command: tuple[str, ...], log: Path) -> None:
+    def start(self, step: Step, command: tuple[str, ...], log: Path) -> None:
         # A machine that is lost is made up for elsewhere: the same command goes on from what is on disk.
-        options: dict[str, Any] = {"num_cpus": 1, "num_gpus": cell.gpus if self._gpus else 0, "max_retries": 2}
+        options: dict[str, Any] = {"num_cpus": 1, "num_gpus": step.gpus if self._gpus else 0, "max_retries": 2}
         task = self._ray.remote(_run_on_ray).options(**options)
-        reference = task.remote(command, str(log.absolute()), self.environment, cell.launcher, str(Path.cwd()))
-        self._running[reference] = cell.name
+        reference = task.remote(command, str(log.absolute()), self.environment, step.launcher, str(Path.cwd()))
+        self._running[reference] = step.name
 
     def wait(self) -> list[tuple[str, int]]:
         ready, _ = self._ray.wait(list(self._running), num_returns=1)
@@ -163,14 +167,14 @@ class RayCluster:
         return ended
 
     def stop(self) -> None:
-        """Its tasks' processes notice that their parents have gone, and save."""
+        """Leave the cluster; the processes of its tasks notice that their parents have gone, and save."""
         self._ray.shutdown()
 
 
 def _run_on_ray(command: tuple[str, ...], log: str, environment: dict[str, str], launcher: tuple[str, ...], folder: str) -> int:
-    """In a Ray worker: the command in a process of its own, from the study's working folder."""
+    """Run a command in a process of its own from the study's working folder; called in a Ray worker."""
     os.chdir(folder)
     os.environ.update(environment)
-    process = start_cell(command, Path(log), environment, method="spawn", launcher=launcher)
+    process = start_step(command, Path(log), environment, method="spawn", launcher=launcher)
     process.join()
     return process.exitcode if process.exitcode is not None else -signal.SIGKILL

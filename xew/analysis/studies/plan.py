@@ -1,4 +1,4 @@
-"""The graph of a study: every command that it takes, what each needs first, and what each depends on.
+"""The graph of a study: every step that it takes, what each needs first, and what each depends on.
 
 generate -> latents -> train -> rollout -> evaluate -> analyse
                          |__ latents -> adapt -> rollout -> evaluate __|
@@ -18,67 +18,70 @@ from typing import Any
 import yaml
 
 import xew
-from xew.analysis.studies.config import Settings, Study, experiment_of, run_folder
+from xew.analysis.studies.config import Settings, Study, build_experiment, run_folder
 from xew.episode import SCHEMA_VERSION
 from xew.protocol import Variant
 
-STAGES = ("generate", "latents", "train", "adapt", "rollout", "evaluate", "distances", "analyse")
+KINDS = ("generate", "latents", "train", "adapt", "rollout", "evaluate", "distances", "analyse")
+"""Kinds of steps, in the order of the work."""
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One command of a study."""
+class Step:
+    """One command of a study, with what it needs and what it makes."""
 
-    stage: str
-    """One of STAGES."""
+    kind: str
+    """One of KINDS."""
     variant: str
-    """Name of a variant; empty where it is for all."""
+    """Name of a variant; empty for a step that serves all."""
     command: tuple[str, ...]
     """Module and arguments."""
     needs: tuple[str, ...]
-    """Names of the cells before it."""
+    """Names of the steps before it."""
     inputs: Any
-    """What its result depends on beside theirs, as plain JSON."""
+    """Inputs that its result depends on beside the results of those steps, as plain JSON."""
     product: Path
     """File or folder that it makes."""
     gpus: int = 1
+    """Number of GPUs that it takes at once."""
     launcher: tuple[str, ...] = ()
+    """Program and arguments that start the command, if any."""
 
     @property
     def name(self) -> str:
-        return f"{self.stage}/{self.variant}" if self.variant else self.stage
+        return f"{self.kind}/{self.variant}" if self.variant else self.kind
 
 
-def plan(study: Study) -> dict[str, Cell]:
-    """All cells of a study by name, each after those that it needs."""
-    experiments = {variant.name: experiment_of(study, variant) for variant in study.planned}
-    cells = [_generate(study)]
+def plan(study: Study) -> dict[str, Step]:
+    """All steps of a study by name, each after those that it needs."""
+    experiments = {variant.name: build_experiment(study, variant) for variant in study.planned_variants}
+    steps = [_plan_generate(study)]
     firsts: dict[str, str] = {}
-    for number, variant in enumerate(study.planned):
+    for number, variant in enumerate(study.planned_variants):
         experiment = experiments[variant.name]
         first = firsts.setdefault(variant.split, f"latents/{variant.name}")
-        cells += [
-            _latents(study, variant, experiment, first),
-            _train(study, variant, experiment),
-            _rollout(study, variant, experiment),
-            _evaluate(study, variant, baselines=number == 0),
+        steps += [
+            _plan_latents(study, variant, experiment, first),
+            _plan_train(study, variant, experiment),
+            _plan_rollout(study, variant, experiment),
+            _plan_evaluate(study, variant, baselines=number == 0),
         ]
     if "loeo" in study.parts:
-        cells.append(_distances(study))
-    cells.append(_analyse(study, tuple(cell.name for cell in cells if cell.stage in ("evaluate", "distances"))))
-    return {cell.name: cell for cell in cells}
+        steps.append(_plan_distances(study))
+    steps.append(_plan_analyse(study, tuple(step.name for step in steps if step.kind in ("evaluate", "distances"))))
+    return {step.name: step for step in steps}
 
 
-def in_order(cells: Mapping[str, Cell]) -> list[Cell]:
-    """Cells, each after those that it needs."""
-    return [cells[name] for name in TopologicalSorter({name: cell.needs for name, cell in cells.items()}).static_order()]
+def sort_steps(steps: Mapping[str, Step]) -> list[Step]:
+    """The steps in an order in which each comes after those that it needs."""
+    return [steps[name] for name in TopologicalSorter({name: step.needs for name, step in steps.items()}).static_order()]
 
 
 def write_configs(study: Study) -> dict[str, Path]:
     """Write every variant's config where its commands read it; returns those that are new or changed."""
     changed = {}
-    for variant in study.planned:
-        path, text = _config(study, variant), yaml.safe_dump(experiment_of(study, variant), sort_keys=False)
+    for variant in study.planned_variants:
+        path, text = _config_path(study, variant), yaml.safe_dump(build_experiment(study, variant), sort_keys=False)
         if not path.exists() or path.read_text() != text:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text)
@@ -86,22 +89,22 @@ def write_configs(study: Study) -> dict[str, Path]:
     return changed
 
 
-def _config(study: Study, variant: Variant) -> Path:
+def _config_path(study: Study, variant: Variant) -> Path:
     return study.out / "configs" / f"{variant.name}.yaml"
 
 
-def _rollouts(study: Study, variant: str) -> Path:
+def _rollouts_path(study: Study, variant: str) -> Path:
     return study.out / "rollouts" / variant
 
 
-def _scores(study: Study, variant: str) -> Path:
+def _scores_path(study: Study, variant: str) -> Path:
     return study.out / "scores" / f"{variant}.parquet"
 
 
-def _generate(study: Study) -> Cell:
+def _plan_generate(study: Study) -> Step:
     tasks = ("--tasks", *study.tasks) if study.tasks else ()
     seeds = ("--train-seeds", str(study.train_seeds), "--test-seeds", str(study.test_seeds))
-    return Cell(
+    return Step(
         "generate",
         "",
         ("xew.sim_warp.generate", "--out", str(study.data_folder), *tasks, "--robots", *study.robots, *seeds, *study.generate),
@@ -111,110 +114,116 @@ def _generate(study: Study) -> Cell:
     )
 
 
-def _latents(study: Study, variant: Variant, experiment: Settings, first: str) -> Cell:
+def _plan_latents(study: Study, variant: Variant, experiment: Settings, first: str) -> Step:
     name = f"latents/{variant.name}"
     # Streams that variants of a split share are encoded by the first of them; an adaptation has its start's codec.
-    before = (_training(variant.start),) if variant.start is not None else () if first == name else (first,)
-    return Cell(
+    before = (_training_name(variant.start),) if variant.start is not None else () if first == name else (first,)
+    return Step(
         "latents",
         variant.name,
-        ("xew.model.latents", str(_config(study, variant))),
+        ("xew.model.latents", str(_config_path(study, variant))),
         needs=("generate", *before),
-        inputs=_of_training(experiment),
+        inputs=_training_inputs(experiment),
         product=study.out / "latents",
     )
 
 
-def _training(variant: Variant) -> str:
+def _training_name(variant: Variant) -> str:
     return f"{'train' if variant.target is None else 'adapt'}/{variant.name}"
 
 
-def _train(study: Study, variant: Variant, experiment: Settings) -> Cell:
+def _plan_train(study: Study, variant: Variant, experiment: Settings) -> Step:
     joins = ("--distributed",) if study.machine.train_launcher else ()
-    before = (_training(variant.start),) if variant.start is not None else ()
-    return Cell(
-        _training(variant).partition("/")[0],
+    before = (_training_name(variant.start),) if variant.start is not None else ()
+    return Step(
+        _training_name(variant).partition("/")[0],
         variant.name,
-        ("xew.model.train", str(_config(study, variant)), *joins),
+        ("xew.model.train", str(_config_path(study, variant)), *joins),
         needs=(f"latents/{variant.name}", *before),
-        inputs=_of_training(experiment),
+        inputs=_training_inputs(experiment),
         product=run_folder(study, variant),
         gpus=study.machine.gpus_per_training,
         launcher=tuple(shlex.split(study.machine.train_launcher)),
     )
 
 
-def _rollout(study: Study, variant: Variant, experiment: Settings) -> Cell:
-    run, out, robots = run_folder(study, variant), _rollouts(study, variant.name), tuple(study.graded(variant))
+def _plan_rollout(study: Study, variant: Variant, experiment: Settings) -> Step:
+    run, out, robots = run_folder(study, variant), _rollouts_path(study, variant.name), tuple(study.graded_counts(variant))
     settings = {key: value for key, value in experiment.get("rollout", {}).items() if value is not None}
     flags = tuple(text for key, value in settings.items() for text in (f"--rollout.{key.replace('_', '-')}", str(value)))
-    return Cell(
+    return Step(
         "rollout",
         variant.name,
         ("xew.model.rollout", str(run), "--data", str(study.data_folder), "--robots", *robots, "--out", str(out), *flags),
-        needs=("generate", _training(variant)),
+        needs=("generate", _training_name(variant)),
         inputs=[settings, robots],
         product=out,
     )
 
 
-def _evaluate(study: Study, variant: Variant, baselines: bool) -> Cell:
-    """The first variant is of all robots, so the baselines stand beside its rows and not again beside the others'."""
-    out = _scores(study, variant.name)
+def _plan_evaluate(study: Study, variant: Variant, baselines: bool) -> Step:
+    """Grading of a variant. The first one covers all robots, so the baselines are graded with it and with no other."""
+    out = _scores_path(study, variant.name)
     given = ("--data", str(study.data_folder), "--out", str(out))
     asked = ("--baselines" if baselines else "--no-baselines", *study.evaluate)
-    return Cell(
+    return Step(
         "evaluate",
         variant.name,
-        ("xew.metrics.evaluate", str(_rollouts(study, variant.name)), *given, *asked),
+        ("xew.metrics.evaluate", str(_rollouts_path(study, variant.name)), *given, *asked),
         needs=("generate", f"rollout/{variant.name}"),
-        inputs=[asked, source_digest("metrics")],
+        inputs=[asked, source_digest("metrics", "statistics")],
         product=out,
     )
 
 
-def _distances(study: Study) -> Cell:
-    """Of the robots as they are drawn here, which the errors of the LOEO folds are held against."""
+def _plan_distances(study: Study) -> Step:
+    """Distances of the robots as they are rendered here, with which the errors of the LOEO folds are correlated."""
     folder = study.out / "distances"
-    return Cell(
+    return Step(
         "distances",
         "",
         ("xew.analysis.distance", "--out", str(folder), *study.distances),
         needs=(),
-        inputs=[study.distances, source_digest("analysis")],
+        inputs=[study.distances, source_digest("analysis", "statistics")],
         product=folder / "distances.csv",
     )
 
 
-def _analyse(study: Study, needs: tuple[str, ...]) -> Cell:
-    """The names of the variants that have been graded are added to its command when it starts."""
-    return Cell(
+def _plan_analyse(study: Study, needs: tuple[str, ...]) -> Step:
+    """The analysis; the names of the variants that have been graded are added to its command when it starts."""
+    return Step(
         "analyse",
         "",
         ("xew.analysis.study_analyse", str(study.out)),
         needs=needs,
-        inputs=[[asdict(variant) for variant in study.planned], source_digest("analysis")],
+        inputs=[[asdict(variant) for variant in study.planned_variants], source_digest("analysis", "statistics")],
         product=study.out / "report" / "index.html",
         gpus=0,
     )
 
 
-def _of_training(experiment: Settings) -> Settings:
-    """What a trained network depends on: not where things lie, nor how it is rolled out."""
+def _training_inputs(experiment: Settings) -> Settings:
+    """Settings that a trained network depends on: not where things lie, nor how it is rolled out."""
     kept = {key: value for key, value in experiment.items() if key not in ("data", "out", "cache", "mesh", "rollout")}
     adapt = {key: value for key, value in experiment.get("adapt", {}).items() if key != "start_from"}
     return kept | {"adapt": adapt, "xew": xew.__version__}
 
 
 @cache
-def source_digest(room: str) -> str:
-    """Of a room's source: what is quickly done again is done again when its code changes, as grading and the report."""
-    folders = sorted(Path(path, room) for path in xew.__path__)
-    content = [file.read_bytes() for folder in folders for file in sorted(folder.glob("*")) if file.is_file()]
-    return hashlib.sha256(b"\0".join(content)).hexdigest()[:16]
+def source_digest(*rooms: str) -> str:
+    """Digest of all files of some rooms, at any depth.
+
+    Steps that are quickly made again, such as grading and the report, depend on the code; the others do not.
+    """
+    content = hashlib.sha256()
+    for root in map(Path, xew.__path__):
+        for path in sorted(path for room in rooms for path in Path(root, room).rglob("*")):
+            if path.is_file() and "__pycache__" not in path.parts:
+                content.update(f"{path.relative_to(root).as_posix()}\0".encode() + path.read_bytes() + b"\0")
+    return content.hexdigest()[:16]
 
 
-def key_of(cell: Cell, outcomes: Sequence[str | None]) -> str:
-    """Digest of all that a cell's result depends on: its own inputs and the outcomes of what it needs."""
-    content = json.dumps([cell.name, cell.inputs, list(outcomes)], sort_keys=True, default=str)
+def step_key(step: Step, outcomes: Sequence[str | None]) -> str:
+    """Digest of all that a step's result depends on: its own inputs and the outcomes of what it needs."""
+    content = json.dumps([step.name, step.inputs, list(outcomes)], sort_keys=True, default=str)
     return hashlib.sha256(content.encode()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""Stage 11 of 11: tables of distance between robots, and of how it goes with scores, in the paper's layouts.
+"""Tables of distance between robots, and of how it goes with scores, in the paper's layouts.
 
 Distances are those that `python -m xew.analysis.distance` wrote; without them the paper's printed ones stand in, and say so.
 """
@@ -11,10 +11,11 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.correlation import Correlation, dof_correlation, loeo_correlation
-from xew.analysis.paper import AXES, Paper
+from xew.analysis.paper import AXES, PAPER_TITLES, Paper
 from xew.analysis.statistics.grades import Grades
-from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
-from xew.analysis.tables.layouts import PAPER_METRICS, SHORT_ROBOTS, Block, Cell, Column, Row, Table
+from xew.analysis.statistics.summary import ROBOT_TITLES
+from xew.analysis.tables.labels import PAPER_METRICS, SHORT_ROBOTS
+from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection
 from xew.config import ConfigError
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES
 
@@ -133,7 +134,7 @@ def correlation_table(grades: Grades, distances: Distances, paper: Paper) -> Tab
     """The paper's layout: r and leave-one-out range for each of its axes, then r with the number of joints."""
     found = correlate(grades, distances)
 
-    def row(metric: str) -> Row:
+    def row(metric: str) -> TableRow:
         cells = []
         for axis in AXES:
             result, printed = found.get((metric, axis)), getattr(paper.metrics[metric], axis)
@@ -144,7 +145,7 @@ def correlation_table(grades: Grades, distances: Distances, paper: Paper) -> Tab
         scores = _loeo_scores(grades, metric)
         dof = [dof_correlation(distances.of("dof").tolist(), scores, grades.metrics[metric].higher_is_better)] if scores else []
         cells.append(_signed_cell(dof, [paper.metrics[metric].dof_r]))
-        return Row((METRIC_TITLES[metric],), tuple(cells))
+        return TableRow((PAPER_TITLES[metric],), tuple(cells))
 
     columns = [Column(title, AXIS_TITLES[axis]) for axis in AXES for title in ("Pearson r", "leave one out")]
     shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
@@ -152,10 +153,11 @@ def correlation_table(grades: Grades, distances: Distances, paper: Paper) -> Tab
         "correlations",
         "Correlation of distance with scores",
         "r of each robot's mean distance with its score when it was held out, and its range when one robot is left out. "
-        f"Positive: farther is worse. LPIPS is the paper's primary outcome, all else exploratory.{_standing_in(distances)}",
+        f"Positive: farther is worse. LPIPS is the paper's primary outcome, all else exploratory."
+        f"{_note_printed_distances(distances)}",
         ("metric",),
         (*columns, Column("DoF r")),
-        (Block("", tuple(row(metric) for metric in shown), _missing_folds(grades, shown)),),
+        (TableSection("", tuple(row(metric) for metric in shown), _note_missing_folds(grades, shown)),),
     )
 
 
@@ -165,17 +167,17 @@ def own_correlation_tables(grades: Grades, distances: Distances) -> list[Table]:
     own = [axis for axis in distances.axes if axis not in AXES]
     shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
 
-    def row(metric: str) -> Row:
-        cells: list[Cell] = []
+    def row(metric: str) -> TableRow:
+        cells: list[TableCell] = []
         for axis in own:
             result = found.get((metric, axis))
-            p = Cell(f"{result.p_value:.3f}", value=result.p_value) if result else Cell()
+            p = TableCell(f"{result.p_value:.3f}", value=result.p_value) if result else TableCell()
             cells += [
                 _signed_cell([result.r] if result else [], []),
                 _signed_cell([result.low, result.high] if result else [], []),
                 p,
             ]
-        return Row((METRIC_TITLES[metric],), tuple(cells))
+        return TableRow((PAPER_TITLES[metric],), tuple(cells))
 
     table = Table(
         "correlations_own",
@@ -183,7 +185,7 @@ def own_correlation_tables(grades: Grades, distances: Distances) -> list[Table]:
         "r, its range when one robot is left out, and the exact two-sided p over all 120 pairings. Positive: farther is worse.",
         ("metric",),
         tuple(Column(title, AXIS_TITLES[axis]) for axis in own for title in ("Pearson r", "leave one out", "p")),
-        (Block("", tuple(row(metric) for metric in shown), _missing_folds(grades, shown)),),
+        (TableSection("", tuple(row(metric) for metric in shown), _note_missing_folds(grades, shown)),),
     )
     return [table] if own else []
 
@@ -192,22 +194,22 @@ def certainty_table(grades: Grades, distances: Distances, paper: Paper) -> Table
     """What five points can say: exact p, Spearman, bootstrap over robots, stability of the sign."""
     found = correlate(grades, distances)
 
-    def row(metric: str) -> Row:
-        cells: list[Cell] = []
+    def row(metric: str) -> TableRow:
+        cells: list[TableCell] = []
         for axis in AXES:
             result, printed = found.get((metric, axis)), getattr(paper.metrics[metric], axis).p_value
-            p = Cell(published=f"{printed:.3f}" if printed else "", printed=printed or np.nan)
+            p = TableCell(published=f"{printed:.3f}" if printed else "", printed=printed or np.nan)
             if result is None:
-                cells += [p, Cell(), Cell(), Cell()]
+                cells += [p, TableCell(), TableCell(), TableCell()]
                 continue
-            spread = f"{signed(result.bootstrap_low)} to {signed(result.bootstrap_high)}"
+            spread = f"{format_signed(result.bootstrap_low)} to {format_signed(result.bootstrap_high)}"
             cells += [
-                Cell(f"{result.p_value:.3f}", published=p.published, printed=p.printed, value=result.p_value),
-                Cell(signed(result.spearman), value=result.spearman),
-                Cell(spread, value=result.r, low=result.bootstrap_low, high=result.bootstrap_high),
-                Cell("stable" if result.stable else "unstable", value=float(result.stable)),
+                TableCell(f"{result.p_value:.3f}", published=p.published, printed=p.printed, value=result.p_value),
+                TableCell(format_signed(result.spearman), value=result.spearman),
+                TableCell(spread, value=result.r, low=result.bootstrap_low, high=result.bootstrap_high),
+                TableCell("stable" if result.stable else "unstable", value=float(result.stable)),
             ]
-        return Row((METRIC_TITLES[metric],), tuple(cells))
+        return TableRow((PAPER_TITLES[metric],), tuple(cells))
 
     shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
     heads = ("exact p", "Spearman ρ", "bootstrap of r", "sign")
@@ -215,14 +217,14 @@ def certainty_table(grades: Grades, distances: Distances, paper: Paper) -> Table
         "certainty",
         "How certain that is",
         "p is two-sided over all 120 pairings; ρ and the 95 % bootstrap over robots are ours; the sign is stable where it "
-        f"survives leaving out any one robot.{_standing_in(distances)}",
+        f"survives leaving out any one robot.{_note_printed_distances(distances)}",
         ("metric",),
         tuple(Column(head, AXIS_TITLES[axis]) for axis in AXES for head in heads),
-        (Block("", tuple(row(metric) for metric in shown), _missing_folds(grades, shown)),),
+        (TableSection("", tuple(row(metric) for metric in shown), _note_missing_folds(grades, shown)),),
     )
 
 
-def signed(value: float) -> str:
+def format_signed(value: float) -> str:
     return f"{value:+z.3f}".replace("-", "−")
 
 
@@ -233,7 +235,7 @@ def _loeo_scores(grades: Grades, metric: str) -> list[float] | None:
     return values if len(values) == len(ROBOT_NAMES) and varies else None
 
 
-def _missing_folds(grades: Grades, metrics: Sequence[str]) -> str:
+def _note_missing_folds(grades: Grades, metrics: Sequence[str]) -> str:
     missing = [
         ROBOT_TITLES[robot]
         for robot in ROBOT_NAMES
@@ -242,15 +244,15 @@ def _missing_folds(grades: Grades, metrics: Sequence[str]) -> str:
     return f"Incomplete: all five folds are needed, not run: {', '.join(missing)}." if missing else ""
 
 
-def _standing_in(distances: Distances) -> str:
+def _note_printed_distances(distances: Distances) -> str:
     return "" if distances.measured else " Distances are the paper's printed ones."
 
 
-def _signed_cell(ours: Sequence[float], printed: Sequence[float]) -> Cell:
+def _signed_cell(ours: Sequence[float], printed: Sequence[float]) -> TableCell:
     """One figure, or the two ends of a range."""
-    return Cell(
-        " to ".join(map(signed, ours)) or "–",
-        published=" to ".join(map(signed, printed)),
+    return TableCell(
+        " to ".join(map(format_signed, ours)) or "–",
+        published=" to ".join(map(format_signed, printed)),
         value=ours[0] if len(ours) == 1 else np.nan,
         low=ours[0] if len(ours) == 2 else np.nan,
         high=ours[-1] if len(ours) == 2 else np.nan,
@@ -261,27 +263,30 @@ def _signed_cell(ours: Sequence[float], printed: Sequence[float]) -> Cell:
 def _robot_table(distances: Distances, name: str, title: str, caption: str, features: Mapping[str, str]) -> Table:
     records = {(row["robot"], row["feature"]): row for row in distances.robots.to_dict("records")}
 
-    def row(robot: str) -> Row:
-        return Row((ROBOT_TITLES[robot],), tuple(_cell(records.get((robot, feature)), feature) for feature in features))
+    def row(robot: str) -> TableRow:
+        cells = (_distance_cell(records.get((robot, feature)), feature) for feature in features)
+        return TableRow((ROBOT_TITLES[robot],), tuple(cells))
 
     seen = tuple(row(robot) for robot in ROBOT_NAMES if robot not in HELD_OUT_ROBOTS)
     held_out = tuple(row(robot) for robot in HELD_OUT_ROBOTS)
     columns = tuple(Column(head) for head in features.values())
-    return Table(name, title, caption, ("robot",), columns, (Block("Seen", seen), Block("Held out", held_out)))
+    return Table(name, title, caption, ("robot",), columns, (TableSection("Seen", seen), TableSection("Held out", held_out)))
 
 
 def _matrix_table(distances: Distances, origin: str) -> Table:
-    def block(axis: str) -> Block:
+    def section(axis: str) -> TableSection:
         chosen = distances.pairs[distances.pairs["axis"] == axis]
         records = {frozenset((row["robot"], row["other"])): row for row in chosen.to_dict("records")}
         rows = tuple(
-            Row(
+            TableRow(
                 (SHORT_ROBOTS[a],),
-                tuple(Cell("0", value=0.0) if a == b else _cell(records.get(frozenset((a, b)))) for b in ROBOT_NAMES),
+                tuple(
+                    TableCell("0", value=0.0) if a == b else _distance_cell(records.get(frozenset((a, b)))) for b in ROBOT_NAMES
+                ),
             )
             for a in ROBOT_NAMES
         )
-        return Block(AXIS_TITLES[axis], rows)
+        return TableSection(AXIS_TITLES[axis], rows)
 
     axes = [axis for axis in AXIS_TITLES if axis in set(distances.pairs["axis"])]
     return Table(
@@ -290,16 +295,16 @@ def _matrix_table(distances: Distances, origin: str) -> Table:
         f"Symmetric.{origin}",
         ("",),
         tuple(Column(SHORT_ROBOTS[robot]) for robot in ROBOT_NAMES),
-        tuple(block(axis) for axis in axes),
+        tuple(section(axis) for axis in axes),
     )
 
 
-def _cell(record: Mapping[object, float] | None, feature: str = "") -> Cell:
+def _distance_cell(record: Mapping[object, float] | None, feature: str = "") -> TableCell:
     if record is None:
-        return Cell()
+        return TableCell()
     digits = 0 if feature in ("dof", "links") else 3
     value, spread, printed = (float(record[name]) for name in ("value", "spread", "published"))
-    return Cell(
+    return TableCell(
         f"{value:.{digits}f}",
         f"± {spread:.{digits}f}" if spread > 0 else "",
         "" if np.isnan(printed) else f"{printed:.{digits}f}",

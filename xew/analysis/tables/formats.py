@@ -1,4 +1,4 @@
-"""Stage 11 of 11: a `Table` as Markdown, LaTeX (booktabs) and CSV. HTML is in `page`."""
+"""A `Table` as Markdown, LaTeX (booktabs) and CSV. HTML is in `page`."""
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
@@ -6,7 +6,7 @@ from itertools import groupby
 import pandas as pd
 
 from xew.analysis.tables.findings import Finding
-from xew.analysis.tables.layouts import Cell, Row, Table
+from xew.analysis.tables.table import Table, TableCell, TableRow
 
 MARK = {"better": "▲", "worse": "▼", "unresolved": "≈", "": ""}
 AGREES = {None: "", True: "✓", False: "✗"}
@@ -21,7 +21,7 @@ LATEX = {
 """What stands for characters that LaTeX reads otherwise, or does not have."""
 
 
-def heads(table: Table) -> list[str]:
+def column_heads(table: Table) -> list[str]:
     """Heads of all columns in one line each: 'Visual quality: PSNR [dB] ↑'."""
     return [*table.stubs, *(": ".join(filter(None, (column.group, column.title))) for column in table.columns)]
 
@@ -29,11 +29,11 @@ def heads(table: Table) -> list[str]:
 def markdown(table: Table) -> str:
     """Ours [interval] mark (paper ...); what is missing stands in the table."""
     width = len(table.stubs) + len(table.columns)
-    lines = [_markdown_line(heads(table)), f"|{'---|' * len(table.stubs)}{'---:|' * len(table.columns)}"]
-    for block in table.blocks:
-        above = [f"**{block.title}**"] * bool(block.title) + [f"*{block.note}*"] * bool(block.note)
+    lines = [_markdown_line(column_heads(table)), f"|{'---|' * len(table.stubs)}{'---:|' * len(table.columns)}"]
+    for section in table.sections:
+        above = [f"**{section.title}**"] * bool(section.title) + [f"*{section.note}*"] * bool(section.note)
         lines += [_markdown_line([text, *[""] * (width - 1)]) for text in above]
-        lines += [_markdown_line([*row.labels, *map(_markdown_cell, row.cells)]) for row in block.rows]
+        lines += [_markdown_line([*row.labels, *map(_markdown_cell, row.cells)]) for row in section.rows]
     return "\n".join(lines)
 
 
@@ -41,7 +41,7 @@ def _markdown_line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
-def _markdown_cell(cell: Cell) -> str:
+def _markdown_cell(cell: TableCell) -> str:
     text = f"**{cell.text}**" if cell.best else cell.text
     interval = f"[{cell.interval}]" if cell.interval else ""
     paper = f"(paper {cell.published})" if cell.published else ""
@@ -65,14 +65,14 @@ def latex(table: Table) -> str:
         _latex_line([*map(_escape, table.stubs), *(_escape(column.title) for column in table.columns)]),
         r"\midrule",
     ]
-    for i, block in enumerate(table.blocks):
+    for i, section in enumerate(table.sections):
         lines += [r"\addlinespace"] if i else []
-        if block.title:
-            lines.append(rf"\multicolumn{{{width}}}{{@{{}}l}}{{\textit{{{_escape(block.title)}}}}} \\")
-        for row, above in zip(block.rows, (None, *block.rows), strict=False):
+        if section.title:
+            lines.append(rf"\multicolumn{{{width}}}{{@{{}}l}}{{\textit{{{_escape(section.title)}}}}} \\")
+        for row, above in zip(section.rows, (None, *section.rows), strict=False):
             lines += _latex_rows(row, above)
     # Notes are too long for a row: they would stretch the table.
-    notes = [": ".join(filter(None, (block.title, block.note))) for block in table.blocks if block.note]
+    notes = [": ".join(filter(None, (section.title, section.note))) for section in table.sections if section.note]
     caption = rf"\textbf{{{_escape(table.title)}.}} {_escape(' '.join([table.caption, *notes]))}"
     lines += [r"\bottomrule", r"\end{tabular}", r"\end{adjustbox}"]
     lines += [rf"\caption{{{caption}}}", rf"\label{{tab:{table.name}}}", r"\end{table*}", ""]
@@ -92,7 +92,7 @@ def _latex_groups(table: Table) -> Iterator[str]:
     yield "".join(rules)
 
 
-def _latex_rows(row: Row, above: Row | None) -> Iterator[str]:
+def _latex_rows(row: TableRow, above: TableRow | None) -> Iterator[str]:
     """A label that the row above has too stands there only, but for the last one."""
     same = [bool(above and above.labels[i] == label and label != row.labels[-1]) for i, label in enumerate(row.labels)]
     labels = ["" if repeated else _escape(label) for label, repeated in zip(row.labels, same, strict=True)]
@@ -104,7 +104,7 @@ def _latex_rows(row: Row, above: Row | None) -> Iterator[str]:
         yield _latex_line([*[""] * len(row.labels), *small])
 
 
-def _latex_cell(cell: Cell) -> str:
+def _latex_cell(cell: TableCell) -> str:
     text = _escape(cell.text)
     return (rf"\textbf{{{text}}}" if cell.best else text) + LATEX_MARK[cell.verdict]
 
@@ -118,17 +118,17 @@ def _escape(text: str) -> str:
     return "-{}-".join("".join(LATEX.get(character, character) for character in part) for part in text.split("--"))
 
 
-def frame(table: Table) -> pd.DataFrame:
-    """A tidy frame, one row a cell: table block note row column text value low high verdict paper episodes.
+def table_frame(table: Table) -> pd.DataFrame:
+    """A tidy table_frame, one row a cell: table section note row column text value low high verdict paper episodes.
 
-    `note` says what the block lacks.
+    `note` says what the section lacks.
     """
-    columns = heads(table)[len(table.stubs) :]
+    columns = column_heads(table)[len(table.stubs) :]
     return pd.DataFrame(
         {
             "table": table.name,
-            "block": block.title,
-            "note": block.note,
+            "block": section.title,
+            "note": section.note,
             "row": ", ".join(row.labels),
             "column": column,
             "text": cell.text,
@@ -139,33 +139,33 @@ def frame(table: Table) -> pd.DataFrame:
             "paper": cell.printed,
             "episodes": cell.episodes,
         }
-        for block in table.blocks
-        for row in block.rows
+        for section in table.sections
+        for row in section.rows
         for column, cell in zip(columns, row.cells, strict=True)
     )
 
 
 def tables_frame(tables: Sequence[Table]) -> pd.DataFrame:
     """All tables, one below the other."""
-    return pd.concat([frame(table) for table in tables], ignore_index=True)
+    return pd.concat([table_frame(table) for table in tables], ignore_index=True)
 
 
 def findings_markdown(findings: Sequence[Finding], papers: Sequence[Finding] = ()) -> str:
     """Claim, test, verdict with numbers, and where given the verdict on the paper's own figures."""
-    beside = [["the paper's own figures"], *([paper.verdict] for paper in papers)] if papers else [[]] * (len(findings) + 1)
+    beside = [["the paper's own figures"], *([paper.answer] for paper in papers)] if papers else [[]] * (len(findings) + 1)
     lines = [_markdown_line(["claim", "test", "verdict", "numbers", *beside[0]]), "|---" * (4 + bool(papers)) + "|"]
     for finding, last in zip(findings, beside[1:], strict=True):
-        numbers = "; ".join(answer.text for answer in finding.answers) or f"missing: {finding.missing}"
+        numbers = "; ".join(one.text for one in finding.comparisons) or f"missing: {finding.missing}"
         claim = finding.claim
-        lines.append(_markdown_line([f"{claim.says} ({claim.where})", claim.test, f"**{finding.verdict}**", numbers, *last]))
+        lines.append(_markdown_line([f"{claim.says} ({claim.where})", claim.test, f"**{finding.answer}**", numbers, *last]))
     return "\n".join(lines)
 
 
 def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = ()) -> str:
     """The verdicts alone: claim, test, here, and where given the paper's own figures."""
-    beside = [["paper"], *([paper.verdict] for paper in papers)] if papers else [[]] * (len(findings) + 1)
+    beside = [["paper"], *([paper.answer] for paper in papers)] if papers else [[]] * (len(findings) + 1)
     rows = [
-        _latex_line([_escape(text) for text in (finding.claim.says, finding.claim.test, finding.verdict, *last)])
+        _latex_line([_escape(text) for text in (finding.claim.says, finding.claim.test, finding.answer, *last)])
         for finding, last in zip(findings, beside[1:], strict=True)
     ]
     return "\n".join(

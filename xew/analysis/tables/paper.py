@@ -1,4 +1,4 @@
-"""Stage 11 of 11: tables of what follows from the paper's figures, for `paper_report`."""
+"""Tables of what follows from the paper's figures, for `paper_report`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -7,14 +7,17 @@ from functools import cache
 import numpy as np
 
 from xew.analysis.correlation import Correlation, loeo_correlation
-from xew.analysis.distance import Frame, chamfer_floor, mean_distances, measure
-from xew.analysis.paper import AXES, Cell, Paper, PublishedChange, RecomputedChange
+from xew.analysis.distances.matrices import mean_distances
+from xew.analysis.distances.workspaces import Frame, chamfer_floor, measure
+from xew.analysis.paper import AXES, PAPER_TITLES, Paper, PublishedChange
 from xew.analysis.statistics.grades import PaperGrades
-from xew.analysis.statistics.summary import METRIC_TITLES, ROBOT_TITLES
-from xew.analysis.tables import layouts as tables
-from xew.analysis.tables.distances import signed
+from xew.analysis.statistics.summary import ROBOT_TITLES
+from xew.analysis.tables.builder import Builder
+from xew.analysis.tables.distances import format_signed
 from xew.analysis.tables.findings import Finding
-from xew.analysis.tables.layouts import ACTIONS, LADDER, SYSTEMS, Block, Builder, Column, Row, Table
+from xew.analysis.tables.labels import ACTIONS, LADDER, SYSTEMS
+from xew.analysis.tables.recompute import RecomputedChange, RecomputedFigure
+from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection
 from xew.protocol import ROBOT_NAMES
 from xew.sim_warp.robots import ROBOTS
 
@@ -62,7 +65,7 @@ ROBOT_TEXT = "Means of the rows of the printed matrices, the printed means below
 class PrintedBuilder(Builder):
     """Tables of the paper alone: its means with all the digits that it prints."""
 
-    def cell(self, part: str, row: str, robots: str, metric: str, base: str = "") -> tables.Cell:
+    def cell(self, part: str, row: str, robots: str, metric: str, base: str = "") -> TableCell:
         assert isinstance(self.ours, PaperGrades)
         cell = super().cell(part, row, robots, metric, base)
         return replace(cell, text=self.ours.print(part, row, robots, metric) or cell.text)
@@ -76,7 +79,7 @@ def frame_distances() -> dict[Frame, np.ndarray]:
 
 
 @cache
-def _floor() -> np.ndarray:
+def _mean_floor() -> np.ndarray:
     return chamfer_floor({name: ROBOTS[name] for name in ROBOT_NAMES}, SEEDS[:5]).mean(axis=0)
 
 
@@ -92,21 +95,23 @@ def frame_results(paper: Paper, distances: np.ndarray) -> dict[str, Correlation]
 def claims_table(claims: Sequence[Finding]) -> Table:
     rows = []
     for one in claims:
-        numbers = "; ".join(answer.text for answer in one.answers) or f"not printed: {one.missing}"
-        cells = (tables.Cell(one.verdict), tables.Cell(numbers))
-        rows.append(Row((f"{one.claim.says} ({one.claim.where})", one.claim.test), cells))
+        numbers = "; ".join(other.text for other in one.comparisons) or f"not printed: {one.missing}"
+        cells = (TableCell(one.answer), TableCell(numbers))
+        rows.append(TableRow((f"{one.claim.says} ({one.claim.where})", one.claim.test), cells))
     columns = (Column("verdict"), Column("numbers"))
     return Table(
-        "claims", "Claims, asked of the paper's own figures", "", ("claim", "test"), columns, (Block("", tuple(rows)),)
+        "claims", "Claims, asked of the paper's own figures", "", ("claim", "test"), columns, (TableSection("", tuple(rows)),)
     )
 
 
-def correlation_table(paper: Paper, cells: Sequence[Cell]) -> Table:
+def correlation_table(paper: Paper, cells: Sequence[RecomputedFigure]) -> Table:
     """The paper's layout: r and leave-one-out range for each axis, then r with the number of joints."""
     found = {(cell.metric, cell.axis, cell.quantity): cell for cell in cells}
     layout = [(axis, names) for axis in AXES for names in (("r",), ("low", "high"))] + [("dof", ("r",))]
     rows = [
-        Row((METRIC_TITLES[metric],), tuple(_compared([found[metric, axis, q] for q in names]) for axis, names in layout))
+        TableRow(
+            (PAPER_TITLES[metric],), tuple(_compared_cell([found[metric, axis, q] for q in names]) for axis, names in layout)
+        )
         for metric in paper.metrics
     ]
     columns = [Column(title, AXIS_TITLES[axis]) for axis in AXES for title in ("Pearson r", "leave one out")]
@@ -115,28 +120,28 @@ def correlation_table(paper: Paper, cells: Sequence[Cell]) -> Table:
     )
 
 
-def _compared(cells: Sequence[Cell]) -> tables.Cell:
+def _compared_cell(cells: Sequence[RecomputedFigure]) -> TableCell:
     """One figure, or the two ends of a range."""
-    ours = " to ".join(signed(cell.ours) for cell in cells)
-    published = " to ".join(signed(cell.published) for cell in cells)
+    ours = " to ".join(format_signed(cell.ours) for cell in cells)
+    published = " to ".join(format_signed(cell.published) for cell in cells)
     value, printed = (cells[0].ours, cells[0].published) if len(cells) == 1 else (np.nan, np.nan)
     agrees = all(cell.agrees for cell in cells)
-    return tables.Cell(ours, published=published, agrees=agrees, value=value, printed=printed)
+    return TableCell(ours, published=published, agrees=agrees, value=value, printed=printed)
 
 
-def certainty_table(paper: Paper, cells: Sequence[Cell], results: Mapping[tuple[str, str], Correlation]) -> Table:
+def certainty_table(paper: Paper, cells: Sequence[RecomputedFigure], results: Mapping[tuple[str, str], Correlation]) -> Table:
     printed = {(cell.metric, cell.axis): cell for cell in cells if cell.quantity == "p_value"}
 
-    def row(metric: str) -> Row:
+    def row(metric: str) -> TableRow:
         columns = []
         for axis in AXES:
             result, p = results[metric, axis], printed.get((metric, axis))
             text = f"{result.p_value:.3f}"
-            compared = tables.Cell(text, value=result.p_value)
+            compared = TableCell(text, value=result.p_value)
             if p:
                 compared = replace(compared, published=f"{p.published:.3f}", agrees=p.agrees, printed=p.published)
             columns += [compared, *_own_certainty(result)]
-        return Row((METRIC_TITLES[metric],), tuple(columns))
+        return TableRow((PAPER_TITLES[metric],), tuple(columns))
 
     heads = ("p", "Spearman ρ", "bootstrap of r", "sign")
     columns = [Column(head, AXIS_TITLES[axis]) for axis in AXES for head in heads]
@@ -145,31 +150,31 @@ def certainty_table(paper: Paper, cells: Sequence[Cell], results: Mapping[tuple[
     )
 
 
-def _own_certainty(result: Correlation) -> list[tables.Cell]:
+def _own_certainty(result: Correlation) -> list[TableCell]:
     ends = (result.bootstrap_low, result.bootstrap_high)
     return [
-        tables.Cell(signed(result.spearman), value=result.spearman),
-        tables.Cell(" to ".join(map(signed, ends)), low=ends[0], high=ends[1]),
-        _stability(result),
+        TableCell(format_signed(result.spearman), value=result.spearman),
+        TableCell(" to ".join(map(format_signed, ends)), low=ends[0], high=ends[1]),
+        _stability_cell(result),
     ]
 
 
-def _stability(result: Correlation) -> tables.Cell:
-    return tables.Cell("stable" if result.stable else "unstable", value=float(result.stable))
+def _stability_cell(result: Correlation) -> TableCell:
+    return TableCell("stable" if result.stable else "unstable", value=float(result.stable))
 
 
 def frame_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
     """The paper's kinematic correlation beside what our own clouds give for it, in each frame."""
     by_frame = {frame: frame_results(paper, distances) for frame, distances in frames.items()}
 
-    def row(metric: str) -> Row:
+    def row(metric: str) -> TableRow:
         printed = paper.metrics[metric].kinematic
-        cells = [_signed(printed.r), _range(printed.low, printed.high)]
+        cells = [_signed_cell(printed.r), _range_cell(printed.low, printed.high)]
         for frame, results in by_frame.items():
             result = results[metric]
-            p = tables.Cell(f"{result.p_value:.3f}", value=result.p_value)
-            cells += [_signed(result.r), *((_range(result.low, result.high), p) if frame != "root" else ())]
-        return Row((METRIC_TITLES[metric],), tuple(cells))
+            p = TableCell(f"{result.p_value:.3f}", value=result.p_value)
+            cells += [_signed_cell(result.r), *((_range_cell(result.low, result.high), p) if frame != "root" else ())]
+        return TableRow((PAPER_TITLES[metric],), tuple(cells))
 
     columns = [Column(head, "As printed") for head in ("r", "leave one out")]
     columns += [
@@ -183,14 +188,14 @@ def frame_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
 
 def base_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
     """The distances that this rests on."""
-    rows, floor = [], _floor()
+    rows, floor = [], _mean_floor()
     for i, name in enumerate(paper.robots):
-        cells = [tables.Cell(f"{paper.robots[name].kinematic:.3f}", value=paper.robots[name].kinematic)]
+        cells = [TableCell(f"{paper.robots[name].kinematic:.3f}", value=paper.robots[name].kinematic)]
         for distances in frames.values():
             mean, spread = float(distances[:, i].mean()), float(distances[:, i].std(ddof=1))
-            cells.append(tables.Cell(f"{mean:.3f}", f"± {spread:.3f}", value=mean, low=mean - spread, high=mean + spread))
-        cells.append(tables.Cell(f"{floor[i]:.3f}", value=float(floor[i])))
-        rows.append(Row((ROBOT_TITLES[name],), tuple(cells)))
+            cells.append(TableCell(f"{mean:.3f}", f"± {spread:.3f}", value=mean, low=mean - spread, high=mean + spread))
+        cells.append(TableCell(f"{floor[i]:.3f}", value=float(floor[i])))
+        rows.append(TableRow((ROBOT_TITLES[name],), tuple(cells)))
     caption = (
         f"Meters. ± is the standard deviation of one draw of configurations, over {len(SEEDS)} draws. Right: how far a robot "
         "is from itself by another draw in the root frame, which is what 4,000 points make of no distance at all."
@@ -200,22 +205,22 @@ def base_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
 
 
 def change_table(changes: Sequence[RecomputedChange]) -> Table:
-    blocks = []
+    sections = []
     for source, title in SECTIONS.items():
         found = [one for one in changes if one.change.source == source]
-        rows = (Row((compared_places(one.change),), (_change_cell(one),)) for one in found)
-        blocks.append(Block(title, tuple(rows)))
+        rows = (TableRow((describe_change(one.change),), (_change_cell(one),)) for one in found)
+        sections.append(TableSection(title, tuple(rows)))
     caption, columns = CHANGE_TEXT, (Column("change"),)
-    return Table("changes", "What the tables give for them", caption, ("what is compared",), columns, tuple(blocks))
+    return Table("changes", "What the tables give for them", caption, ("what is compared",), columns, tuple(sections))
 
 
-def _change_cell(found: RecomputedChange) -> tables.Cell:
-    printed = percent(found.change.percent, 0)
+def _change_cell(found: RecomputedChange) -> TableCell:
+    printed = format_percent(found.change.percent, 0)
     if found.change.word != "rounded":
         printed = f"{found.change.word} {printed.lstrip('+−') if found.change.word == 'less than' else printed}"
-    return tables.Cell(
-        percent(found.ours),
-        f"{percent(found.least)} to {percent(found.most)}",
+    return TableCell(
+        format_percent(found.ours),
+        f"{format_percent(found.least)} to {format_percent(found.most)}",
         printed,
         agrees=found.agrees,
         value=found.ours,
@@ -225,7 +230,7 @@ def _change_cell(found: RecomputedChange) -> tables.Cell:
     )
 
 
-def compared_places(change: PublishedChange) -> str:
+def describe_change(change: PublishedChange) -> str:
     """Such as 'LPIPS, Piper: joint pose to optical flow'."""
     (part, before, start), (_, after, end) = (place.split("/") for place in (change.before, change.after))
     if start == end:
@@ -233,7 +238,7 @@ def compared_places(change: PublishedChange) -> str:
     else:
         subject, first, second = SYSTEMS[after], *(ROBOT_TITLES.get(robot, "seen robots") for robot in (start, end))
     gap = ", share of the gap to seen robots" if change.toward else ""
-    return f"{METRIC_TITLES[change.metric]}, {subject}: {first} to {second}{gap}"
+    return f"{PAPER_TITLES[change.metric]}, {subject}: {first} to {second}{gap}"
 
 
 def _row_title(part: str, key: str, robot: str) -> str:
@@ -243,37 +248,37 @@ def _row_title(part: str, key: str, robot: str) -> str:
     return {"actions": ACTIONS, "ladder": LADDER, "forgetting": {"none": "no adaptation"}}[part][key].lower()
 
 
-def percent(value: float, digits: int = 1) -> str:
+def format_percent(value: float, digits: int = 1) -> str:
     return f"{value:+z.{digits}f} %".replace("-", "−")
 
 
-def robot_table(paper: Paper, means: Sequence[Cell]) -> Table:
+def robot_table(paper: Paper, means: Sequence[RecomputedFigure]) -> Table:
     found = {(cell.metric, cell.axis): cell for cell in means}
 
-    def row(name: str) -> Row:
+    def row(name: str) -> TableRow:
         robot = paper.robots[name]
-        cells = [_mean(found[name, axis]) for axis in AXES]
-        cells += [tables.Cell(str(count), value=count) for count in (robot.dof, robot.links)]
-        cells += [tables.Cell(f"{size:.3f}", value=size) for size in (robot.reach, robot.volume)]
-        return Row((ROBOT_TITLES[name],), tuple(cells))
+        cells = [_mean_cell(found[name, axis]) for axis in AXES]
+        cells += [TableCell(str(count), value=count) for count in (robot.dof, robot.links)]
+        cells += [TableCell(f"{size:.3f}", value=size) for size in (robot.reach, robot.volume)]
+        return TableRow((ROBOT_TITLES[name],), tuple(cells))
 
     columns = [Column(head, "Mean distance to the other four") for head in ("appearance", "kinematic [m]")]
     columns += [Column(head, "Features") for head in ("joints", "links", "reach [m]", "hull [m³]")]
     return _table("robots", "Distances and features", ROBOT_TEXT, "robot", columns, [row(name) for name in paper.robots])
 
 
-def _mean(cell: Cell) -> tables.Cell:
+def _mean_cell(cell: RecomputedFigure) -> TableCell:
     printed = f"{cell.published:.3f}"
-    return tables.Cell(f"{cell.ours:.3f}", published=printed, agrees=cell.agrees, value=cell.ours, printed=cell.published)
+    return TableCell(f"{cell.ours:.3f}", published=printed, agrees=cell.agrees, value=cell.ours, printed=cell.published)
 
 
-def _signed(value: float) -> tables.Cell:
-    return tables.Cell(signed(value), value=value)
+def _signed_cell(value: float) -> TableCell:
+    return TableCell(format_signed(value), value=value)
 
 
-def _range(low: float, high: float) -> tables.Cell:
-    return tables.Cell(f"{signed(low)} to {signed(high)}", low=low, high=high)
+def _range_cell(low: float, high: float) -> TableCell:
+    return TableCell(f"{format_signed(low)} to {format_signed(high)}", low=low, high=high)
 
 
-def _table(name: str, title: str, caption: str, stub: str, columns: Sequence[Column], rows: Sequence[Row]) -> Table:
-    return Table(name, title, caption, (stub,), tuple(columns), (Block("", tuple(rows)),))
+def _table(name: str, title: str, caption: str, stub: str, columns: Sequence[Column], rows: Sequence[TableRow]) -> Table:
+    return Table(name, title, caption, (stub,), tuple(columns), (TableSection("", tuple(rows)),))

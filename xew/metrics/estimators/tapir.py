@@ -16,6 +16,7 @@ from PIL import Image
 
 from xew.config import ConfigError
 from xew.metrics.estimators.adapters import check_tracks, import_package, lost, query_frames
+from xew.metrics.networks.pickles import read_arrays
 
 SIDE = 256
 """Of the square for which the networks were trained [pixels]."""
@@ -107,15 +108,6 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return content
 
 
-class _ArrayUnpickler(pickle.Unpickler):
-    """A pickle can run any code; this one can build arrays and dictionaries and nothing else."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in ADMITTED:
-            raise pickle.UnpicklingError(f"the file asks for {module}.{name}, which no file of arrays needs; it was not run")
-        return super().find_class(module.replace("numpy.core", "numpy._core"), name)
-
-
 def _read_object(file: IO[bytes]) -> Any:
     """The one object of a .npy file."""
     if np.lib.format.read_magic(file) != (1, 0):
@@ -123,4 +115,4 @@ def _read_object(file: IO[bytes]) -> Any:
     shape, _, dtype = np.lib.format.read_array_header_1_0(file)
     if shape != () or not dtype.hasobject:
         raise ValueError(f"it holds {dtype} {shape}, not one dictionary")
-    return _ArrayUnpickler(file).load().item()
+    return read_arrays(file, ADMITTED).item()

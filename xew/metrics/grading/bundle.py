@@ -18,7 +18,8 @@ import numpy as np
 import pandas as pd
 
 from xew.config import ConfigError
-from xew.metrics.grading.scores import KEY, Cell, file_digest, write_whole
+from xew.files import digest_files
+from xew.metrics.grading.scores import KEY, Cell, write_whole
 
 FORMAT = 1
 DIGESTS = ("prediction", "rgb", "states")
@@ -53,7 +54,7 @@ def write_bundle(path: Path, table: Path, rows: pd.DataFrame, cells: Sequence[Ce
         for cell in sorted(cells, key=lambda cell: cell.key)
         if cell.key in values
     ]
-    bundle: Bundle = {"format": FORMAT, "table": table.name, "table_sha256": file_digest([table])}
+    bundle: Bundle = {"format": FORMAT, "table": table.name, "table_sha256": digest_files([table])}
     bundle |= {str(name): value for name, value in rows.attrs.items()} | {"samples": samples, "means": means(samples)}
     write_whole(path, (json.dumps(bundle | {"digest": digest(bundle)}, indent=1) + "\n").encode())
 
@@ -77,7 +78,7 @@ def read_bundle(path: Path) -> Bundle:
         elif len({_key(sample) for sample in samples}) != len(samples):
             wrong.append("it holds a video twice")
         table = path.parent / bundle["table"]
-        if not wrong and table.exists() and file_digest([table]) != bundle["table_sha256"]:
+        if not wrong and table.exists() and digest_files([table]) != bundle["table_sha256"]:
             wrong.append(f"{table} is another table than it was made from")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{path} is no bundle of xew, or is damaged ({type(error).__name__}: {error}).") from error

@@ -10,14 +10,16 @@ from tqdm import tqdm
 
 from xew.config import ConfigError
 from xew.episode import EpisodeError, Record, episode_folder, read_record
-from xew.metrics.grading.scores import Cell, file_digest
+from xew.files import digest_files
+from xew.metrics.grading.scores import Cell
 from xew.metrics.truth import Truth
+from xew.protocol import COPY_FIRST_FRAME, GROUND_TRUTH
 from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video, resized
 from xew.threads import in_order
 
 BASELINES: dict[str, Callable[[Truth], np.ndarray]] = {
-    "copy_first_frame": lambda truth: np.repeat(truth.rgb[:1], len(truth.rgb), axis=0),
-    "ground_truth": lambda truth: truth.rgb,
+    COPY_FIRST_FRAME: lambda truth: np.repeat(truth.rgb[:1], len(truth.rgb), axis=0),
+    GROUND_TRUTH: lambda truth: truth.rgb,
 }
 """What a score of nothing and a score of everything look like; the second is the noise floor of the estimators."""
 SOFTNESS = 0.8
@@ -94,7 +96,7 @@ def _jobs(rollout: Rollout, data: Path, settings: str, baselines: Collection[str
             "more than there are."
         )
     try:
-        digest = file_digest(rollout.video)
+        digest = digest_files(rollout.video)
     except OSError as error:
         raise RolloutError(f"{rollout.folder} cannot be read: {error}.") from error
     rgb, states = (record.hashes.get(name, "") for name in ("rgb", "states"))

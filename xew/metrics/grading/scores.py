@@ -52,7 +52,7 @@ class Cell:
     frames: int
     """Frames compared, the given one included."""
     prediction: str
-    """SHA-256 of the video (`file_digest`); '' for a baseline, which is made of the truth."""
+    """SHA-256 of the video (`xew.files.digest_files`); '' for a baseline, which is made of the truth."""
     rgb: str
     """SHA-256 of the true video, as its episode says."""
     states: str
@@ -217,19 +217,9 @@ def describe(settings: dict[str, Any], metrics: tuple[str, ...]) -> dict[str, An
         metric = METRICS[name]
         low, high = (bound if math.isfinite(bound) else None for bound in metric.range)
         fields = {key: getattr(metric, key) for key in ("dimension", "unit", "higher_is_better", "reference")}
-        described[name] = fields | {"low": low, "high": high}
+        fields |= {"low": low, "high": high}
+        described[name] = fields | {"title": metric.title or name, "estimated": metric.estimated, "reported": metric.reported}
     return settings | {"metrics": described, "versions": {"xew": xew.__version__, "jax": jax.__version__}}
-
-
-def file_digest(paths: Sequence[Path]) -> str:
-    """SHA-256 of a file; of several, that of their digests in order."""
-    digests = []
-    for path in paths:
-        with path.open("rb") as file:
-            digests.append(hashlib.file_digest(file, "sha256"))
-    if len(digests) == 1:
-        return digests[0].hexdigest()
-    return hashlib.sha256(b"".join(digest.digest() for digest in digests)).hexdigest()
 
 
 def _finite(value: float) -> float | None:

@@ -13,7 +13,6 @@ import jax
 import numpy as np
 
 from xew.config import ConfigError, pick
-from xew.files import cache_folder
 from xew.metrics.backends import Masker, Tracker
 from xew.metrics.estimators.adapters import use_torch_device
 
@@ -76,9 +75,3 @@ def in_turn(estimator: E) -> E:
             return estimator(*arrays)
 
     return call  # type: ignore[return-value]
-
-
-def compile_cache() -> None:
-    """Keep compiled programs between runs in the user's cache folder, unless JAX was told otherwise."""
-    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder("jax")))

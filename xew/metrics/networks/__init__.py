@@ -1,3 +1,3 @@
-"""What LPIPS computes with: AlexNet's published weights, and convolutions of images in float32."""
+"""What LPIPS computes with: AlexNet's published weights, read without trusting a pickle, and convolutions in float32."""
 
-__all__ = ["alexnet", "convolution"]
+__all__ = ["alexnet", "convolution", "pickles"]

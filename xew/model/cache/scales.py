@@ -1,6 +1,6 @@
-"""Numbers of a common size: how conditions of numbers are scaled by those of the training episodes.
+"""Normalization of conditions that are numbers, by their spread over the training episodes.
 
-Reads  what conditions tell of the training episodes' commands
+Reads  the numbers that conditions make of the training episodes' commands
 Writes `Scale`, kept with the latent cache and with the run, since a rollout needs the very same
 """
 
@@ -13,21 +13,25 @@ from typing import Any
 import numpy as np
 
 from xew.config import ConfigError
+from xew.dataset import Episode
 from xew.files import replacing
+from xew.model.cache.keys import scales_path
 from xew.model.conditions import Command, Condition
-from xew.model.experiment import Experiment
+from xew.model.episodes.commands import episode_command
+from xew.model.experiment import Encoding
 
 PERCENTILES = (1, 99)
-"""Ctrl-World and Boundless-World-Model map these to -1 and 1, and clip."""
+"""Percentiles that become -1 and 1, with clipping beyond, as in Ctrl-World and Boundless-World-Model."""
 SCALES = "scales.json"
-"""In a run."""
+"""Name of the file in a run."""
 STILL = 1e-3
-"""A number that moves less over all training episodes is divided by this [m, rad or 1]: noise is not blown up."""
+"""Least width [m, rad or 1]: a number that hardly moves over all training episodes is divided by this, so that its noise is
+not blown up."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """(x - middle) / width, clipped where there is a limit."""
+    """The normalization (x - middle) / width, clipped where there is a limit."""
 
     middle: np.ndarray
     """[n] float32."""
@@ -36,25 +40,25 @@ class Scale:
     limit: float | None
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Values [... k*n], k rows of n numbers beside each other, in their shape: float32."""
-        rows = (values.reshape(*values.shape[:-1], -1, len(self.middle)) - self.middle) / self.width
-        rows = rows if self.limit is None else np.clip(rows, -self.limit, self.limit)
-        return rows.reshape(values.shape).astype(np.float32)
+        """Normalize values [... k*n], which are k times n numbers beside each other, to float32 of their shape."""
+        scaled = (values.reshape(*values.shape[:-1], -1, len(self.middle)) - self.middle) / self.width
+        scaled = scaled if self.limit is None else np.clip(scaled, -self.limit, self.limit)
+        return scaled.reshape(values.shape).astype(np.float32)
 
 
 def fit_scales(conditions: Iterable[Condition], commands: Iterable[Command]) -> dict[str, Scale]:
-    """The scale of every condition that has one, by its name."""
+    """Fit the scale of every condition that has one, by its name, to commands [t 16] of episodes."""
     scaled = {condition.name: condition for condition in conditions if condition.scale != "none"}
-    told: dict[str, list[np.ndarray]] = {name: [] for name in scaled}
+    values: dict[str, list[np.ndarray]] = {name: [] for name in scaled}
     for command in commands if scaled else ():
         for name, condition in scaled.items():
             assert condition.make is not None
-            told[name].append(condition.change(condition.make(command)))
-    return {name: _fit(condition, np.concatenate(told[name])) for name, condition in scaled.items()}
+            values[name].append(condition.change(condition.make(command)))
+    return {name: _fit(condition, np.concatenate(values[name])) for name, condition in scaled.items()}
 
 
 def _fit(condition: Condition, values: np.ndarray) -> Scale:
-    """Of values [m n]."""
+    """Fit the scale of values [m n] float32."""
     if condition.scale == "percentiles":
         low, high = np.percentile(values, PERCENTILES, axis=0)
         middle, width, limit = (low + high) / 2, (high - low) / 2, 1.0
@@ -66,7 +70,7 @@ def _fit(condition: Condition, values: np.ndarray) -> Scale:
 def apply_scales(
     scales: Mapping[str, Scale], conditions: Mapping[str, Condition], arrays: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Arrays by stream, with the numbers of conditions that have a scale in that scale."""
+    """Normalize the arrays [... n], by stream, of those conditions that have a scale; the others stay as they are."""
     names = {stream: condition.name for stream, condition in conditions.items() if condition.scale != "none"}
     return {stream: scales[names[stream]](array) if stream in names else array for stream, array in arrays.items()}
 
@@ -101,6 +105,25 @@ def read_scales(path: Path, conditions: Sequence[Condition], remedy: str) -> dic
     }
 
 
-def load_run_scales(experiment: Experiment, run: Path) -> dict[str, Scale]:
+def load_run_scales(conditions: Mapping[str, Condition], run: Path) -> dict[str, Scale]:
     """The scales that a run was trained with. Raises ConfigError if it needs some and has none."""
-    return read_scales(run / SCALES, tuple(experiment.conditions.values()), "train it again with --overwrite")
+    return read_scales(run / SCALES, tuple(conditions.values()), "train it again with --overwrite")
+
+
+def load_scales(encoding: Encoding, episodes: Sequence[Episode]) -> dict[str, Scale]:
+    """The scales of these episodes' numbers, or in an adaptation those of the run that it starts from.
+
+    Raises:
+        ConfigError: `latents` has not been run for them.
+    """
+    conditions = encoding.inputs.conditions
+    if encoding.start_from is not None:
+        return load_run_scales(conditions, encoding.start_from)
+    return read_scales(scales_path(encoding, episodes), tuple(conditions.values()), encoding.remedy)
+
+
+def keep_scales(encoding: Encoding, episodes: Sequence[Episode]) -> None:
+    """Fit and keep the scales of numbers of these episodes, where any is needed and they are not there yet."""
+    path, conditions = scales_path(encoding, episodes), encoding.inputs.conditions.values()
+    if any(condition.scale != "none" for condition in conditions) and encoding.start_from is None and not path.exists():
+        save_scales(path, fit_scales(conditions, (episode_command(folder, record) for folder, record in episodes)))

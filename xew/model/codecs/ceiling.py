@@ -41,7 +41,7 @@ def measure_ceiling(codec: Codec, videos: Iterable[np.ndarray], frames: int, hei
         videos: true video, uint8 [t 240 320 3] each; a shorter one is continued by its last frame, which is not graded.
         frames, height, width: of the model's clip.
     """
-    from xew.metrics import lpips, psnr  # only here: the model room does without metrics
+    from xew.metrics import lpips, psnr
 
     scores = []
     for video in videos:

@@ -1,7 +1,7 @@
-"""Many devices and hosts: the mesh, where parameters and batches lie on it, and starting the processes.
+"""Many devices and hosts: the mesh, how parameters and batches are sharded over it, and starting the processes.
 
-The mesh has two axes. Batches are cut over both. Parameters, their moving average and the optimizer's moments are copied
-along `data` and cut along `fsdp` (each layer's are gathered when it is computed). The numbers do not depend on the mesh,
+The mesh has two axes. Batches are sharded over both. Parameters, their moving average and the optimizer's moments are copied
+along `data` and sharded along `fsdp` (each layer's are gathered when it is computed). The numbers do not depend on the mesh,
 up to the order of sums.
 """
 
@@ -14,15 +14,18 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax import Array
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Int, Shaped
 
 from xew.config import ConfigError
 
 AXES = ("data", "fsdp")
+"""Names of the mesh's axes."""
 SMALL = 2**14
-"""Arrays of fewer numbers (in one layer) are copied to every device: gathering them costs more than they weigh."""
+"""Number of numbers (in one layer) below which an array is copied to every device: gathering it costs more than it weighs."""
 LAYERS = "blocks"
-"""Arrays below this name have a leading axis of layers, over which the network scans: it is never cut."""
+"""Name below which arrays have a leading axis of layers, over which the network scans: it is never sharded."""
 
 
 @dataclass(frozen=True)
@@ -30,15 +33,15 @@ class MeshSettings:
     """How many ways the devices share the work; -1 means what the other leaves."""
 
     data: int = -1
-    """Copies of the parameters, each with its part of the batch."""
+    """Number of copies of the parameters, each with its shard of the batch."""
     fsdp: int = 1
-    """Parts that parameters and optimizer are cut into, each with its part of the batch too."""
+    """Number of shards of parameters and optimizer, each with its shard of the batch too."""
 
 
 def start_processes(force: bool = False, environment: Mapping[str, str] = os.environ) -> None:
     """Join the other processes of this run, if a launcher has started several.
 
-    Done when asked, or when the variables of a launcher are there: JAX_COORDINATOR_ADDRESS with JAX_NUM_PROCESSES and
+    It does so when asked, or when the variables of a launcher are set: JAX_COORDINATOR_ADDRESS with JAX_NUM_PROCESSES and
     JAX_PROCESS_ID (one pair for each process), or those of Slurm or Open MPI with more than one task, which JAX reads itself.
 
     Raises:
@@ -60,7 +63,7 @@ def start_processes(force: bool = False, environment: Mapping[str, str] = os.env
 
 
 def mesh_shape(settings: MeshSettings, devices: int) -> tuple[int, int]:
-    """Sizes of the axes data and fsdp on so many devices. Raises ConfigError if they do not fill them exactly."""
+    """Sizes of the axes data and fsdp on a number of devices. Raises ConfigError if they do not fill them exactly."""
     asked = (settings.data, settings.fsdp)
     known = math.prod(size for size in asked if size != -1)
     if asked.count(-1) > 1 or min(asked) < -1 or 0 in asked:
@@ -84,7 +87,7 @@ def make_mesh(settings: MeshSettings, devices: Sequence[jax.Device] | None = Non
 
 
 def check_batch(batch: int, accumulate: int, devices: int) -> None:
-    """Raises ConfigError unless every device gets equally many samples of every part of the batch."""
+    """Raise ConfigError unless every device gets equally many samples of each of the `accumulate` parts of the batch."""
     if batch % (devices * accumulate):
         near = max(1, round(batch / (devices * accumulate))) * devices * accumulate
         raise ConfigError(
@@ -94,7 +97,7 @@ def check_batch(batch: int, accumulate: int, devices: int) -> None:
 
 
 def parameter_spec(path: Sequence[Any], shape: Sequence[int], fsdp: int) -> PartitionSpec:
-    """Which axis of an array is cut: the largest that `fsdp` divides (the last of equals), never the layers'; none if small."""
+    """The axis of an array that is sharded: the largest that `fsdp` divides, the last of equals, never the layers; or none."""
     first = 1 if LAYERS in path and len(shape) > 1 else 0
     candidates = [axis for axis in range(first, len(shape)) if shape[axis] % fsdp == 0]
     if fsdp == 1 or not candidates or math.prod(shape[first:]) < SMALL:
@@ -104,7 +107,7 @@ def parameter_spec(path: Sequence[Any], shape: Sequence[int], fsdp: int) -> Part
 
 
 def state_shardings(state: Any, mesh: Mesh) -> Any:
-    """Where each array of a tree (parameters, optimizer) lies, in the same tree; only shapes and names are looked at."""
+    """Sharding of each array of a tree (parameters, optimizer), in the same tree; only shapes and names are looked at."""
 
     def place(path: tuple[Any, ...], leaf: Any) -> NamedSharding:
         return NamedSharding(mesh, parameter_spec(path_names(path), leaf.shape, mesh.shape["fsdp"]))
@@ -119,31 +122,31 @@ def path_names(path: Sequence[Any]) -> tuple[str, ...]:
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
-    """The leading axis cut over all devices."""
+    """Sharding of the leading axis over all devices."""
     return NamedSharding(mesh, PartitionSpec(AXES))
 
 
 def replicated_sharding(mesh: Mesh) -> NamedSharding:
-    """A copy on every device."""
+    """Sharding of an array that every device has a copy of."""
     return NamedSharding(mesh, PartitionSpec())
 
 
-def process_samples(mesh: Mesh, batch: int) -> np.ndarray:
-    """Which samples of the whole batch this process loads, in order."""
+def process_samples(mesh: Mesh, batch: int) -> Int[np.ndarray, " n"]:
+    """Indices [n] of the samples of the whole batch that this process loads, in order."""
     slices = batch_sharding(mesh).addressable_devices_indices_map((batch,)).values()
     return np.unique(np.concatenate([np.arange(batch)[index] for index in slices]))
 
 
 def place_batch(batch: Any, mesh: Mesh) -> Any:
-    """This process's samples (any tree of arrays [b' ...]) as its part of the whole batch on the mesh."""
+    """Put this process's samples, any tree of arrays [b' ...], on the mesh as its shard of the whole batch [b ...]."""
     sharding = batch_sharding(mesh)
     return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, leaf), batch)
 
 
-def shard_over_batch(values: jax.Array) -> jax.Array:
-    """Tell the compiler that activations [b ...] stay cut over the batch alone, where a mesh is set; else nothing.
+def shard_over_batch(values: Shaped[Array, "b ..."]) -> Shaped[Array, "b ..."]:
+    """Tell the compiler that activations [b ...] stay sharded over the batch alone, where a mesh is set.
 
-    Left to itself it may cut their features where it has cut the parameters', which cuDNN's attention cannot take.
+    Left to itself it may shard their features where it has sharded the parameters', which cuDNN's attention cannot take.
     """
     mesh = jax.sharding.get_abstract_mesh()
     axes = tuple(axis for axis in AXES if axis in mesh.axis_names)
@@ -152,19 +155,20 @@ def shard_over_batch(values: jax.Array) -> jax.Array:
 
 
 def gather_parameters(parameters: Any, *, layer: bool = False) -> Any:
-    """Parameters that are cut along `fsdp`, whole on every device; their gradients are summed and cut again.
+    """Gather parameters that are sharded along `fsdp` on every device; their gradients are summed and sharded again.
 
     Left to itself the compiler moves activations instead wherever they are the smaller, many times a layer. Nothing is done
-    where no mesh is set or it does not cut.
+    where no mesh is set or it does not shard.
 
     Args:
+        parameters: any tree of arrays.
         layer: they are those of one layer, without the axis of layers; else all, of which the layers are left as they are.
     """
     fsdp = dict(jax.sharding.get_abstract_mesh().shape).get("fsdp", 1)
     if fsdp == 1:
         return parameters
 
-    def gather(path: tuple[Any, ...], leaf: jax.Array) -> jax.Array:
+    def gather(path: tuple[Any, ...], leaf: Array) -> Array:
         names = path_names(path)
         if layer:
             return _gather(leaf, PartitionSpec(*parameter_spec((LAYERS, *names), (1, *leaf.shape), fsdp)[1:]))
@@ -174,15 +178,15 @@ def gather_parameters(parameters: Any, *, layer: bool = False) -> Any:
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
-def _gather(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
+def _gather(leaf: Array, spec: PartitionSpec) -> Array:
     return jax.lax.with_sharding_constraint(leaf, PartitionSpec())
 
 
-def _gather_forward(leaf: jax.Array, spec: PartitionSpec) -> tuple[jax.Array, None]:
+def _gather_forward(leaf: Array, spec: PartitionSpec) -> tuple[Array, None]:
     return _gather(leaf, spec), None
 
 
-def _gather_backward(spec: PartitionSpec, _: None, gradient: jax.Array) -> tuple[jax.Array]:
+def _gather_backward(spec: PartitionSpec, _: None, gradient: Array) -> tuple[Array]:
     return (jax.lax.with_sharding_constraint(gradient, spec),)
 
 

@@ -1,4 +1,4 @@
-"""One block of the network, and what it is made of: attention, norms, feed-forward, and how they are computed on a device.
+"""One block of the network and what it is made of: attention, norms, feed-forward, and how they are computed on a device.
 
 Reads  tokens [b s d] of all streams, modulations [b r 6 d], rotations, context [b l d]
 Writes tokens [b s d]
@@ -20,6 +20,8 @@ import numpy as np
 from flax import nnx
 from jax import Array
 from jax.ad_checkpoint import checkpoint_name
+from jax.typing import DTypeLike
+from jaxtyping import Float, Int, Key
 
 from xew.config import ConfigError
 from xew.model.devices.sharding import shard_over_batch
@@ -27,21 +29,24 @@ from xew.model.network.mechanisms import FramedContext
 from xew.model.network.tokens import WAVELENGTH_BASE
 
 EPSILON = 1e-6
+"""Added to the variance in every norm."""
 
 Activation = Callable[[Array], Array]
-Rotary = tuple[Array, Array]
-"""Cosine and sine [s head_dim/2] of every token's rotation angles."""
+Rotary = tuple[Float[Array, "s angles"], Float[Array, "s angles"]]
+"""Cosine and sine [s head_dim/2] float32 of every token's rotation angles."""
+Levels = Int[np.ndarray, " s"]
+"""Index [s] of each token's noise level among the r of a sample: 0 is no noise, 1 the sample's own."""
 AttentionName = Literal["auto", "xla", "cudnn"]
 RematName = Literal["none", "attention", "dots", "full"]
 
 
 class ConditionCache(NamedTuple):
-    """What every layer's RGB tokens read of the condition tokens, when these do not look back (`one_way`)."""
+    """What every layer's RGB tokens read of the condition tokens, where these do not look back (`one_way`)."""
 
-    keys: Array
-    """[layers b s n head_dim], rotated."""
-    values: Array
-    """[layers b s n head_dim]."""
+    keys: Float[Array, "*layers b s heads k"]
+    """Rotated keys [layers b s n head_dim]; of one layer [b s n head_dim]."""
+    values: Float[Array, "*layers b s heads k"]
+    """Values of the same shape."""
 
 
 @dataclass(frozen=True)
@@ -49,24 +54,30 @@ class ModelSize:
     """Everything that distinguishes one size of the network from another."""
 
     dim: int
+    """Width of a token."""
     depth: int
+    """Number of blocks."""
     heads: int
     ffn_dim: int
+    """Width of the hidden layer of the feed-forward."""
     text_dim: int
+    """Width of the text's embeddings."""
     text_tokens: int
+    """Number of tokens that the text is padded to."""
     rotary_base: float = WAVELENGTH_BASE
     """Ratio of the slowest to the fastest rotation of positions; Wan's serves clips of hundreds of positions a side, and
     a model of few positions tells them apart sooner with less."""
 
     @property
     def head_dim(self) -> int:
+        """Width of an attention head."""
         return self.dim // self.heads
 
 
 class Block(nnx.Module):
     """Self-attention over all streams, cross-attention to the text, feed-forward; modulated by the noise level."""
 
-    def __init__(self, size: ModelSize, dtype: jnp.dtype, attention: AttentionName, rngs: nnx.Rngs) -> None:
+    def __init__(self, size: ModelSize, dtype: DTypeLike, attention: AttentionName, rngs: nnx.Rngs) -> None:
         self.dtype = dtype
         self.modulation = nnx.Param(scaled_normal(rngs.params(), (1, 6, size.dim)))
         self.self_attn = Attention(size, dtype, attention, rngs)
@@ -76,71 +87,99 @@ class Block(nnx.Module):
 
     def __call__(
         self,
-        tokens: Array,
-        modulation: Array,
-        rows: np.ndarray,
+        tokens: Float[Array, "b s d"],
+        modulation: Float[Array, "b r 6 d"],
+        levels: Levels,
         rotary: Rotary,
-        text: Array | FramedContext,
-        alone: int | None = None,
+        text: Float[Array, "b l d"] | FramedContext,
+        condition_start: int | None = None,
         cache: ConditionCache | None = None,
-    ) -> Array:
-        """tokens [b s d]; modulation [b r 6 d], of which token i takes row rows[i]; text [b l d].
+    ) -> Float[Array, "b s d"]:
+        """One block's change of the tokens.
 
-        Tokens from `alone` on see none before them; those before see all, and the keys and values of `cache` too.
+        Args:
+            tokens: [b s d].
+            modulation: [b r 6 d] float32, one for each noise level.
+            levels: [s], which of them each token takes.
+            rotary: rotations of the tokens' positions.
+            text: [b l d], what cross-attention reads.
+            condition_start: tokens from here on see none before them; those before see all. All see all if left out.
+            cache: keys and values that the tokens before `condition_start` see too.
+
+        Returns:
+            Tokens [b s d].
         """
-        shift_sa, scale_sa, gate_sa, shift_ffn, scale_ffn, gate_ffn = self._chunks(modulation, rows)
-        attended = self.self_attn(modulate(tokens, shift_sa, scale_sa, self.dtype), rotary=rotary, alone=alone, cache=cache)
+        shift_sa, scale_sa, gate_sa, shift_ffn, scale_ffn, gate_ffn = self._chunks(modulation, levels)
+        modulated = modulate(tokens, shift_sa, scale_sa, self.dtype)
+        attended = self.self_attn(modulated, rotary=rotary, condition_start=condition_start, cache=cache)
         tokens = add(tokens, attended, gate_sa)
         asked = self.norm3(tokens).astype(self.dtype)
         read = self.cross_attn.attend_by_frame(asked, text) if isinstance(text, FramedContext) else self.cross_attn(asked, text)
         tokens = add(tokens, read)
         return add(tokens, self.ffn(modulate(tokens, shift_ffn, scale_ffn, self.dtype)), gate_ffn)
 
-    def keys_values(self, tokens: Array, modulation: Array, rows: np.ndarray, rotary: Rotary) -> tuple[Array, Array]:
-        """What others' self-attention reads of these tokens: keys and values [b s n head_dim]."""
-        shift, scale = self._chunks(modulation, rows)[:2]
+    def keys_values(
+        self, tokens: Float[Array, "b s d"], modulation: Float[Array, "b r 6 d"], levels: Levels, rotary: Rotary
+    ) -> tuple[Float[Array, "b s heads k"], Float[Array, "b s heads k"]]:
+        """What others' self-attention reads of these tokens: keys and values [b s n head_dim].
+
+        Args:
+            tokens: [b s d].
+            modulation: [b r 6 d] float32, one for each noise level.
+            levels: [s], which of them each token takes.
+            rotary: rotations of the tokens' positions.
+        """
+        shift, scale = self._chunks(modulation, levels)[:2]
         return self.self_attn.keys_values(modulate(tokens, shift, scale, self.dtype), rotary)
 
-    def _chunks(self, modulation: Array, rows: np.ndarray) -> list[Array]:
+    def _chunks(self, modulation: Array, levels: np.ndarray) -> list[Array]:
         """Six [b s d]: shift, scale and gate of self-attention, then of the feed-forward; never formed at once."""
         chunks = self.modulation[...][None] + modulation
-        return [select_levels(chunks[:, :, i], rows) for i in range(6)]
+        return [select_levels(chunks[:, :, i], levels) for i in range(6)]
 
 
 class Attention(nnx.Module):
     """Multi-head attention; queries and keys are normalized over the full width, before they are split into heads."""
 
-    def __init__(self, size: ModelSize, dtype: jnp.dtype, implementation: AttentionName, rngs: nnx.Rngs) -> None:
+    def __init__(self, size: ModelSize, dtype: DTypeLike, implementation: AttentionName, rngs: nnx.Rngs) -> None:
         self.heads, self.dtype, self.implementation = size.heads, dtype, implementation
         self.q, self.k, self.v, self.o = (linear(size.dim, size.dim, dtype, rngs) for _ in range(4))
         self.norm_q, self.norm_k = (nnx.RMSNorm(size.dim, epsilon=EPSILON, dtype=jnp.float32, rngs=rngs) for _ in range(2))
 
     def __call__(
         self,
-        tokens: Array,
-        context: Array | None = None,
+        tokens: Float[Array, "b s d"],
+        context: Float[Array, "b l d"] | None = None,
         rotary: Rotary | None = None,
-        alone: int | None = None,
+        condition_start: int | None = None,
         cache: ConditionCache | None = None,
-    ) -> Array:
-        """tokens [b s d] attend to context [b l d], or to each other under rotary positions.
+    ) -> Float[Array, "b s d"]:
+        """Tokens attend to context, or to each other under rotary positions.
 
-        Tokens from `alone` on see none before them: two calls of attention instead of a mask [s s]. The keys and values
-        of `cache` (one layer's) are seen beside the tokens' own.
+        Args:
+            tokens: [b s d].
+            context: [b l d]; the tokens themselves if left out.
+            rotary: rotations of the tokens' positions.
+            condition_start: tokens from here on see none before them, by two calls of attention instead of a mask [s s].
+            cache: keys and values of one layer, seen beside the tokens' own.
+
+        Returns:
+            [b s d].
         """
         q = self._heads(self.norm_q(self.q(tokens)), rotary)
         k, v = self.keys_values(tokens if context is None else context, rotary)
         if cache is not None:
             k, v = jnp.concatenate([k, cache.keys], axis=1), jnp.concatenate([v, cache.values], axis=1)
-        if alone is None:
+        if condition_start is None:
             attended = self._attend(q, k, v)
         else:
-            parts = self._attend(q[:, :alone], k, v), self._attend(q[:, alone:], k[:, alone:], v[:, alone:])
-            attended = jnp.concatenate(parts, axis=1)
+            start = condition_start
+            rgb, conditions = self._attend(q[:, :start], k, v), self._attend(q[:, start:], k[:, start:], v[:, start:])
+            attended = jnp.concatenate([rgb, conditions], axis=1)
         return self.o(attended.reshape(tokens.shape))
 
-    def attend_by_frame(self, tokens: Array, context: FramedContext) -> Array:
-        """tokens [b s d] attend to the shared context; those of the first frames to their own frame's beside it."""
+    def attend_by_frame(self, tokens: Float[Array, "b s d"], context: FramedContext) -> Float[Array, "b s d"]:
+        """Tokens [b s d] attend to the shared context, those of the first frames to their own frame's beside it: [b s d]."""
         batch, frames, own, width = context.framed.shape
         shared = self.keys_values(context.shared, None)
         k, v = (
@@ -157,8 +196,10 @@ class Attention(nnx.Module):
             attended = jnp.concatenate([attended, self._attend(q[:, cut:], *shared)], axis=1)
         return self.o(attended.reshape(tokens.shape))
 
-    def keys_values(self, context: Array, rotary: Rotary | None) -> tuple[Array, Array]:
-        """Keys (rotated where there are positions) and values [b l n head_dim] of context [b l d]."""
+    def keys_values(
+        self, context: Float[Array, "b s d"], rotary: Rotary | None
+    ) -> tuple[Float[Array, "b s heads k"], Float[Array, "b s heads k"]]:
+        """Keys (rotated where there are positions) and values [b s n head_dim] of context [b s d]."""
         return self._heads(self.norm_k(self.k(context)), rotary), self._heads(self.v(context), None)
 
     def _heads(self, values: Array, rotary: Rotary | None) -> Array:
@@ -178,10 +219,18 @@ class Head(nnx.Module):
         self.modulation = nnx.Param(scaled_normal(rngs.params(), (1, 2, dim)))
         self.head = nnx.Linear(dim, features, dtype=jnp.float32, kernel_init=nnx.initializers.zeros_init(), rngs=rngs)
 
-    def __call__(self, tokens: Array, time: Array, rows: np.ndarray) -> Array:
-        """Features [b s pt*ph*pw*c] of tokens [b s d]; time [b r d]."""
+    def __call__(
+        self, tokens: Float[Array, "b s d"], time: Float[Array, "b r d"], levels: Levels
+    ) -> Float[Array, "b s features"]:
+        """Features [b s pt*ph*pw*c] float32 of tokens.
+
+        Args:
+            tokens: [b s d] float32.
+            time: [b r d] float32, embeddings of the noise levels.
+            levels: [s], which of them each token takes.
+        """
         chunks = self.modulation[...][None] + time[:, :, None]
-        return self.head(modulate(tokens, select_levels(chunks[:, :, 0], rows), select_levels(chunks[:, :, 1], rows)))
+        return self.head(modulate(tokens, select_levels(chunks[:, :, 0], levels), select_levels(chunks[:, :, 1], levels)))
 
 
 class TwoLayer(nnx.Module):
@@ -193,7 +242,7 @@ class TwoLayer(nnx.Module):
         hidden: int,
         out: int,
         activation: Activation,
-        dtype: jnp.dtype,
+        dtype: DTypeLike,
         init: nnx.Initializer,
         rngs: nnx.Rngs,
     ) -> None:
@@ -201,55 +250,70 @@ class TwoLayer(nnx.Module):
         self.first = nnx.Linear(features, hidden, dtype=dtype, kernel_init=init, rngs=rngs)
         self.second = nnx.Linear(hidden, out, dtype=dtype, kernel_init=init, rngs=rngs)
 
-    def __call__(self, values: Array) -> Array:
+    def __call__(self, values: Float[Array, "*n i"]) -> Float[Array, "*n o"]:
+        """Values [... features] -> [... out]."""
         return self.second(self.activation(self.first(values)))
 
 
-def modulate(tokens: Array, shift: Array, scale: Array, dtype: jnp.dtype = jnp.float32) -> Array:
-    """LayerNorm without parameters in float32, then scale and shift [b s d], rounded once for all who read it."""
+def modulate(
+    tokens: Float[Array, "b s d"], shift: Float[Array, "b s d"], scale: Float[Array, "b s d"], dtype: DTypeLike = jnp.float32
+) -> Float[Array, "b s d"]:
+    """LayerNorm of tokens without parameters in float32, then scale and shift, rounded to `dtype` once for all who read it.
+
+    All arrays are [b s d].
+    """
     tokens = tokens.astype(jnp.float32)
     centered = tokens - tokens.mean(-1, keepdims=True)
     normed = centered * jax.lax.rsqrt(jnp.square(centered).mean(-1, keepdims=True) + EPSILON)
     return (normed * (1 + scale) + shift).astype(dtype)
 
 
-def add(tokens: Array, change: Array, gate: Array | None = None) -> Array:
-    """tokens + change * gate [b s d] in float32, in the type of the tokens."""
+def add(
+    tokens: Float[Array, "b s d"], change: Float[Array, "b s d"], gate: Float[Array, "b s d"] | None = None
+) -> Float[Array, "b s d"]:
+    """The sum tokens + change * gate, all [b s d], computed in float32 and given in the type of the tokens."""
     change = change.astype(jnp.float32)
     return (tokens.astype(jnp.float32) + (change if gate is None else change * gate)).astype(tokens.dtype)
 
 
-def select_levels(values: Array, rows: np.ndarray) -> Array:
-    """values[:, rows] [b s d] of [b r d] float32, in forms whose gradient is no scatter (slow on every device).
+def select_levels(values: Float[Array, "b r d"], levels: Levels) -> Float[Array, "b s d"]:
+    """Values of each token's noise level, in forms whose gradient is no scatter (slow on every device).
 
-    Two rows are a choice, which fuses into what uses it and whose gradient is a masked sum. More (a row for each latent
-    frame) are a gather whose gradient is a product with the matrix of ones that says which token has which row.
+    Two levels are a choice, which fuses into what uses it and whose gradient is a masked sum. More (one for each latent
+    frame) are a gather whose gradient is a product with the matrix of ones that says which token has which level.
+
+    Args:
+        values: [b r d] float32, of each level.
+        levels: [s], the level of each token.
+
+    Returns:
+        values[:, levels] [b s d] float32.
     """
     count = values.shape[1]
     if count <= 2:
-        return jnp.where((rows == 0)[None, :, None], values[:, :1], values[:, count - 1 :])
-    return _gather_levels(values, tuple(rows.tolist()))
+        return jnp.where((levels == 0)[None, :, None], values[:, :1], values[:, count - 1 :])
+    return _gather_levels(values, tuple(levels.tolist()))
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
-def _gather_levels(values: Array, rows: tuple[int, ...]) -> Array:
-    return values[:, np.asarray(rows)]
+def _gather_levels(values: Array, levels: tuple[int, ...]) -> Array:
+    return values[:, np.asarray(levels)]
 
 
-def _gather_levels_forward(values: Array, rows: tuple[int, ...]) -> tuple[Array, int]:
-    return _gather_levels(values, rows), values.shape[1]
+def _gather_levels_forward(values: Array, levels: tuple[int, ...]) -> tuple[Array, int]:
+    return _gather_levels(values, levels), values.shape[1]
 
 
-def _gather_levels_backward(rows: tuple[int, ...], count: int, gradient: Array) -> tuple[Array]:
-    has_row = jnp.asarray(np.equal(rows, np.arange(count)[:, None]), gradient.dtype)
-    return (jnp.einsum("rs,bsd->brd", has_row, gradient, precision=jax.lax.Precision.HIGHEST),)
+def _gather_levels_backward(levels: tuple[int, ...], count: int, gradient: Array) -> tuple[Array]:
+    has_level = jnp.asarray(np.equal(levels, np.arange(count)[:, None]), gradient.dtype)
+    return (jnp.einsum("rs,bsd->brd", has_level, gradient, precision=jax.lax.Precision.HIGHEST),)
 
 
 _gather_levels.defvjp(_gather_levels_forward, _gather_levels_backward)
 
 
-def rotate(values: Array, rotary: Rotary) -> Array:
-    """Turn neighboring pairs of features of [b s n k] by each token's angles, in float32."""
+def rotate(values: Float[Array, "b s heads k"], rotary: Rotary) -> Float[Array, "b s heads k"]:
+    """Turn neighboring pairs of features of [b s n k] by each token's angles: [b s n k] float32."""
     cos, sin = (table[None, :, None, :, None] for table in rotary)
     pairs = values.reshape(*values.shape[:-1], -1, 2)
     return (pairs * cos + pairs[..., ::-1] * jnp.concatenate([-sin, sin], axis=-1)).reshape(values.shape)
@@ -267,7 +331,7 @@ REMAT: dict[str, Callable[..., bool] | None] = {
     "dots": _POLICIES.save_from_both_policies(_POLICIES.dots_with_no_batch_dims_saveable, _KEEP_ATTENTION),
     "full": None,
 }
-"""What the backward pass finds kept beside each block's input, by name.
+"""Policy of what is kept for the backward pass beside each block's input, by name.
 
 full       nothing: the forward pass is computed twice (4/3 of the work), the least memory
 attention  results of attention, so that all but its quadratic part is computed twice; two widths more a token and block
@@ -276,7 +340,7 @@ none       everything that the backward pass reads
 """
 
 
-def choose_attention(asked: AttentionName, head_dim: int, dtype: jnp.dtype) -> Literal["xla", "cudnn"]:
+def choose_attention(asked: AttentionName, head_dim: int, dtype: DTypeLike) -> Literal["xla", "cudnn"]:
     """The implementation of `jax.nn.dot_product_attention` on this machine.
 
     "auto" is cuDNN's on a CUDA GPU of compute capability 8.0 and up, in bfloat16 or float16, where the width of a head is
@@ -310,20 +374,22 @@ def _reason_against_cudnn(head_dim: int, dtype: np.dtype) -> str:
     return ""
 
 
-def gelu(values: Array) -> Array:
+def gelu(values: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Gelu of values [...] by its approximation with tanh, as Wan has it."""
     return nnx.gelu(values, approximate=True)
 
 
-def linear(features: int, out: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> nnx.Linear:
+def linear(features: int, out: int, dtype: DTypeLike, rngs: nnx.Rngs) -> nnx.Linear:
+    """A linear layer whose product is computed in `dtype`."""
     return nnx.Linear(features, out, dtype=dtype, kernel_init=nnx.initializers.xavier_uniform(), rngs=rngs)
 
 
-def scaled_normal(key: Array, shape: tuple[int, ...]) -> Array:
-    """Wan's start for modulations: normal over the root of the width."""
+def scaled_normal(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "..."]:
+    """Random start of modulations as Wan's: normal numbers float32 of `shape`, over the root of the width."""
     return jax.random.normal(key, shape, jnp.float32) / np.sqrt(shape[-1]).astype(np.float32)
 
 
-def stacked_blocks(size: ModelSize, dtype: jnp.dtype, attention: AttentionName, rngs: nnx.Rngs) -> Block:
+def stacked_blocks(size: ModelSize, dtype: DTypeLike, attention: AttentionName, rngs: nnx.Rngs) -> Block:
     """`depth` blocks as one whose parameters have a leading layer axis."""
 
     @nnx.split_rngs(splits=size.depth)

@@ -4,8 +4,8 @@ Reads  latents [b t h w c] of each stream, noise level, text embeddings [b l e]
 Writes velocity [b t h w c] of the RGB stream
 To add a size: one line in MODELS. To add a stream: one line in STREAMS. Published weights: dit_layouts.py.
 
-Shape letters: b batch, t h w c latent video, s tokens (t' h' w' flattened), d width, n heads, r distinct noise levels,
-l text tokens (in a cache: layers).
+Shape letters: b batch, t h w c latent video, s tokens (t' h' w' flattened), d width, n heads, r distinct noise levels of
+a sample, l text tokens of e features, k tokens of context (in attention: features of a head).
 Numbers that look arbitrary (eps 1e-6, 256 frequencies, six modulations) are those of the published weights.
 """
 
@@ -19,6 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import Float, Int
 
 from xew.model.devices.sharding import gather_parameters, shard_over_batch
 from xew.model.network.blocks import (
@@ -26,6 +28,7 @@ from xew.model.network.blocks import (
     AttentionName,
     ConditionCache,
     Head,
+    Levels,
     ModelSize,
     RematName,
     Rotary,
@@ -49,9 +52,16 @@ from xew.model.network.tokens import (
 )
 
 TIMESTEPS = 1000.0
-"""The network is told the noise level as sigma times this."""
+"""Factor from a noise level in [0, 1] to the timestep that the network gets as input."""
 EMBEDDING_INIT = nnx.initializers.normal(0.02)
 
+Latents = Float[Array, "b t h w c"]
+Conditions = Mapping[str, Float[Array, "b ..."]]
+"""Latents [b t' h' w' c] or numbers [b t' n] by the stream or mechanism that they feed."""
+Text = Float[Array, "b l e"] | Int[Array, "b l"]
+"""Embeddings [b l e] of a frozen encoder, or ids [b l] of words."""
+TokenGrid = tuple[int, int, int]
+"""Number of tokens in time, height and width."""
 Visibility = Literal["joint", "one_way"]
 TimeEmbedding = Literal["exact", "flowwam"]
 
@@ -71,7 +81,7 @@ class Stream:
     """Encoded video [b t h w c], the 16-number action of each latent frame [b t 16], or earlier RGB frames, each encoded
     alone [b n h w c], which RGB's own patch embedding takes."""
     timestep: Literal["shared", "clean"]
-    """Noise level that its tokens are told: RGB's own (0 in latent frame 0), as FlowWAM does, or 0."""
+    """Noise level that its tokens get as input: RGB's own (0 in latent frame 0), as FlowWAM does, or 0."""
 
 
 STREAMS = {
@@ -84,7 +94,7 @@ STREAMS = {
 
 
 class WorldModel(nnx.Module):
-    """Predicts the flow-matching velocity of the RGB stream given clean condition streams.
+    """Predicts the flow-matching velocity of the RGB stream, given clean condition streams.
 
     Args:
         size: one of `MODELS`.
@@ -97,7 +107,7 @@ class WorldModel(nnx.Module):
         unroll: blocks compiled as one loop body; more is faster on a CPU and slower to compile.
         attention: see `choose_attention`.
         visibility: "joint": all tokens see all, as in FlowWAM. "one_way": condition tokens see condition tokens only and
-            are told the noise level 0, so that a sampler computes them once a clip (`condition_cache`); a departure.
+            get the noise level 0, so that a sampler computes them once a clip (`condition_cache`); a departure.
         time: "exact", or "flowwam": the rounding with which FlowWAM's published weights were trained.
         history: when the frames of the stream history were, in latent frames from the clip's first (negative).
         words: rows of a learned table of words; text is then ids [b l] instead of embeddings. 0 has none.
@@ -109,8 +119,8 @@ class WorldModel(nnx.Module):
         channels: int,
         streams: Sequence[str] = (),
         *,
-        dtype: jnp.dtype = jnp.float32,
-        residual: jnp.dtype = jnp.float32,
+        dtype: DTypeLike = jnp.float32,
+        residual: DTypeLike = jnp.float32,
         remat: RematName = "none",
         unroll: int = 1,
         attention: AttentionName = "auto",
@@ -151,12 +161,12 @@ class WorldModel(nnx.Module):
 
     def __call__(
         self,
-        latents: Array,
-        conditions: Mapping[str, Array],
-        sigma: Array,
-        text: Array,
+        latents: Latents,
+        conditions: Conditions,
+        sigma: Float[Array, " b"],
+        text: Text,
         cache: ConditionCache | None = None,
-    ) -> Array:
+    ) -> Latents:
         """Velocity of the RGB latents.
 
         Args:
@@ -171,57 +181,73 @@ class WorldModel(nnx.Module):
             [b t h w c] float32; frame 0 carries no meaning.
         """
         rgb = np.prod(token_grid(latents.shape)).item()
-        tokens, rows, rotary = self.embed_streams(latents, conditions, cached=cache is not None)
-        time, rows = self.add_frame_vectors(self.embed_time(sigma), rows, latents.shape, conditions)
+        tokens, levels, rotary = self.embed_streams(latents, conditions, cached=cache is not None)
+        time, levels = self.add_frame_vectors(self.embed_time(sigma), levels, latents.shape, conditions)
         context = self.framed_context(text, latents.shape, conditions)
-        tokens = self.apply_blocks(tokens, self.modulation(time), rows, rotary, context, rgb, cache)
-        return unpatchify(self.head(tokens[:, :rgb].astype(jnp.float32), time, rows[:rgb]), latents.shape)
+        tokens = self.apply_blocks(tokens, self.modulation(time), levels, rotary, context, rgb, cache)
+        return unpatchify(self.head(tokens[:, :rgb].astype(jnp.float32), time, levels[:rgb]), latents.shape)
 
-    def condition_cache(self, conditions: Mapping[str, Array], text: Array) -> ConditionCache:
+    def condition_cache(self, conditions: Conditions, text: Text) -> ConditionCache:
         """Keys and values of the condition tokens in every layer; they hold for all steps of sampling a clip.
+
+        Args:
+            conditions: as of `__call__`.
+            text: as of `__call__`.
+
+        Returns:
+            Two of [layers b s n head_dim].
 
         Raises:
             ValueError: the model is not `one_way`, so that condition tokens depend on the RGB tokens of each step.
         """
         if self.visibility != "one_way":
             raise ValueError("condition tokens can only be computed ahead in a model of visibility one_way.")
-        tokens, rows, rotary = self._join({name: conditions[name] for name in self.condition_streams})
+        tokens, levels, rotary = self._join({name: conditions[name] for name in self.condition_streams})
         modulation = self.modulation(self.embed_time(jnp.zeros(tokens.shape[0], jnp.float32)))
         context = self.context(text, conditions)
         graph, layers = nnx.split(self.blocks)
 
         def block(carry: Array, layer: nnx.State) -> tuple[Array, ConditionCache]:
             module, carry = nnx.merge(graph, gather_parameters(layer, layer=True)), shard_over_batch(carry)
-            read = ConditionCache(*module.keys_values(carry, modulation, rows, rotary))
-            return module(carry, modulation, rows, rotary, context), read
+            read = ConditionCache(*module.keys_values(carry, modulation, levels, rotary))
+            return module(carry, modulation, levels, rotary, context), read
 
         return jax.lax.scan(block, tokens, layers, unroll=self.unroll)[1]
 
     def embed_streams(
-        self, latents: Array, conditions: Mapping[str, Array], cached: bool = False
-    ) -> tuple[Array, np.ndarray, Rotary]:
-        """All streams' tokens [b s d], the row of the noise level that each token is told [s], and their rotations."""
+        self, latents: Latents, conditions: Conditions, cached: bool = False
+    ) -> tuple[Float[Array, "b s d"], Levels, Rotary]:
+        """Tokens of all streams, their noise levels and their rotations.
+
+        Args:
+            latents: [b t h w c] of RGB.
+            conditions: as of `__call__`.
+            cached: leave the condition streams out.
+
+        Returns:
+            Tokens [b s d], the index of each one's noise level [s], cosine and sine of its angles [s head_dim/2].
+        """
         streams = {name: conditions[name] for name in self.condition_streams if not cached}
-        tokens, rows, rotary = self._join({"rgb": latents} | streams)
+        tokens, levels, rotary = self._join({"rgb": latents} | streams)
         for name in self._entering("channels"):
             pictures = conditions[name]
             if MECHANISMS[name].source == "camera":
                 pictures = ray_maps(pictures, latents.shape)
             columns = self.mechanisms[name](patchify(pictures)).astype(jnp.float32)
             tokens = tokens.at[:, : columns.shape[1]].add(columns.astype(self.residual))
-        return tokens, rows, rotary
+        return tokens, levels, rotary
 
     def _join(self, inputs: Mapping[str, Array]) -> tuple[Array, np.ndarray, Rotary]:
         grids = {name: token_grid(array.shape) for name, array in inputs.items()}
         tokens = jnp.concatenate([self._embed(name, array) for name, array in inputs.items()], axis=1)
-        rows = np.concatenate([token_levels(self._stream(name), grid) for name, grid in grids.items()])
+        levels = np.concatenate([token_levels(self._stream(name), grid) for name, grid in grids.items()])
         head_dim, base, times = self.size.head_dim, self.size.rotary_base, {"history": self.history}
         angles = np.concatenate([rotary_angles(grid, head_dim, base, times.get(name)) for name, grid in grids.items()])
         rotary = jnp.asarray(np.cos(angles), jnp.float32), jnp.asarray(np.sin(angles), jnp.float32)
-        return tokens.astype(self.residual), rows, rotary
+        return tokens.astype(self.residual), levels, rotary
 
     def _stream(self, name: str) -> Stream:
-        """A stream as this model tells it the time: nothing that RGB does not feed can know its noise level."""
+        """A stream with the noise level that it gets in this model: what RGB does not feed cannot know RGB's."""
         stream = STREAMS[name]
         return dataclasses.replace(stream, timestep="clean") if self.visibility == "one_way" and name != "rgb" else stream
 
@@ -232,8 +258,8 @@ class WorldModel(nnx.Module):
         embed = self.patch_embedding if STREAMS[name].source == "history" else self.stream_inputs[name]
         return embed(values).astype(jnp.float32) + self.stream_embeddings[name][None, None]
 
-    def embed_time(self, sigma: Array) -> Array:
-        """Time embeddings [b 2 d] of the two noise levels of each sample: none, and its own [b]."""
+    def embed_time(self, sigma: Float[Array, " b"]) -> Float[Array, "b 2 d"]:
+        """Time embeddings [b 2 d] float32 of the two noise levels of each sample: none, and its own [b]."""
         timesteps = jnp.stack([jnp.zeros_like(sigma), TIMESTEPS * sigma], axis=1)
         return self.time_embedding(rounded_sinusoid(timesteps) if self.time == "flowwam" else sinusoid(timesteps))
 
@@ -242,72 +268,100 @@ class WorldModel(nnx.Module):
         return [name for name in self.mechanisms if MECHANISMS[name].enters == place]
 
     def add_frame_vectors(
-        self, time: Array, rows: np.ndarray, shape: Sequence[int], conditions: Mapping[str, Array]
-    ) -> tuple[Array, np.ndarray]:
-        """Time embeddings [b r d] and rows [s] in which each frame of RGB latents of `shape` has a row of its own.
+        self, time: Float[Array, "b r d"], levels: Levels, shape: Sequence[int], conditions: Conditions
+    ) -> tuple[Float[Array, "b r2 d"], Levels]:
+        """Give each latent frame of RGB a time embedding of its own, with the vectors of the mechanisms that enter there.
 
-        It is the embedding of the frame's noise level plus the vectors of the mechanisms that enter there; without one,
-        all stays as it is. Other streams keep their two rows.
+        Without such a mechanism all stays as it is. Other streams keep their two levels.
+
+        Args:
+            time: [b r d] float32, embeddings of the noise levels.
+            levels: [s], which of them each token takes.
+            shape: of the RGB latents [b t h w c].
+            conditions: as of `__call__`.
+
+        Returns:
+            Embeddings [b r+t' d] float32 and the one that each token takes [s].
         """
         names = self._entering("time")
         if not names:
-            return time, rows
+            return time, levels
         frames, height, width = token_grid(shape)
-        levels = token_levels(STREAMS["rgb"], (frames, 1, 1))
-        told = sum((self.mechanisms[name](conditions[name]) for name in names), select_levels(time, levels))
+        of_frames = select_levels(time, token_levels(STREAMS["rgb"], (frames, 1, 1)))
+        vectors = sum((self.mechanisms[name](conditions[name]) for name in names), of_frames)
         own = np.repeat(time.shape[1] + np.arange(frames), height * width)
-        return jnp.concatenate([time, told], axis=1), np.concatenate([own, rows[len(own) :]])
+        return jnp.concatenate([time, vectors], axis=1), np.concatenate([own, levels[len(own) :]])
 
-    def context(self, text: Array, conditions: Mapping[str, Array] | None = None) -> Array:
-        """What all tokens' cross-attention reads [b l d].
+    def context(self, text: Text, conditions: Conditions | None = None) -> Float[Array, "b k d"]:
+        """What the cross-attention of all tokens reads: [b k d].
 
         Args:
             text: embeddings [b l e], or ids of words [b l].
             conditions: of mechanisms whose tokens stand beside the text, or instead of it.
         """
         names = self._entering("context")
-        told = [self.mechanisms[name]((conditions or {})[name]).astype(self.dtype) for name in names]
+        tokens = [self.mechanisms[name]((conditions or {})[name]).astype(self.dtype) for name in names]
         if any(MECHANISMS[name].replaces_text for name in names):
-            return jnp.concatenate(told, axis=1)
+            return jnp.concatenate(tokens, axis=1)
         if self.words is not None:
             text = self.words(text) * (text > 0)[..., None].astype(jnp.float32)
-        return jnp.concatenate([self.text_embedding(text), *told], axis=1)
+        return jnp.concatenate([self.text_embedding(text), *tokens], axis=1)
 
-    def framed_context(self, text: Array, shape: Sequence[int], conditions: Mapping[str, Array]) -> Array | FramedContext:
-        """`context`, and beside it what only the tokens of one frame read, where a mechanism has such tokens.
+    def framed_context(self, text: Text, shape: Sequence[int], conditions: Conditions) -> Float[Array, "b k d"] | FramedContext:
+        """What cross-attention reads: `context`, and beside it what only the tokens of one frame read.
 
-        The frames are those of RGB latents of `shape` and, after them as in the tokens, those of the history.
+        Args:
+            text: as of `context`.
+            shape: of the RGB latents [b t h w c].
+            conditions: as of `__call__`.
+
+        Returns:
+            [b k d] where no mechanism has tokens of single frames. Else these stand beside, [b f k d]: those of RGB's frames
+            and, after them as in the tokens, those of the history.
         """
         shared, names = self.context(text, conditions), self._entering("frame")
         if not names:
             return shared
         frames, height, width = token_grid(shape)
-        told = jnp.concatenate([self.mechanisms[name](conditions[name]).astype(self.dtype) for name in names], axis=2)
-        earlier = told.shape[1] - frames
-        return FramedContext(shared, jnp.concatenate([told[:, earlier:], told[:, :earlier]], axis=1), height * width)
+        framed = jnp.concatenate([self.mechanisms[name](conditions[name]).astype(self.dtype) for name in names], axis=2)
+        earlier = framed.shape[1] - frames
+        return FramedContext(shared, jnp.concatenate([framed[:, earlier:], framed[:, :earlier]], axis=1), height * width)
 
-    def modulation(self, time: Array) -> Array:
-        """Adaptive-norm shifts, scales and gates [b r 6 d] of time embeddings [b r d]."""
+    def modulation(self, time: Float[Array, "b r d"]) -> Float[Array, "b r 6 d"]:
+        """Adaptive-norm shifts, scales and gates [b r 6 d] float32 of time embeddings [b r d]."""
         return self.time_projection(nnx.silu(time)).reshape(*time.shape[:-1], 6, self.size.dim)
 
     def apply_blocks(
         self,
-        tokens: Array,
-        modulation: Array,
-        rows: np.ndarray,
+        tokens: Float[Array, "b s d"],
+        modulation: Float[Array, "b r 6 d"],
+        levels: Levels,
         rotary: Rotary,
-        text: Array | FramedContext,
+        text: Float[Array, "b k d"] | FramedContext,
         rgb: int | None = None,
         cache: ConditionCache | None = None,
-    ) -> Array:
-        """The block stack as a scan over the leading axis of the stacked parameters; the first `rgb` tokens are RGB's."""
+    ) -> Float[Array, "b s d"]:
+        """Apply the block stack, as a scan over the leading axis of the stacked parameters.
+
+        Args:
+            tokens: [b s d] of all streams.
+            modulation: [b r 6 d] float32, one for each noise level.
+            levels: [s], which of them each token takes.
+            rotary: rotations of the tokens' positions.
+            text: [b k d], what cross-attention reads.
+            rgb: number of RGB's tokens, which come first.
+            cache: from `condition_cache`.
+
+        Returns:
+            Tokens [b s d].
+        """
         graph, layers = nnx.split(self.blocks)
-        alone = rgb if self.visibility == "one_way" and rgb != tokens.shape[1] else None
+        start = rgb if self.visibility == "one_way" and rgb != tokens.shape[1] else None
 
         def block(carry: Array, xs: tuple[nnx.State, ConditionCache | None]) -> tuple[Array, None]:
             layer, read = xs
             module = nnx.merge(graph, gather_parameters(layer, layer=True))
-            return module(shard_over_batch(carry), modulation, rows, rotary, text, alone=alone, cache=read), None
+            return module(shard_over_batch(carry), modulation, levels, rotary, text, start, read), None
 
         if self.remat != "none":
             # The loop already keeps recomputation apart from the forward pass; only without a loop must it be forced.
@@ -315,15 +369,15 @@ class WorldModel(nnx.Module):
         return jax.lax.scan(block, tokens, (layers, cache), unroll=self.unroll)[0]
 
 
-def token_levels(stream: Stream, grid: tuple[int, int, int]) -> np.ndarray:
-    """Which noise level each token is told [s]: row 0 is clean, row 1 the sample's own."""
+def token_levels(stream: Stream, grid: TokenGrid) -> Levels:
+    """Index [s] of the noise level that each token of a stream gets: 0 is no noise, 1 the sample's own."""
     frames = np.zeros(grid[0], int) if stream.timestep == "clean" else np.minimum(np.arange(grid[0]), 1)
     return np.repeat(frames, grid[1] * grid[2])
 
 
 def flops(
     size: ModelSize,
-    grids: Sequence[tuple[int, int, int]],
+    grids: Sequence[TokenGrid],
     text_tokens: int | None = None,
     batch: int = 1,
     *,
@@ -331,7 +385,7 @@ def flops(
     cached: bool = False,
     channels: int = 48,
 ) -> float:
-    """Floating-point operations of one forward pass: two for each multiply-add of the matrix products, nothing else.
+    """Number of floating-point operations of one forward pass: two for each multiply-add of the matrix products.
 
     A training step is three times this (what remat computes again is not counted, as is usual for MFU).
 
@@ -359,7 +413,7 @@ def flops(
 
 
 def cast_params(graph: nnx.GraphDef, params: Any) -> Any:
-    """Parameters with every matrix in the type in which its product is computed; the others stay as they are.
+    """Cast every matrix to the type in which its product is computed; the other parameters stay as they are.
 
     With it the rounding is done once, before the loop over blocks (and over the steps of a sampler), instead of in every
     block of every pass, and sharded parameters are gathered in half the bytes. Within a loss it is differentiable: the
@@ -375,5 +429,5 @@ def cast_params(graph: nnx.GraphDef, params: Any) -> Any:
 
 
 def parameter_count(model: nnx.Module) -> int:
-    """How many numbers the model learns."""
+    """Number of parameters that the model learns."""
     return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)))

@@ -1,8 +1,8 @@
-"""Adaptation of a trained run to a new robot from a few episodes: which episodes, and low-rank corrections (LoRA).
+"""LoRA: low-rank corrections of the blocks' matrices, by which a trained run is adapted to a new robot.
 
-The paper's few-shot protocol (its section on few-shot adaptation) changes all weights on the target's episodes alone.
-Two remedies against forgetting, which it leaves open, are options: replay of the run's own training episodes, and LoRA
-(Hu et al. 2021, arXiv 2106.09685), which leaves the run's weights as they are and learns W + A B with A of `rank` columns.
+LoRA (Hu et al. 2021, arXiv 2106.09685) leaves the run's weights as they are and learns W + A B, where A has `rank` columns.
+The paper's few-shot protocol changes all weights on the target's episodes alone; this is one of two remedies against
+forgetting that it leaves open (the other is replay, in training/data.py).
 """
 
 from collections.abc import Sequence
@@ -12,42 +12,55 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Float, Key
 
 from xew.model.devices.sharding import LAYERS, path_names
 
 LORA_LAYERS = ("q", "k", "v", "o", "first", "second")
-"""Linear layers of the blocks that are corrected: both attentions' and the feed-forward's."""
+"""Names of the linear layers in a block that get corrections: both attentions' and the feed-forward's."""
+Lora = dict[str, dict[str, dict[str, Float[Array, "layers i o"]]]]
+"""Matrices A [layers in rank] and B [layers rank out] float32, as {"blocks": {"self_attn.q.kernel": {"a": A, "b": B}, …}}."""
 
 
-def init_lora(params: Any, rank: int, key: Array) -> dict[str, dict[str, dict[str, Array]]]:
-    """Corrections of the blocks' matrices, all zero in effect: A is normal over the root of its inputs, B is zero.
+def init_lora(params: Any, rank: int, key: Key[Array, ""]) -> Lora:
+    """Corrections that change nothing yet: A is normal over the root of its inputs, B is zero.
+
+    Args:
+        params: of the network, whose matrices in the blocks are [layers in out].
+        rank: columns of A.
+        key: of the random numbers.
 
     Returns:
-        {"blocks": {"self_attn.q.kernel": {"a": [layers in rank], "b": [layers rank out]}, …}} float32.
+        See `Lora`.
     """
-    corrections = {}
+    learned = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         names = path_names(path)
         if is_lora_layer(names):
             key, own = jax.random.split(key)
             layers, inputs, outputs = leaf.shape
             a = jax.random.normal(own, (layers, inputs, rank), jnp.float32) / np.sqrt(inputs).astype(np.float32)
-            corrections[".".join(names[1:])] = {"a": a, "b": jnp.zeros((layers, rank, outputs), jnp.float32)}
-    return {LAYERS: corrections}
+            learned[".".join(names[1:])] = {"a": a, "b": jnp.zeros((layers, rank, outputs), jnp.float32)}
+    return {LAYERS: learned}
+
+
+def apply_lora(base: Any, learned: Any) -> Any:
+    """The network's parameters: `base` plus its corrections, or without a base what was learned itself.
+
+    Args:
+        base: parameters of the run that the adaptation started from; None without LoRA.
+        learned: see `Lora`; without a base, parameters.
+    """
+    if base is None:
+        return learned
+
+    def add(path: tuple[Any, ...], leaf: Array) -> Array:
+        matrices = learned[LAYERS].get(".".join(path_names(path)[1:]))
+        return leaf if matrices is None else leaf + matrices["a"] @ matrices["b"]
+
+    return jax.tree_util.tree_map_with_path(add, base)
 
 
 def is_lora_layer(names: Sequence[str]) -> bool:
     """Whether the parameter of this path is a matrix that LoRA corrects."""
     return names[0] == LAYERS and names[-1] == "kernel" and names[-2] in LORA_LAYERS
-
-
-def apply_lora(base: Any, learned: Any) -> Any:
-    """The network's parameters: `base` plus its corrections, or without a base what was learned itself."""
-    if base is None:
-        return learned
-
-    def add(path: tuple[Any, ...], leaf: Array) -> Array:
-        correction = learned[LAYERS].get(".".join(path_names(path)[1:]))
-        return leaf if correction is None else leaf + correction["a"] @ correction["b"]
-
-    return jax.tree_util.tree_map_with_path(add, base)

@@ -22,20 +22,23 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import Float
 
 from xew.episode import HEIGHT, WIDTH
 from xew.model.video.frames import TEMPORAL_FACTOR, padding_to
 
 TOOLS = 14
-"""Position, roll-pitch-yaw and gripper of two tools."""
+"""Number of numbers of two tools: position, roll, pitch, yaw and gripper of each."""
 CAMERA = 16
-"""fx fy cx cy [pixels of the camera], rotation of world to camera [9], position [3, m]."""
+"""Number of numbers of a camera: fx fy cx cy [pixels of the camera], rotation from world to camera [9], position [3, m]."""
 RAY_PATCH = 6 * 4
-"""Numbers of a patch of a ray map: direction and origin of 2x2 latent pixels."""
+"""Number of numbers in a patch of a ray map: direction and origin of 2x2 latent pixels."""
 HIDDEN = 4
 """Width of the hidden layer of per-frame vectors, in widths of the network (IRASim and BWM alike)."""
 POOLED_TOKENS, POOLING_LAYERS = 16, 2
-"""EnerVerse-AC's resampler has 16 queries and four layers of its own width; ours has the network's width and two."""
+"""Number of queries and of layers of the resampler. EnerVerse-AC's has 16 queries and four layers of its own width; ours has
+the network's width and two."""
 
 Activation = Callable[[Array], Array]
 
@@ -53,8 +56,8 @@ class FrameVector(nnx.Module):
         self.second = nnx.Linear(HIDDEN * dim, dim, kernel_init=nnx.initializers.zeros_init(), rngs=rngs)
         self.null = nnx.Param(0.02 * jax.random.normal(rngs.params(), (dim,), jnp.float32)) if null else None
 
-    def __call__(self, numbers: Array) -> Array:
-        """[b t 4*n] -> float32 [b t d]."""
+    def __call__(self, numbers: Float[Array, "b t n"]) -> Float[Array, "b t d"]:
+        """Numbers [b t 4*n] -> vectors [b t d] float32."""
         vectors = self.second(self.activation(self.first(numbers)))
         if self.null is None:
             return vectors
@@ -65,11 +68,11 @@ class FrameVector(nnx.Module):
 class FrameTokens(nnx.Module):
     """Three layers from the tool poses of a latent frame to one context token of that frame (Ctrl-World)."""
 
-    def __init__(self, dim: int, numbers: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
+    def __init__(self, dim: int, numbers: int, dtype: DTypeLike, rngs: nnx.Rngs) -> None:
         self.layers = nnx.List([_linear(width, dim, dtype, rngs) for width in (numbers, dim, dim)])
 
-    def __call__(self, numbers: Array) -> Array:
-        """[b f n] -> [b f 1 d]."""
+    def __call__(self, numbers: Float[Array, "b f n"]) -> Float[Array, "b f 1 d"]:
+        """Numbers [b f n] -> tokens [b f 1 d]."""
         first, second, third = self.layers
         return third(nnx.silu(second(nnx.silu(first(numbers)))))[:, :, None]
 
@@ -77,24 +80,24 @@ class FrameTokens(nnx.Module):
 class ClipTokens(nnx.Module):
     """Two layers from the tool pose of each frame of video to a context token of all (BWM)."""
 
-    def __init__(self, dim: int, numbers: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
+    def __init__(self, dim: int, numbers: int, dtype: DTypeLike, rngs: nnx.Rngs) -> None:
         self.first, self.second = _linear(numbers // TEMPORAL_FACTOR, dim, dtype, rngs), _linear(dim, dim, dtype, rngs)
 
-    def __call__(self, numbers: Array) -> Array:
-        """[b t 4*n] -> [b k d], k the frames of video."""
+    def __call__(self, numbers: Float[Array, "b t n"]) -> Float[Array, "b k d"]:
+        """Numbers [b t 4*n] -> tokens [b k d], k the frames of video."""
         return self.second(nnx.gelu(self.first(frames_of_groups(numbers)), approximate=False))
 
 
 class PooledTokens(nnx.Module):
     """A fixed number of learned queries that attend to the actions of all frames of video (EnerVerse-AC's resampler)."""
 
-    def __init__(self, dim: int, heads: int, numbers: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
+    def __init__(self, dim: int, heads: int, numbers: int, dtype: DTypeLike, rngs: nnx.Rngs) -> None:
         self.first = _linear(numbers // TEMPORAL_FACTOR, dim, dtype, rngs)
         self.queries = nnx.Param(0.02 * jax.random.normal(rngs.params(), (POOLED_TOKENS, dim), jnp.float32))
         self.layers = nnx.List([PoolingLayer(dim, heads, dtype, rngs) for _ in range(POOLING_LAYERS)])
 
-    def __call__(self, numbers: Array) -> Array:
-        """[b t 4*n] -> [b 16 d]."""
+    def __call__(self, numbers: Float[Array, "b t n"]) -> Float[Array, "b 16 d"]:
+        """Numbers [b t 4*n] -> tokens [b 16 d] float32."""
         actions = self.first(frames_of_groups(numbers)).astype(jnp.float32)
         actions = actions + jnp.asarray(positions(*actions.shape[1:]))[None]
         tokens = jnp.broadcast_to(self.queries[...], (len(actions), *self.queries.shape))
@@ -106,13 +109,13 @@ class PooledTokens(nnx.Module):
 class PoolingLayer(nnx.Module):
     """Queries attend to the actions and to themselves, then a feed-forward layer; both on top of what came in."""
 
-    def __init__(self, dim: int, heads: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
+    def __init__(self, dim: int, heads: int, dtype: DTypeLike, rngs: nnx.Rngs) -> None:
         self.norm_tokens, self.norm_actions, self.norm = (nnx.LayerNorm(dim, dtype=jnp.float32, rngs=rngs) for _ in range(3))
         self.attention = nnx.MultiHeadAttention(heads, dim, dtype=dtype, decode=False, rngs=rngs)
         self.first, self.second = _linear(dim, HIDDEN * dim, dtype, rngs), _linear(HIDDEN * dim, dim, dtype, rngs)
 
-    def __call__(self, tokens: Array, actions: Array) -> Array:
-        """tokens [b 16 d], actions [b k d] -> [b 16 d], all float32."""
+    def __call__(self, tokens: Float[Array, "b 16 d"], actions: Float[Array, "b k d"]) -> Float[Array, "b 16 d"]:
+        """Tokens [b 16 d] and actions [b k d] -> tokens [b 16 d], all float32."""
         asked = self.norm_tokens(tokens)
         seen = jnp.concatenate([self.norm_actions(actions), asked], axis=1)
         tokens = tokens + self.attention(asked, seen).astype(jnp.float32)
@@ -122,12 +125,12 @@ class PoolingLayer(nnx.Module):
 class Channels(nnx.Module):
     """More channels of RGB's patches: new columns of its patch embedding, at zero to begin with, kept apart from it."""
 
-    def __init__(self, dim: int, features: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
+    def __init__(self, dim: int, features: int, dtype: DTypeLike, rngs: nnx.Rngs) -> None:
         self.columns = nnx.Linear(
             features, dim, use_bias=False, dtype=dtype, kernel_init=nnx.initializers.zeros_init(), rngs=rngs
         )
 
-    def __call__(self, patches: Array) -> Array:
+    def __call__(self, patches: Float[Array, "b s features"]) -> Float[Array, "b s d"]:
         """Patches [b s features] -> [b s d] to be added to RGB's tokens."""
         return self.columns(patches)
 
@@ -138,15 +141,16 @@ class Mechanism:
 
     enters: Literal["time", "frame", "context", "channels"]
     source: Literal["numbers", "camera", "latents"]
-    """`width` numbers for each latent frame, the camera's 16 (drawn as a map of rays), or encoded pictures."""
-    build: Callable[[Any, int, jnp.dtype, nnx.Rngs], nnx.Module]
-    """(`dit.ModelSize`, features of a patch of the source, dtype of products, rngs) -> the module."""
+    """Input: `width` numbers for each latent frame, the camera's 16 (drawn as a map of rays), or encoded pictures."""
+    build: Callable[[Any, int, DTypeLike, nnx.Rngs], nnx.Module]
+    """Function (`dit.ModelSize`, features of a patch of the source, dtype of products, rngs) -> the module."""
     width: int = 0
+    """Number of numbers of a latent frame; 0 for pictures."""
     replaces_text: bool = False
-    """Its context stands alone; the text is not attended to."""
+    """Whether its context stands in the place of the text, which is then not attended to."""
 
 
-def _frame_vector(activation: Activation, null: bool) -> Callable[[Any, int, jnp.dtype, nnx.Rngs], nnx.Module]:
+def _frame_vector(activation: Activation, null: bool) -> Callable[[Any, int, DTypeLike, nnx.Rngs], nnx.Module]:
     return lambda size, _, dtype, rngs: FrameVector(size.dim, TEMPORAL_FACTOR * TOOLS, activation, null, rngs)
 
 
@@ -181,27 +185,27 @@ MECHANISMS = {
 class FramedContext(NamedTuple):
     """What cross-attention reads where frames have a context of their own."""
 
-    shared: Array
-    """[b k d], for every token: the text's embeddings, or what stands in their place."""
-    framed: Array
-    """[b f k d], beside it for the tokens of one frame each: the first f * `tokens` tokens, frame by frame."""
+    shared: Float[Array, "b k d"]
+    """Context [b k d] of every token: the text's embeddings, or what stands in their place."""
+    framed: Float[Array, "b f m d"]
+    """Context [b f k d] beside it for the tokens of one frame each: the first f * `tokens` tokens, frame by frame."""
     tokens: int
-    """Tokens of a frame."""
+    """Number of tokens of a frame."""
 
 
-def create_mechanism(name: str, size: Any, features: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> nnx.Module:
-    """The module of a mechanism for a network of this size, whose RGB patches have so many `features`."""
+def create_mechanism(name: str, size: Any, features: int, dtype: DTypeLike, rngs: nnx.Rngs) -> nnx.Module:
+    """The module of a mechanism for a network of this size whose RGB patches have `features` numbers."""
     mechanism = MECHANISMS[name]
     return mechanism.build(size, RAY_PATCH if mechanism.source == "camera" else features, dtype, rngs)
 
 
-def frames_of_groups(numbers: Array) -> Array:
-    """[b t 4*n] of latent frames -> [b 4*(t-1)+1 n] of frames of video: the first group is one frame, four times."""
+def frames_of_groups(numbers: Float[Array, "b t n"]) -> Float[Array, "b k m"]:
+    """Numbers of latent frames [b t 4*n] -> of frames of video [b 4*(t-1)+1 n]; the first group is one frame, four times."""
     frames = numbers.reshape(len(numbers), TEMPORAL_FACTOR * numbers.shape[1], -1)
     return frames[:, TEMPORAL_FACTOR - 1 :]
 
 
-def ray_maps(camera: Array, shape: Sequence[int]) -> Array:
+def ray_maps(camera: Float[Array, "b t 16"], shape: Sequence[int]) -> Float[Array, "b t h w 6"]:
     """Where each latent pixel looks: unit direction and origin of its ray in the world (EnerVerse-AC's ray maps).
 
     Args:
@@ -209,7 +213,7 @@ def ray_maps(camera: Array, shape: Sequence[int]) -> Array:
         shape: of the latents [b t h w c], whose frames are the camera's after `frames.to_model_size`.
 
     Returns:
-        [b t h w 6].
+        Unit directions and origins [m] in the world [b t h w 6] float32.
     """
     height, width = shape[2:4]
     top, bottom, left, right = padding_to(height, width)
@@ -224,11 +228,11 @@ def ray_maps(camera: Array, shape: Sequence[int]) -> Array:
     return jnp.concatenate([direction, jnp.broadcast_to(camera[:, :, None, None, 13:], direction.shape)], axis=-1)
 
 
-def positions(count: int, dim: int) -> np.ndarray:
+def positions(count: int, dim: int) -> Float[np.ndarray, "count dim"]:
     """Sines and cosines [count dim] float32 that tell the order of frames."""
     angles = np.arange(count)[:, None] * 10_000.0 ** (-np.arange(0, dim, 2) / dim)
     return np.concatenate([np.sin(angles), np.cos(angles)], axis=-1)[:, :dim].astype(np.float32)
 
 
-def _linear(features: int, out: int, dtype: jnp.dtype, rngs: nnx.Rngs) -> nnx.Linear:
+def _linear(features: int, out: int, dtype: DTypeLike, rngs: nnx.Rngs) -> nnx.Linear:
     return nnx.Linear(features, out, dtype=dtype, kernel_init=nnx.initializers.xavier_uniform(), rngs=rngs)

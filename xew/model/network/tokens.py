@@ -10,13 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Float
 
 PATCH = (1, 2, 2)
+"""Latent frames, rows and columns of a token."""
 WAVELENGTH_BASE = 10_000.0
 TIME_FREQUENCIES = 256
 
 
-def sinusoid(timestep: Array) -> Array:
+def sinusoid(timestep: Float[Array, "*n"]) -> Float[Array, "*n 256"]:
     """Cosines, then sines [... 256] of float32 timesteps [...], as exact as Wan's float64 (to 2e-7; plain float32: 6e-5).
 
     A timestep times a frequency is split in a product of their upper halves, which float32 holds exactly, and a small
@@ -36,11 +38,14 @@ def sinusoid(timestep: Array) -> Array:
 
 
 UPPER_HALF = np.uint32(0xFFFFF000)
-"""Bits of a float32 that keep 12 of its 24 significant ones."""
+"""Bits of a float32 number that keep 12 of its 24 significant ones."""
 
 
-def rounded_sinusoid(timestep: Array) -> Array:
-    """`sinusoid` as FlowWAM has it: of the timestep in bfloat16 (steps of 4 from 512 on), itself rounded to bfloat16."""
+def rounded_sinusoid(timestep: Float[Array, "*n"]) -> Float[Array, "*n 256"]:
+    """`sinusoid` of timesteps [...] as FlowWAM has it: [... 256] float32.
+
+    The timestep is in bfloat16 (steps of 4 from 512 on), and the result is rounded to bfloat16.
+    """
     return sinusoid(timestep.astype(jnp.bfloat16).astype(jnp.float32)).astype(jnp.bfloat16).astype(jnp.float32)
 
 
@@ -53,11 +58,17 @@ def token_grid(shape: Sequence[int]) -> tuple[int, int, int]:
 
 def rotary_angles(
     grid: tuple[int, int, int], head_dim: int, base: float = WAVELENGTH_BASE, times: Sequence[float] | None = None
-) -> np.ndarray:
-    """Rotation angles [s head_dim/2] float64 of the tokens of a grid; every stream counts from (0, 0, 0).
+) -> Float[np.ndarray, "s angles"]:
+    """Rotation angles [s head_dim/2, rad] float64 of the tokens of a grid; every stream counts from (0, 0, 0).
 
     The head is split among time, height and width as in Wan (44, 42, 42 of 128; 24, 20, 20 of 64), and each part has
     its own geometric series of frequencies.
+
+    Args:
+        grid: tokens in time, height and width.
+        head_dim: width of a head.
+        base: ratio of the fastest to the slowest rotation.
+        times: of the frames, in latent frames; 0, 1, … if left out.
     """
     part = 2 * (head_dim // 6)
     parts = (head_dim - 2 * part, part, part)
@@ -67,16 +78,16 @@ def rotary_angles(
     return np.concatenate([np.outer(positions[:, axis], frequencies) for axis, frequencies in enumerate(series)], axis=-1)
 
 
-def patchify(latents: Array) -> Array:
-    """[b t h w c] -> tokens [b s c*ph*pw] in the feature order of Wan's convolution weights."""
+def patchify(latents: Float[Array, "b t h w c"]) -> Float[Array, "b s features"]:
+    """Latents [b t h w c] -> tokens [b s c*ph*pw] in the feature order of Wan's convolution weights."""
     b, _, _, _, c = latents.shape
     t, h, w = token_grid(latents.shape)
     cut = latents.reshape(b, t, PATCH[0], h, PATCH[1], w, PATCH[2], c)
     return cut.transpose(0, 1, 3, 5, 7, 2, 4, 6).reshape(b, t * h * w, -1)
 
 
-def unpatchify(features: Array, shape: Sequence[int]) -> Array:
-    """Head features [b s pt*ph*pw*c] -> latents of `shape` [b t h w c]; here c runs fastest."""
+def unpatchify(features: Float[Array, "b s features"], shape: Sequence[int]) -> Float[Array, "b t h w c"]:
+    """Features of the head [b s pt*ph*pw*c] -> latents of `shape` [b t h w c]; here c runs fastest."""
     b, _, _, _, c = shape
     t, h, w = token_grid(shape)
     cut = features.reshape(b, t, h, w, *PATCH, c)

@@ -23,13 +23,14 @@ from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from xew.config import pick
+from xew.dataset import Episode
+from xew.model.cache.clips import read_streams, take_frames
 from xew.model.cache.scales import Scale, apply_scales
 from xew.model.codecs.codec import Codec, encode_pictures, to_pictures, to_signed
 from xew.model.conditions import Condition, clip_numbers
 from xew.model.devices.sharding import batch_sharding, replicated_sharding
 from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES, NoiseSchedule
-from xew.model.experiment import Experiment
-from xew.model.latents import Episode, stream_videos
+from xew.model.experiment import ClipInputs, Instructions, RolloutSettings
 from xew.model.network.dit import WorldModel, cast_params
 
 Streams = dict[str, np.ndarray]
@@ -78,13 +79,15 @@ class Prediction(NamedTuple):
 class Predictor:
     """A trained model that continues videos."""
 
-    experiment: Experiment
+    inputs: ClipInputs
+    instructions: Instructions
+    settings: RolloutSettings
     codec: Codec
     graph: nnx.GraphDef
     params: Any
-    """On one device, or on the devices of a mesh (`xew.model.devices.sharding`), over which batches are then cut."""
+    """Parameters on one device, or on the devices of a mesh (`xew.model.devices.sharding`), over which batches are cut."""
     scales: Mapping[str, Scale] = field(default_factory=dict)
-    """Of the numbers that the network is told, as in training."""
+    """Normalization of conditions that are numbers, as in training."""
 
     def predict(self, episodes: Sequence[Episode], frame_count: int) -> np.ndarray:
         """The first `frame_count` frames of each episode, predicted from its first: uint8 [b t h w 3] at the model's size.
@@ -104,12 +107,12 @@ class Predictor:
         whole = [*episodes, *[episodes[-1]] * (filled - len(episodes))]
         streams = [self._read(episode) for episode in episodes]
         streams += streams[-1:] * (filled - len(episodes))
-        text, negative = self._text(whole)
+        text, negative = self._encode_text(whole)
         given = self._place(np.stack([stream["rgb"][:1] for stream in streams]))
-        standing = self._standing(streams)
+        unaligned = self._encode_unaligned(streams)
         chunks: list[Array] = []
-        for number, start in enumerate(range(0, max(frame_count - 1, 1), self.experiment.clip.frames - 1)):
-            conditions = self._conditions(streams, start) | standing | self._history(given, chunks, start)
+        for number, start in enumerate(range(0, max(frame_count - 1, 1), self.inputs.clip.frames - 1)):
+            conditions = self._encode_conditions(streams, start) | unaligned | self._encode_history(given, chunks, start)
             keys = self._place(np.stack([self._key(episode, number) for episode in whole]))
             reference = chunks[-1][:, -1:] if chunks else given
             inputs = ChunkInputs(reference, conditions, text, negative, keys)
@@ -119,64 +122,61 @@ class Predictor:
 
     @property
     def _sampling(self) -> Sampling:
-        settings = self.experiment.rollout
-        schedule = pick(SCHEDULES, settings.grid, "noise schedule")(
-            settings.steps, settings.shift or self.experiment.train.shift
-        )
-        return Sampling(settings.sampler, schedule, settings.guidance, self.experiment.latent_shape)
+        settings = self.settings
+        assert settings.shift is not None, "give `Experiment.sampling`, whose shift is resolved"
+        schedule = pick(SCHEDULES, settings.grid, "noise schedule")(settings.steps, settings.shift)
+        return Sampling(settings.sampler, schedule, settings.guidance, self.inputs.latent_shape)
 
     def _read(self, episode: Episode) -> Streams:
-        conditions = {name: condition for name, condition in self.experiment.conditions.items() if condition.make is not None}
-        return stream_videos(self.experiment, *episode, ("rgb", *conditions))
+        conditions = {name: condition for name, condition in self.inputs.conditions.items() if condition.make is not None}
+        return read_streams(self.inputs.conditions, self.inputs.clip, *episode, ("rgb", *conditions))
 
-    def _text(self, episodes: Sequence[Episode]) -> tuple[Any, Any]:
+    def _encode_text(self, episodes: Sequence[Episode]) -> tuple[Any, Any]:
         """The instructions and, where there is guidance, as many negative prompts."""
-        settings = self.experiment.rollout
+        settings = self.settings
         spoken = [record.instruction for _, record in episodes]
-        encoded = self.experiment.encode_instructions(spoken)
+        encoded = self.instructions.encode(spoken)
         text = self._place(np.stack([encoded[instruction] for instruction in spoken]))
         if settings.guidance == 1:
             return text, None
-        negative = self.experiment.encode_instructions([settings.negative_prompt])[settings.negative_prompt]
+        negative = self.instructions.encode([settings.negative_prompt])[settings.negative_prompt]
         return text, self._place(np.stack([negative] * len(episodes)))
 
-    def _standing(self, streams: Sequence[Streams]) -> dict[str, Array]:
+    def _encode_unaligned(self, streams: Sequence[Streams]) -> dict[str, Array]:
         """Pictures that say the same of every chunk."""
         return {
             name: encode_pictures(self.codec, self._place(np.stack([stream[name] for stream in streams])))
-            for name, condition in self.experiment.conditions.items()
+            for name, condition in self.inputs.conditions.items()
             if _is_picture(condition, streams[0].get(name)) and not condition.aligned
         }
 
-    def _conditions(self, streams: Sequence[Streams], start: int) -> dict[str, Array]:
+    def _encode_conditions(self, streams: Sequence[Streams], start: int) -> dict[str, Array]:
         """What conditions say of the chunk that begins at frame `start`; past the end the last frame stays."""
-        frames, history = self.experiment.clip.frames, self.experiment.model.history
+        frames, history = self.inputs.clip.frames, self.inputs.history
         pictures, numbers = {}, {}
-        for name, condition in self.experiment.conditions.items():
+        for name, condition in self.inputs.conditions.items():
             if _is_picture(condition, streams[0].get(name)) and condition.aligned:
-                clips = [
-                    stream[name][np.minimum(np.arange(start, start + frames), len(stream[name]) - 1)] for stream in streams
-                ]
+                clips = [take_frames(stream[name], start, frames) for stream in streams]
                 pictures[name] = encode_pictures(self.codec, self._place(np.stack(clips)))
             elif name in streams[0] and streams[0][name].ndim == 2:
                 numbers[name] = np.stack([clip_numbers(condition, s[name], start, frames, history) for s in streams])
-        scaled = apply_scales(self.scales, self.experiment.conditions, numbers)
+        scaled = apply_scales(self.scales, self.inputs.conditions, numbers)
         return pictures | {name: self._place(array) for name, array in scaled.items()}
 
-    def _history(self, given: Array, chunks: Sequence[Array], start: int) -> dict[str, Array]:
+    def _encode_history(self, given: Array, chunks: Sequence[Array], start: int) -> dict[str, Array]:
         """Earlier frames, each encoded alone: what the model has made itself, for the recorded ones would show the future."""
-        names = [name for name, condition in self.experiment.conditions.items() if condition.make is None]
+        names = [name for name, condition in self.inputs.conditions.items() if condition.make is None]
         if not names:
             return {}
         past = jnp.concatenate([given, *(chunk[:, 1:] for chunk in chunks)], axis=1)
-        earlier = np.maximum(start + np.asarray(self.experiment.model.history), 0)
+        earlier = np.maximum(start + np.asarray(self.inputs.history), 0)
         encoded = [encode_pictures(self.codec, past[:, frame : frame + 1]) for frame in earlier]
         return dict.fromkeys(names, jnp.concatenate(encoded, axis=1))
 
     def _key(self, episode: Episode, chunk: int) -> np.ndarray:
         _, record = episode
         name = zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode())
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.experiment.rollout.seed), name), chunk)
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.settings.seed), name), chunk)
         return np.asarray(jax.random.key_data(key))
 
     @property
@@ -211,10 +211,10 @@ def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInp
 
 def guided_velocity(model: WorldModel, inputs: ChunkInputs, guidance: float) -> Callable[[Array, Array], Array]:
     """The network's velocity as a function of latents and level; with guidance away from the negative prompt's."""
-    wanted = _velocity(model, inputs.conditions, inputs.text)
+    wanted = _make_velocity(model, inputs.conditions, inputs.text)
     if inputs.negative is None:
         return wanted
-    unwanted = _velocity(model, inputs.conditions, inputs.negative)
+    unwanted = _make_velocity(model, inputs.conditions, inputs.negative)
 
     def velocity(latents: Array, level: Array) -> Array:
         away = unwanted(latents, level)
@@ -223,7 +223,7 @@ def guided_velocity(model: WorldModel, inputs: ChunkInputs, guidance: float) -> 
     return velocity
 
 
-def _velocity(model: WorldModel, conditions: Mapping[str, Array], text: Array) -> Callable[[Array, Array], Array]:
+def _make_velocity(model: WorldModel, conditions: Mapping[str, Array], text: Array) -> Callable[[Array, Array], Array]:
     """Condition tokens that do not see RGB's are computed here, once a chunk."""
     once = model.visibility == "one_way" and model.condition_streams
     cache = model.condition_cache(conditions, text) if once else None

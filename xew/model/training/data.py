@@ -4,7 +4,7 @@ Reads  the latent cache
 Writes `Batch`
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,11 +12,13 @@ import grain
 import jax
 import numpy as np
 
+from xew.dataset import Episode
 from xew.episode import Record
-from xew.model.cache.scales import apply_scales
+from xew.model.cache.clips import sample_starts
+from xew.model.cache.scales import Scale, apply_scales, load_scales
+from xew.model.cache.store import LatentCache, open_cache
 from xew.model.codecs.codec import latent_frames
-from xew.model.experiment import Experiment, replayed
-from xew.model.latents import Episode, LatentCache, load_scales, sample_starts
+from xew.model.experiment import ClipInputs, Encoding, Instructions, count_replayed
 from xew.model.text.instructions import VOCABULARY
 from xew.model.video.frames import TEMPORAL_FACTOR
 
@@ -24,42 +26,56 @@ from xew.model.video.frames import TEMPORAL_FACTOR
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Batch:
-    """What the network trains on."""
+    """The arrays that the network trains on."""
 
     latents: Any
     """[b t h w c] float32, the RGB stream."""
     conditions: dict[str, Any]
-    """Stream or mechanism -> [b t' h' w' c] latents or [b t' n] numbers, scaled, float32."""
+    """Arrays by stream or mechanism: [b t' h' w' c] latents or [b t' n] numbers, scaled, float32."""
     text: Any
     """[b l e] float32, or [b l] int32 rows of the network's table of words; zero-padded."""
     shown: Any = None
-    """[b t] float32, 1 where a latent frame shows the episode and 0 past its end; None where all do."""
+    """[b t] float32 valid mask, 1 where a latent frame shows the episode and 0 past its end; None where all do."""
     following: "Batch | None" = None
-    """The next chunk, whose first frame is the last of this one; None where one chunk is trained. A sample whose episode
-    ends before it has a following chunk of which nothing is shown."""
+    """Next chunk, whose first frame is the last of this one; None where one chunk is trained. A sample whose episode ends
+    before it has a following chunk of which nothing is shown."""
 
 
 class ClipSource:
     """Random access to the training samples of the cache, for Grain: index -> Batch without its leading axis.
 
     Args:
+        cache: the latents.
+        text: instructions as the network takes them, [l e] float32 or [l] int32.
+        scales: of conditions that are numbers.
         episodes: those to learn from.
         replay: episodes of which every batch has a part beside them.
     """
 
-    def __init__(self, cache: LatentCache, episodes: Sequence[Episode], replay: Sequence[Episode] = ()) -> None:
-        self.cache = cache
-        self.samples = [sample for _, record in episodes for sample in self._samples(record)]
+    def __init__(
+        self,
+        cache: LatentCache,
+        text: Mapping[str, np.ndarray],
+        scales: Mapping[str, Scale],
+        episodes: Sequence[Episode],
+        replay: Sequence[Episode] = (),
+    ) -> None:
+        self.cache, self.text, self.scales = cache, text, scales
+        self.samples = [sample for _, record in episodes for sample in self._list_samples(record)]
         self.fresh = len(self.samples)
-        self.samples += [sample for _, record in replay for sample in self._samples(record)]
-        every = [record for _, record in (*episodes, *replay)]
-        self.scales = load_scales(cache.experiment, episodes)
-        self.text = cache.experiment.encode_instructions(record.instruction for record in every)
+        self.samples += [sample for _, record in replay for sample in self._list_samples(record)]
 
-    def _samples(self, record: Record) -> list[tuple[Record, tuple[int, ...]]]:
-        experiment = self.cache.experiment
-        starts = sample_starts(record.frame_count, experiment.clip.frames, experiment.train.chunks)
-        return [(record, chunks) for chunks in starts]
+    @classmethod
+    def open(
+        cls, encoding: Encoding, instructions: Instructions, episodes: Sequence[Episode], replay: Sequence[Episode] = ()
+    ) -> "ClipSource":
+        """Open the cache of these episodes. Raises ConfigError if codec or scales were never fitted on them."""
+        text = instructions.encode(record.instruction for _, record in (*episodes, *replay))
+        return cls(open_cache(encoding, episodes), text, load_scales(encoding, episodes), episodes, replay)
+
+    def _list_samples(self, record: Record) -> list[tuple[Record, tuple[int, ...]]]:
+        inputs = self.cache.encoding.inputs
+        return [(record, chunks) for chunks in sample_starts(record.frame_count, inputs.clip.frames, inputs.chunks)]
 
     def __len__(self) -> int:
         return len(self.samples)
@@ -72,80 +88,79 @@ class ClipSource:
 
     def __getitem__(self, index: int) -> Batch:
         record, starts = self.samples[index]
-        first = self._chunk(record, starts[0])
-        if self.cache.experiment.train.chunks == 1:
+        first = self._read_chunk(record, starts[0])
+        if self.cache.encoding.inputs.chunks == 1:
             return first
         if len(starts) == 2:
-            return replace(first, following=self._chunk(record, starts[1]))
+            return replace(first, following=self._read_chunk(record, starts[1]))
         return replace(first, following=replace(first, shown=np.zeros_like(first.shown)))
 
-    def _chunk(self, record: Record, start: int) -> Batch:
-        experiment = self.cache.experiment
+    def _read_chunk(self, record: Record, start: int) -> Batch:
+        inputs = self.cache.encoding.inputs
         clip = self.cache.starts(record).index(start)
         arrays = {name: self.cache.read(record, name, clip).astype(np.float32) for name in self.cache.streams}
-        shown = shown_frames(record.frame_count - start, experiment.clip.frames)
+        shown = shown_frames(record.frame_count - start, inputs.clip.frames)
         latents = arrays.pop("rgb")
-        conditions = apply_scales(self.scales, experiment.conditions, arrays)
+        conditions = apply_scales(self.scales, inputs.conditions, arrays)
         return Batch(latents, conditions, self.text[record.instruction], shown)
 
 
 def shown_frames(left: int, frames: int) -> np.ndarray:
-    """Which latent frames of a clip show anything of an episode that has `left` frames from there on: float32 [t]."""
+    """Mask [t] float32 of the latent frames of a clip that show anything of an episode with `left` frames from there on."""
     firsts = np.maximum(np.arange(latent_frames(frames)) * TEMPORAL_FACTOR - (TEMPORAL_FACTOR - 1), 0)
     return (firsts < left).astype(np.float32)
 
 
 def make_dataset(
-    source: ClipSource, batch: int, seed: int, replay: float = 0.0, rows: np.ndarray | None = None
+    source: ClipSource, batch: int, seed: int, replay: float = 0.0, own: np.ndarray | None = None
 ) -> grain.IterDataset:
-    """Endless shuffled batches; the iterator's get_state and set_state carry its position.
+    """Make endless shuffled batches; the iterator's get_state and set_state carry its position.
 
-    The order is that of whole batches, of which each process loads its rows, so that neither the numbers nor the position
-    depend on how many processes there are.
+    The order is that of whole batches, of which each process loads its own samples, so that neither the numbers nor the
+    position depend on how many processes there are.
 
     Args:
         batch: samples over all processes.
         replay: part of each batch that comes from the source's replayed episodes.
-        rows: which samples of each batch to load; all where left out.
+        own: [b] numbers of the samples of each batch that this process loads; all where left out.
     """
-    old = replayed(batch, replay)
-    fresh = _order(range(source.fresh), seed, batch - old)
-    again = _order(range(source.fresh, len(source)), seed + 1, old) if old else None
-    rows = np.arange(batch) if rows is None else rows
+    old = count_replayed(batch, replay)
+    fresh = _shuffle(range(source.fresh), seed, batch - old)
+    again = _shuffle(range(source.fresh, len(source)), seed + 1, old) if old else None
+    own = np.arange(batch) if own is None else own
 
     def load(number: int, indices: np.ndarray) -> Batch:
         if again is not None:
             indices = np.concatenate([indices, again[number]])
-        return stack([source[int(index)] for index in indices[rows]])
+        return stack([source[int(index)] for index in indices[own]])
 
     dataset = fresh.map_with_index(load)
     return dataset.to_iter_dataset(grain.ReadOptions(num_threads=2, prefetch_buffer_size=4))
 
 
-def _order(samples: range, seed: int, count: int) -> grain.MapDataset:
-    """Batches of `count` sample numbers without end; each pass over the samples has its own order."""
+def _shuffle(samples: range, seed: int, count: int) -> grain.MapDataset:
+    """Make batches [count] of sample numbers without end; each pass over the samples has its own order."""
     return grain.MapDataset.source(samples).seed(seed).shuffle().repeat().batch(count)
 
 
 def stack(examples: Sequence[Batch]) -> Batch:
-    """Examples to a batch."""
+    """Join examples to a batch with a leading axis [b]."""
     return jax.tree.map(lambda *leaves: np.stack(leaves), *examples)
 
 
-def fake_batch(experiment: Experiment, batch: int, seed: int = 0) -> Batch:
-    """A batch of noise in the shapes that the experiment's data would have, for tests and compile checks."""
+def fake_batch(inputs: ClipInputs, batch: int, seed: int = 0) -> Batch:
+    """Make a batch [b ...] of noise in the shapes that the experiment's data would have, for tests and compile checks."""
     rng = np.random.default_rng(seed)
-    tokens, width = experiment.size.text_tokens, experiment.size.text_dim
-    learned = experiment.text_encoder.learned
+    text_shape = inputs.shapes["text"]
 
-    def normal(*shape: int) -> np.ndarray:
+    def draw(*shape: int) -> np.ndarray:
         return rng.standard_normal((batch, *shape), np.float32)
 
-    def chunk() -> Batch:
-        conditions = {name: normal(*experiment.condition_shape(name)) for name in experiment.conditions}
-        latents = normal(*experiment.latent_shape)
-        text = rng.integers(1, VOCABULARY, (batch, tokens), np.int32) if learned else normal(tokens, width)
+    def draw_chunk() -> Batch:
+        conditions = {name: draw(*inputs.shapes[name]) for name in inputs.conditions}
+        latents = draw(*inputs.latent_shape)
+        text = draw(*text_shape) if len(text_shape) == 2 else rng.integers(1, VOCABULARY, (batch, *text_shape), np.int32)
         return Batch(latents, conditions, text, np.ones(latents.shape[:2], np.float32))
 
-    first = chunk()
-    return replace(first, following=chunk()) if experiment.train.chunks == 2 else first
+    first = draw_chunk()
+    return replace(first, following=draw_chunk()) if inputs.chunks == 2 else first

@@ -16,19 +16,18 @@ import jax.numpy as jnp
 from flax import nnx
 
 from xew.config import ConfigError, pick
-from xew.model.codecs.codec import latent_frames
+from xew.model.codecs.codec import CodecSettings, latent_frames
 from xew.model.codecs.vae import VAES, abstract_vae
 from xew.model.devices.sharding import parameter_spec, path_names
-from xew.model.experiment import Experiment
+from xew.model.experiment import Clip, ClipInputs, Learning, Network
 from xew.model.network.dit import STREAMS, ModelSize, RematName, flops, token_grid
-from xew.model.training.data import fake_batch
-from xew.model.training.step import abstract_state
+from xew.model.runs.checkpoint import TrainState
 from xew.model.video.frames import TEMPORAL_FACTOR
 
 MARGIN = 1.1
-"""Room for what the estimate does not see."""
+"""Factor that leaves room for what the estimate does not see."""
 PEAK_FLOPS = {"H100": 989e12, "H200": 989e12, "A100": 312e12}
-"""Dense bfloat16 products a second by the maker's data sheets, by part of the device's name."""
+"""Dense bfloat16 FLOPs a second by the maker's data sheets, by part of the device's name."""
 
 
 @dataclass(frozen=True)
@@ -37,30 +36,39 @@ class Memory:
 
     parts: dict[str, float]
     layout: str
-    """How the work is laid out, for people."""
+    """Layout of the work, in words."""
 
     @property
     def total(self) -> float:
         return MARGIN * sum(self.parts.values())
 
     def line(self) -> str:
-        """In one line."""
+        """All parts in one line of text."""
         shares = ", ".join(f"{name} {size / 1e9:.2f}" for name, size in self.parts.items() if size)
         return f"memory of each device [GB]: {shares}; with {MARGIN - 1:.0%} of room {self.total / 1e9:.2f} ({self.layout})"
 
     def table(self) -> str:
-        """With every part on a line of its own."""
-        rows = [f"{name:<28}{size / 1e9:10.3f} GB" for name, size in self.parts.items()]
+        """Text with every part on a line of its own."""
+        lines = [f"{name:<28}{size / 1e9:10.3f} GB" for name, size in self.parts.items()]
         total = f"{'total with ' + format(MARGIN - 1, '.0%') + ' of room':<28}{self.total / 1e9:10.3f} GB"
-        return "\n".join([f"each device, {self.layout}:", *rows, total])
+        return "\n".join([f"each device, {self.layout}:", *lines, total])
 
 
-def estimate_memory(experiment: Experiment, devices: int, fsdp: int) -> Memory:
-    """What each of `devices` devices needs to train an experiment with its state cut in `fsdp` parts."""
-    settings, compute = experiment.train, jnp.dtype(experiment.model.dtype).itemsize
-    state = abstract_state(experiment)[1]
-    network = state.params if state.base is None else state.base
-    weights = cut_bytes(network, fsdp, 1)  # numbers a device
+def estimate_memory(
+    learning: Learning, state: TrainState, inputs: ClipInputs, codec: CodecSettings, devices: int, fsdp: int
+) -> Memory:
+    """Estimate what each of `devices` devices needs to train with its state cut in `fsdp` shards.
+
+    Args:
+        learning: the network and its optimizer.
+        state: shapes and types of the state (`abstract_state`).
+        inputs: what the network is given of a clip.
+        codec: settings of the codec, which works between two chunks.
+    """
+    settings, network = learning.settings, learning.network
+    compute = jnp.dtype(network.settings.dtype).itemsize
+    params = state.params if state.base is None else state.base
+    weights = cut_bytes(params, fsdp, 1)  # numbers a device
     summed = settings.accumulate > 1 or settings.chunks > 1
     samples = settings.batch / devices / settings.accumulate
     parts = {
@@ -68,13 +76,13 @@ def estimate_memory(experiment: Experiment, devices: int, fsdp: int) -> Memory:
         "parameters kept as they are": cut_bytes(state.base, fsdp),
         "optimizer": cut_bytes(state.optimizer, fsdp),
         "moving average": cut_bytes(state.ema, fsdp),
-        f"rounded to {experiment.model.dtype}": weights * compute if compute < 4 else 0.0,
+        f"rounded to {network.settings.dtype}": weights * compute if compute < 4 else 0.0,
         "gradients": weights * compute + (weights * 4 if summed else 0.0),
-        "layers gathered": 2 * compute * cut_bytes(network, 1, 1) / experiment.size.depth if fsdp > 1 else 0.0,
-        "activations": samples * activation_bytes(experiment),
-        "autoencoder": codec_bytes(experiment, samples) if settings.chunks == 2 else 0.0,
+        "layers gathered": 2 * compute * cut_bytes(params, 1, 1) / network.size.depth if fsdp > 1 else 0.0,
+        "activations": samples * activation_bytes(network, inputs),
+        "autoencoder": codec_bytes(codec, inputs.clip, samples) if settings.chunks == 2 else 0.0,
     }
-    layout = f"{devices} devices, state in {fsdp} parts, {samples:g} samples at once on each, remat {experiment.model.remat}"
+    layout = f"{devices} devices, state in {fsdp} parts, {samples:g} samples at once on each, remat {network.settings.remat}"
     return Memory(parts, layout)
 
 
@@ -88,19 +96,18 @@ def cut_bytes(tree: Any, fsdp: int, itemsize: int = 0) -> float:
     return float(sum(size(path, leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)))
 
 
-def activation_bytes(experiment: Experiment) -> float:
+def activation_bytes(network: Network, inputs: ClipInputs) -> float:
     """Bytes of activations of one sample: what is kept of every block, and the work of one block in the backward pass."""
-    settings, size = experiment.model, experiment.size
-    tokens = sum(math.prod(grid) for grid in stream_grids(experiment))
+    settings, size = network.settings, network.size
+    tokens = sum(math.prod(grid) for grid in stream_grids(inputs))
     compute, residual = jnp.dtype(settings.dtype).itemsize, jnp.dtype(settings.residual).itemsize
-    logits = logits_bytes(experiment, tokens)
+    logits = logits_bytes(network, tokens)
     kept = tokens * kept_bytes(size, settings.remat, compute, residual) + (logits if settings.remat == "none" else 0.0)
     return size.depth * kept + 2 * (tokens * work_bytes(size, compute, residual) + logits)
 
 
-def codec_bytes(experiment: Experiment, samples: float) -> float:
-    """Of the codec that decodes and encodes between two chunks: weights, and four of its widest arrays for each sample."""
-    settings, clip = experiment.codec, experiment.clip
+def codec_bytes(settings: CodecSettings, clip: Clip, samples: float) -> float:
+    """Bytes of the codec that decodes and encodes between two chunks: weights, and four of its widest arrays a sample."""
     if settings.name != "wan_vae":
         return 0.0
     size = pick(VAES, settings.vae, "autoencoder")
@@ -125,31 +132,31 @@ def work_bytes(size: ModelSize, compute: int, residual: int) -> float:
     return compute * (14 * size.dim + 2 * size.ffn_dim) + residual * 5 * size.dim
 
 
-def logits_bytes(experiment: Experiment, tokens: int) -> float:
-    """Of XLA's attention, which forms every pair of tokens (float32, and rounded); cuDNN's forms none."""
-    settings = experiment.model
+def logits_bytes(network: Network, tokens: int) -> float:
+    """Bytes of XLA's attention, which forms every pair of tokens (float32, and rounded); cuDNN's forms none."""
+    settings = network.settings
     fused = settings.attention == "cudnn" or (settings.attention == "auto" and settings.dtype == "bfloat16")
     compute = jnp.dtype(settings.dtype).itemsize
-    return 0.0 if fused else experiment.size.heads * tokens**2 * (4 + compute)
+    return 0.0 if fused else network.size.heads * tokens**2 * (4 + compute)
 
 
-def stream_grids(experiment: Experiment) -> list[tuple[int, int, int]]:
+def stream_grids(inputs: ClipInputs) -> list[tuple[int, int, int]]:
     """Tokens (t', h', w') of each stream, RGB first."""
-    batch = fake_batch(experiment, 1)
-    arrays = [batch.latents, *(batch.conditions[name] for name in experiment.conditions if name in STREAMS)]
-    return [token_grid(array.shape) for array in arrays]
+    streams = ["rgb", *(name for name in inputs.conditions if name in STREAMS)]
+    return [token_grid((1, *inputs.shapes[name])) for name in streams]
 
 
-def flops_of_step(experiment: Experiment) -> float:
+def flops_of_step(learning: Learning, inputs: ClipInputs) -> float:
     """Model FLOPs of one training step over all devices: three times the forward pass, recomputation not counted."""
-    settings, size = experiment.train, experiment.size
-    channels, visibility = experiment.codec.channels, experiment.model.visibility
-    forward = flops(size, stream_grids(experiment), batch=settings.batch, channels=channels, visibility=visibility)
+    settings, network = learning.settings, learning.network
+    visibility = network.settings.visibility
+    grids = stream_grids(inputs)
+    forward = flops(network.size, grids, batch=settings.batch, channels=network.channels, visibility=visibility)
     return 3 * settings.chunks * forward
 
 
 def peak_flops(device_kind: str) -> float | None:
-    """Of one device by its name; None where it is not known, and then no MFU is logged."""
+    """FLOPs a second of one device by its name; None where it is not known, and then no MFU is logged."""
     return next((peak for name, peak in PEAK_FLOPS.items() if name in device_kind), None)
 
 
@@ -162,13 +169,13 @@ def device_memory() -> float:
 
 
 def check_memory(memory: Memory, ignore: bool = False) -> None:
-    """Print the estimate beside what there is. Raises ConfigError if it is too much, unless told to go on."""
-    there = device_memory()
+    """Print the estimate beside the memory that there is. Raises ConfigError if it is too much, unless that is ignored."""
+    available = device_memory()
     if jax.process_index() == 0:
-        print(f"{memory.line()}; there is {there / 1e9:.2f}", file=sys.stderr)
-    if memory.total > there and not ignore:
+        print(f"{memory.line()}; there is {available / 1e9:.2f}", file=sys.stderr)
+    if memory.total > available and not ignore:
         raise ConfigError(
-            f"training needs about {memory.total / 1e9:.1f} GB a device, there is {there / 1e9:.1f} GB ({memory.layout}). "
+            f"training needs about {memory.total / 1e9:.1f} GB a device, there is {available / 1e9:.1f} GB ({memory.layout}). "
             "Use more devices with a larger mesh.fsdp, --model.remat full, a smaller --train.batch, a larger "
             "--train.accumulate or --train.mu-dtype bfloat16; on a GPU the variable XLA_PYTHON_CLIENT_MEM_FRACTION=0.95 lets "
             "JAX have more than its usual three quarters; --ignore-memory starts all the same."

@@ -6,11 +6,11 @@ from dataclasses import replace
 import jax.numpy as jnp
 import optax
 
-from xew.model.experiment import Experiment, TrainSettings, replayed
+from xew.model.experiment import TrainSettings, count_replayed
 
 
 def learning_rate(settings: TrainSettings) -> optax.Schedule:
-    """Step -> learning rate: optional warm-up, then constant or decaying by a cosine."""
+    """Make the schedule, step -> learning rate: optional warm-up, then constant or decaying by a cosine."""
     decaying = max(settings.steps - settings.warmup_steps, 1)
     decay = optax.cosine_decay_schedule(settings.learning_rate, decaying, alpha=settings.decay_to)
     schedule = optax.constant_schedule(settings.learning_rate) if settings.decay_to == 1 else decay
@@ -21,16 +21,14 @@ def learning_rate(settings: TrainSettings) -> optax.Schedule:
 
 
 def make_optimizer(settings: TrainSettings) -> optax.GradientTransformation:
-    """AdamW after clipping by the global norm; moments in float32, the first in `mu_dtype`."""
+    """Make AdamW after clipping by the global norm; moments in float32, the first in `mu_dtype`."""
     adamw = optax.adamw(learning_rate(settings), weight_decay=settings.weight_decay, mu_dtype=jnp.dtype(settings.mu_dtype))
     return optax.chain(optax.clip_by_global_norm(settings.clip_norm), adamw)
 
 
-def with_steps(experiment: Experiment, samples: int) -> Experiment:
-    """The same experiment with `train.steps` set to its `train.epochs` passes over `samples` new (not replayed) samples."""
-    settings = experiment.train
+def set_steps(settings: TrainSettings, samples: int, replay: float = 0.0) -> TrainSettings:
+    """The same settings with `steps` set to their `epochs` passes over `samples` new (not replayed) samples."""
     if not settings.epochs:
-        return experiment
-    fresh = settings.batch - replayed(settings.batch, experiment.adapt.replay)
-    steps = max(1, math.ceil(settings.epochs * samples / fresh))
-    return replace(experiment, train=replace(settings, steps=steps))
+        return settings
+    fresh = settings.batch - count_replayed(settings.batch, replay)
+    return replace(settings, steps=max(1, math.ceil(settings.epochs * samples / fresh)))

@@ -22,7 +22,7 @@ from jax.sharding import Mesh
 from xew.model.codecs.codec import Codec
 from xew.model.devices.sharding import gather_parameters, replicated_sharding, state_shardings
 from xew.model.diffusion.flow_matching import TrainingPair, sample_losses, training_pair
-from xew.model.experiment import Experiment, create_model
+from xew.model.experiment import Learning, Network
 from xew.model.network.dit import cast_params
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs.checkpoint import TrainState
@@ -48,40 +48,105 @@ class StepResult(NamedTuple):
     """Whether the losses, the gradients and the new parameters are all finite."""
 
 
-def abstract_state(experiment: Experiment) -> tuple[nnx.GraphDef, TrainState]:
+@dataclass(frozen=True)
+class Learner:
+    """A network and its optimizer on a mesh: the structure, and where each part of the state lies."""
+
+    learning: Learning
+    mesh: Mesh
+    graph: nnx.GraphDef
+    shapes: TrainState
+    """Shapes, types and shardings of the state."""
+
+    @property
+    def network_shapes(self) -> Any:
+        """Shapes, types and shardings of the network's parameters, which with LoRA are not those that are learned."""
+        return self.shapes.params if self.shapes.base is None else self.shapes.base
+
+    def init_state(self, start: Any = None) -> TrainState:
+        """Make the state of step 0, on the devices where each part of it lies.
+
+        Args:
+            start: parameters to begin with, placed on the mesh; random where left out. They are given up to the state.
+        """
+        init = jax.jit(lambda start: _init(self.learning, start), out_shardings=list_shardings(self.shapes), donate_argnums=0)
+        with jax.set_mesh(self.mesh):
+            return init(start)
+
+    def compile_step(self, codec: Codec | None = None) -> "TrainStep":
+        """The compiled step; its noise depends on the seed, the step and the place in the batch only.
+
+        A resumed run therefore repeats it.
+
+        Args:
+            codec: needed where `train.chunks` is 2, to decode and encode the first chunk's prediction.
+        """
+        settings, graph, optimizer = self.learning.settings, self.graph, make_optimizer(self.learning.settings)
+        places = list_shardings(self.network_shapes)
+        objective = Objective(graph, places, settings.shift, settings.accumulate, settings.history_noise)
+
+        def step(state: TrainState, batch: Batch, codec: Codec | None) -> tuple[TrainState, StepResult]:
+            key = jax.random.fold_in(jax.random.key(settings.seed), state.step)
+            samples = Samples(batch, chunk_weights(batch), jax.random.split(key, len(batch.latents)))
+            params, back = jax.vjp(
+                lambda learned: objective.place(cast_params(graph, apply_lora(state.base, learned))), state.params
+            )
+            gradients, losses, sigma = objective.gradients(params, samples, codec)
+            (gradients,) = back(jax.tree.map(lambda total, like: total.astype(like.dtype), gradients, params))
+            updates, moments = optimizer.update(gradients, state.optimizer, state.params)
+            learned = optax.apply_updates(state.params, updates)
+            ema = None if state.ema is None else optax.incremental_update(learned, state.ema, 1 - settings.ema_decay)
+            norm = optax.tree.norm(gradients)
+            finite = jnp.isfinite(norm) & jnp.isfinite(optax.tree.norm(learned)) & jnp.isfinite(losses).all()
+            result = StepResult(losses, sigma, samples.weights, norm, finite)
+            return TrainState(state.step + 1, learned, moments, ema, state.base), result
+
+        everywhere = replicated_sharding(self.mesh)
+        jitted = jax.jit(step, donate_argnums=0, out_shardings=(list_shardings(self.shapes), everywhere))
+        copies = jax.device_put(jax.tree.map(np.asarray, codec), everywhere) if settings.chunks == 2 else None
+        return TrainStep(jitted, self.mesh, copies)
+
+
+def make_learner(learning: Learning, mesh: Mesh) -> Learner:
+    """Lay a network and its optimizer out on a mesh, without computing anything."""
+    graph, shapes = abstract_state(learning)
+    return Learner(learning, mesh, graph, place_shapes(shapes, mesh))
+
+
+def abstract_state(learning: Learning) -> tuple[nnx.GraphDef, TrainState]:
     """The network's structure, and the shapes and types of the state of step 0, without computing anything."""
-    graph = nnx.split(nnx.eval_shape(lambda: create_model(experiment)), nnx.Param)[0]
-    return graph, jax.eval_shape(lambda: _init(experiment, None))
+    graph = nnx.split(nnx.eval_shape(learning.network.create), nnx.Param)[0]
+    return graph, jax.eval_shape(lambda: _init(learning, None))
 
 
-def _init(experiment: Experiment, start: Any) -> TrainState:
-    """The state of step 0 from loaded parameters, or from random ones where there are none."""
-    params = nnx.state(create_model(experiment), nnx.Param) if start is None else start
-    base, learned = None, params
-    if experiment.adapt.lora_rank:
+def _init(learning: Learning, start: Any) -> TrainState:
+    """Make the state of step 0 from loaded parameters, or from random ones where there are none."""
+    params = nnx.state(learning.network.create(), nnx.Param) if start is None else start
+    base, learned, settings = None, params, learning.settings
+    if learning.lora_rank:
         base = params
-        learned = init_lora(params, experiment.adapt.lora_rank, jax.random.key(experiment.train.seed))
-    ema = jax.tree.map(jnp.copy, learned) if experiment.train.ema_decay else None
-    return TrainState(jnp.int32(0), learned, make_optimizer(experiment.train).init(learned), ema, base)
+        learned = init_lora(params, learning.lora_rank, jax.random.key(settings.seed))
+    ema = jax.tree.map(jnp.copy, learned) if settings.ema_decay else None
+    return TrainState(jnp.int32(0), learned, make_optimizer(settings).init(learned), ema, base)
 
 
-def init_train_state(experiment: Experiment, mesh: Mesh, start: Any = None) -> tuple[nnx.GraphDef, TrainState]:
-    """The network's structure and the state of step 0, made on the devices where each part of it lies.
-
-    Args:
-        start: parameters to begin with, placed on the mesh; random where left out. They are given up to the state.
-    """
-    graph, shapes = abstract_state(experiment)
-    init = jax.jit(lambda start: _init(experiment, start), out_shardings=state_shardings(shapes, mesh), donate_argnums=0)
-    with jax.set_mesh(mesh):
-        return graph, init(start)
-
-
-def random_params(experiment: Experiment, mesh: Mesh) -> tuple[nnx.GraphDef, Any]:
+def random_params(network: Network, mesh: Mesh) -> tuple[nnx.GraphDef, Any]:
     """The network's structure and its parameters at their random start, made where they lie on the mesh."""
-    graph, shapes = nnx.split(nnx.eval_shape(lambda: create_model(experiment)), nnx.Param)
-    init = jax.jit(lambda: nnx.state(create_model(experiment), nnx.Param), out_shardings=state_shardings(shapes, mesh))
+    graph, shapes = nnx.split(nnx.eval_shape(network.create), nnx.Param)
+    init = jax.jit(lambda: nnx.state(network.create(), nnx.Param), out_shardings=state_shardings(shapes, mesh))
     return graph, init()
+
+
+def place_shapes(shapes: Any, mesh: Mesh) -> Any:
+    """Give shapes and types their places on the mesh."""
+    return jax.tree.map(
+        lambda leaf, place: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), shapes, state_shardings(shapes, mesh)
+    )
+
+
+def list_shardings(shapes: Any) -> Any:
+    """The shardings of shapes that have their places, in the same tree."""
+    return jax.tree.map(lambda leaf: leaf.sharding, shapes)
 
 
 @dataclass(frozen=True)
@@ -102,38 +167,7 @@ class TrainStep:
             return self.jitted.lower(state, batch, self.codec)
 
 
-def make_train_step(experiment: Experiment, graph: nnx.GraphDef, mesh: Mesh, codec: Codec | None = None) -> TrainStep:
-    """The compiled step; its noise depends on the seed, the step and the place in the batch only, so a resumed run repeats it.
-
-    Args:
-        codec: needed where `train.chunks` is 2, to decode and encode the first chunk's prediction.
-    """
-    settings, optimizer = experiment.train, make_optimizer(experiment.train)
-    objective = Objective(graph, mesh, settings.shift, settings.accumulate, settings.history_noise)
-
-    def step(state: TrainState, batch: Batch, codec: Codec | None) -> tuple[TrainState, StepResult]:
-        key = jax.random.fold_in(jax.random.key(settings.seed), state.step)
-        rows = Rows(batch, chunk_weights(batch), jax.random.split(key, len(batch.latents)))
-        params, back = jax.vjp(
-            lambda learned: objective.place(cast_params(graph, apply_lora(state.base, learned))), state.params
-        )
-        gradients, losses, sigma = objective.gradients(params, rows, codec)
-        (gradients,) = back(jax.tree.map(lambda total, like: total.astype(like.dtype), gradients, params))
-        updates, moments = optimizer.update(gradients, state.optimizer, state.params)
-        learned = optax.apply_updates(state.params, updates)
-        ema = None if state.ema is None else optax.incremental_update(learned, state.ema, 1 - settings.ema_decay)
-        norm = optax.tree.norm(gradients)
-        finite = jnp.isfinite(norm) & jnp.isfinite(optax.tree.norm(learned)) & jnp.isfinite(losses).all()
-        result = StepResult(losses, sigma, rows.weights, norm, finite)
-        return TrainState(state.step + 1, learned, moments, ema, state.base), result
-
-    shardings = state_shardings(abstract_state(experiment)[1], mesh)
-    jitted = jax.jit(step, donate_argnums=0, out_shardings=(shardings, replicated_sharding(mesh)))
-    everywhere = jax.device_put(jax.tree.map(np.asarray, codec), replicated_sharding(mesh)) if settings.chunks == 2 else None
-    return TrainStep(jitted, mesh, everywhere)
-
-
-class Rows(NamedTuple):
+class Samples(NamedTuple):
     """Some samples of a batch: every leaf has them as its leading axis."""
 
     batch: Batch
@@ -148,52 +182,55 @@ class Objective:
     """The loss of a batch, and its gradients part by part."""
 
     graph: nnx.GraphDef
-    mesh: Mesh
+    places: Any
+    """Shardings of the network's parameters, in their tree."""
     shift: float
     parts: int
-    """How many parts of the batch are computed one after another."""
+    """Number of parts of the batch that are computed one after another."""
     history_noise: float = 0.0
-    """Of earlier frames' latents."""
+    """Standard deviation of the noise on earlier frames' latents."""
 
     def place(self, tree: Any) -> Any:
-        """Keep a tree in the shape of the parameters cut along fsdp as they are: the compiler might gather it too soon."""
-        return jax.lax.with_sharding_constraint(tree, state_shardings(tree, self.mesh))
+        """Keep a tree like that of the parameters cut along fsdp as they are: the compiler might gather it too soon."""
+        leaves, structure = jax.tree.flatten(tree)
+        kept = [jax.lax.with_sharding_constraint(*pair) for pair in zip(leaves, jax.tree.leaves(self.places), strict=True)]
+        return jax.tree.unflatten(structure, kept)
 
-    def gradients(self, params: Any, rows: Rows, codec: Codec | None) -> tuple[Any, Array, Array]:
+    def gradients(self, params: Any, samples: Samples, codec: Codec | None) -> tuple[Any, Array, Array]:
         """Gradients of the mean loss over samples, and the chunks' losses and noise levels [b k].
 
         A sample's loss is the mean over its chunks. Sums over parts and over chunks are in float32.
         """
-        size = len(rows.keys)
+        size = len(samples.keys)
         if self.parts == 1:
-            return self._of_part(params, rows, codec, size)
+            return self._part_gradients(params, samples, codec, size)
 
-        def add(total: Any, part: Rows) -> tuple[Any, tuple[Array, Array]]:
-            gradients, losses, sigma = self._of_part(params, part, codec, size)
+        def add(total: Any, part: Samples) -> tuple[Any, tuple[Array, Array]]:
+            gradients, losses, sigma = self._part_gradients(params, part, codec, size)
             return self.place(_sum(total, gradients)), (losses, sigma)
 
         zeros = self.place(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, jnp.float32), params))
-        cut = jax.tree.map(lambda leaf: cut_rows(leaf, self.parts), rows)
+        cut = jax.tree.map(lambda leaf: cut_samples(leaf, self.parts), samples)
         gradients, (losses, sigma) = jax.lax.scan(add, zeros, cut)
-        return gradients, join_rows(losses), join_rows(sigma)
+        return gradients, join_samples(losses), join_samples(sigma)
 
-    def _of_part(self, params: Any, rows: Rows, codec: Codec | None, size: int) -> tuple[Any, Array, Array]:
-        """One part; `size` is the number of samples of the whole batch."""
-        gradients, losses, sigmas, chunk = None, [], [], rows.batch
-        for number in range(rows.weights.shape[1]):
-            keys = jax.vmap(jax.random.fold_in, (0, None))(rows.keys, number)
+    def _part_gradients(self, params: Any, samples: Samples, codec: Codec | None, size: int) -> tuple[Any, Array, Array]:
+        """Gradients, losses and noise levels of one part; `size` is the number of samples of the whole batch."""
+        gradients, losses, sigmas, chunk = None, [], [], samples.batch
+        for number in range(samples.weights.shape[1]):
+            keys = jax.vmap(jax.random.fold_in, (0, None))(samples.keys, number)
             pair = sample_pairs(keys, chunk.latents, self.shift)
-            chunk = with_noisy_history(keys, chunk, self.history_noise)
-            of_chunk, loss, predicted = self._of_chunk(params, chunk, pair, rows.weights[:, number] / size)
-            gradients = of_chunk if gradients is None else self.place(_sum(gradients, of_chunk))
+            chunk = add_history_noise(keys, chunk, self.history_noise)
+            own, loss, predicted = self._chunk_gradients(params, chunk, pair, samples.weights[:, number] / size)
+            gradients = own if gradients is None else self.place(_sum(gradients, own))
             losses.append(loss)
             sigmas.append(pair.sigma)
             if chunk.following is not None:
                 assert codec is not None, "two chunks need the codec"
-                chunk = begin_with(chunk.following, codec.next_reference(estimate(chunk.latents, pair, predicted)))
+                chunk = replace_first(chunk.following, codec.next_reference(estimate_clean(chunk.latents, pair, predicted)))
         return gradients, jnp.stack(losses, axis=1), jnp.stack(sigmas, axis=1)
 
-    def _of_chunk(self, params: Any, chunk: Batch, pair: TrainingPair, shares: Array) -> tuple[Any, Array, Array]:
+    def _chunk_gradients(self, params: Any, chunk: Batch, pair: TrainingPair, shares: Array) -> tuple[Any, Array, Array]:
         """Gradients, losses [b] and prediction of one chunk, whose samples have these shares in the loss [b]."""
 
         def loss(params: Any) -> tuple[Array, tuple[Array, Array]]:
@@ -206,13 +243,13 @@ class Objective:
 
 
 def sample_pairs(keys: Array, latents: Array, shift: float) -> TrainingPair:
-    """`training_pair` of each sample with its own key [b]."""
+    """Make the `training_pair` of each sample of latents [b t h w c], with its own key [b]."""
     pairs = jax.vmap(lambda key, sample: training_pair(key, sample[None], shift))(keys, latents)
     return jax.tree.map(lambda leaf: leaf[:, 0], pairs)
 
 
-def with_noisy_history(keys: Array, chunk: Batch, strength: float) -> Batch:
-    """A chunk whose earlier frames, if it has any, are not as clean as recorded: a rollout's are its own predictions."""
+def add_history_noise(keys: Array, chunk: Batch, strength: float) -> Batch:
+    """Add noise to the earlier frames [b t h w c] of a chunk, if it has any: a rollout's are its own predictions."""
     if "history" not in chunk.conditions or not strength:
         return chunk
     history = chunk.conditions["history"]
@@ -221,33 +258,33 @@ def with_noisy_history(keys: Array, chunk: Batch, strength: float) -> Batch:
     return replace(chunk, conditions={**chunk.conditions, "history": history + strength * noise})
 
 
-def estimate(latents: Array, pair: TrainingPair, predicted: Array) -> Array:
-    """The clean latents [b t h w c] that a prediction of the velocity means, in one step; frame 0 is the given one."""
+def estimate_clean(latents: Array, pair: TrainingPair, predicted: Array) -> Array:
+    """Estimate the clean latents [b t h w c] in one step from a predicted velocity [b t h w c]; frame 0 is the given one."""
     clean = pair.noisy - pair.sigma[:, None, None, None, None] * predicted
     return jnp.concatenate([latents[:, :1], clean[:, 1:]], axis=1)
 
 
-def begin_with(chunk: Batch, reference: Array) -> Batch:
-    """A chunk whose first latent frame is not the true one but the given [b 1 h w c]."""
+def replace_first(chunk: Batch, reference: Array) -> Batch:
+    """Replace the first latent frame of a chunk by the given one [b 1 h w c]."""
     return replace(chunk, latents=jnp.concatenate([reference, chunk.latents[:, 1:]], axis=1))
 
 
 def chunk_weights(batch: Batch) -> Array:
-    """[b k] each chunk's share in its sample's loss: equal over those that show the episode beyond their first frame."""
+    """Each chunk's share [b k] in its sample's loss: equal over those that show the episode beyond their first frame."""
     if batch.following is None:
         return jnp.ones((len(batch.latents), 1), jnp.float32)
     later = batch.following.shown[:, 1:].any(axis=1).astype(jnp.float32)
-    there = jnp.stack([jnp.ones(len(later)), later], axis=1)
-    return there / there.sum(axis=1, keepdims=True)
+    valid = jnp.stack([jnp.ones(len(later)), later], axis=1)
+    return valid / valid.sum(axis=1, keepdims=True)
 
 
-def cut_rows(leaf: Array, parts: int) -> Array:
-    """[b ...] -> [parts b/parts ...]: part i has rows i, i + parts, …, so that every device keeps rows of its own."""
+def cut_samples(leaf: Array, parts: int) -> Array:
+    """Cut [b ...] into [parts b/parts ...]: part i has samples i, i + parts, …, so that every device keeps its own."""
     return leaf.reshape(-1, parts, *leaf.shape[1:]).swapaxes(0, 1)
 
 
-def join_rows(leaf: Array) -> Array:
-    """The inverse of `cut_rows`."""
+def join_samples(leaf: Array) -> Array:
+    """Join [parts b/parts ...] to [b ...]: the inverse of `cut_samples`."""
     return leaf.swapaxes(0, 1).reshape(-1, *leaf.shape[2:])
 
 

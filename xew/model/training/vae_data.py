@@ -19,10 +19,11 @@ import numpy as np
 from tqdm import tqdm
 
 from xew.config import ConfigError, pick
+from xew.dataset import Episode
 from xew.episode import EpisodeError, Record, episode_folder, write_video
 from xew.files import replacing
 from xew.model.conditions import optical_flow, ray_map, robot_mask
-from xew.model.latents import Episode, episode_command
+from xew.model.episodes.commands import episode_command
 from xew.model.video.frames import to_model_size
 from xew.threads import in_order
 

@@ -93,7 +93,7 @@ def center_of_mass(shape: Shape) -> np.ndarray:
 
 
 def height(shape: Shape) -> float:
-    """Of the top above the bottom face [m]."""
+    """Height of the top above the bottom face [m]."""
     return float(shape.mesh.vertices[:, 2].max())
 
 
@@ -277,7 +277,7 @@ def _shampoo(rng: np.random.Generator) -> tuple[Shape, str]:
 
 
 def _rounded_box_points(width: float, depth: float, low: float, high: float, edge: float = 0.012) -> np.ndarray:
-    """Points of a box about z whose upright edges are rounded."""
+    """Points [k 3] m of a box about z whose upright edges are rounded."""
     angle = np.linspace(0, np.pi / 2, 4)
     quarter = np.stack([width / 2 - edge + edge * np.cos(angle), depth / 2 - edge + edge * np.sin(angle)], -1)
     ring = np.concatenate([quarter * [sx, sy] for sx in (-1, 1) for sy in (-1, 1)])

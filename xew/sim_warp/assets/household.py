@@ -76,22 +76,22 @@ class Thing:
 
     @property
     def height(self) -> float:
-        """m."""
+        """Height of the top above the bottom [m]."""
         return float(max(hull[:, 2].max() for hull in self.shape.hulls))
 
     @property
     def length(self) -> float:
-        """Along y [m]."""
+        """Length along y [m]."""
         return float(np.ptp(np.concatenate(self.shape.hulls)[:, 1]))
 
     @property
     def radius(self) -> float:
-        """Of the circle about the origin that holds the footprint [m]."""
+        """Radius of the circle about the origin that holds the footprint [m]."""
         return footprint_radius(self.shape)
 
 
 def footprint_radius(shape: Shape) -> float:
-    """Of the circle about a shape's z axis that holds all that collides of it [m]."""
+    """Radius of the circle about a shape's z axis that holds all that collides of it [m]."""
     return float(max(np.hypot(hull[:, 0], hull[:, 1]).max() for hull in shape.hulls))
 
 

@@ -1,3 +1,6 @@
-"""Which device does the work, how many processes share it, and how a process waits for a GPU without spinning."""
+"""Devices and worker processes: which device does the work, how many processes share it, and how they wait for a GPU.
+
+`workers` starts processes that end with their parent, `waiting` waits without keeping a core busy.
+"""
 
 __all__ = ["waiting", "workers"]

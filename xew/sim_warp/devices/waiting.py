@@ -1,4 +1,4 @@
-"""Waiting for a GPU without keeping a core busy: CUDA's own wait spins, and workers have better use for the core."""
+"""Waiting for a GPU without keeping a core busy. CUDA's own wait spins, and workers need the core."""
 
 import time
 

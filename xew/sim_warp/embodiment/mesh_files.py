@@ -112,7 +112,7 @@ def _texture_colors(shape: trimesh.Trimesh, visual: TextureVisuals) -> np.ndarra
 
 
 def _unit_color(color: np.ndarray) -> np.ndarray:
-    """0 to 1, whether stored so or as 0 to 255."""
+    """The color in 0 to 1, whether it is stored so or in 0 to 255."""
     return color / 255 if color.dtype == np.uint8 else color.astype(float)
 
 

@@ -1,4 +1,4 @@
-"""What the simulator must know of a robot beside its URDF."""
+"""`RobotSpec`: what the simulator knows of a robot beside its URDF."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,8 +53,10 @@ class RobotSpec:
 
     @property
     def one_urdf_holds_both_arms(self) -> bool:
+        """True for one URDF with two arms, False for a URDF of one arm that is put up twice."""
         return self.arms[0].joints != self.arms[1].joints
 
     @property
     def arm_joint_count(self) -> int:
+        """Number of joints of each arm, six or seven."""
         return len(self.arms[0].joints)

@@ -185,18 +185,19 @@ def _pack(forests: Sequence[Sequence[Node]], kernels: object, dtype: type, devic
     still = Source(0, 0.0)
     packed = kernels.Forest()  # type: ignore[attr-defined]
 
-    def array(values: Sequence[object] | np.ndarray, kind: type) -> wp.array:
+    def to_device(values: Sequence[object] | np.ndarray, kind: type) -> wp.array:
+        """Numbers [l ...] as an array of a type of Warp."""
         return wp.array(np.array(values), dtype=kind, device=device)
 
-    packed.links = array(np.stack([np.cumsum(counts) - counts, counts], -1), wp.vec2i)
-    packed.above = array([node.above for node in nodes], int)
-    packed.kind = array([_kind(node) for node in nodes], int)
-    packed.origin = array([node.origin for node in nodes], kernels.frame)  # type: ignore[attr-defined]
+    packed.links = to_device(np.stack([np.cumsum(counts) - counts, counts], -1), wp.vec2i)
+    packed.above = to_device([node.above for node in nodes], int)
+    packed.kind = to_device([_kind(node) for node in nodes], int)
+    packed.origin = to_device([node.origin for node in nodes], kernels.frame)  # type: ignore[attr-defined]
     axes = [node.joint.axis if node.joint else np.zeros(3) for node in nodes]
-    packed.axis = array(axes, kernels.vector)  # type: ignore[attr-defined]
-    packed.column = array([(node.source or still).column for node in nodes], int)
-    packed.gain = array([(node.source or still).gain for node in nodes], dtype)
-    packed.bias = array([(node.source or still).bias for node in nodes], dtype)
+    packed.axis = to_device(axes, kernels.vector)  # type: ignore[attr-defined]
+    packed.column = to_device([(node.source or still).column for node in nodes], int)
+    packed.gain = to_device([(node.source or still).gain for node in nodes], dtype)
+    packed.bias = to_device([(node.source or still).bias for node in nodes], dtype)
     return packed
 
 

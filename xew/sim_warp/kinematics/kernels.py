@@ -54,7 +54,7 @@ def kinematics_kernels(scalar: type) -> SimpleNamespace:
         # Out
         pose_out: wp.array3d(dtype=scalar),  # [l 7 n] as joint_pos, m and quaternion x y z w; threads write side by side
     ):
-        """Walk the links of one configuration from the root outward; one thread a row."""
+        """Walk the links of one configuration from the root outward: a thread makes the poses [l 7] of one row of [n]."""
         row = wp.tid()
         which = 0
         if robot.shape[0] > 0:

@@ -1,4 +1,4 @@
-"""The robots room: five bimanual robots, each a URDF with our own geometry and one `RobotSpec`.
+"""Registry of robots: five bimanual ones, each a URDF with our own geometry and one `RobotSpec`.
 
 To add one, write a file with `SPEC = RobotSpec(...)` here and add its line to `ROBOTS`; outside the repository write it
 anywhere importable and name it `module:SPEC` wherever a robot is asked for, or name the path of a URDF or of a RoboTwin

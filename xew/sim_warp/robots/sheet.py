@@ -40,7 +40,13 @@ def sheet(views: np.ndarray) -> np.ndarray:
 
 
 def overview(views: dict[str, np.ndarray], head: dict[str, np.ndarray]) -> np.ndarray:
-    """One row a robot at half size: its name, what the head camera sees at home, and every other of the nine views."""
+    """All robots in one picture [h w 3] uint8, a row each at half size: the title, what the head camera sees at home, and every
+    other of the nine views.
+
+    Args:
+        views: [9 h w 3] uint8, nine views by robot.
+        head: [h w 3] uint8, the head camera's view by robot.
+    """
     rows = []
     for key, images in views.items():
         small = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in (head[key], *images[::2])]

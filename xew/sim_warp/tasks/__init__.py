@@ -1,4 +1,4 @@
-"""The tasks: one file each, of one shape: sample, plan, success.
+"""Registry of tasks: one file each with the functions sample, plan and success.
 
 To add one, write a file with `TASK = Task(...)` here and add its line to `TASKS`; outside the repository write it
 anywhere importable and name it `module:TASK` wherever a task is asked for.

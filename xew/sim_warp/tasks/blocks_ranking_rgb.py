@@ -1,7 +1,8 @@
 """Task: put a red, a green and a blue block in a row, from left to right, one hand at a time.
 
 Randomization: three cubes of one size (half edge 15 to 25 mm) at |x| in [.05, .28], y in [-.08, .05] (y at most 0 where
-    |x| < .15), any yaw within 43 degrees, at least .10 apart; never in order already. The row's y and its three x.
+    |x| < .15), any yaw within 43 degrees, at least .10 apart; never in order already. The row's y and its three x
+    vary too.
 Success: red left of green left of blue, neighbors within 130 mm in x and 30 mm in y, both grippers open.
 After RoboTwin 2.0's blocks_ranking_rgb.
 """

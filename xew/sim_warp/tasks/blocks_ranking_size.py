@@ -2,7 +2,7 @@
 
 Randomization: three cubes of half edges 28 to 31, 23 to 26 and 18 to 21 mm in three colors at |x| in [.05, .28], y in
     [-.08, .05] (y at most 0 where |x| < .15), any yaw within 43 degrees, at least .12 apart and .10 from the places of the
-    row; never in order already. The row's y and its three x.
+    row; never in order already. The row's y and its three x vary too.
 Success: large left of medium left of small, neighbors within 130 mm in x and 30 mm in y, both grippers open.
 After RoboTwin 2.0's blocks_ranking_size, whose large block is 60 to 66 mm wide (the narrowest of our hands opens 80 mm) and
     whose medium block goes within 70 mm of the small one, where a wide hand has no room between them.

@@ -74,7 +74,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 
 def top_height(scene: Scene) -> float:
-    """Of the stand's upper face over its origin [m]."""
+    """Height of the stand's upper face over its origin [m]."""
     return float(max(hull[:, 2].max() for hull in scene.object("stand").shape.hulls))
 
 

@@ -46,13 +46,13 @@ def lying_bottle(task: str, rng: np.random.Generator, seed: int) -> Scene:
 
 
 def front_pose(arm: int) -> Tool:
-    """Where a hand shakes: nearly level, so that what lay under it stands nearly upright."""
+    """The pose in which a hand shakes: nearly level, so that what lay under it stands nearly upright."""
     x, y, z = FRONT
     return tool((side_sign(arm) * x, y, z), side_sign(arm) * FRONT_YAW, FRONT_TILT)
 
 
 def roll_hand(hand: Tool, angle: float) -> Tool:
-    """Turned about its approach direction [rad]."""
+    """The hand turned about its approach direction [rad]."""
     return Tool(hand.position, hand.rotation * Rotation.from_euler("x", angle))
 
 

@@ -1,4 +1,4 @@
-"""What a task is: a scene to sample, a plan that solves it, and a test of success."""
+"""Tasks and the moves that they share: a task is a scene to sample, a plan that solves it, and a test of success."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -50,6 +50,7 @@ class Moment:
 
     @property
     def both_open(self) -> bool:
+        """Are both grippers open?"""
         return bool((self.gripper > GRIPPER_OPEN).all())
 
 
@@ -100,7 +101,7 @@ def radial_yaw(arm: int, position: Point) -> float:
 
 
 def symmetric_yaw(arm: int, position: Point, yaw: float, symmetry: float) -> float:
-    """Of the yaws `yaw` plus multiples of `symmetry` [rad] the one nearest to the radial yaw."""
+    """The yaw nearest to the radial one, out of `yaw` plus multiples of `symmetry` [rad]."""
     return float(yaw + symmetry * np.round((radial_yaw(arm, position) - yaw) / symmetry))
 
 
@@ -160,7 +161,7 @@ def across(position: Point, direction: float, arm: int) -> Tool:
 
 
 def vessel_pose(position: Point) -> Pose:
-    """Upright on the table at (x, y), turned so that a wall segment faces the hand that will take it."""
+    """A pose upright on the table at (x, y), turned so that a wall segment faces the hand that will take it."""
     return upright(position[:2], TABLE_TOP, radial_yaw(arm_for(position[0]), position))
 
 
@@ -182,7 +183,7 @@ def rim_grasp(vessel: SceneObject, wall: float, depth: float) -> tuple[int, Tool
 
 
 def aside_poses(working: Collection[int]) -> dict[int, Tool]:
-    """Where the arms that are not working wait."""
+    """Poses where the arms that are not working wait."""
     return {arm: ASIDE[arm] for arm in (LEFT, RIGHT) if arm not in working}
 
 

@@ -26,6 +26,7 @@ class Box:
 
     @property
     def size(self) -> np.ndarray:
+        """[3] edge lengths [m]."""
         return np.subtract(self.high, self.low)
 
     @property

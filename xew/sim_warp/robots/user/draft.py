@@ -1,4 +1,4 @@
-"""What a user says of a robot of their own: a `RobotDraft`, most of which may be left open.
+"""Descriptions of users' robots as `RobotDraft`s, most of which may be left open.
 
 Reads  a URDF, a folder with a robot.yaml, or a RoboTwin embodiment folder (config.yml)
 Writes RobotDraft; `xew.sim_warp.robots.user.own` fills in what is open
@@ -145,7 +145,7 @@ def _robotwin_arm(reader: "_Reader", side: int, tool: Pose) -> ArmDraft:
 
 
 def _unit_quaternion(quaternion: np.ndarray, reader: "_Reader") -> tuple[float, float, float, float]:
-    """RoboTwin writes .707 for the root of a half."""
+    """The quaternion [4] at unit length, for RoboTwin writes .707 for the root of a half."""
     length = float(np.linalg.norm(quaternion))
     if not 0.9 < length < 1.1:
         raise reader.error("robot_pose", "unit quaternions w x y z")
@@ -161,6 +161,7 @@ class _Reader:
     source: str
 
     def value(self, key: str, kind: type) -> Any:
+        """The value of a key, which must be there and of a type."""
         if key not in self.config:
             raise ConfigError(f"{self.source}: missing key {key!r}; a RoboTwin embodiment has it.")
         if not isinstance(self.config[key], kind):
@@ -175,6 +176,7 @@ class _Reader:
         return entries[-1 if side else 0]
 
     def numbers(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
+        """Finite numbers [...] float64 of a shape."""
         try:
             array = np.asarray(self.value(key, object), float)
         except (TypeError, ValueError) as error:
@@ -184,6 +186,7 @@ class _Reader:
         return array
 
     def rotation(self, key: str) -> np.ndarray:
+        """A rotation matrix [3 3]."""
         matrix = self.numbers(key, (3, 3))
         if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3) or np.linalg.det(matrix) < 0:
             raise self.error(key, "a rotation matrix")

@@ -1,4 +1,4 @@
-"""What a URDF shows of itself: its hands, the joints of its arms, its tool frame, which way its fingers close.
+"""Inference from a URDF: its hands, the joints of its arms, its tool frame, which way its fingers close.
 
 Reads  a Urdf
 Writes the fields of an Arm that a draft leaves open. Where the URDF leaves more than one reading, a ConfigError says which
@@ -83,6 +83,7 @@ def finger_ends(urdf: Urdf, fingers: tuple[str, str]) -> tuple[tuple[float, floa
 
 
 def _middle_position(joint: Joint, urdf: Urdf) -> float:
+    """The middle of a finger's way [m]. Raises ConfigError if it has none."""
     if joint.kind != "prismatic" or not math.isfinite(joint.upper - joint.lower) or joint.upper - joint.lower < 1e-4:
         raise ConfigError(
             f"{urdf.path}: the finger {joint.name} is {joint.kind} from {joint.lower:g} to {joint.upper:g}; expected a "
@@ -92,7 +93,7 @@ def _middle_position(joint: Joint, urdf: Urdf) -> float:
 
 
 def _finger_points(urdf: Urdf, name: str, positions: dict[str, float]) -> np.ndarray:
-    """Points [k 3] of all that a finger joint moves, in the frame of the hand; its origin if that has no shape."""
+    """Points [k 3] m of all that a finger joint moves, in the frame of the hand; its origin if that has no shape."""
     row = np.array([[positions.get(joint, 0.0) for joint in urdf.joint_names]])
     frames = link_matrices(urdf, row)
     hand = np.linalg.inv(frames[urdf.joints[name].parent][0])

@@ -27,6 +27,15 @@ from xew.protocol import ROBOT_NAMES
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
 from xew.sim_warp.robots.user.draft import OWN, ArmDraft, RobotDraft, find_description, read_draft
+from xew.sim_warp.robots.user.infer import (
+    arm_joints,
+    find_fingers,
+    finger_ends,
+    hand_link,
+    joint_limits,
+    tool_at_tips,
+    tool_frame,
+)
 
 FOLDERS = "XEW_ROBOTS"
 """Name of the environment variable that lists folders of robots, separated as in PATH."""
@@ -75,11 +84,11 @@ def robot_key(description: Path) -> str:
 
 def complete_draft(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> RobotSpec:
     """A RobotSpec of a draft and its URDF; `source` names the draft in errors."""
-    arms = _arms(draft, urdf, source)
+    arms = _complete_arms(draft, urdf, source)
     counts = [len(arm.joints) for arm in arms]
     if counts[0] != counts[1] or counts[0] not in (6, 7):
         raise ConfigError(f"{source}: the arms have {counts[0]} and {counts[1]} joints; expected equal arms of six or seven.")
-    lower, upper, speed = _limits(draft, urdf, arms, source)
+    lower, upper, speed = _complete_limits(draft, urdf, arms, source)
     robot = RobotSpec(
         key=key,
         title=draft.title or urdf.name or key,
@@ -92,9 +101,8 @@ def complete_draft(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> Robo
     return _settle(draft, robot, source)
 
 
-def _arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]:
-    from xew.sim_warp.robots.user.infer import arm_joints, find_fingers, finger_ends, hand_link, tool_at_tips, tool_frame
-
+def _complete_arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]:
+    """Left and right arm with nothing open but homes and bases."""
     told = _fill_right_arm(draft.arms)
     found = [] if all(arm.fingers for arm in told) else find_fingers(urdf)
     arms: list[Arm] = []
@@ -126,7 +134,7 @@ def _arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]:
 
 
 def _fill_right_arm(arms: tuple[ArmDraft, ArmDraft]) -> tuple[ArmDraft, ArmDraft]:
-    """Where the right arm is left open it is told as the left, but for its home."""
+    """Both arms, the right one as the left where it is left open, but for its home."""
     left, right = arms
     return (left, replace(left, home=None)) if right == ArmDraft() else (left, right)
 
@@ -171,9 +179,10 @@ def _check_arm(urdf: Urdf, arm: Arm, source: str) -> None:
         raise ConfigError(f"{source}: {', '.join(loose)} do not lead to {arm.tool_link}; name the joints of this arm.")
 
 
-def _limits(draft: RobotDraft, urdf: Urdf, arms: tuple[Arm, Arm], source: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    from xew.sim_warp.robots.user.infer import joint_limits
-
+def _complete_limits(
+    draft: RobotDraft, urdf: Urdf, arms: tuple[Arm, Arm], source: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lower and upper position limits [d] rad and speed limits [d] rad/s that experts keep."""
     both = [joint_limits(urdf, arm.joints) for arm in arms]
     found = (np.maximum(both[0][0], both[1][0]), np.minimum(both[0][1], both[1][1]), np.minimum(both[0][2], both[1][2]))
     given = (draft.joint_lower, draft.joint_upper, draft.joint_velocity)
@@ -187,7 +196,7 @@ def _limits(draft: RobotDraft, urdf: Urdf, arms: tuple[Arm, Arm], source: str) -
 
 
 def _settle(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
-    """The robot with bases and homes, given or found."""
+    """The robot with bases and homes, which are found where the draft leaves them open."""
     from xew.sim_warp.robots.user import placement
 
     left, right = _fill_right_arm(draft.arms)
@@ -207,7 +216,7 @@ def _settle(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
 
 
 def _posture(arm: ArmDraft, robot: RobotSpec, source: str) -> np.ndarray | None:
-    """Where to look for a home. Raises ConfigError if it does not fit the arm."""
+    """Posture [d] rad to look for a home from, if the draft has one. Raises ConfigError if it does not fit the arm."""
     near = arm.home or arm.near
     if near is not None and len(near) != robot.arm_joint_count:
         raise ConfigError(f"{source}: a home has {len(near)} joints, the arm {robot.arm_joint_count}; expected as many.")
@@ -273,7 +282,7 @@ def keep_robot(robot: RobotSpec, data: Path, digest: str = "") -> RobotSpec:
 
 
 def _write(robot: RobotSpec, digest: str, folder: Path) -> None:
-    """robot.yaml, the URDF and its files under a folder, as they lie to one another."""
+    """Write robot.yaml, the URDF and its files under a folder, as they lie to one another."""
     urdf = load_urdf(robot.urdf)
     top = Path(os.path.commonpath([file.resolve().parent for file in urdf.files]))
     with complete_folder(folder) as temporary:

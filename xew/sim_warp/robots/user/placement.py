@@ -1,4 +1,4 @@
-"""Where a robot of a user's own stands and how it holds its arms at rest, found by inverse kinematics.
+"""Placement of users' robots: where they stand and how they hold their arms at rest, found by inverse kinematics.
 
 Reads  a RobotSpec whose bases or homes are not decided yet
 Writes the same robot with both tools at `plan.HOME`, so that every task's plan begins where the robot is
@@ -72,7 +72,7 @@ def find_homes(robot: RobotSpec, near: tuple[np.ndarray | None, np.ndarray | Non
 
 
 def find_place(robot: RobotSpec, near: tuple[np.ndarray | None, np.ndarray | None]) -> RobotSpec:
-    """The robot where its left arm reaches most, of the places that are tried, with homes."""
+    """The robot where its left arm reaches most, of the places that are tried, with homes near postures [d] rad."""
     found: list[tuple[float, RobotSpec]] = []
     for candidate in _places(robot):
         solver = ArmSolver(candidate, "cpu")
@@ -88,7 +88,8 @@ def find_place(robot: RobotSpec, near: tuple[np.ndarray | None, np.ndarray | Non
 
 
 def find_distance(robot: RobotSpec, near: tuple[np.ndarray | None, np.ndarray | None], distance: float | None) -> RobotSpec:
-    """The robot with its bases moved to either side by half a distance [m], the first of `DISTANCES` that works, and homes."""
+    """The robot with its bases moved to either side by half a distance [m], the first of `DISTANCES` that works, and homes near
+    postures [d] rad."""
     problem: ConfigError | None = None
     for gap in DISTANCES if distance is None else (distance,):
         try:
@@ -100,8 +101,9 @@ def find_distance(robot: RobotSpec, near: tuple[np.ndarray | None, np.ndarray | 
 
 
 def try_turned_tools(robot: RobotSpec, settle: Callable[[RobotSpec], RobotSpec]) -> RobotSpec:
-    """A robot after `settle`, one of the functions above, with its tool frames as they are or, where too little of the work
-    area is reached so, turned by half about the approach, which is the same to its fingers: whichever reaches more."""
+    """The robot after `settle`, one of the functions above, with its tool frames as they are or turned by half about the
+    approach, which is the same to its fingers. They are turned where the arms reach more of the work area so, and tried only
+    where the arms reach less than `ENOUGH` of it."""
     settled = settle(robot)
     if _least_share(settled) >= ENOUGH:
         return settled
@@ -118,11 +120,13 @@ def try_turned_tools(robot: RobotSpec, settle: Callable[[RobotSpec], RobotSpec])
 
 
 def _least_share(robot: RobotSpec) -> float:
+    """Share of the work area that the worse of the two arms reaches."""
     solver = ArmSolver(robot, "cpu")
     return min(_reached_share(solver, arm) for arm in (0, 1))
 
 
 def _places(robot: RobotSpec) -> Iterator[RobotSpec]:
+    """The robot at every place that is tried."""
     if robot.one_urdf_holds_both_arms:
         for y, z in product(BASE_Y, ROOT_Z):
             arms = tuple(replace(arm, root_pose=(0.0, y, z, *YAW_90)) for arm in robot.arms)
@@ -134,6 +138,7 @@ def _places(robot: RobotSpec) -> Iterator[RobotSpec]:
 
 
 def _move_apart(robot: RobotSpec, gap: float) -> RobotSpec:
+    """The robot with each base moved outward by half a gap [m]."""
     left, right = (
         replace(arm, root_pose=(arm.root_pose[0] + side * gap / 2, *arm.root_pose[1:]))
         for side, arm in zip((-1, 1), robot.arms, strict=True)
@@ -193,14 +198,14 @@ def _distinct_postures(postures: np.ndarray) -> list[np.ndarray]:
 
 
 def _limit_room(robot: RobotSpec, posture: np.ndarray) -> float:
-    """How far the joint that is nearest to one of its limits is from it [rad]."""
+    """Least distance of a joint of a posture [d] from its limits [rad]."""
     return float(np.minimum(posture - robot.joint_lower, robot.joint_upper - posture).min())
 
 
 def _reached_share(solver: ArmSolver, arm: int) -> float:
-    """How much of the work area the arm reaches from its home, of 54 grasps that are turned as tasks turn them.
+    """Share of the work area that the arm reaches from its home, of 54 grasps that are turned as tasks turn them.
 
-    It counts a quarter where the arm cannot go aside, as every plan asks of an arm that has nothing to do.
+    The share counts a quarter where the arm cannot go aside, as every plan asks of an arm that has nothing to do.
     """
     cells = list(product(OFFSETS, product(WORK_X[::2], WORK_Y[::2], WORK_Z[::2])))
     positions = np.array([ASIDE[0].position, *(position for _, position in cells)])
@@ -230,6 +235,7 @@ def _is_clear(robot: RobotSpec, arm: int) -> bool:
 
 
 def _set_home(robot: RobotSpec, arm: int, home: np.ndarray) -> RobotSpec:
+    """The robot with the home [d] rad of one arm, rounded."""
     arms = list(robot.arms)
     arms[arm] = replace(arms[arm], home=tuple(round(float(value), 4) for value in home))
     return replace(robot, arms=(arms[0], arms[1]))

@@ -1,7 +1,7 @@
-"""One cell of a study as a process: a command of this package, its output in a log, its end noticed.
+"""The process of one step of a study: a command of this package, its output in a log, its end noticed.
 
-A cell's process leaves when the study is killed (training saves first), and waits while one that was left behind still works
-on the same cell, so that two never write to the same place. On one machine processes are forked from one that has already
+A step's process leaves when the study is killed (training saves first), and waits while one that was left behind still works
+on the same step, so that two never write to the same place. On one machine processes are forked from one that has already
 imported JAX and the model (multiprocessing's forkserver): starting costs a fraction of a second instead of several.
 """
 
@@ -24,9 +24,9 @@ from typing import Literal
 from xew.processes import leave_with_parent
 
 PRELOADED = ("xew.model.train", "xew.model.rollout", "xew.metrics.evaluate")
-"""What the fork server imports. None of them may start a thread or a JAX backend at import, which forks would not survive."""
+"""Modules that the fork server imports. None of them may start a thread or a JAX backend at import, which no fork survives."""
 ENDED = "exit status"
-"""How the last line of a log begins."""
+"""Beginning of the last line of a log."""
 
 CONTEXTS: dict[str, ForkServerContext | SpawnContext] = {
     "forkserver": multiprocessing.get_context("forkserver"),
@@ -34,7 +34,7 @@ CONTEXTS: dict[str, ForkServerContext | SpawnContext] = {
 }
 
 
-def start_cell(
+def start_step(
     command: Sequence[str],
     log: Path,
     environment: Mapping[str, str],
@@ -59,7 +59,7 @@ def start_cell(
     return process
 
 
-def shown(command: Sequence[str]) -> str:
+def format_command(command: Sequence[str]) -> str:
     """A command as it is typed."""
     return f"python -m {' '.join(command)}"
 
@@ -75,14 +75,14 @@ def last_lines(log: Path, count: int = 3) -> str:
 
 
 def _run(command: tuple[str, ...], log: Path, environment: dict[str, str], launcher: tuple[str, ...]) -> None:
-    """In the new process: the module as `__main__`, as `python -m` would run it, or the launcher's process."""
+    """Run a module as `python -m` would, or the launcher's process; called in the new process."""
     os.environ.update(environment)
-    os.setpgrp()  # Ctrl-C reaches the study only, which asks its cells to stop
+    os.setpgrp()  # Ctrl-C reaches the study only, which asks its steps to stop
     leave_with_parent(lambda: os.kill(os.getpid(), signal.SIGTERM))
-    with log.open("a", buffering=1) as file, _alone(log.with_suffix(".lock")):
+    with log.open("a", buffering=1) as file, _hold_lock(log.with_suffix(".lock")):
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-        print("$", " ".join([*launcher, shown(command)]), flush=True)
+        print("$", " ".join([*launcher, format_command(command)]), flush=True)
         try:
             code = _launch([*launcher, sys.executable, "-m", *command]) if launcher else _run_module(*command)
         finally:
@@ -93,7 +93,7 @@ def _run(command: tuple[str, ...], log: Path, environment: dict[str, str], launc
 
 
 def _run_module(module: str, *arguments: str) -> int:
-    """The exit status of a module that is run as `python -m` runs it."""
+    """Run a module as `python -m` does; returns its exit status."""
     sys.argv[1:] = arguments
     sys.modules.pop(module, None)  # the fork server has imported it under its own name
     try:
@@ -109,21 +109,21 @@ def _run_module(module: str, *arguments: str) -> int:
 
 
 def _cpu_seconds() -> float:
-    """Of this process and of those that it has started and waited for."""
+    """CPU time of this process and of those that it has started and waited for [s]."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(usage.ru_utime + usage.ru_stime for usage in used)
 
 
 def _launch(command: Sequence[str]) -> int:
-    """The exit status of a program that hears of this process's end."""
+    """Run a program, to which SIGTERM is passed on; returns its exit status."""
     process = subprocess.Popen(command)
     signal.signal(signal.SIGTERM, lambda *_: process.terminate())
     return process.wait()
 
 
 @contextlib.contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """Waits until no other process holds this file's lock; it is let go with the block or the process."""
+def _hold_lock(path: Path) -> Iterator[None]:
+    """Wait until no other process holds this file's lock, and hold it until the block or the process ends."""
     with path.open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield

@@ -1,0 +1,137 @@
+"""`evaluate` and `report` say the same of the same scores: means, intervals and verdicts, to the last digit."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.analysis.synthetic_study import paper_axes
+from xew.analysis.paper import read_paper
+from xew.analysis.scores import COPY, TRUTH, Scores, read_scores
+from xew.analysis.statistics.grades import StudyGrades
+from xew.analysis.statistics.summary import robot_table
+from xew.analysis.tables.builder import Builder, paired_verdict
+from xew.metrics import METRICS
+from xew.metrics.grading.scores import describe
+from xew.metrics.grading.summary import Summary, summarize
+from xew.protocol import ROBOT_NAMES, SEEN_ROBOTS, reference
+
+ROBOTS = ("ur5_wsg", "piper")
+JOINTS, FLOW = (reference(action=action).name for action in ("joints", "optical_flow"))
+BASE = {"psnr": 20.0, "ssim": 0.8, "mask_iou": 0.6, "keypoint_error": 6.0, "trajectory_error": 9.0}
+"""Mean score of the worse model by metric; the second and third are estimated with the others."""
+
+
+def write_scores(path: Path, scenes: int, truth: bool, spread: float, missing: float) -> Scores:
+    """Two models and the baselines on scenes of four tasks; scores are rounded, so that some are tied."""
+    rng = np.random.default_rng(scenes)
+    gains = {JOINTS: 0.0, FLOW: 0.08, COPY: -0.02} | ({TRUTH: 0.3} if truth else {})
+    rows = [
+        {"model": model, "condition": "", "task": f"task{i % 4}", "seed": 1_000_000 + i // 4, "robot": robot, "metric": metric}
+        | {"value": _score(metric, base, gain + 0.05 * shared + spread * rng.normal())}
+        for i, shared in enumerate(rng.normal(size=scenes))
+        for robot in ROBOTS
+        for model, gain in gains.items()
+        for metric, base in BASE.items()
+        if rng.random() >= missing
+    ]
+    table = pd.DataFrame(rows).assign(frames=5, exact_frames=0)
+    table.attrs = describe({"protocol": 3, "estimators": {}, "frame_zero": "given", "allowed": []}, tuple(BASE))
+    table.to_parquet(path)
+    table.to_parquet(path.with_suffix(".curves.parquet"))
+    return read_scores(path)
+
+
+def _score(metric: str, base: float, gain: float) -> float:
+    low, high = METRICS[metric].range
+    value = base * (1 + gain if METRICS[metric].higher_is_better else 1 - gain)
+    return float(np.clip(np.round(value, 2 if high == 1 else 1), low, high))
+
+
+@pytest.fixture(params=[(3, True), (6, True), (12, True), (12, False)], ids=lambda p: f"{p[0]}-{'truth' if p[1] else 'none'}")
+def size(request: pytest.FixtureRequest) -> tuple[int, bool]:
+    return request.param
+
+
+@pytest.fixture(params=[(0.01, 0.0), (0.06, 0.15), (0.0, 0.0)], ids=["clear", "gaps", "ties"])
+def scores(request: pytest.FixtureRequest, size: tuple[int, bool], tmp_path: Path) -> Scores:
+    return write_scores(tmp_path / "scores.parquet", *size, *request.param)
+
+
+def pairs_of(summary: Summary, model: str, other: str) -> Iterator[tuple[tuple[str, str], str]]:
+    pairs = summary.pairs[(summary.pairs["model"] == model) & (summary.pairs["other"] == other)]
+    for pair in pairs.itertuples():
+        yield (str(pair.robot), str(pair.metric)), str(pair.verdict)
+
+
+def test_a_run_is_the_same_in_both(scores: Scores) -> None:
+    summary = summarize(scores.rows)
+    means = summary.means.set_index(["robot", "model", "metric"])
+    reported = {robot: robot_table(scores, robot, [robot], None) for robot in ROBOTS}
+    compared = 0
+    for robot, table in reported.items():
+        for row in table.rows:
+            for metric, score in row.scores.items():
+                found = means.loc[(robot, row.model, metric)]
+                np.testing.assert_array_equal(found[["mean", "low", "high"]].astype(float), [score.mean, score.low, score.high])
+                assert found["episodes"] == score.count
+                compared += 1
+    assert compared == len(summary.means)
+    for model in (JOINTS, FLOW):
+        found = dict(pairs_of(summary, model, COPY))
+        own = {
+            (robot, name): word
+            for robot, t in reported.items()
+            for r in t.rows
+            if r.model == model
+            for name, word in r.verdicts.items()
+        }
+        assert found == own and len(own) == len(ROBOTS) * len(BASE)
+
+
+def test_a_study_is_the_same_in_both(scores: Scores) -> None:
+    summary = summarize(scores.rows)
+    means = summary.means.set_index(["robot", "model", "metric"])
+    variants = scores.rows["model"].where(scores.rows["model"].isin([JOINTS, FLOW]), "")
+    grades = StudyGrades(scores.rows.assign(variant=variants), scores.metrics, paper_axes(read_paper()))
+    builder = Builder(grades, None)
+    found = dict(pairs_of(summary, JOINTS, FLOW))
+    words = set()
+    for robot in ROBOTS:
+        for metric in BASE:
+            for row, model in (("joints", JOINTS), ("optical_flow", FLOW)):
+                cell, mean = builder.cell("actions", row, robot, metric), means.loc[(robot, model, metric)]
+                np.testing.assert_array_equal([cell.value, cell.low, cell.high], mean[["mean", "low", "high"]].astype(float))
+            assert paired_verdict(grades, "actions", "joints", "optical_flow", robot, metric) == found[robot, metric]
+            assert grades.floor(robot, metric) == pytest.approx(means.loc[(robot, JOINTS, metric), "noise"], abs=0, nan_ok=True)
+            words.add(found[robot, metric])
+    if len(scores.rows["seed"].unique()) < 2:
+        assert words == {"unresolved"}, "three scenes resolve nothing, in neither"
+
+
+def test_what_the_two_once_disagreed_on(tmp_path: Path) -> None:
+    """Three scenes are too few in both, and what is estimated has no floor without the true video, in both."""
+    for scenes, truth, resolved in ((3, True, set()), (12, True, set(BASE)), (12, False, {"psnr", "ssim"})):
+        scores = write_scores(tmp_path / "scores.parquet", scenes, truth, 0.01, 0.0)
+        tables = [robot_table(scores, robot, [robot], None) for robot in ROBOTS]
+        reported = [row.verdicts for table in tables for row in table.rows if row.model == FLOW]
+        graded = dict(pairs_of(summarize(scores.rows), FLOW, COPY))
+        for words in (*reported, {metric: word for (_, metric), word in graded.items()}):
+            found = {metric for metric, word in words.items() if word == "better"}
+            assert found <= resolved and (found & {"psnr", "ssim"}) == (resolved & {"psnr", "ssim"})
+
+
+def test_robots_that_are_pooled_are_the_same_in_a_run_and_a_study(tmp_path: Path) -> None:
+    scores = write_scores(tmp_path / "scores.parquet", 12, True, 0.05, 0.1)
+    rows = pd.concat([scores.rows.assign(robot=robot) for robot in ROBOT_NAMES])
+    rows["value"] *= 1 - 0.001 * rows.groupby(["model", "task", "seed", "metric"]).cumcount()
+    rows = rows.drop_duplicates(["model", "task", "seed", "robot", "metric"])
+    variants = rows["model"].where(rows["model"].isin([JOINTS, FLOW]), "")
+    grades = StudyGrades(rows.assign(variant=variants), scores.metrics, paper_axes(read_paper()))
+    table = robot_table(Scores(rows, scores.curves, scores.metrics, {}), "seen", SEEN_ROBOTS, None)
+    for row in table.rows:
+        for metric, score in row.scores.items():
+            mean = grades.baseline(row.model, SEEN_ROBOTS, metric)
+            assert mean and (mean.value, *mean.interval(), mean.count) == (score.mean, score.low, score.high, score.count)

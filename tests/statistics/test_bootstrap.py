@@ -1,0 +1,101 @@
+"""Draws and intervals: against SciPy, against what is known, and to the last bit where that is promised."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from xew.statistics import DRAWS, MIN_SCENES, Mean, Units, bootstrap_means, draw_units, every_draw, interval
+
+
+def ends(values: np.ndarray, numbers: np.ndarray, count: int | None = None) -> np.ndarray:
+    """[2 c] of the columns' intervals."""
+    means = bootstrap_means(values, numbers, count or int(numbers.max()) + 1)
+    return np.array([mean.interval() if mean else (np.nan, np.nan) for mean in means]).T
+
+
+def test_intervals_are_those_of_scipy_up_to_chance() -> None:
+    values = np.random.default_rng(0).gamma(2, size=(40, 3))
+    low, high = ends(values, np.arange(40))
+    for column in range(3):
+        expected = stats.bootstrap(
+            (values[:, column],), np.mean, n_resamples=20000, method="percentile", rng=np.random.default_rng(1)
+        ).confidence_interval
+        width = expected.high - expected.low
+        assert low[column] == pytest.approx(expected.low, abs=0.03 * width)
+        assert high[column] == pytest.approx(expected.high, abs=0.03 * width)
+
+
+def test_rows_of_a_unit_are_drawn_together() -> None:
+    """Ten copies of each value say no more than one: the interval stays as wide, and is ten times too narrow without units."""
+    values = np.random.default_rng(0).normal(size=(12, 1))
+    once = ends(values, np.arange(12))
+    copies = np.repeat(values, 10, axis=0)
+    assert ends(copies, np.repeat(np.arange(12), 10)) == pytest.approx(once, abs=1e-12)
+    alone = ends(copies, np.arange(120))
+    assert np.ptp(alone) < 0.5 * np.ptp(once)
+
+
+def test_missing_values_are_left_out_and_few_units_have_no_interval() -> None:
+    values = np.full((8, 4), np.nan)
+    values[:, 0] = np.arange(8)
+    values[1:7, 1] = np.arange(6)
+    values[:5, 2] = 1.0
+    all_eight, six, five, none = bootstrap_means(values, np.arange(8), 8)
+    assert none is None and all_eight and six and five
+    assert (all_eight.count, all_eight.scenes, all_eight.value) == (8, 8, 3.5) and six.value == 2.5
+    assert MIN_SCENES == 6 and np.isnan(five.interval()).all() and five.value == 1.0
+    assert all(low < mean.value < high for mean in (all_eight, six) for low, high in [mean.interval()])
+
+
+def test_equal_values_have_exactly_their_value_as_interval() -> None:
+    [mean] = bootstrap_means(np.full((7, 1), 0.1), np.arange(7), 7)
+    assert mean and (mean.value, *mean.interval()) == (0.1, 0.1, 0.1)
+
+
+def test_a_column_does_not_depend_on_those_beside_it_or_on_the_order_of_rows() -> None:
+    """To the last bit: what is summed is exact, so that no library of matrices can round it otherwise."""
+    rng = np.random.default_rng(4)
+    values = rng.normal(1e3, 1, (90, 300)) * 10.0 ** rng.integers(-6, 6, 300)
+    values[rng.random(values.shape) < 0.1] = np.nan
+    numbers, order = np.arange(90) // 3, rng.permutation(90)
+    together = list(bootstrap_means(values, numbers, 30))
+    for i in (0, 1, 127, 128, 299):
+        [alone] = bootstrap_means(values[order][:, [i]], numbers[order], 30)
+        beside = together[i]
+        assert alone and beside and alone.values.tobytes() == beside.values.tobytes()
+        assert alone.value == pytest.approx(np.nanmean(values[:, i]), rel=1e-13)
+
+
+def test_differences_of_means_are_means_of_differences() -> None:
+    """All columns see the same draws, so that whatever is computed of several means is paired."""
+    a, b = np.random.default_rng(5).normal(size=(2, 20, 1))
+    first, second, difference = (next(bootstrap_means(v, np.arange(20), 20)) for v in (a, b, a - b))
+    assert first and second and difference
+    np.testing.assert_allclose(first.values - second.values, difference.values, atol=1e-12)
+
+
+def test_units_are_those_of_the_whole_table() -> None:
+    rows = pd.DataFrame({"task": ["b", "a", "a", "b"], "seed": [0, 1, 0, 0]})
+    index = pd.MultiIndex.from_tuples([("b", 0, "piper"), ("a", 1, "piper")], names=["task", "seed", "robot"])
+    scenes, tasks = Units(rows), Units(rows, "task")
+    assert (len(scenes), len(tasks)) == (3, 2)
+    assert scenes.numbers(index).tolist() == [2, 1] and tasks.numbers(index).tolist() == [1, 0]
+
+
+def test_draws_are_the_same_at_every_call() -> None:
+    weights = draw_units(9)
+    assert weights.shape == (1 + DRAWS, 9) and (weights[0] == 1).all() and (weights.sum(axis=1) == 9).all()
+    draw_units.cache_clear()
+    assert (draw_units(9) == weights).all()
+
+
+def test_every_draw_is_counted_once() -> None:
+    assert every_draw(2, least=1).tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
+    assert len(every_draw(3, least=2)) == 24 and len(every_draw(3, least=3)) == 6
+
+
+def test_an_interval_leaves_out_the_point_and_what_does_not_exist() -> None:
+    values = np.array([99.0, *range(101), np.nan])
+    assert interval(values, 0.9) == pytest.approx((5, 95)) and interval(values, 1.0) == (0, 100)
+    assert Mean(values, 0, None).interval(1.0) == (0, 100) and np.isnan(Mean(values, 5, 5).interval()).all()

@@ -1,0 +1,71 @@
+"""Appearance distance: what robots look like, alone on white, by the paper's descriptor or by any distance of images."""
+
+from collections.abc import Callable, Sequence
+from itertools import combinations
+
+import cv2
+import numpy as np
+
+from xew.analysis.distances.matrices import symmetric_matrix
+
+HUE_BINS = SATURATION_BINS = 16
+"""Numbers of bins of the histogram."""
+WHITE = 250
+"""Level from which on, in all channels, a pixel of a robot-only render is background."""
+
+ImageDistance = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Distance of two videos or lists of views, both [n h w 3] uint8, frame by frame: [n] float."""
+
+
+def appearance_descriptor(renders: np.ndarray) -> np.ndarray:
+    """Describe what a robot looks like by one vector, the mean over its views.
+
+    Each view gives a 16 x 16 histogram of hue and saturation over the robot's pixels (sum 1) and the logarithms of the
+    seven Hu moments of its silhouette, which keep the moments' signs, as is customary. The last three moments are tiny and
+    of either sign, so their logarithms jump between large positive and negative numbers and outweigh all else, colors too.
+
+    Args:
+        renders: [v h w 3] uint8 RGB, the robot alone on white; the paper uses nine standard views.
+
+    Returns:
+        [263] float64.
+
+    Raises:
+        ValueError: a view shows no robot.
+    """
+    return np.mean([_describe_view(view, i) for i, view in enumerate(renders)], axis=0)
+
+
+def cosine_distance(a: np.ndarray, b: np.ndarray) -> float:
+    """1 - cos of the angle between two descriptors [d]: 0 for the same direction, 2 for opposite ones."""
+    return float(1 - a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))
+
+
+def appearance_matrix(renders: Sequence[np.ndarray]) -> np.ndarray:
+    """Cosine distances [n n] float64 of the descriptors of n robots' renders, each [v h w 3] uint8."""
+    descriptors = [appearance_descriptor(views) for views in renders]
+    return symmetric_matrix(len(renders), lambda a, b: cosine_distance(descriptors[a], descriptors[b]))
+
+
+def perceptual_matrices(renders: Sequence[np.ndarray], distance: ImageDistance) -> np.ndarray:
+    """Distances of n robots' renders, each [v h w 3] uint8, as a matrix for each view [v n n] float64. Ours.
+
+    `distance` may be `xew.metrics.lpips`. View i has the same azimuth for every robot, so the same sides are compared.
+    """
+    matrices = np.zeros((len(renders[0]), len(renders), len(renders)))
+    for a, b in combinations(range(len(renders)), 2):
+        matrices[:, a, b] = matrices[:, b, a] = distance(renders[a], renders[b])
+    return matrices
+
+
+def _describe_view(view: np.ndarray, index: int) -> np.ndarray:
+    """The descriptor [263] of one view [h w 3] uint8; `index` names it in the error."""
+    robot = (view < WHITE).any(axis=-1)
+    if not robot.any():
+        raise ValueError(f"view {index} shows no robot; every pixel is white. Render the robot alone on a white ground.")
+    hsv = cv2.cvtColor(view, cv2.COLOR_RGB2HSV)
+    ranges = [0, 180, 0, 256]
+    histogram = cv2.calcHist([hsv], [0, 1], robot.astype(np.uint8), [HUE_BINS, SATURATION_BINS], ranges)
+    moments = cv2.HuMoments(cv2.moments(robot.astype(np.uint8), binaryImage=True)).reshape(-1)
+    logs = -np.sign(moments) * np.log10(np.maximum(np.abs(moments), 1e-30))
+    return np.concatenate([histogram.reshape(-1) / histogram.sum(), logs])

@@ -1,0 +1,124 @@
+"""The loop of a study: skips what is done, starts what can be started, and notes what ended."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+from xew.analysis.studies.config import Study
+from xew.analysis.studies.cost import format_duration
+from xew.analysis.studies.ledger import Ledger
+from xew.analysis.studies.machines import Machines
+from xew.analysis.studies.plan import Step
+from xew.dataset import find_accepted
+from xew.protocol import seed_split
+
+
+@dataclass
+class StudyRunner:
+    """One pass over a study's graph of steps, in which the step on the longest critical path starts first."""
+
+    study: Study
+    steps: Mapping[str, Step]
+    """All steps by name."""
+    ledger: Ledger
+    machines: Machines
+    critical_paths: Mapping[str, float]
+    """Seconds from the start of each step to the end of the study."""
+    started: dict[str, float] = field(default_factory=dict)
+    """Start times of the steps that run [s]."""
+    settled: int = 0
+    """Number of steps that are done, failed or blocked."""
+    failed: dict[str, str] = field(default_factory=dict)
+    """Steps that failed, and steps that could not be made because of them, with the reason."""
+
+    def run(self) -> dict[str, str]:
+        """Run every step that can be run; returns those that failed, with the reason."""
+        order = TopologicalSorter({name: step.needs for name, step in self.steps.items()})
+        order.prepare()
+        waiting: set[str] = set()
+        try:
+            while order.is_active():
+                waiting |= set(order.get_ready())
+                ended = self._settle_or_start(waiting)
+                if not ended:
+                    ended = [self._finish(name, code) for name, code in self.machines.wait()]
+                order.done(*ended)
+                self.settled += len(ended)
+        except BaseException:
+            self.machines.stop()
+            raise
+        return self.failed
+
+    def _settle_or_start(self, waiting: set[str]) -> list[str]:
+        """Start what there is room for; returns steps that need no work or cannot be made."""
+        ended = []
+        for name in sorted(waiting, key=lambda name: -self.critical_paths[name]):
+            step = self.steps[name]
+            reason = self._find_blocker(step)
+            if reason:
+                self.failed[name] = reason
+            elif not self.ledger.find_done(step):
+                if self.machines.has_room_for(step):
+                    waiting.discard(name)
+                    self._start(step)
+                continue
+            waiting.discard(name)
+            ended.append(name)
+        return ended
+
+    def _find_blocker(self, step: Step) -> str:
+        """Why a step cannot be made, or ''. The analysis is of whatever was graded."""
+        missing = [name for name in step.needs if name in self.failed]
+        if not missing or (step.kind == "analyse" and list_graded_variants(step, self.failed)):
+            return ""
+        return f"needs {missing[0]}"
+
+    def _start(self, step: Step) -> None:
+        goes_on = self.ledger.begin(step)
+        self.started[step.name] = time.monotonic()
+        self._print_progress(f"{step.name}{', goes on' if goes_on else ''}")
+        self.machines.start(step, complete_command(step, goes_on, self.failed), self.ledger.log(step))
+
+    def _finish(self, name: str, code: int) -> str:
+        """Note how a step ended; returns its name."""
+        step, seconds = self.steps[name], time.monotonic() - self.started.pop(name)
+        error = self.ledger.finish(step, code, seconds)
+        if not error and step.kind == "generate":
+            error = self._check_data()
+        if error:
+            self.failed[name] = error
+        self._print_progress(f"{name} {'FAILED: ' + error if error else 'done'} after {format_duration(seconds)}")
+        return name
+
+    def _check_data(self) -> str:
+        """What the data set holds beyond the study, or '': its models would be trained and graded on that, too."""
+        study, accepted = self.study, [record for _, record in find_accepted(self.study.data_folder)]
+        tasks, robots = ({getattr(record, name) for record in accepted} for name in ("task", "robot"))
+        beyond = sorted(tasks - set(study.tasks or tasks)) + sorted(robots - set(study.robots))
+        for family, wanted in (("train", study.train_seeds), ("test", study.test_seeds)):
+            seeds = {(record.task, record.seed) for record in accepted if seed_split(record.seed) == family}
+            more = max((len([1 for task, _ in seeds if task == name]) for name in tasks), default=0) - wanted
+            beyond += [f"{more} more {family} seeds a task"] if more > 0 else []
+        found = ", ".join(beyond)
+        return f"{study.data_folder} also holds {found}; name them in the study, or give it its own data" if found else ""
+
+    def _print_progress(self, text: str) -> None:
+        print(f"{time.strftime('%H:%M:%S')} [{self.settled}/{len(self.steps)}] {text}", flush=True)
+
+
+def complete_command(step: Step, goes_on: bool, failed: Mapping[str, str]) -> tuple[str, ...]:
+    """A step's command with what is known at its start only: whether a training goes on, what the analysis has."""
+    if step.kind in ("train", "adapt") and goes_on:
+        return (*step.command, "--resume")
+    if step.kind == "analyse":
+        measured = "distances" in step.needs and "distances" not in failed
+        folder = ("--distances", str(Path(step.command[1], "distances"))) if measured else ()
+        return (*step.command, *list_graded_variants(step, failed), *folder)
+    return step.command
+
+
+def list_graded_variants(analyse: Step, failed: Mapping[str, str]) -> list[str]:
+    """Names of the variants that an analysis has scores of."""
+    return [name.partition("/")[2] for name in analyse.needs if name.startswith("evaluate/") and name not in failed]

@@ -1,0 +1,147 @@
+"""Cells, rows and notes of a study's tables, made from its means and the paper's printed values."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from xew import statistics
+from xew.analysis.scores import COPY, TRUTH
+from xew.analysis.statistics.grades import Grades, PaperGrades, StudyGrades, find_variant, pooled
+from xew.analysis.tables.labels import PAPER_METRICS, STILL, TRUE
+from xew.analysis.tables.table import TableCell, TableRow, format_interval, format_number
+from xew.protocol import (
+    PAPER_PARTS,
+    PARTS,
+    expected_counts,
+    reference,
+)
+from xew.statistics import Mean
+
+
+@dataclass(frozen=True)
+class Builder:
+    """Makes cells, rows and sections of means.
+
+    Attributes:
+        ours: what is reported on.
+        paper: the printed values beside; None leaves them out.
+        planned: episodes that the study meant to grade, by variant and robot; the paper's where it does not say.
+    """
+
+    ours: Grades
+    paper: PaperGrades | None
+    planned: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+
+    @property
+    def any_metric(self) -> str:
+        """The first metric, for counts."""
+        return next(iter(self.ours.metrics))
+
+    @property
+    def reported(self) -> tuple[str, ...]:
+        """Metrics of the full tables: the paper's suite, and whatever else the scores ask to be shown."""
+        return tuple(name for name, info in self.ours.metrics.items() if name in PAPER_METRICS or info.reported)
+
+    def has_results(self, part: str) -> bool:
+        """Was anything measured that only this part asks for? The models that comparisons start from do not count."""
+        if not isinstance(self.ours, StudyGrades):
+            return part in PAPER_PARTS
+        adapted = [variant for variant in PARTS[part] if variant.target is not None]
+        own = adapted or [variant for variant in PARTS[part] if variant != reference()] or PARTS[part]
+        return any(self.ours.has(variant.name) for variant in own)
+
+    def cell(self, part: str, row: str, robots: str, metric: str, base: str = "") -> TableCell:
+        """The mean at an address, against that of the row `base`."""
+        info = self.ours.metrics.get(metric)
+        mean = self.ours.mean(part, row, robots, metric) if info else None
+        printed = self._printed(part, row, robots, metric)
+        if info is None or mean is None:
+            return printed
+        ends = _interval_ends(mean, self.ours.level)
+        return replace(
+            printed,
+            text=format_number(mean.value, info),
+            interval=format_interval(ends, info),
+            verdict=paired_verdict(self.ours, part, row, base, robots, metric) if base and base != row else "",
+            value=mean.value,
+            low=ends[0],
+            high=ends[1],
+            episodes=mean.count,
+        )
+
+    def row(self, part: str, row: str, robots: str, metrics: Sequence[str], labels: Sequence[str], base: str = "") -> TableRow:
+        return TableRow(tuple(labels), tuple(self.cell(part, row, robots, metric, base) for metric in metrics))
+
+    def baselines(self, robots: Sequence[str], metrics: Sequence[str]) -> list[TableRow]:
+        """The frozen first frame and the true video, where they were graded."""
+        still = [TableRow((STILL,), tuple(self.baseline(COPY, robots, metric) for metric in metrics), baseline=True)]
+        return [*_keep_graded(still), *self.truth((TRUE,), [(robots, metric) for metric in metrics])]
+
+    def truth(self, labels: tuple[str, ...], places: Sequence[tuple[Sequence[str], str]]) -> list[TableRow]:
+        """The true video, of robots and a metric for each column: what it lacks is the noise floor. Empty if not graded."""
+        return _keep_graded([TableRow(labels, tuple(self.baseline(TRUTH, *place) for place in places), baseline=True)])
+
+    def note(self, part: str, rows: Iterable[tuple[str, str, str]]) -> str:
+        """What a section lacks. Rows are key, robots and label."""
+        if not isinstance(self.ours, StudyGrades):
+            return ""
+        found: dict[str, list[str]] = {}
+        as_planned, as_paper = True, True
+        for key, robots, label in rows:
+            variant = find_variant(part, key)
+            paper = sum(expected_counts(variant).get(robot, 0) for robot in pooled(variant, robots))
+            planned = sum(self.planned.get(variant.name, {}).get(robot, 0) for robot in pooled(variant, robots)) or paper
+            # A metric that is not defined for an episode lacks it; the episode is graded all the same.
+            means = (self.ours.mean(part, key, robots, metric) for metric in self.ours.metrics)
+            count = max((mean.count for mean in means if mean), default=0)
+            as_planned, as_paper = as_planned and count == planned, as_paper and count == paper
+            text = f"{count} of {paper if count == planned else planned} episodes" if count else "not run"
+            found.setdefault(text, []).append(label)
+        if as_paper:
+            return ""
+        word = "As planned, but smaller than the paper's protocol" if as_planned else "Incomplete"
+        if len(found) == 1:
+            return f"{word}: {next(iter(found))} in every row."
+        parts = (f"{text[0].upper()}{text[1:]}: {'; '.join(names)}." for text, names in found.items())
+        return f"{word}. {' '.join(parts)}"
+
+    def baseline(self, model: str, robots: Sequence[str], metric: str) -> TableCell:
+        """Mean of COPY or TRUTH on some robots."""
+        info = self.ours.metrics.get(metric)
+        mean = self.ours.baseline(model, robots, metric) if isinstance(self.ours, StudyGrades) else None
+        if info is None or mean is None:
+            return TableCell()
+        if model == TRUTH and metric == "psnr":
+            return TableCell("exact", episodes=mean.count)
+        ends = _interval_ends(mean, self.ours.level)
+        return TableCell(
+            format_number(mean.value, info),
+            format_interval(ends, info),
+            value=mean.value,
+            low=ends[0],
+            high=ends[1],
+            episodes=mean.count,
+        )
+
+    def _printed(self, part: str, row: str, robots: str, metric: str) -> TableCell:
+        text = self.paper.print(part, row, robots, metric) if self.paper else ""
+        return TableCell(published=text, printed=float(text)) if text else TableCell()
+
+
+def _keep_graded(rows: Sequence[TableRow]) -> list[TableRow]:
+    return [row for row in rows if any(cell.episodes for cell in row.cells)]
+
+
+def paired_verdict(grades: Grades, part: str, row: str, base: str, robots: str, metric: str) -> str:
+    """Is a row better than another of its part, on the cells that all rows of the part have?"""
+    difference = grades.difference(part, row, base, robots, metric)
+    if difference is None:
+        return ""
+    floor, info = grades.floor(robots, metric), grades.metrics[metric]
+    return statistics.verdict(difference.value, difference.interval(grades.level), floor, info.higher_is_better)
+
+
+def _interval_ends(mean: Mean, level: float) -> tuple[float, float]:
+    """NaN where there are too few scenes for an interval, or where none is known (the paper)."""
+    return mean.interval(level) if mean.scenes is not None else (np.nan, np.nan)

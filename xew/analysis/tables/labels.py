@@ -1,0 +1,53 @@
+"""Titles and labels of what tables and charts show: metrics of the paper, robots, conditions, systems, remedies.
+
+They live on the entries of the registries. What a registry does not hold is shown under its key.
+"""
+
+from xew.analysis.paper import PAPER_TITLES
+from xew.analysis.statistics.grades import REFERENCE
+from xew.model.conditions import ACTIONS as REPRESENTATIONS
+from xew.model.conditions import CONDITIONS
+from xew.protocol import PARTS, SEEN_ROBOTS
+from xew.sim_warp.robots import ROBOTS
+
+PAPER_METRICS = tuple(PAPER_TITLES)
+"""Metrics of the paper's suite, in its order."""
+SHORT_ROBOTS = {key: robot.label for key, robot in ROBOTS.items()}
+"""Label of each robot by its key."""
+SEEN_TITLE = "Seen pool: {}, {} and {}".format(*(ROBOTS[robot].title.partition(" with ")[0] for robot in SEEN_ROBOTS))
+"""Title of what is pooled over the robots that the fixed split trains on."""
+
+
+def action_title(key: str) -> str:
+    """Title of an action representation."""
+    return REPRESENTATIONS[key].title if key in REPRESENTATIONS else spell_key(key)
+
+
+def condition_label(key: str) -> str:
+    """Label of a condition on the robot's looks, as a step of the ladder."""
+    return CONDITIONS[key].label if key in CONDITIONS else spell_key(key)
+
+
+def spell_key(key: str) -> str:
+    """A key as words, for what no registry holds."""
+    return key.replace("_", " ")
+
+
+ACTIONS = {variant.action: action_title(variant.action) for variant in PARTS["actions"]}
+"""Title of each action representation by its key."""
+LADDER = {variant.embodiment: condition_label(variant.embodiment) for variant in PARTS["ladder"]}
+"""Label of each condition of the ladder by its key, from nothing to a render of every frame."""
+SYSTEMS = {
+    variant.system: "reference model" if variant.system == REFERENCE else action_title(variant.action)
+    for variant in PARTS["baselines"]
+}
+"""Title of each world model by its key."""
+SYSTEM_ACTIONS = tuple(
+    REPRESENTATIONS[variant.action].label if variant.action in REPRESENTATIONS else spell_key(variant.action)
+    for variant in PARTS["baselines"]
+)
+"""What each of SYSTEMS is told of actions."""
+STILL, TRUE = "frozen first frame", "true video, graded"
+"""Labels of the rows of both baselines."""
+REMEDIES = {"replay": "with replay", "lora": "with LoRA"}
+"""Label of each remedy against forgetting, by its key."""

@@ -1,0 +1,109 @@
+"""A table as plain data, and how its numbers and heads are written."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from xew.analysis.scores import MetricInfo
+from xew.protocol import (
+    DIMENSION_TITLES,
+)
+from xew.statistics import MIN_SCENES
+
+MARKS = (
+    "▲ better, ▼ worse, ≈ not resolved: the interval of the paired difference holds 0, the difference is inside the noise "
+    f"floor or the floor is not known, or there are fewer than {MIN_SCENES} scenes"
+)
+"""What stands behind values; captions name the row that they are compared with."""
+
+
+@dataclass(frozen=True)
+class TableCell:
+    """One value of a table, as text and as numbers."""
+
+    text: str = "–"
+    """'–' where nothing was measured."""
+    interval: str = ""
+    published: str = ""
+    """The paper's value as it is printed."""
+    verdict: str = ""
+    """Against the row that the caption names: better, worse or unresolved; '' where there is none."""
+    agrees: bool | None = None
+    """Does a recomputed value print like the paper's; None where this is not asked."""
+    best: bool = False
+    """Of the rows of a section that are models."""
+    value: float = np.nan
+    low: float = np.nan
+    high: float = np.nan
+    printed: float = np.nan
+    episodes: int = 0
+
+
+@dataclass(frozen=True)
+class Column:
+    title: str
+    group: str = ""
+    """Title over several columns."""
+
+
+@dataclass(frozen=True)
+class TableRow:
+    labels: tuple[str, ...]
+    """One for each stub of the table."""
+    cells: tuple[TableCell, ...]
+    baseline: bool = False
+
+
+@dataclass(frozen=True)
+class TableSection:
+    """Rows under one heading, such as those of one robot."""
+
+    title: str
+    rows: tuple[TableRow, ...]
+    note: str = ""
+    """What is missing."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table as any of the output formats shows it."""
+
+    name: str
+    """For file names and labels."""
+    title: str
+    caption: str
+    stubs: tuple[str, ...]
+    """Heads of the columns of labels."""
+    columns: tuple[Column, ...]
+    sections: tuple[TableSection, ...]
+
+    @property
+    def complete(self) -> bool:
+        return not any(section.note for section in self.sections)
+
+
+def format_number(value: float, metric: MetricInfo) -> str:
+    """Digits that mean something: 0.01 dB, 0.1 px, else 0.001."""
+    return f"{value:.{ {'dB': 2, 'px': 1}.get(metric.unit, 3) }f}"
+
+
+def metric_title(metric: MetricInfo) -> str:
+    """Such as 'PSNR [dB] ↑': the arrow points to better."""
+    unit = f" [{metric.unit}]" if metric.unit else ""
+    return f"{metric.title}{unit} {'↑' if metric.higher_is_better else '↓'}"
+
+
+def metric_columns(metrics: Mapping[str, MetricInfo], names: Sequence[str]) -> tuple[Column, ...]:
+    """A column for each name, under its dimension."""
+    infos = [metrics[name] for name in names]
+    return tuple(Column(metric_title(info), DIMENSION_TITLES.get(info.dimension, info.dimension)) for info in infos)
+
+
+def format_interval(ends: tuple[float, float], metric: MetricInfo) -> str:
+    """Such as '0.12–0.15'; '' where there is no interval, or none at these digits."""
+    low, high = ends
+    if np.isnan(low):
+        return ""
+    first, last = format_number(low, metric), format_number(high, metric)
+    return "" if first == last else f"{first}–{last}"

@@ -1,0 +1,3 @@
+"""What the mergeable states of metrics are made of: sums of floats that are exact in any order."""
+
+__all__ = ["sums"]

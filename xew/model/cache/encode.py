@@ -1,0 +1,78 @@
+"""Encoding episodes into the latent cache: pixels are read or rendered ahead in threads, the codec works in batches."""
+
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+from tqdm import tqdm
+
+from xew.dataset import Episode
+from xew.episode import Record
+from xew.model.cache.clips import cut_clip, needed_pixels, read_streams
+from xew.model.cache.store import LatentCache
+from xew.model.codecs.codec import Codec, check_clip_shape, encode_pictures
+from xew.model.video.pixels import PixelSource, stored_pixels
+from xew.threads import in_order
+
+
+def encode_episodes(
+    cache: LatentCache, episodes: Sequence[Episode], source: PixelSource = stored_pixels, batch: int = 4
+) -> int:
+    """Encode what is missing of some episodes, and return the number of bytes written.
+
+    Args:
+        source: where their pixels come from; they are read or rendered, and conditions drawn, ahead in threads.
+        batch: clips that the codec encodes at once.
+    """
+    inputs = cache.encoding.inputs
+    pending = [episode for episode in episodes if cache.missing(episode[1])]
+    done = len(episodes) - len(pending)
+    progress = tqdm(total=len(episodes), initial=done, desc="encode", unit="episode", file=sys.stderr)
+    written = 0
+
+    def load(episode: Episode) -> dict[str, np.ndarray]:
+        missing = cache.missing(episode[1])
+        pixels = source(*episode, needed_pixels(inputs.conditions, missing))
+        return read_streams(inputs.conditions, inputs.clip, *episode, missing, pixels)
+
+    for (_, record), videos in zip(pending, in_order(load, pending), strict=True):
+        written += _encode_streams(cache, record, videos, batch)
+        progress.update()
+    progress.close()
+    return written
+
+
+def _encode_streams(cache: LatentCache, record: Record, videos: dict[str, np.ndarray], batch: int) -> int:
+    """Encode some streams of one episode, and write each as a whole."""
+    pieces = {name: _cut_stream(cache, record, name, video) for name, video in videos.items()}
+    pictures = [piece for clips in pieces.values() for clip in clips for piece in clip if piece.dtype == np.uint8]
+    encoded = iter(encode_many(cache.codec, pictures, batch))
+    written = 0
+    for name, clips in pieces.items():
+        arrays = [np.concatenate([next(encoded) if p.dtype == np.uint8 else p for p in clip]) for clip in clips]
+        written += cache.write(record, name, np.stack(arrays))
+    return written
+
+
+def _cut_stream(cache: LatentCache, record: Record, name: str, video: np.ndarray) -> list[list[np.ndarray]]:
+    """What each clip of a stream is made from, see `cut_clip`."""
+    condition, inputs = cache.streams[name], cache.encoding.inputs
+    starts = cache.starts(record) if condition is None or condition.aligned else (0,)
+    return [cut_clip(condition, video, start, inputs.clip.frames, inputs.history) for start in starts]
+
+
+def encode_many(codec: Codec, clips: Sequence[np.ndarray], batch: int) -> list[np.ndarray]:
+    """Encode clips [t h w 3] uint8 to latents [t' h' w' c] float32, `batch` of equal shape at once.
+
+    The last batch is filled up.
+    """
+    encoded: dict[int, np.ndarray] = {}
+    shapes = sorted({clip.shape for clip in clips})
+    for shape in shapes:
+        check_clip_shape(shape, codec.spatial_factor)
+        same = [index for index, clip in enumerate(clips) if clip.shape == shape]
+        for group in (same[first : first + batch] for first in range(0, len(same), batch)):
+            filled = group + group[-1:] * (batch - len(group))
+            latents = np.asarray(encode_pictures(codec, np.stack([clips[index] for index in filled])))
+            encoded |= dict(zip(group, latents, strict=False))
+    return [encoded[index] for index in range(len(clips))]

@@ -1,0 +1,48 @@
+"""Names of the files of the latent cache: each holds a key of what its content was made from.
+
+What is stale is therefore not found, and never mistaken.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from xew.config import digest
+from xew.dataset import Episode
+from xew.episode import Record, episode_folder
+from xew.model.experiment import Encoding
+
+CACHE_VERSION = 2
+
+
+def stream_path(encoding: Encoding, codec_hash: str, record: Record, stream: str) -> Path:
+    """The file of one encoded stream of one episode."""
+    inputs = encoding.inputs
+    condition = inputs.conditions.get(stream)
+    name = condition.name if condition else stream
+    of_scene = condition is None or condition.make is None
+    sources = (record.hashes["rgb"],) if of_scene else (record.hashes["states"], record.hashes["robot"])
+    if condition is not None and (of_scene or condition.with_history):
+        sources = (*sources, str(inputs.history))
+    cut = digest(inputs.clip) if inputs.chunks == 1 else (digest(inputs.clip), "chunks")
+    key = _hash((CACHE_VERSION, codec_hash, cut, name, *sources))
+    return episode_folder(encoding.folder, record.task, record.seed, record.robot) / f"{name}-{key}.safetensors"
+
+
+def codec_path(encoding: Encoding, episodes: Sequence[Episode]) -> Path:
+    """The folder where the codec fitted on these episodes is kept."""
+    hashes = [(record.hashes["rgb"], record.hashes["robot"]) for _, record in episodes]
+    return encoding.folder / f"codec-{_hash((CACHE_VERSION, digest(encoding.codec), digest(encoding.inputs.clip), hashes))}"
+
+
+def scales_path(encoding: Encoding, episodes: Sequence[Episode]) -> Path:
+    """The file where the scales of these episodes' numbers are kept."""
+    names = sorted({condition.name for condition in encoding.inputs.conditions.values() if condition.scale != "none"})
+    hashes = sorted(record.hashes["states"] for _, record in episodes)
+    return encoding.folder / f"scales-{_hash((CACHE_VERSION, hashes, names))}.json"
+
+
+def _hash(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]

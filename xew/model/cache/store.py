@@ -1,0 +1,89 @@
+"""The latent cache on disk: each stream of each episode in one file, written once and read clip by clip."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from xew.config import ConfigError
+from xew.dataset import Episode
+from xew.episode import Record
+from xew.files import replacing
+from xew.model.cache.clips import clip_starts
+from xew.model.cache.codecs import load_codec
+from xew.model.cache.keys import stream_path
+from xew.model.codecs.codec import Codec
+from xew.model.conditions import Condition
+from xew.model.experiment import Encoding
+
+CLIPS = "clips"
+"""Name of the one array of a cached stream. Safetensors and not .npy, whose headers no two threads may read at once."""
+
+
+@dataclass(frozen=True)
+class LatentCache:
+    """Encoded streams, and whether they are still those of their data."""
+
+    encoding: Encoding
+    codec: Codec
+
+    @property
+    def streams(self) -> dict[str, Condition | None]:
+        """The streams of an experiment: rgb (no condition) and its conditions."""
+        return {"rgb": None} | dict(self.encoding.inputs.conditions)
+
+    def path(self, record: Record, stream: str) -> Path:
+        """The file of one stream of one episode."""
+        return stream_path(self.encoding, self.codec.hash, record, stream)
+
+    def starts(self, record: Record) -> tuple[int, ...]:
+        """First frames of the clips of an episode."""
+        inputs = self.encoding.inputs
+        return clip_starts(record.frame_count, inputs.clip.frames, inputs.chunks)
+
+    def read(self, record: Record, stream: str, clip: int) -> np.ndarray:
+        """Read one stream of one clip of an episode: latents [t h w c] float16 or numbers [t n] float32.
+
+        What is not aligned has one clip for all.
+
+        Raises:
+            ConfigError: it was never encoded, or from other data, codec or clips.
+        """
+        path = self.path(record, stream)
+        try:
+            with safe_open(path, framework="np") as stored:
+                clips = stored.get_slice(CLIPS)
+                return clips[min(clip, clips.get_shape()[0] - 1)]
+        except FileNotFoundError:
+            stale = list(path.parent.glob(f"{path.stem.rpartition('-')[0]}-*.safetensors"))
+            found = "was encoded from other data, with another codec or other clips" if stale else "is not in the cache"
+            raise ConfigError(f"{path.parent}: the stream {stream} {found}; {self.encoding.remedy}.") from None
+        except SafetensorError as error:
+            raise ConfigError(f"{path} is damaged ({error}); delete it and {self.encoding.remedy}.") from error
+
+    def write(self, record: Record, stream: str, clips: np.ndarray) -> int:
+        """Write one stream of all clips of an episode, whole or not at all, and return its size in bytes.
+
+        Args:
+            clips: latents [clips t h w c], stored as float16, or numbers [clips t n], stored as float32.
+        """
+        clips = clips.astype(np.float32 if clips.ndim == 3 else np.float16)
+        with replacing(self.path(record, stream)) as temporary:
+            save_file({CLIPS: clips}, temporary)
+        return clips.nbytes
+
+    def missing(self, record: Record) -> list[str]:
+        """Streams of an episode that are not encoded yet."""
+        return [name for name in self.streams if not self.path(record, name).exists()]
+
+
+def open_cache(encoding: Encoding, episodes: Sequence[Episode]) -> LatentCache:
+    """Open the cache with the codec of these training episodes.
+
+    Raises:
+        ConfigError: `latents` has not been run for them, or the codec's weights are missing or do not fit.
+    """
+    return LatentCache(encoding, load_codec(encoding, episodes))

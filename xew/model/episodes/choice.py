@@ -1,0 +1,105 @@
+"""Choosing the episodes of a data set that a training, its samples or a rollout read."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from xew.config import ConfigError, suggestion
+from xew.dataset import Dataset, Episode, read_dataset
+from xew.episode import EpisodeError
+from xew.model.experiment import EpisodeChoice
+
+
+@dataclass(frozen=True)
+class TrainingEpisodes:
+    """The episodes that a training reads."""
+
+    fresh: list[Episode]
+    """Those to learn from."""
+    replay: list[Episode]
+    """Those of the run that an adaptation starts from, of which every batch has a part."""
+    samples: dict[str, Episode]
+    """Those that sample videos are drawn of, by role and robot."""
+
+
+def choose_episodes(choice: EpisodeChoice) -> TrainingEpisodes:
+    """Choose all episodes that a training reads, from one index of its data set.
+
+    Raises:
+        ConfigError, EpisodeError: there are none to learn from, or too few to adapt to.
+    """
+    return TrainingEpisodes(training_episodes(choice), replay_episodes(choice), sample_episodes(choice))
+
+
+def training_episodes(choice: EpisodeChoice) -> list[Episode]:
+    """Episodes to learn from, of training seeds: all of the split's training robots, or a few of the robots to adapt to.
+
+    Raises:
+        ConfigError, EpisodeError: there are none, or too few to adapt to.
+    """
+    dataset, adapt = read_dataset(choice.data), choice.adapt
+    if adapt.start_from is None:
+        return _select_training(dataset, choice.split.train_robots, need_all=False)
+    return first_of_each(_select_training(dataset, adapt.robots, need_all=True), adapt.episodes)
+
+
+def replay_episodes(choice: EpisodeChoice) -> list[Episode]:
+    """In an adaptation with replay, what the run that it starts from was trained on; else none."""
+    return _select_training(read_dataset(choice.data), choice.replay, need_all=True) if choice.replay else []
+
+
+def _select_training(dataset: Dataset, robots: Sequence[str], *, need_all: bool) -> list[Episode]:
+    """Episodes of training seeds of some robots. Raises ConfigError if a robot has none (one of all, unless all are needed)."""
+    chosen = dataset.select(robots=robots, split="train")
+    missing = [robot for robot in robots if robot not in {record.robot for _, record in chosen}]
+    if missing and (need_all or not chosen):
+        meant = suggestion(missing[0], dataset.robots)
+        command = f"python -m xew.sim_warp.generate --robots {' '.join(robots)} --out {dataset.root}"
+        raise ConfigError(f"{dataset.root} has no training episode of {', '.join(missing)};{meant} make some: {command}")
+    return chosen
+
+
+def first_of_each(episodes: Sequence[Episode], count: int) -> list[Episode]:
+    """The first `count` seeds of every task and robot. Raises ConfigError where there are fewer."""
+    groups: dict[tuple[str, str], list[Episode]] = {}
+    for episode in sorted(episodes, key=lambda episode: episode[1].seed):
+        groups.setdefault((episode[1].task, episode[1].robot), []).append(episode)
+    for (task, robot), group in groups.items():
+        if len(group) < count:
+            raise ConfigError(
+                f"adapt.episodes is {count}, there are only {len(group)} training episodes of {robot} in {task}; lower it, or "
+                "make more with `python -m xew.sim_warp.generate`."
+            )
+    return [episode for _, group in sorted(groups.items()) for episode in group[:count]]
+
+
+def test_episodes(data: Path, robots: Sequence[str]) -> list[Episode]:
+    """Accepted episodes of test seeds of the given robots, possibly none."""
+    return read_dataset(data).select(robots=robots, split="test")
+
+
+def sample_episodes(choice: EpisodeChoice) -> dict[str, Episode]:
+    """An episode of each robot of the split by role and robot, of test seeds where there are any.
+
+    In an adapted run the robots adapted to are the target, and seen are those of the run that it started from.
+    """
+    split, targets = choice.split, choice.adapt.robots
+    roles = dict.fromkeys(split.train_robots, "seen") | dict.fromkeys(split.held_out_robots, "unseen")
+    roles |= dict.fromkeys(targets, "target")
+    found = test_episodes(choice.data, tuple(roles)) or training_episodes(choice)
+    first = {record.robot: (folder, record) for folder, record in reversed(found)}
+    return {f"{roles[robot]}/{robot}": first[robot] for robot in roles if robot in first}
+
+
+def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None) -> list[Episode]:
+    """Accepted episodes of a seed family and of the given robots, or of all. Raises ConfigError if there is none."""
+    dataset = read_dataset(data)
+    known = dataset.robots
+    for robot in robots or ():
+        if robot not in known:
+            raise ConfigError(f"unknown robot {robot!r};{suggestion(robot, known)} {data} has: {', '.join(known)}.")
+    chosen = dataset.select(robots=robots, split=split)
+    if not chosen:
+        asked = f"{split} episode of {', '.join(robots)}" if robots else f"{split} episode"
+        raise EpisodeError(f"{data} has no {asked}; run python -m xew.sim_warp.generate --out {data}")
+    return chosen

@@ -1,0 +1,194 @@
+"""The loop of every training: steps, log lines, checkpoints, samples, and an orderly end when a signal asks for it."""
+
+import contextlib
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import optax
+from jax.experimental import multihost_utils
+from tqdm import tqdm
+
+from xew.model.runs.checkpoint import TrainState, open_checkpoints, save_state
+from xew.model.training.memory import peak_flops
+from xew.model.training.tensorboard import RunLog
+
+STOPPED = 128 + signal.SIGTERM
+"""Exit status of a run that was asked to stop before its last step: it is saved, but nobody may take it for done."""
+
+
+@dataclass(frozen=True)
+class Session:
+    """The open files of a run."""
+
+    checkpoints: Any
+    log: RunLog | None
+    """None on all processes but the first."""
+
+    @property
+    def step(self) -> int:
+        """Step of the latest checkpoint; 0 of a new run."""
+        return self.checkpoints.latest_step() or 0
+
+
+@contextlib.contextmanager
+def open_session(out: Path, keep: int) -> Iterator[Session]:
+    """Open the checkpoints and the log of a run; what is being written is finished when the block ends.
+
+    Args:
+        out: folder of the run.
+        keep: number of checkpoints to keep.
+    """
+    with open_checkpoints(out, keep) as checkpoints:
+        log = RunLog(out, checkpoints.latest_step() or 0) if jax.process_index() == 0 else None
+        try:
+            yield Session(checkpoints, log)
+        finally:
+            if log is not None:
+                log.close()
+
+
+@dataclass(frozen=True)
+class Timetable:
+    """When a training logs, saves and draws samples, all in steps."""
+
+    steps: int
+    log_every: int
+    save_every: int
+    sample_every: int
+    """0 draws no samples."""
+    learning_rate: optax.Schedule
+
+
+@dataclass
+class Meter:
+    """The results and times of the steps since the last log line."""
+
+    summarize: Callable[[Sequence[Any]], dict[str, float]]
+    """Means of the results of some steps; each result has a field `finite`."""
+    samples: int
+    """Number of samples of one step."""
+    flops: float = 0.0
+    """FLOPs of one step, forward and backward, counted on the model; 0 where they are not known."""
+    results: list[Any] = field(default_factory=list)
+    wait_s: float = 0.0
+    """Time in which the devices had to wait for data."""
+    since: float = field(default_factory=time.perf_counter)
+
+    def add(self, result: Any, wait_s: float) -> None:
+        """Add the result of a step, and the time [s] that it waited for its batch."""
+        self.results.append(result)
+        self.wait_s += wait_s
+
+    def check_finite(self) -> None:
+        """End the program if any step since the last log line was not finite: the state is spoilt and must not be saved."""
+        steps = len(self.results)
+        for number, result in enumerate(self.results):
+            if not bool(result.finite):
+                sys.exit(
+                    f"error: loss, gradients or update are not finite {steps - number - 1} steps ago; nothing of it was saved. "
+                    "--resume returns to the last checkpoint, or lower the rate (train.learning_rate)."
+                )
+
+    def take(self) -> dict[str, float]:
+        """Take the values of a log line, and begin anew."""
+        results, seconds = jax.device_get(self.results), time.perf_counter() - self.since
+        values = self.summarize(results) | {
+            "time/step_s": seconds / len(results),
+            "time/data_wait_s": self.wait_s / len(results),
+            "time/samples_per_s": len(results) * self.samples / seconds,
+        }
+        peak = peak_flops(jax.devices()[0].device_kind)
+        if peak and self.flops:
+            values["time/mfu"] = len(results) * self.flops / seconds / (peak * jax.device_count())
+        if used := (jax.local_devices()[0].memory_stats() or {}).get("peak_bytes_in_use"):
+            values["memory/peak_gb"] = used / 1e9
+        self.results, self.wait_s, self.since = [], 0.0, time.perf_counter()
+        return values
+
+    @contextlib.contextmanager
+    def pause(self) -> Iterator[None]:
+        """Leave out the time of the block, which is not training."""
+        begin = time.perf_counter()
+        yield
+        self.since += time.perf_counter() - begin
+
+
+class StopSignal:
+    """Notes SIGTERM and SIGINT, so that the run saves before it ends."""
+
+    def __init__(self) -> None:
+        self.received = False
+        self.before = {number: signal.signal(number, self._note) for number in (signal.SIGTERM, signal.SIGINT)}
+
+    def _note(self, number: int, frame: Any) -> None:
+        self.received = True
+
+    def is_agreed(self) -> bool:
+        """Whether any process was asked to stop; all processes must ask at the same step."""
+        if jax.process_count() == 1:
+            return self.received
+        return bool(np.any(multihost_utils.process_allgather(np.asarray(self.received))))
+
+    def release(self) -> None:
+        """Give the signals back to who had them."""
+        for number, handler in self.before.items():
+            signal.signal(number, handler)
+
+
+def run_steps(
+    timetable: Timetable,
+    session: Session,
+    meter: Meter,
+    take_step: Callable[[TrainState, Any], tuple[TrainState, Any]],
+    state: TrainState,
+    batches: Any,
+    draw_samples: Callable[[TrainState, int], None],
+    place: Callable[[Any], Any] = lambda batch: batch,
+) -> TrainState:
+    """Go from the given state to the last step; log, save and draw samples when the timetable says.
+
+    Where a signal asks to stop before, the state that was reached is saved and returned.
+
+    Args:
+        take_step: (state, batch) -> (next state, result).
+        batches: an iterator of this process's batches, with its position (get_state).
+        draw_samples: called with the state and its step.
+        place: brings a batch to the devices; its time counts as waiting for data.
+    """
+    begin, stop, log = int(state.step), StopSignal(), session.log
+    progress = tqdm(range(begin, timetable.steps), desc="train", initial=begin, total=timetable.steps, file=sys.stderr)
+    for step in (number + 1 for number in progress):
+        asked = time.perf_counter()
+        batch = place(next(batches))
+        wait_s = time.perf_counter() - asked
+        state, result = take_step(state, batch)
+        meter.add(result, wait_s)
+        last = step == timetable.steps
+        logs = step % timetable.log_every == 0 or last
+        stops = (logs or jax.process_count() == 1) and stop.is_agreed()
+        saves = step % timetable.save_every == 0 or last or stops
+        if logs or saves:
+            meter.check_finite()
+        if logs:
+            values = meter.take() | {"train/learning_rate": float(timetable.learning_rate(step - 1))}
+            progress.set_postfix(loss=f"{values['train/loss']:.4f}")
+            if log:
+                log.scalars(step, values)
+            stops = stops or stop.is_agreed()
+        if saves or stops:
+            save_state(session.checkpoints, state, batches.get_state())
+        if stops and not last:  # whoever asked will not wait for samples
+            progress.write(f"stopped at step {step} of {timetable.steps} and saved; continue with --resume", file=sys.stderr)
+            break
+        if timetable.sample_every and (step % timetable.sample_every == 0 or last):
+            with meter.pause():
+                draw_samples(state, step)
+    stop.release()
+    return state
