@@ -15,7 +15,7 @@ from xew.model.devices.sharding import make_mesh
 from xew.model.experiment import create_model, load_experiment
 from xew.model.network.dit_layouts import load_dit
 from xew.model.runs.checkpoint import TrainState, open_checkpoints, save_state
-from xew.model.weights.tensors import read_tensors
+from xew.model.weights.reading import read_tensors
 
 CONFIG = """
 data: data

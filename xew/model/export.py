@@ -20,7 +20,7 @@ from xew.model.network.dit import parameter_count
 from xew.model.network.dit_layouts import Naming, save_dit, wan_layout
 from xew.model.network.tokens import WAVELENGTH_BASE
 from xew.model.runs.checkpoint import load_run_config, restore_params
-from xew.model.weights.tensors import checkpoint_shapes
+from xew.model.weights.layout import checkpoint_shapes
 
 
 def export(run: Path, out: Path, naming: Naming = "diffusers", dtype: str = "float32", step: int | None = None) -> int:

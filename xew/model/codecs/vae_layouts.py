@@ -11,7 +11,9 @@ from flax import nnx
 
 from xew.config import ConfigError
 from xew.model.codecs.vae import VideoVae
-from xew.model.weights.tensors import Layout, Source, Tensors, fill, read_tensors, save_weights
+from xew.model.weights.layout import Layout, Source
+from xew.model.weights.reading import Tensors, fill, read_tensors
+from xew.model.weights.writing import save_weights
 
 STATISTICS = ("latents_mean", "latents_std")
 

@@ -16,7 +16,9 @@ from flax import nnx
 from xew.model.network.blocks import EPSILON
 from xew.model.network.dit import STREAMS, WorldModel
 from xew.model.network.tokens import PATCH, TIME_FREQUENCIES
-from xew.model.weights.tensors import Layout, Source, Tensors, check_fit, fill, read_tensors, save_weights
+from xew.model.weights.layout import Layout, Source
+from xew.model.weights.reading import Tensors, check_fit, fill, read_tensors
+from xew.model.weights.writing import save_weights
 
 Naming = Literal["official", "diffusers"]
 COLUMN = {"official": 0, "diffusers": 1}

@@ -18,7 +18,8 @@ import numpy as np
 from flax import nnx
 from jax import Array
 
-from xew.model.weights.tensors import Layout, Source, fill, read_tensors
+from xew.model.weights.layout import Layout, Source
+from xew.model.weights.reading import fill, read_tensors
 
 EPSILON = 1e-6
 
