@@ -17,7 +17,7 @@ from xew.model.network.dit_layouts import load_dit
 from xew.model.runs.checkpoint import TrainState, open_checkpoints, save_state
 from xew.model.training.start import check_network, start_params
 from xew.model.training.step import make_learner
-from xew.model.weights.tensors import read_tensors
+from xew.model.weights.reading import read_tensors
 
 CONFIG = """
 data: data

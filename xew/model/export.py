@@ -22,7 +22,7 @@ from xew.model.network.dit_layouts import Naming, save_dit, wan_layout
 from xew.model.network.tokens import WAVELENGTH_BASE
 from xew.model.runs.checkpoint import restore_params
 from xew.model.runs.folder import load_run_config
-from xew.model.weights.tensors import checkpoint_shapes
+from xew.model.weights.layout import checkpoint_shapes
 
 
 def export(run: Path, out: Path, naming: Naming = "diffusers", dtype: str = "float32", step: int | None = None) -> int:

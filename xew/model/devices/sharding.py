@@ -97,7 +97,7 @@ def check_batch(batch: int, accumulate: int, devices: int) -> None:
 
 
 def parameter_spec(path: Sequence[Any], shape: Sequence[int], fsdp: int) -> PartitionSpec:
-    """The axis of an array that is sharded: the largest that `fsdp` divides, the last of equals, never the layers; or none."""
+    """Axis of an array that is sharded: the largest that `fsdp` divides (the last of equals), but no axis of layers."""
     first = 1 if LAYERS in path and len(shape) > 1 else 0
     candidates = [axis for axis in range(first, len(shape)) if shape[axis] % fsdp == 0]
     if fsdp == 1 or not candidates or math.prod(shape[first:]) < SMALL:
