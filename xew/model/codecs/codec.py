@@ -371,8 +371,8 @@ class WanVaeCodec(BatchCodec):
 CODECS: dict[str, type[Codec]] = {"patch_pca": PatchCodec, "wan_vae": WanVaeCodec}
 
 
-def codec_class(settings: CodecSettings) -> type[Codec]:
-    """The kind of codec that a config names. Raises ConfigError if there is none of that name."""
+def codec_class(settings: CodecSettings) -> type[Any]:
+    """The class of codec that a config names, with what `Codec` asks. Raises ConfigError if there is none of that name."""
     return pick(CODECS, settings.name, "codec")
 
 
