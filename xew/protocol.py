@@ -16,7 +16,7 @@ ACTION_DIM = 16
 closed, to 1, open. Arms of six joints leave their seventh at zero."""
 LEFT_ARM, LEFT_GRIPPER, RIGHT_ARM, RIGHT_GRIPPER = slice(0, 7), 7, slice(8, 15), 15
 ARMS = ((LEFT_ARM, LEFT_GRIPPER), (RIGHT_ARM, RIGHT_GRIPPER))
-"""Where each arm's joints and gripper stand in a command."""
+"""Places of each arm's joints and gripper in a command."""
 
 DIMENSION_TITLES = {
     "visual": "Visual quality",

@@ -28,7 +28,23 @@ COPY, TRUTH = BASELINES
 COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero")
 """Attributes that say how a table was graded; tables that differ in one cannot be compared."""
 DEFINITION = ("dimension", "unit", "higher_is_better", "low", "high", "reference")
-"""What every table, old ones too, says of each metric."""
+"""Attributes of each metric that every table has, old ones too."""
+EARLIER_TITLES = {
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "mask_iou": "Mask IoU",
+    "boundary_f1": "Boundary F1",
+    "region_lpips": "Region LPIPS",
+    "pck": "PCK",
+    "pck_05": "PCK at 0.05",
+    "keypoint_error": "Keypoint error",
+    "ndtw": "nDTW",
+    "coverage": "Keypoints found",
+    "trajectory_error": "Object error",
+    "object_coverage": "Objects found",
+}
+"""Titles of metrics in score tables that were written before tables carried them."""
 LISTED = 20
 """Largest number of rows of each kind that an error names; it counts the others."""
 
@@ -55,7 +71,7 @@ class MetricInfo:
 
     def __post_init__(self) -> None:
         if not self.title:
-            object.__setattr__(self, "title", self.name)
+            object.__setattr__(self, "title", EARLIER_TITLES.get(self.name, self.name))
 
     @property
     def best(self) -> float | None:

@@ -164,7 +164,7 @@ def _stability_cell(result: Correlation) -> TableCell:
 
 
 def frame_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
-    """Table of the paper's kinematic correlation beside those that our own clouds give, in each frame."""
+    """Table of the paper's kinematic correlation beside those that our own clouds give; `frames` has mean distances [s 5]."""
     by_frame = {frame: frame_results(paper, distances) for frame, distances in frames.items()}
 
     def row(metric: str) -> TableRow:
@@ -187,7 +187,7 @@ def frame_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
 
 
 def base_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
-    """Table of the distances that `frame_table` rests on."""
+    """Table of the mean distances [s 5] that `frame_table` rests on."""
     rows, floor = [], _mean_floor()
     for i, name in enumerate(paper.robots):
         cells = [TableCell(f"{paper.robots[name].kinematic:.3f}", value=paper.robots[name].kinematic)]
