@@ -240,19 +240,19 @@ def _read(path: Path, command: str) -> pd.DataFrame:
 
 
 def _read_metric_infos(path: Path, described: Mapping[str, Mapping[str, Any]]) -> tuple[MetricInfo, ...]:
-    """What a table says of its metrics; more than is asked for here is left alone."""
+    """Read the descriptions of a table's metrics; further entries are ignored."""
     for metric, info in described.items():
         if missing := [name for name in DEFINITION if name not in info]:
             raise ConfigError(f"{path} does not say the {', '.join(missing)} of {metric}; it is no score table of this xew.")
     known = {field.name for field in fields(MetricInfo)}
     return tuple(
-        MetricInfo(name=metric, **{"estimated": _was_estimated(metric, info)} | {k: v for k, v in info.items() if k in known})
+        MetricInfo(name=metric, **{"estimated": _guess_estimated(metric, info)} | {k: v for k, v in info.items() if k in known})
         for metric, info in described.items()
     )
 
 
-def _was_estimated(metric: str, info: Mapping[str, Any]) -> bool:
-    """Of tables that were written before they said so: of whole pictures nothing was estimated."""
+def _guess_estimated(metric: str, info: Mapping[str, Any]) -> bool:
+    """Whether a metric is estimated, for tables that were written before they said so: metrics of whole pictures are not."""
     return info["dimension"] != "visual" and metric != "region_lpips"
 
 

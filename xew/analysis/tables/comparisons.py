@@ -1,4 +1,4 @@
-"""What claims are made of: numbers with bounds, and the reader that computes them from a study's means."""
+"""Parts of claims: numbers with bounds, and the reader that computes them from a study's means."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

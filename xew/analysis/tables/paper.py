@@ -140,7 +140,7 @@ def certainty_table(paper: Paper, cells: Sequence[RecomputedFigure], results: Ma
             compared = TableCell(text, value=result.p_value)
             if p:
                 compared = replace(compared, published=f"{p.published:.3f}", agrees=p.agrees, printed=p.published)
-            columns += [compared, *_own_certainty(result)]
+            columns += [compared, *_certainty_cells(result)]
         return TableRow((PAPER_TITLES[metric],), tuple(columns))
 
     heads = ("p", "Spearman ρ", "bootstrap of r", "sign")
@@ -150,7 +150,7 @@ def certainty_table(paper: Paper, cells: Sequence[RecomputedFigure], results: Ma
     )
 
 
-def _own_certainty(result: Correlation) -> list[TableCell]:
+def _certainty_cells(result: Correlation) -> list[TableCell]:
     ends = (result.bootstrap_low, result.bootstrap_high)
     return [
         TableCell(format_signed(result.spearman), value=result.spearman),
