@@ -8,7 +8,6 @@ import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from jaxtyping import install_import_hook
@@ -105,21 +104,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def strict_arrays() -> Iterator[None]:
+def strict_arrays() -> None:
     """JAX neither converts types nor adds axes silently, in fixtures of any scope and in threads too."""
     import jax
 
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_numpy_rank_promotion", "raise")
-    packbits = jax.numpy.packbits
-
-    def packbits_with_promotion(*arguments: Any, **named: Any) -> jax.Array:
-        with jax.numpy_rank_promotion("allow"):  # JAX's own code shifts [... 8 n] by [8 1]
-            return packbits(*arguments, **named)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jax.numpy, "packbits", packbits_with_promotion)
-        yield
 
 
 @pytest.fixture(autouse=True)

@@ -57,7 +57,7 @@ split: additions:SPLIT
 clip: {frames: 5, height: 64, width: 80}
 codec: {spatial_factor: 8, channels: 4}
 model: {size: tiny, action: "additions:CONDITION"}
-train: {steps: 1, batch: 1, sample_every: 0}
+train: {steps: 1, batch: 2, sample_every: 0}
 rollout: {steps: 1, batch: 1, max_frames: 5}
 """
 

@@ -1,4 +1,4 @@
-"""The session is as strict as tests/conftest.py says of types, ranks, shapes and warnings; exceptions end with their test."""
+"""The session is as strict as tests/conftest.py says: of types, ranks, shapes and warnings; exceptions end with their test."""
 
 import os
 import subprocess

@@ -14,7 +14,8 @@ import pandas as pd
 import pytest
 
 from tests.commands import run_command
-from xew.rollout import read_rollout_video
+from xew.dataset import find_accepted
+from xew.episode import read_states, read_video, verify_episode
 
 ARCHIVE = Path(__file__).with_name("version_0_1_0.tar.xz")
 EPISODE = Path("place_empty_cup/1000000/piper")
@@ -43,8 +44,11 @@ def old(unpacked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 
 
 def test_episodes_are_whole(old: Path) -> None:
-    said = run_command("xew.sim_warp.inspect", "data", "--verify")
-    assert "2 episodes" in said or "2 of 2" in said or "damaged" not in said, said
+    found = find_accepted(old / "data")
+    assert [(record.seed, record.robot) for _, record in found] == [(0, "aloha_agilex"), (1_000_000, "piper")]
+    for folder, record in found:
+        assert verify_episode(folder) == record
+        assert read_video(folder / "rgb.mkv").shape == (5, 240, 320, 3) and read_states(folder).frame_count == 5
 
 
 def test_a_run_goes_on_from_its_checkpoint_and_latents(old: Path) -> None:
@@ -57,7 +61,7 @@ def test_a_run_goes_on_from_its_checkpoint_and_latents(old: Path) -> None:
 
 def test_rollouts_come_out_as_before(old: Path) -> None:
     run_command("xew.model.rollout", "runs/tiny", "--data", "data", "--split", "test", "--out", "again")
-    before, again = (read_rollout_video(old / name / EPISODE) for name in ("rollouts", "again"))
+    before, again = (read_video(old / name / EPISODE / "rgb.mkv") for name in ("rollouts", "again"))
     assert before.shape == again.shape == (5, 240, 320, 3)
     assert np.abs(before.astype(int) - again).mean() < ROUNDING
     headers = [json.loads((old / name / EPISODE / "rollout.json").read_text()) for name in ("rollouts", "again")]
@@ -88,7 +92,7 @@ def test_grades_that_are_done_are_kept(old: Path) -> None:
 def test_scores_become_a_report(old: Path) -> None:
     run_command("xew.analysis.report", "scores.parquet", "--data", "data", "--rollouts", "rollouts", "--out", "report")
     page = (old / "report" / "index.html").read_text()
-    assert "tiny" in page and "mask_iou" in page
+    assert "tiny · joints+robot_render" in page and "Mask IoU" in page
 
 
 def test_steps_of_a_study_that_are_done_are_known(old: Path) -> None:

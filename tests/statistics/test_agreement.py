@@ -12,7 +12,7 @@ from xew.analysis.paper import read_paper
 from xew.analysis.scores import COPY, TRUTH, Scores, read_scores
 from xew.analysis.statistics.grades import StudyGrades
 from xew.analysis.statistics.summary import robot_table
-from xew.analysis.tables.builder import Builder, verdict
+from xew.analysis.tables.builder import Builder, paired_verdict
 from xew.metrics import METRICS
 from xew.metrics.grading.scores import describe
 from xew.metrics.grading.summary import Summary, summarize
@@ -104,7 +104,7 @@ def test_a_study_is_the_same_in_both(scores: Scores) -> None:
             for row, model in (("joints", JOINTS), ("optical_flow", FLOW)):
                 cell, mean = builder.cell("actions", row, robot, metric), means.loc[(robot, model, metric)]
                 np.testing.assert_array_equal([cell.value, cell.low, cell.high], mean[["mean", "low", "high"]].astype(float))
-            assert verdict(grades, "actions", "joints", "optical_flow", robot, metric) == found[robot, metric]
+            assert paired_verdict(grades, "actions", "joints", "optical_flow", robot, metric) == found[robot, metric]
             assert grades.floor(robot, metric) == pytest.approx(means.loc[(robot, JOINTS, metric), "noise"], abs=0, nan_ok=True)
             words.add(found[robot, metric])
     if len(scores.rows["seed"].unique()) < 2:

@@ -71,7 +71,7 @@ def _packed(mask: jax.Array) -> jax.Array:
     """[t h w] bool to [t bytes w] uint8: pixel (x, y) is bit y % 8 of byte (x, y // 8); no pixel is beyond the height."""
     t, height, width = mask.shape
     rows = jnp.pad(mask, ((0, 0), (0, -height % BYTE), (0, 0))).reshape(t, -1, BYTE, width)
-    places = jnp.arange(BYTE, dtype=jnp.uint8)[:, None]
+    places = jnp.arange(BYTE, dtype=jnp.uint8)[None, None, :, None]
     return jnp.sum(rows.astype(jnp.uint8) << places, axis=2, dtype=jnp.uint8)
 
 

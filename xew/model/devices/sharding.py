@@ -115,6 +115,23 @@ def state_shardings(state: Any, mesh: Mesh) -> Any:
     return jax.tree_util.tree_map_with_path(place, state)
 
 
+def place_shapes(shapes: Any, mesh: Mesh) -> Any:
+    """Give a tree of shapes and types their places on the mesh."""
+    return _with_places(shapes, state_shardings(shapes, mesh))
+
+
+def place_beside(shapes: Any, like: Any) -> Any:
+    """Give a tree of shapes and types their places on the mesh of another tree, or on its device."""
+    sharding = jax.tree.leaves(like)[0].sharding
+    if isinstance(sharding, NamedSharding) and isinstance(sharding.mesh, Mesh):
+        return place_shapes(shapes, sharding.mesh)
+    return _with_places(shapes, jax.tree.map(lambda leaf: sharding, shapes))
+
+
+def _with_places(shapes: Any, places: Any) -> Any:
+    return jax.tree.map(lambda leaf, place: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), shapes, places)
+
+
 def path_names(path: Sequence[Any]) -> tuple[str, ...]:
     """The plain names along a path in a tree, such as (blocks, self_attn, q, kernel)."""
     names = [str(getattr(entry, "key", getattr(entry, "name", getattr(entry, "idx", entry)))) for entry in path]
