@@ -16,7 +16,7 @@ ACTION_DIM = 16
 closed, to 1, open. Arms of six joints leave their seventh at zero."""
 LEFT_ARM, LEFT_GRIPPER, RIGHT_ARM, RIGHT_GRIPPER = slice(0, 7), 7, slice(8, 15), 15
 ARMS = ((LEFT_ARM, LEFT_GRIPPER), (RIGHT_ARM, RIGHT_GRIPPER))
-"""Where each arm's joints and gripper stand in a command."""
+"""Places of each arm's joints and gripper in a command."""
 
 DIMENSION_TITLES = {
     "visual": "Visual quality",
@@ -115,7 +115,7 @@ def system(name: str) -> Variant:
     return Variant(f"fixed-{name}", name, "fixed", name)
 
 
-def adapted(target: str, shots: int, remedy: str = "full") -> Variant:
+def adaptation(target: str, shots: int, remedy: str = "full") -> Variant:
     """The nine-view model of the fixed split after training on `shots` episodes of each task of an unseen robot."""
     ending = "" if remedy == "full" else f"-{remedy}"
     return Variant(f"few_shot-{target}-{shots}{ending}", "reference", "fixed", *MULTI_VIEW, target, shots, remedy)
@@ -123,7 +123,7 @@ def adapted(target: str, shots: int, remedy: str = "full") -> Variant:
 
 MULTI_VIEW = ("optical_flow", "nine_views")
 """Conditions on action and looks of the model that adaptations start from (the paper's appendix on few-shot adaptation)."""
-_FEW_SHOT = tuple(adapted(target, shots) for target in HELD_OUT_ROBOTS for shots in SHOTS)
+_FEW_SHOT = tuple(adaptation(target, shots) for target in HELD_OUT_ROBOTS for shots in SHOTS)
 _RENDERED = reference(embodiment="robot_render")
 
 PARTS: dict[str, tuple[Variant, ...]] = {
@@ -139,7 +139,7 @@ PARTS: dict[str, tuple[Variant, ...]] = {
     "baselines": (*(system(name) for name in ("irasim", "ctrl_world", "enerverse_ac")), reference()),
     # Ours; the paper leaves them open.
     "remedies": tuple(
-        adapted(target, shots, remedy) for remedy in ("replay", "lora") for target in HELD_OUT_ROBOTS for shots in SHOTS
+        adaptation(target, shots, remedy) for remedy in ("replay", "lora") for target in HELD_OUT_ROBOTS for shots in SHOTS
     ),
     "more_systems": (system("bwm"),),
 }

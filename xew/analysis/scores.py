@@ -28,7 +28,23 @@ COPY, TRUTH = BASELINES
 COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero")
 """Attributes that say how a table was graded; tables that differ in one cannot be compared."""
 DEFINITION = ("dimension", "unit", "higher_is_better", "low", "high", "reference")
-"""What every table, old ones too, says of each metric."""
+"""Attributes of each metric that every table has, old ones too."""
+EARLIER_TITLES = {
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "mask_iou": "Mask IoU",
+    "boundary_f1": "Boundary F1",
+    "region_lpips": "Region LPIPS",
+    "pck": "PCK",
+    "pck_05": "PCK at 0.05",
+    "keypoint_error": "Keypoint error",
+    "ndtw": "nDTW",
+    "coverage": "Keypoints found",
+    "trajectory_error": "Object error",
+    "object_coverage": "Objects found",
+}
+"""Titles of metrics in score tables that were written before tables carried them."""
 LISTED = 20
 """Largest number of rows of each kind that an error names; it counts the others."""
 
@@ -55,7 +71,7 @@ class MetricInfo:
 
     def __post_init__(self) -> None:
         if not self.title:
-            object.__setattr__(self, "title", self.name)
+            object.__setattr__(self, "title", EARLIER_TITLES.get(self.name, self.name))
 
     @property
     def best(self) -> float | None:
@@ -224,19 +240,19 @@ def _read(path: Path, command: str) -> pd.DataFrame:
 
 
 def _read_metric_infos(path: Path, described: Mapping[str, Mapping[str, Any]]) -> tuple[MetricInfo, ...]:
-    """What a table says of its metrics; more than is asked for here is left alone."""
+    """Read the descriptions of a table's metrics; further entries are ignored."""
     for metric, info in described.items():
         if missing := [name for name in DEFINITION if name not in info]:
             raise ConfigError(f"{path} does not say the {', '.join(missing)} of {metric}; it is no score table of this xew.")
     known = {field.name for field in fields(MetricInfo)}
     return tuple(
-        MetricInfo(name=metric, **{"estimated": _was_estimated(metric, info)} | {k: v for k, v in info.items() if k in known})
+        MetricInfo(name=metric, **{"estimated": _guess_estimated(metric, info)} | {k: v for k, v in info.items() if k in known})
         for metric, info in described.items()
     )
 
 
-def _was_estimated(metric: str, info: Mapping[str, Any]) -> bool:
-    """Of tables that were written before they said so: of whole pictures nothing was estimated."""
+def _guess_estimated(metric: str, info: Mapping[str, Any]) -> bool:
+    """Whether a metric is estimated, for tables that were written before they said so: metrics of whole pictures are not."""
     return info["dimension"] != "visual" and metric != "region_lpips"
 
 

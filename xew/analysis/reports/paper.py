@@ -93,7 +93,7 @@ def build(paper: Paper, footer: str) -> Report:
     by_frame = {frame: frame_results(paper, frames[frame]) for frame in OWN_FRAMES}
     grades = PaperGrades(paper, paper.infos)
     claims = ask(grades)
-    chart = distance_chart(grades, _with_own_frames(printed_distances(paper), frames), PRIMARY)
+    chart = distance_chart(grades, _add_own_frames(printed_distances(paper), frames), PRIMARY)
     assert chart is not None  # all folds are printed
     content = Content(
         finding(cells, results, changes, by_frame, claims),
@@ -193,7 +193,7 @@ def _name_correlation(metric: str, axis: str) -> str:
     return f"{PAPER_TITLES[metric]} by {axis}"
 
 
-def _with_own_frames(distances: Distances, frames: Mapping[Frame, np.ndarray]) -> Distances:
+def _add_own_frames(distances: Distances, frames: Mapping[Frame, np.ndarray]) -> Distances:
     """The printed distances, and our own [s 5] in other frames."""
     own = [pd.DataFrame({"robot": ROBOT_NAMES, "feature": frame, "value": frames[frame].mean(axis=0)}) for frame in OWN_FRAMES]
     return replace(distances, robots=pd.concat([distances.robots, *own], ignore_index=True))

@@ -55,7 +55,7 @@ class Builder:
         """The mean at an address, with the paper's value and the verdict on its difference from the row `base`."""
         info = self.ours.metrics.get(metric)
         mean = self.ours.mean(part, row, robots, metric) if info else None
-        printed = self._printed(part, row, robots, metric)
+        printed = self._printed_cell(part, row, robots, metric)
         if info is None or mean is None:
             return printed
         ends = _interval_ends(mean, self.ours.level)
@@ -134,7 +134,7 @@ class Builder:
             episodes=mean.count,
         )
 
-    def _printed(self, part: str, row: str, robots: str, metric: str) -> TableCell:
+    def _printed_cell(self, part: str, row: str, robots: str, metric: str) -> TableCell:
         text = self.paper.print(part, row, robots, metric) if self.paper else ""
         return TableCell(published=text, printed=float(text)) if text else TableCell()
 

@@ -1,4 +1,4 @@
-"""What claims are made of: numbers with bounds, and the reader that computes them from a study's means."""
+"""Parts of claims: numbers with bounds, and the reader that computes them from a study's means."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -94,7 +94,7 @@ class Reader:
     def closed_share(
         self, part: str, after: str, before: str, robots: str, metric: str, goal: tuple[str, str]
     ) -> tuple[np.ndarray, str]:
-        """`share` of the gap from a row to the goal (part and row, on seen robots) that another row closes."""
+        """`share` [1 + n] of the gap from a row to the goal (part and row, on seen robots) that another row closes."""
         old, new = self.mean(part, before, robots, metric), self.mean(part, after, robots, metric)
         return self.share(old, new, self.mean(*goal, SEEN, metric), metric)
 

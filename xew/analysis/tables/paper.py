@@ -140,7 +140,7 @@ def certainty_table(paper: Paper, cells: Sequence[RecomputedFigure], results: Ma
             compared = TableCell(text, value=result.p_value)
             if p:
                 compared = replace(compared, published=f"{p.published:.3f}", agrees=p.agrees, printed=p.published)
-            columns += [compared, *_own_certainty(result)]
+            columns += [compared, *_certainty_cells(result)]
         return TableRow((PAPER_TITLES[metric],), tuple(columns))
 
     heads = ("p", "Spearman ρ", "bootstrap of r", "sign")
@@ -150,7 +150,7 @@ def certainty_table(paper: Paper, cells: Sequence[RecomputedFigure], results: Ma
     )
 
 
-def _own_certainty(result: Correlation) -> list[TableCell]:
+def _certainty_cells(result: Correlation) -> list[TableCell]:
     ends = (result.bootstrap_low, result.bootstrap_high)
     return [
         TableCell(format_signed(result.spearman), value=result.spearman),
@@ -164,7 +164,7 @@ def _stability_cell(result: Correlation) -> TableCell:
 
 
 def frame_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
-    """Table of the paper's kinematic correlation beside those that our own clouds give, in each frame."""
+    """Table of the paper's kinematic correlation beside those that our own clouds give; `frames` has mean distances [s 5]."""
     by_frame = {frame: frame_results(paper, distances) for frame, distances in frames.items()}
 
     def row(metric: str) -> TableRow:
@@ -187,7 +187,7 @@ def frame_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
 
 
 def base_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
-    """Table of the distances that `frame_table` rests on."""
+    """Table of the mean distances [s 5] that `frame_table` rests on."""
     rows, floor = [], _mean_floor()
     for i, name in enumerate(paper.robots):
         cells = [TableCell(f"{paper.robots[name].kinematic:.3f}", value=paper.robots[name].kinematic)]
