@@ -29,6 +29,22 @@ COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero")
 """What a table says of how it was graded; tables that differ in it do not compare."""
 DEFINITION = ("dimension", "unit", "higher_is_better", "low", "high", "reference")
 """What a table says of each metric, and has always said."""
+TITLES_OF_0_1 = {
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "mask_iou": "Mask IoU",
+    "boundary_f1": "Boundary F1",
+    "region_lpips": "Region LPIPS",
+    "pck": "PCK",
+    "pck_05": "PCK at 0.05",
+    "keypoint_error": "Keypoint error",
+    "ndtw": "nDTW",
+    "coverage": "Keypoints found",
+    "trajectory_error": "Object error",
+    "object_coverage": "Objects found",
+}
+"""Titles of metrics in tables of version 0.1.0, which do not say them."""
 LISTED = 20
 """Cells that an error names of each kind; it counts the others."""
 
@@ -230,14 +246,15 @@ def _read_metric_infos(path: Path, described: Mapping[str, Mapping[str, Any]]) -
             raise ConfigError(f"{path} does not say the {', '.join(missing)} of {metric}; it is no score table of this xew.")
     known = {field.name for field in fields(MetricInfo)}
     return tuple(
-        MetricInfo(name=metric, **{"estimated": _was_estimated(metric, info)} | {k: v for k, v in info.items() if k in known})
+        MetricInfo(name=metric, **_of_0_1(metric, info) | {k: v for k, v in info.items() if k in known})
         for metric, info in described.items()
     )
 
 
-def _was_estimated(metric: str, info: Mapping[str, Any]) -> bool:
-    """Of tables that were written before they said so: of whole pictures nothing was estimated."""
-    return info["dimension"] != "visual" and metric != "region_lpips"
+def _of_0_1(metric: str, info: Mapping[str, Any]) -> dict[str, Any]:
+    """What tables of version 0.1.0 do not say of a metric: its title, and that of whole pictures nothing was estimated."""
+    estimated = info["dimension"] != "visual" and metric != "region_lpips"
+    return {"title": TITLES_OF_0_1.get(metric, ""), "estimated": estimated}
 
 
 def _have_same_metrics(one: Mapping[str, Mapping[str, Any]], other: Mapping[str, Mapping[str, Any]]) -> bool:
