@@ -51,6 +51,8 @@ WITH_TORCH = ("xew.model.weights.reading",)
 """Modules of `model` that may import PyTorch inside functions: files of weights that only it can read."""
 REGISTRIES = {"analysis": "xew.model.conditions"}
 """Registry of another room that a room may read at once, for titles; it loads without JAX and Warp."""
+JAX_GROUND = "xew.compilation"
+"""The one file at the root that imports JAX; only rooms that import JAX anyway may import it."""
 STATISTICS_STANDS_ON = ("xew.statistics", "xew.protocol", "xew.config")
 METRIC_READERS = {"evaluate", "backends", "grade", "truth", "calibrate"}
 """Files at the root of `metrics` that may touch the disk or anything of ours outside the room; the others are pure."""
@@ -76,6 +78,8 @@ def room_failures(sources: Sources) -> list[str]:
         libraries = FORBIDDEN[source.room] - (
             {"torch"} if source.module in WITH_TORCH and not touches(at_once, "torch") else set()
         )
+        libraries -= {"jax"} if source.module == JAX_GROUND else set()
+        libraries |= {JAX_GROUND} if "jax" in libraries else set()
         failures += [f"{source.name} imports {name}" for name in sorted(libraries) if touches(names, name)]
         names = {name for name in names if not touches([name], REGISTRIES.get(source.room, "none"))}
         for other in sorted(MAY_IMPORT.keys() - {"", "statistics", source.room}):
@@ -253,6 +257,7 @@ GOOD: Files = {
 PLANTED: dict[str, tuple[Callable[[Sources], list[str]], Files, str]] = {
     "a library": (room_failures, {"sim_warp/a.py": "import jax.numpy as jnp\n"}, "sim_warp/a.py imports jax"),
     "a library in a function": (room_failures, {"model/a.py": "def f():\n    import warp as wp\n"}, "model/a.py imports warp"),
+    "the ground with JAX": (room_failures, {"sim_warp/a.py": "from xew.compilation import f\n"}, "imports xew.compilation"),
     "a room": (room_failures, {"sim_warp/a.py": "from xew.model import b\n"}, "sim_warp/a.py imports xew.model"),
     "a room in a function": (room_failures, {"sim_warp/a.py": "def f():\n    from xew import model\n"}, "imports xew.model"),
     "a room from the ground": (room_failures, {"files.py": "from xew.analysis import b\n"}, "files.py imports xew.analysis"),

@@ -34,8 +34,8 @@ UNITS = {"m", "mm", "m/s", "m/s^2", "rad", "rad/s", "s", "px", "pixel", "pixels"
 QUESTIONS = "So|How|What|Where|Who|Whom|Which|When|Why|By|As (?:many|much|far|long)|Not more|No more"
 CONSTANT_OPENING = re.compile(rf"(?:{QUESTIONS})\b", re.IGNORECASE)
 """Openings of docstrings of constants that are no noun."""
-KEPT_WORDS = ("analyse",)
-"""British words that stay: the name of a study's last step in ledgers on disk, and of its command."""
+KEPT_WORDS = ("analyse", "writeable")
+"""Words that stay: the name of a study's last step in ledgers on disk and of its command, and NumPy's flag."""
 SPELLED = (
     "xew",
     "tests",

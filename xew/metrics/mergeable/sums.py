@@ -95,7 +95,8 @@ def _limbs(values: jax.Array) -> jax.Array:
     first, shift = place // BITS, place % BITS
     low, high = (mantissa & 0xFFFF) << shift, (mantissa >> BITS) << shift
     parts = low & 0xFFFF, (low >> BITS) + (high & 0xFFFF), high >> BITS
-    limbs = sum(jnp.where(np.arange(LIMBS) == (first + i)[..., None], part[..., None], 0) for i, part in enumerate(parts))
+    places = np.arange(LIMBS).reshape((1,) * first.ndim + (LIMBS,))
+    limbs = sum(jnp.where(places == (first + i)[..., None], part[..., None], 0) for i, part in enumerate(parts))
     return jnp.where(bits < 0, -1, 1)[..., None] * limbs
 
 
