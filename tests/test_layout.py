@@ -23,7 +23,7 @@ FORBIDDEN = {
 }
 """Names that a room must not import; '' is the ground that all rooms stand on (episode, protocol, rollout, config)."""
 
-CALIBRATION = {"calibrate", "wrong"}
+CALIBRATION = {"calibrate", "perturbations"}
 """The files of `metrics` that ask other rooms to render and to encode; inside functions, so that they load without them."""
 READERS = {"evaluate", "backends", "grade", "truth"}
 """The files at the root of `metrics` that may touch the disk or anything of ours outside the room."""

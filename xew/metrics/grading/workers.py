@@ -42,14 +42,14 @@ class Bench(threading.local):
         self.masker, self.tracker = masker(self.device), tracker(self.device)
 
 
-def not_needed(_: jax.Device) -> Any:
+def open_nothing(_: jax.Device) -> Any:
     """In place of an estimator that no metric asks."""
 
 
 E = TypeVar("E", bound=Callable[..., np.ndarray])
 
 
-def opener(
+def make_opener(
     name: str, registry: Any, open_: Callable[[str, Path | None], E], checkpoint: Path | None
 ) -> Callable[[jax.Device], E]:
     """How a thread on a device comes by an estimator: its own, or, of one with weights, the device's, used in turn."""
@@ -61,13 +61,13 @@ def opener(
     def of_device(device: jax.Device) -> E:
         with opening, jax.default_device(device):
             if device not in opened:
-                opened[device] = in_turn(open_(name, checkpoint))
+                opened[device] = serialize_calls(open_(name, checkpoint))
             return opened[device]
 
     return of_device
 
 
-def in_turn(estimator: E) -> E:
+def serialize_calls(estimator: E) -> E:
     """The same estimator for one thread at a time; estimators keep notes of the episode at hand."""
     turn = threading.Lock()
 
