@@ -1,4 +1,4 @@
-"""Metrics, many videos at once: worker threads, what each has for itself, and how far they run ahead.
+"""Many videos at once: worker threads, what each has for itself, and how far they run ahead.
 
 Threads and not processes: decoding, OpenCV and XLA let go of Python's lock, and compiled programs are shared.
 """
@@ -18,7 +18,7 @@ from xew.metrics.backends import Masker, Tracker
 from xew.metrics.estimators.adapters import use_torch_device
 
 MOST_WORKERS = 32
-"""A worker holds an episode and a prediction, a quarter of a gigabyte at full length."""
+"""Largest number of workers: each holds an episode and a prediction, a quarter of a gigabyte at full length."""
 
 
 def worker_count(asked: int) -> int:
@@ -43,7 +43,12 @@ class Bench(threading.local):
 
 
 def open_nothing(_: jax.Device) -> Any:
-    """In place of an estimator that no metric asks."""
+    """Stand in for an estimator that no metric needs."""
+
+    def refuse(*arrays: np.ndarray) -> np.ndarray:
+        raise AssertionError("no metric needs this estimator, so none was opened")
+
+    return refuse
 
 
 E = TypeVar("E", bound=Callable[..., np.ndarray])
