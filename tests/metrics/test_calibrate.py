@@ -18,15 +18,15 @@ from xew.metrics import METRICS
 from xew.metrics.calibrate import (
     ESTIMATED,
     Args,
-    another,
     choose,
+    find_another,
     main,
     motion_table,
     order_table,
     reference_videos,
     true_grades,
 )
-from xew.metrics.calibration.wrong import MOTIONS, WrongVideo, wrong_videos
+from xew.metrics.calibration.perturbations import MOTIONS, Perturbation, render_perturbations
 from xew.metrics.truth import NEEDS, read_truth
 
 
@@ -51,7 +51,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_wrong_renderings_are_wrong_as_they_say(simulated: Path) -> None:
-    shown = dict(wrong_videos(simulated))
+    shown = dict(render_perturbations(simulated))
     truth, states = read_video(simulated / "rgb.mkv"), read_states(simulated)
     assert list(shown) == list(MOTIONS)
     np.testing.assert_array_equal(shown["as recorded"].rgb, truth)
@@ -89,12 +89,12 @@ def test_half_the_motion_is_half_of_it(data: Path) -> None:
 def test_true_grades_take_the_known_truth_and_not_an_estimate(data: Path) -> None:
     folder, record = find_accepted(data)[0]
     truth = read_truth(folder, record.frame_count, NEEDS)
-    same = WrongVideo(np.zeros_like(truth.rgb), truth.mask, truth.keypoints, truth.objects)
+    same = Perturbation(np.zeros_like(truth.rgb), truth.mask, truth.keypoints, truth.objects)
     values = true_grades(same, truth).values
     assert set(values) == set(ESTIMATED)
     assert values["mask_iou"] == values["boundary_f1"] == values["pck"] == values["coverage"] == 1
     assert values["keypoint_error"] == values["trajectory_error"] == 0
-    off = WrongVideo(same.rgb, np.roll(truth.mask, 5, axis=2), truth.keypoints + 3, truth.objects + np.float32([0, 4]))
+    off = Perturbation(same.rgb, np.roll(truth.mask, 5, axis=2), truth.keypoints + 3, truth.objects + np.float32([0, 4]))
     values = true_grades(off, truth).values
     assert values["mask_iou"] < 0.9 and values["boundary_f1"] < 0.9
     assert values["keypoint_error"] == pytest.approx(3 * np.sqrt(2), rel=1e-5)
@@ -109,7 +109,7 @@ def test_references_are_what_they_are_called(data: Path) -> None:
     assert [len(video) for video in videos.values()] == [len(truth.rgb)] * 6
     np.testing.assert_array_equal(videos["truth through the codec"], 255 - truth.rgb)
     np.testing.assert_array_equal(videos["frozen first frame"], np.repeat(truth.rgb[:1], len(truth.rgb), axis=0))
-    others = {name: read_record(another(episodes, record, name.split()[1])) for name in ("another robot", "another seed")}
+    others = {name: read_record(find_another(episodes, record, name.split()[1])) for name in ("another robot", "another seed")}
     assert (others["another robot"].robot, others["another robot"].seed) == ("piper", 0)
     assert (others["another seed"].robot, others["another seed"].seed) == ("franka_panda", 1)
 
@@ -118,7 +118,7 @@ def test_without_others_nothing_is_made_up(tmp_path: Path) -> None:
     write_synthetic_data(tmp_path, seeds=(0,), robots=("piper",), frames=3)
     episodes = find_accepted(tmp_path)
     record = episodes[0][1]
-    assert another(episodes, record, "robot") is None and another(episodes, record, "seed") is None
+    assert find_another(episodes, record, "robot") is None and find_another(episodes, record, "seed") is None
 
 
 def wrong_rows(estimates: list[float], truths: list[float]) -> pd.DataFrame:
@@ -147,17 +147,17 @@ def test_frames_are_told_by_their_motion() -> None:
 def test_the_command_writes_its_tables(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Synthetic episodes cannot be rendered; here a wrong video is one that stands still from the middle on."""
 
-    def stopped(folder: Path) -> list[tuple[str, WrongVideo]]:
+    def stopped(folder: Path) -> list[tuple[str, Perturbation]]:
         shown = np.minimum(np.arange(7), 3)
         states, video = read_states(folder), read_video(folder / "rgb.mkv")[shown]
         truth = read_truth(folder, 7, NEEDS)
-        right = WrongVideo(read_video(folder / "rgb.mkv"), truth.mask, truth.keypoints, truth.objects)
+        right = Perturbation(read_video(folder / "rgb.mkv"), truth.mask, truth.keypoints, truth.objects)
         return [
             ("right", right),
-            ("stopped", WrongVideo(video, states.robot_mask[shown], states.keypoints[shown], truth.objects[shown])),
+            ("stopped", Perturbation(video, states.robot_mask[shown], states.keypoints[shown], truth.objects[shown])),
         ]
 
-    monkeypatch.setattr("xew.metrics.calibrate.wrong_videos", stopped)
+    monkeypatch.setattr("xew.metrics.calibrate.render_perturbations", stopped)
     monkeypatch.setattr("xew.metrics.calibrate.METRICS", {name: METRICS[name] for name in METRICS if "lpips" not in name})
     main(Args(data=data, out=tmp_path / "out", seeds=(1,), episodes=1))
     text = (tmp_path / "out" / "calibration.md").read_text()

@@ -20,7 +20,7 @@ from xew.metrics.estimators.contact import predicted_contact, touching_distance
 from xew.metrics.evaluate import Args, main
 from xew.metrics.grade import Comparison
 from xew.metrics.grade import grade as grade_one
-from xew.metrics.truth import _visible, read_truth
+from xew.metrics.truth import _find_visible, read_truth
 from xew.projection import project
 from xew.rollout import write_rollout
 
@@ -179,10 +179,10 @@ def test_projected_objects_lie_where_they_are_drawn(data: Path) -> None:
     assert not read.object_visible[-1, 0] and read.mask[-1][tuple(np.round(read.objects[-1, 0, ::-1]).astype(int))]
     rgb, points = read.rgb.copy(), np.repeat(read.objects[:1], FRAMES, axis=0)
     rgb[:] = rgb[0]
-    assert _visible(points, rgb, np.zeros(rgb.shape[:3], bool)).all()
+    assert _find_visible(points, rgb, np.zeros(rgb.shape[:3], bool)).all()
     x, y = np.round(points[0, 0]).astype(int)
     rgb[5:, y - 4 : y + 5, x - 4 : x + 5] = 0
-    assert _visible(points, rgb, np.zeros(rgb.shape[:3], bool))[:, 0].tolist() == [t < 5 for t in range(FRAMES)]
+    assert _find_visible(points, rgb, np.zeros(rgb.shape[:3], bool))[:, 0].tolist() == [t < 5 for t in range(FRAMES)]
     behind, _ = project(np.array([[0.0, 0.0, -1.0]]), np.eye(3), np.eye(4))
     assert np.isnan(behind).all()
 

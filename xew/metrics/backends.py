@@ -10,7 +10,7 @@ To add one: its file, and one line in MASKERS, TRACKERS or FLOWS; from outside t
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from xew.metrics.estimators.tracks import estimate_tracks
 T_co = TypeVar("T_co", covariant=True)
 
 
+@runtime_checkable
 class Masker(Protocol):
     """Robot masks in a predicted video."""
 
@@ -33,6 +34,7 @@ class Masker(Protocol):
         """Masks bool [t h w] of a prediction [t h w 3] uint8, from the true video [t h w 3] uint8 and masks [t h w] bool."""
 
 
+@runtime_checkable
 class Tracker(Protocol):
     """Where the true video's points are in a predicted video."""
 
@@ -46,6 +48,7 @@ class Tracker(Protocol):
         """
 
 
+@runtime_checkable
 class Flow(Protocol):
     """Optical flow between pairs of images."""
 

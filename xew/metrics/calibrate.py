@@ -29,14 +29,14 @@ from xew.dataset import find_accepted
 from xew.episode import EpisodeError, Record, read_video
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
-from xew.metrics.calibration.wrong import WrongVideo, wrong_videos
-from xew.metrics.grade import Comparison, Grades, compared, grade
+from xew.metrics.calibration.perturbations import Perturbation, render_perturbations
+from xew.metrics.grade import Comparison, Grades, grade, input_kind
 from xew.metrics.truth import NEEDS, Truth, read_truth
 
 LATE = 8
 """Frames of the time-shifted truth, half a second."""
 KEY = ["task", "seed", "robot", "case"]
-ESTIMATED = tuple(name for name in METRICS if compared(name) in ("mask", "keypoints", "objects"))
+ESTIMATED = tuple(name for name in METRICS if input_kind(name) in ("mask", "keypoints", "objects"))
 """Metrics that see a prediction through an estimator."""
 BY_MOTION = ("mask_iou", "boundary_f1", "keypoint_error")
 """Metrics of the table by motion, frame by frame."""
@@ -117,7 +117,7 @@ def calibrate(
     for case, video in reference_videos(episodes, record, truth, through_codec):
         values = estimators.grade(video, truth, tuple(METRICS)).values
         references += [key | {"case": case, "metric": name, "value": value} for name, value in values.items()]
-    for case, shown in wrong_videos(folder):
+    for case, shown in render_perturbations(folder):
         grades, true = estimators.grade(shown.rgb, truth, ESTIMATED), true_grades(shown, truth)
         pairs = {name: {"estimate": grades.values[name], "truth": true.values[name]} for name in ESTIMATED}
         wrong += [key | {"case": case, "metric": name} | pair for name, pair in pairs.items()]
@@ -132,10 +132,10 @@ def choose(episodes: Sequence[Episode], args: Args) -> list[Episode]:
     if unknown := [seed for seed in args.seeds if seed not in held]:
         raise ConfigError(f"{args.data} holds no seed {unknown[0]}; it has {', '.join(map(str, held[:20]))}: --seeds.")
     chosen = [episode for episode in episodes if not args.seeds or episode[1].seed in args.seeds]
-    return _mixed(chosen)[: args.episodes or None]
+    return _take_turns(chosen)[: args.episodes or None]
 
 
-def _mixed(episodes: Sequence[Episode]) -> list[Episode]:
+def _take_turns(episodes: Sequence[Episode]) -> list[Episode]:
     """Robots by turns, each beginning elsewhere, so that the first few are of many robots and tasks."""
     queues = []
     for index, robot in enumerate(dict.fromkeys(record.robot for _, record in episodes)):
@@ -155,13 +155,13 @@ def reference_videos(
     yield "frozen first frame", truth.rgb[np.zeros_like(frames)]
     yield f"truth {LATE} frames late", truth.rgb[np.maximum(frames - LATE, 0)]
     for differs in ("robot", "seed"):
-        folder = another(episodes, record, differs)
+        folder = find_another(episodes, record, differs)
         if folder is not None:
             video = read_video(folder / "rgb.mkv")
             yield f"another {differs}", video[np.minimum(frames, len(video) - 1)]
 
 
-def another(episodes: Sequence[Episode], record: Record, differs: str) -> Path | None:
+def find_another(episodes: Sequence[Episode], record: Record, differs: str) -> Path | None:
     """The next episode that differs in robot or seed alone, the first after the last; None where there is none."""
     same = ("task", "seed") if differs == "robot" else ("task", "robot")
     folders = {
@@ -190,13 +190,13 @@ def open_codec(run: Path, opener: str) -> Callable[[np.ndarray], np.ndarray]:
     return found(run)
 
 
-def true_grades(shown: WrongVideo, truth: Truth) -> Grades:
+def true_grades(shown: Perturbation, truth: Truth) -> Grades:
     """What the metrics of ESTIMATED say of a wrong video's true mask and true points."""
     values: dict[str, float] = {}
     curves: dict[str, np.ndarray] = {}
     points = {"keypoints": (shown.keypoints, truth.keypoint_visible), "objects": (shown.objects, truth.object_visible)}
     for name in ESTIMATED:
-        places, visible = points.get(compared(name), (shown.keypoints, truth.keypoint_visible))
+        places, visible = points.get(input_kind(name), (shown.keypoints, truth.keypoint_visible))
         known = Estimators(lambda *_: shown.mask, lambda *_, p=places, v=visible: p[:, v.any(axis=0)])
         grades = known.grade(shown.rgb, truth, (name,))
         values |= grades.values
@@ -268,8 +268,8 @@ def order_table(wrong: pd.DataFrame) -> pd.DataFrame:
         if len(own) < 3 or own["truth"].nunique() < 2:
             continue
         apart = TOLD_APART[METRICS[name].unit]
-        pairs = [kept for _, episode in own.groupby(["task", "seed", "robot"]) for kept in _kept(episode, apart)]
-        means = list(_kept(own.groupby("case")[["estimate", "truth"]].mean(), apart))
+        pairs = [kept for _, episode in own.groupby(["task", "seed", "robot"]) for kept in _keeps_order(episode, apart)]
+        means = list(_keeps_order(own.groupby("case")[["estimate", "truth"]].mean(), apart))
         rows[name] = {
             "Spearman, all videos": f"{spearmanr(own['estimate'], own['truth']).statistic:.3f}",
             "pairs of an episode's videos in order": f"{sum(pairs)} of {len(pairs)}",
@@ -278,7 +278,7 @@ def order_table(wrong: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def _kept(table: pd.DataFrame, apart: float) -> Iterator[bool]:
+def _keeps_order(table: pd.DataFrame, apart: float) -> Iterator[bool]:
     """For each two rows whose truths lie so far apart: does the estimate put them in the same order?"""
     for (_, a), (_, b) in combinations(table[["estimate", "truth"]].iterrows(), 2):
         if abs(a["truth"] - b["truth"]) >= apart:

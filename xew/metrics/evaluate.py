@@ -29,12 +29,12 @@ from xew.config import ConfigError, pick, suggestion, user_errors
 from xew.episode import EpisodeError, verify_episode
 from xew.metrics import METRICS
 from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, identity, open_masker, open_tracker
-from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, compared, grade
-from xew.metrics.grading.bundle import demand_none, differences, disagreements, read_bundle, write_bundle
-from xew.metrics.grading.jobs import BASELINES, Job, plan, prediction_of, shown_of
-from xew.metrics.grading.scores import CellStore, beside, check_out, describe, write_diagnostics, write_tables, write_whole
+from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, grade, input_kind
+from xew.metrics.grading.bundle import differences, disagreements, raise_if_any, read_bundle, write_bundle
+from xew.metrics.grading.jobs import BASELINES, Job, estimator_view, list_jobs, read_prediction
+from xew.metrics.grading.scores import CellStore, check_out, describe, path_beside, write_diagnostics, write_tables, write_whole
 from xew.metrics.grading.summary import summarize, to_markdown
-from xew.metrics.grading.workers import Bench, not_needed, opener, worker_count
+from xew.metrics.grading.workers import Bench, make_opener, open_nothing, worker_count
 from xew.metrics.truth import Truth, read_truth
 from xew.protocol import HELD_OUT_ROBOTS
 from xew.rollout import RolloutError
@@ -113,7 +113,7 @@ def main(args: Args) -> None:
     check_out(args.out)
     metrics = choose_metrics(args)
     attributes = describe(settings(args), metrics)
-    store = CellStore(beside(args.out, "cells"))
+    store = CellStore(path_beside(args.out, "cells"))
     errors: list[str] = []
     jobs = find_jobs(args, errors if args.keep_going else None)
     total = len(jobs) + len(errors)
@@ -122,9 +122,9 @@ def main(args: Args) -> None:
     cells = [job.cell for job in jobs]
     write_tables(args.out, attributes, cells, store)
     if diagnostics:
-        write_diagnostics(beside(args.out, "diagnostics.parquet"), attributes, diagnostics, cells, store)
+        write_diagnostics(path_beside(args.out, "diagnostics.parquet"), attributes, diagnostics, cells, store)
     rows = pd.read_parquet(args.out)
-    write_bundle(beside(args.out, "bundle.json"), args.out, rows, cells)
+    write_bundle(path_beside(args.out, "bundle.json"), args.out, rows, cells)
     print(_write_summary(args, rows))
     if errors:
         raise EpisodeError(f"{len(errors)} of {total} could not be graded:\n  " + "\n  ".join(errors))
@@ -135,10 +135,10 @@ def _write_summary(args: Args, rows: pd.DataFrame) -> str:
     if rows.empty:
         return "no scores"
     summary = summarize(rows, args.resample, HELD_OUT_ROBOTS)
-    write_whole(beside(args.out, "summary.md"), to_markdown(summary).encode())
-    write_whole(beside(args.out, "summary.csv"), summary.means.to_csv(index=False).encode())
-    write_whole(beside(args.out, "pairs.csv"), summary.pairs.to_csv(index=False).encode())
-    written = "\n".join(f"{beside(args.out, ending)}  {what}" for ending, what in WRITTEN.items())
+    write_whole(path_beside(args.out, "summary.md"), to_markdown(summary).encode())
+    write_whole(path_beside(args.out, "summary.csv"), summary.means.to_csv(index=False).encode())
+    write_whole(path_beside(args.out, "pairs.csv"), summary.pairs.to_csv(index=False).encode())
+    written = "\n".join(f"{path_beside(args.out, ending)}  {what}" for ending, what in WRITTEN.items())
     return f"{to_markdown(summary, with_pairs=False)}\n{written}"
 
 
@@ -180,18 +180,18 @@ def find_jobs(args: Args, problems: list[str] | None = None) -> list[Job]:
     if args.frame_zero == "predicted" and args.baselines:
         raise ConfigError("frame 0 of the frozen first frame is the truth: with --frame-zero predicted say --no-baselines.")
     baselines = tuple(BASELINES) if args.baselines else ()
-    return plan(args.rollouts, args.data, str(settings(args)), baselines, worker_count(args.workers), problems)
+    return list_jobs(args.rollouts, args.data, str(settings(args)), baselines, worker_count(args.workers), problems)
 
 
 def open_bench(args: Args, metrics: Sequence[str]) -> Bench:
     """A bench with the chosen estimators, as far as these metrics need them. Raises ConfigError if weights are missing."""
-    kinds = {compared(name) for name in metrics}
-    masker: Callable[[jax.Device], Masker] = not_needed
-    tracker: Callable[[jax.Device], Tracker] = not_needed
+    kinds = {input_kind(name) for name in metrics}
+    masker: Callable[[jax.Device], Masker] = open_nothing
+    tracker: Callable[[jax.Device], Tracker] = open_nothing
     if "mask" in kinds:
-        masker = opener(args.masks, MASKERS, open_masker, args.masks_checkpoint)
+        masker = make_opener(args.masks, MASKERS, open_masker, args.masks_checkpoint)
     if kinds & {"keypoints", "objects", "contact"}:
-        tracker = opener(args.tracks, TRACKERS, open_tracker, args.tracks_checkpoint)
+        tracker = make_opener(args.tracks, TRACKERS, open_tracker, args.tracks_checkpoint)
     return Bench(masker, tracker, itertools.cycle(jax.local_devices()))
 
 
@@ -230,7 +230,7 @@ def _grade_group(
         if stop.is_set():
             break
         try:
-            needed = {compared(name) for _, names in group for name in names}
+            needed = {input_kind(name) for _, names in group for name in names}
             truth = truth or read_truth(job.episode, job.cell.frames, needed)
             store.write(job.cell, _grade_job(job, truth, metrics, args, bench))
         except (EpisodeError, ValueError) as error:
@@ -242,10 +242,10 @@ def _grade_group(
 
 
 def _grade_job(job: Job, truth: Truth, metrics: tuple[str, ...], args: Args, bench: Bench) -> Grades:
-    prediction = prediction_of(job, truth, args.allow, args.frame_zero)
+    prediction = read_prediction(job, truth, args.allow, args.frame_zero)
     first = 0 if args.frame_zero == "predicted" else 1
     with jax.default_device(bench.device):
-        return grade(Comparison(prediction, truth, bench.masker, bench.tracker, first, shown_of(job, truth)), metrics)
+        return grade(Comparison(prediction, truth, bench.masker, bench.tracker, first, estimator_view(job, truth)), metrics)
 
 
 def check(args: Args, path: Path) -> None:
@@ -259,16 +259,16 @@ def check(args: Args, path: Path) -> None:
     if not args.rollouts:
         return
     jobs = find_jobs(args)
-    demand_none(path, differences(bundle, settings(args), [job.cell for job in jobs]))
+    raise_if_any(path, differences(bundle, settings(args), [job.cell for job in jobs]))
     print("made from these rollouts and this data, by their digests")
     picked = [jobs[i] for i in np.unique(np.linspace(0, len(jobs) - 1, args.regrade).astype(int))]
     metrics = tuple(name for name in bundle["metrics"] if name in METRICS)
     bench, found = open_bench(args, metrics), list[str]()
     for job in tqdm(picked, desc="grade anew", unit="video", disable=None):
         verify_episode(job.episode)
-        truth = read_truth(job.episode, job.cell.frames, {compared(name) for name in metrics})
+        truth = read_truth(job.episode, job.cell.frames, {input_kind(name) for name in metrics})
         found += disagreements(bundle, job.cell.key, _grade_job(job, truth, metrics, args, bench).values)
-    demand_none(path, found)
+    raise_if_any(path, found)
     if picked:
         print(f"{len(picked)} videos graded anew: the same scores")
 

@@ -15,7 +15,7 @@ from xew.metrics.backends import Masker, Tracker
 from xew.metrics.estimators.contact import predicted_contact
 from xew.metrics.metric import ACCELERATOR_CHUNK, Metric
 from xew.metrics.perceptual import SMALLEST_SIDE, union_box
-from xew.metrics.truth import Truth, inside
+from xew.metrics.truth import Truth, is_inside
 
 FRAME_BLOCK = 16
 """On a CPU; on a GPU as many frames as it takes at once."""
@@ -38,7 +38,7 @@ class Grades:
     """How many graded frames equal the truth in every byte (their PSNR is the cap's)."""
 
 
-def compared(name: str) -> str:
+def input_kind(name: str) -> str:
     """What a metric or a diagnostic compares, a key of `truth.NEEDS`."""
     if name in DIAGNOSTICS:
         return "contact"
@@ -69,11 +69,11 @@ class Comparison:
 
 def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
     """Scores of one predicted video by the metrics and diagnostics of these names."""
-    inputs = {kind: INPUTS[kind](comparison) for kind in sorted({compared(name) for name in metrics})}
+    inputs = {kind: INPUTS[kind](comparison) for kind in sorted({input_kind(name) for name in metrics})}
     values: dict[str, float] = {}
     curves: dict[str, np.ndarray] = {}
     for name in metrics:
-        arrays = inputs[compared(name)]
+        arrays = inputs[input_kind(name)]
         if arrays is None:
             values[name] = float("nan")
         elif name in DIAGNOSTICS:
@@ -83,7 +83,7 @@ def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
             curves |= {} if curve is None else {name: curve}
         else:
             whole = OF_WHOLE_FRAMES.get(name)
-            known = curves.get(whole) if whole and _spans(arrays[-1][0]) else None
+            known = curves.get(whole) if whole and _touches_all_borders(arrays[-1][0]) else None
             curves[name] = _curve(name, arrays) if known is None else known
             values[name] = float(np.mean(curves[name], dtype=np.float64))
     prediction, target = _video(comparison)
@@ -125,7 +125,7 @@ def _contact(c: Comparison) -> Arrays | None:
     """
     arms, objects = np.nonzero(np.any(c.truth.contact, axis=0))
     points = np.concatenate([c.truth.hands, c.truth.objects], axis=1)
-    within = inside(points, c.truth.rgb.shape)
+    within = is_inside(points, c.truth.rgb.shape)
     if not within[:, 2 + objects].any():
         return None
     true = np.where(within[..., None], points, np.nan)
@@ -156,7 +156,7 @@ def _tracks(c: Comparison, points: np.ndarray, visible: np.ndarray) -> Arrays | 
     return found[c.first :].astype(np.float32), points[c.first :], visible[c.first :]
 
 
-def _spans(mask: np.ndarray) -> bool:
+def _touches_all_borders(mask: np.ndarray) -> bool:
     """Does the bounding box of a mask [h w] touch all four borders of the image?"""
     return bool(mask[[0, -1]].any(axis=1).all() and mask[:, [0, -1]].any(axis=0).all())
 

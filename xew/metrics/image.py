@@ -114,13 +114,13 @@ def _frame_ssim(x: jax.Array, y: jax.Array) -> jax.Array:
     sum_x, sum_y = sum_x + n * offset, sum_y + n * offset
     # Of equal frames both ratios are of equal integers, treated alike: what lacks of 1 is exactly 0.
     samples = n * (n - 1)
-    numerator = _stabilized(2 * sum_x * sum_y, n * n, SSIM_C1) * _stabilized(2 * shared, samples, SSIM_C2)
-    denominator = _stabilized(sum_x * sum_x + sum_y * sum_y, n * n, SSIM_C1) * _stabilized(spread, samples, SSIM_C2)
+    numerator = _stabilize(2 * sum_x * sum_y, n * n, SSIM_C1) * _stabilize(2 * shared, samples, SSIM_C2)
+    denominator = _stabilize(sum_x * sum_x + sum_y * sum_y, n * n, SSIM_C1) * _stabilize(spread, samples, SSIM_C2)
     # One axis at a time: a single running float32 sum over 200,000 windows would lose the last three digits.
     return 1 - jnp.mean(jnp.mean(1 - numerator / denominator, axis=0))
 
 
-def _stabilized(total: jax.Array, size: int, constant: float) -> jax.Array:
+def _stabilize(total: jax.Array, size: int, constant: float) -> jax.Array:
     return total.astype(jnp.float32) / size + constant
 
 

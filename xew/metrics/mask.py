@@ -32,7 +32,7 @@ def mask_iou(prediction: Masks, target: Masks) -> ByFrame:
     Returns:
         [t] float32; 1 where both masks are empty, 0 where one is.
     """
-    p, t = _packed(prediction), _packed(target)
+    p, t = _pack(prediction), _pack(target)
     return _iou(p, t, p & t)
 
 
@@ -55,19 +55,19 @@ def boundary_f1(prediction: Masks, target: Masks, tolerance: int | float = 2) ->
         ValueError: shapes differ, or the tolerance is negative.
         TypeError: a mask is not bool.
     """
-    p, t = _packed(prediction), _packed(target)
+    p, t = _pack(prediction), _pack(target)
     return _f1(p, t, np.shape(target)[1], _disc(tolerance))
 
 
 @check_first(check_masks)
 def mask_scores(prediction: Masks, target: Masks, tolerance: int | float = 2) -> tuple[ByFrame, ByFrame]:
     """`mask_iou` and `boundary_f1`, [t] float32 each, of the same masks [t h w] bool, each of which is packed once."""
-    p, t = _packed(prediction), _packed(target)
+    p, t = _pack(prediction), _pack(target)
     return _iou(p, t, p & t), _f1(p, t, np.shape(target)[1], _disc(tolerance))
 
 
 @jax.jit
-def _packed(mask: jax.Array) -> jax.Array:
+def _pack(mask: jax.Array) -> jax.Array:
     """[t h w] bool to [t bytes w] uint8: pixel (x, y) is bit y % 8 of byte (x, y // 8); no pixel is beyond the height."""
     t, height, width = mask.shape
     rows = jnp.pad(mask, ((0, 0), (0, -height % BYTE), (0, 0))).reshape(t, -1, BYTE, width)
@@ -84,7 +84,7 @@ def _iou(p: jax.Array, t: jax.Array, both: jax.Array) -> jax.Array:
 
 def _f1(p: jax.Array, t: jax.Array, height: int, disc: tuple[int, ...]) -> jax.Array:
     edges = _inner_edges(p, t, height=height)
-    return _f1_of_pixels(*edges, *_matched(*edges, disc=disc), p ^ t)
+    return _f1_of_pixels(*edges, *_match(*edges, disc=disc), p ^ t)
 
 
 @jax.jit
@@ -108,13 +108,13 @@ def _count(packed: jax.Array) -> jax.Array:
 def _inner_edges(*masks: jax.Array, height: int) -> list[jax.Array]:
     """Pixels of packed masks with an 8-neighbor outside. Beyond the image there is no outside."""
     image = np.packbits(np.arange(masks[0].shape[1] * BYTE) < height, bitorder="little")[:, None]
-    return [mask & _grown(~mask & image, SQUARE) for mask in masks]
+    return [mask & _grow(~mask & image, SQUARE) for mask in masks]
 
 
 @functools.partial(jax.jit, static_argnames="disc")
-def _matched(edge_p: jax.Array, edge_t: jax.Array, disc: tuple[int, ...]) -> list[jax.Array]:
+def _match(edge_p: jax.Array, edge_t: jax.Array, disc: tuple[int, ...]) -> list[jax.Array]:
     """The pixels of each edge that lie within the disc of a pixel of the other."""
-    return [edge_p & _grown(edge_t, disc), edge_t & _grown(edge_p, disc)]
+    return [edge_p & _grow(edge_t, disc), edge_t & _grow(edge_p, disc)]
 
 
 def _disc(radius: int | float) -> tuple[int, ...]:
@@ -124,22 +124,22 @@ def _disc(radius: int | float) -> tuple[int, ...]:
     return tuple(math.isqrt(math.floor(radius * radius) - x * x) for x in range(math.floor(radius) + 1))
 
 
-def _grown(packed: jax.Array, half_heights: tuple[int, ...]) -> jax.Array:
+def _grow(packed: jax.Array, half_heights: tuple[int, ...]) -> jax.Array:
     """The union of a packed mask's shifts over a shape whose columns, at distances 0, 1, ..., have these half heights."""
     count, width = packed.shape[1:]
     reach, border = len(half_heights) - 1, half_heights[0] // BYTE + 1
     padded = jnp.pad(packed, ((0, 0), (border, border), (reach, reach)))
 
-    def lifted(y: int) -> jax.Array:
+    def lift(y: int) -> jax.Array:
         """The mask y pixels up (or down, where y is negative)."""
         step, bits = divmod(y, BYTE)
         low, high = (padded[:, border + step + i : border + step + i + count] for i in (0, 1))
         return low if bits == 0 else (low >> bits) | (high << (BYTE - bits))
 
-    grown, column, reached = jnp.zeros_like(packed), lifted(0), 0
+    grown, column, reached = jnp.zeros_like(packed), lift(0), 0
     for x in reversed(range(reach + 1)):  # from the shape's lowest column, at its rim, to its highest
         for y in range(reached + 1, half_heights[x] + 1):
-            column = column | lifted(y) | lifted(-y)
+            column = column | lift(y) | lift(-y)
         reached = half_heights[x]
         grown = grown | column[:, :, reach - x : reach - x + width] | column[:, :, reach + x : reach + x + width]
     return grown

@@ -66,7 +66,7 @@ def lpips(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFr
         ValueError: shapes differ or a side is under 31 pixels.
         FileNotFoundError: the weights are not installed.
     """
-    return _box_distance(_weights(), prediction, target, _whole(target), chunk)
+    return _box_distance(_weights(), prediction, target, _whole_box(target), chunk)
 
 
 def check_region(prediction: Any, target: Any, target_mask: Any) -> None:
@@ -128,7 +128,7 @@ def lpips_features(target: Video, target_mask: Masks | None = None, *, chunk: in
         ValueError: as in `lpips` and `region_lpips`.
         FileNotFoundError: the weights are not installed.
     """
-    box = _whole(target) if target_mask is None else _mask_box(target_mask)
+    box = _whole_box(target) if target_mask is None else _mask_box(target_mask)
     return Features(_box_features(_weights(), target, box, chunk), box, np.shape(target))
 
 
@@ -168,7 +168,7 @@ def union_box(mask: Masks) -> Box:
     return top, left, height, width
 
 
-def _whole(video: AnyArray) -> Box:
+def _whole_box(video: AnyArray) -> Box:
     height, width = np.shape(video)[1:3]
     return jnp.int32(0), jnp.int32(0), jnp.int32(height), jnp.int32(width)
 

@@ -112,14 +112,14 @@ def contact_f1(prediction: Contacts, target: Contacts, tolerance: int = 0) -> Sc
         Scalar float32 in [0, 1]; 1 where neither has any contact, 0 where one has none.
     """
     counts = jnp.sum(prediction), jnp.sum(target)
-    hits = jnp.sum(prediction & _widened(target, tolerance)), jnp.sum(target & _widened(prediction, tolerance))
+    hits = jnp.sum(prediction & _widen(target, tolerance)), jnp.sum(target & _widen(prediction, tolerance))
     precision, recall = (hit / jnp.maximum(count, 1) for hit, count in zip(hits, counts, strict=True))
     total = precision + recall
     score = jnp.where(total > 0, 2 * precision * recall / jnp.where(total > 0, total, 1), 0)
     return jnp.where(counts[0] + counts[1] > 0, score, 1).astype(jnp.float32)
 
 
-def _widened(contact: AnyArray, frames: int) -> jax.Array:
+def _widen(contact: AnyArray, frames: int) -> jax.Array:
     """[t c] true within so many frames of a true one."""
     shifted = jnp.pad(contact, ((frames, frames), (0, 0)))
     return functools.reduce(jnp.logical_or, (shifted[i : i + len(contact)] for i in range(2 * frames + 1)))
@@ -155,21 +155,21 @@ def hits(prediction: Tracks, target: Tracks, valid: Valid, alpha: float | jax.Ar
 @check_first(check_tracks)
 def presence(prediction: Tracks, target: Tracks, valid: Valid) -> tuple[PointValues, Valid]:
     """What `coverage` of tracks [t k 2] is the mean of: [t k] float32, 1 where one was found, and [t k] bool, which count."""
-    return _found(prediction).astype(jnp.float32), valid
+    return _is_found(prediction).astype(jnp.float32), valid
 
 
 @jax.jit
 @check_first(check_tracks)
 def distances(prediction: Tracks, target: Tracks, valid: Valid) -> tuple[PointValues, Valid]:
     """What errors of tracks [t k 2] are means of: [t k] float32 pixels, infinite where lost, and [t k] bool, which count."""
-    return _distance(prediction, target), valid & _found(prediction)
+    return _distance(prediction, target), valid & _is_found(prediction)
 
 
 @jax.jit
 @check_first(check_tracks)
 def warpings(prediction: Tracks, target: Tracks, valid: Valid) -> tuple[Float32[jax.Array, " k"], Bool[jax.Array, " k"]]:
     """What `ndtw` of tracks [t k 2] is the mean of: [k] float32, and [k] bool, which count."""
-    tracked = valid & _found(prediction)
+    tracked = valid & _is_found(prediction)
     diagonal = jnp.broadcast_to(box_diagonal(target, valid)[:, None], valid.shape)
     scale = _masked_mean(diagonal, tracked, axis=0)
     length = jnp.sum(tracked, axis=0)
@@ -220,11 +220,11 @@ def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray) -> jax
 
 def _distance(prediction: AnyArray, target: AnyArray) -> jax.Array:
     """[t k] Euclidean distance; infinite where the prediction has no point."""
-    found = _found(prediction)
+    found = _is_found(prediction)
     return jnp.where(found, _norm(jnp.where(found[..., None], prediction, target) - target), jnp.inf)
 
 
-def _found(points: AnyArray) -> jax.Array:
+def _is_found(points: AnyArray) -> jax.Array:
     return jnp.all(jnp.isfinite(points), axis=-1)
 
 

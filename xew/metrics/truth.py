@@ -46,7 +46,7 @@ class Truth:
     objects: np.ndarray
     """[t o 2] float32 pixels, origins of the objects' recorded poses, projected; NaN behind the camera."""
     object_visible: np.ndarray
-    """[t o] bool: in the image, not behind the robot, and, where the object rests, not behind another (`_changed_at_rest`).
+    """[t o] bool: in the image, not behind the robot, and, where the object rests, not behind another (`_has_changed_at_rest`).
     A moving object that is behind another counts as visible: episodes hold no depth."""
     hands: np.ndarray
     """[t 2 2] float32 pixels, the tool frames of the left and right arm, projected; NaN behind the camera."""
@@ -80,19 +80,19 @@ def read_truth(folder: Path, frames: int, compared: Collection[str]) -> Truth:
         keypoints=states.keypoints[:frames],
         keypoint_visible=states.keypoint_visible[:frames],
         objects=objects[:frames],
-        object_visible=_visible(objects, rgb, states.robot_mask)[:frames],
+        object_visible=_find_visible(objects, rgb, states.robot_mask)[:frames],
         hands=hands[:frames],
         contact=states.contact[:frames],
     )
 
 
-def _visible(points: np.ndarray, rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def _find_visible(points: np.ndarray, rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """[t o] bool, as `Truth.object_visible` says."""
-    free = inside(points, rgb.shape) & ~_covered(points, mask)
-    return free & ~_changed_at_rest(points, free, rgb)
+    free = is_inside(points, rgb.shape) & ~_is_covered(points, mask)
+    return free & ~_has_changed_at_rest(points, free, rgb)
 
 
-def _changed_at_rest(points: np.ndarray, free: np.ndarray, rgb: np.ndarray) -> np.ndarray:
+def _has_changed_at_rest(points: np.ndarray, free: np.ndarray, rgb: np.ndarray) -> np.ndarray:
     """[t o] bool: the object is where it was when it was first free, and its place has another color since.
 
     So is what a robot puts on something, a cup on its coaster, told from the coaster.
@@ -109,13 +109,13 @@ def _changed_at_rest(points: np.ndarray, free: np.ndarray, rgb: np.ndarray) -> n
     return at_rest & changed & free.any(axis=0)
 
 
-def inside(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def is_inside(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """[t n] bool, is each point [t n 2] in a pixel of a video of this shape [t h w 3]."""
     x, y = np.moveaxis(_pixels(points), -1, 0)
     return (x >= 0) & (x < shape[2]) & (y >= 0) & (y < shape[1])
 
 
-def _covered(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def _is_covered(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """[t n] bool, does the pixel of each point [t n 2] belong to the mask [t h w]; of points outside, the nearest pixel."""
     x, y = np.moveaxis(_pixels(points), -1, 0)
     frames, height, width = mask.shape

@@ -7,7 +7,7 @@ import pytest
 from tests.synthetic import write_cell
 from xew.episode import States, read_states, read_video
 from xew.metrics import coverage, keypoint_error, pck
-from xew.metrics.estimators.alike import most_alike
+from xew.metrics.estimators.similarity import find_most_similar
 from xew.metrics.estimators.tracks import estimate_tracks, likeness
 
 FRAMES = 13
@@ -112,11 +112,11 @@ def test_the_moment_that_a_frame_shows(episode: Episode) -> None:
     video, _ = episode
     moving = np.flatnonzero((video[1:] != video[:-1]).any(axis=(1, 2, 3))) + 1
     shown = SHOWN["three frames late"]
-    found, difference = most_alike(video[shown], video)
+    found, difference = find_most_similar(video[shown], video)
     np.testing.assert_array_equal(video[found], video[shown])
     assert len(moving) > 3 and difference.max() < 0.01
     still = np.repeat(video[:1], FRAMES, axis=0)
-    np.testing.assert_array_equal(most_alike(still, still)[0], np.arange(FRAMES))
+    np.testing.assert_array_equal(find_most_similar(still, still)[0], np.arange(FRAMES))
 
 
 def test_patches_are_compared_as_far_as_both_are_in_the_image(episode: Episode) -> None:

@@ -136,7 +136,7 @@ import threading, time
 from pathlib import Path
 import jax
 from xew.metrics.backends import Backend
-from xew.metrics.grading.workers import opener
+from xew.metrics.grading.workers import make_opener
 
 opened, busy, overlaps = [], set(), []
 
@@ -151,7 +151,7 @@ def open_network(name, checkpoint):
         return number
     return call
 
-network = opener("mine", {"mine": Backend(open_network, "weights", "")}, open_network, Path("x"))
+network = make_opener("mine", {"mine": Backend(open_network, "weights", "")}, open_network, Path("x"))
 found = []
 
 def work(device):

@@ -1,3 +1,3 @@
-"""Videos that are wrong in a known way, to measure estimators and metrics by."""
+"""Perturbations: videos that are wrong in a known way, to measure estimators and metrics by."""
 
-__all__ = ["wrong"]
+__all__ = ["perturbations"]

@@ -3,4 +3,4 @@
 Two estimators need no weights; the others open local checkpoints of other projects.
 """
 
-__all__ = ["adapters", "alike", "contact", "cotracker", "flow", "masks", "sam2", "tapir", "tracks"]
+__all__ = ["adapters", "contact", "cotracker", "flow", "masks", "sam2", "similarity", "tapir", "tracks"]

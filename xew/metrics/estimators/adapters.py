@@ -85,7 +85,7 @@ def query_frames(visible: np.ndarray) -> np.ndarray:
     return np.where(visible.any(axis=0), frames, -1)
 
 
-def lost(shape: tuple[int, ...]) -> np.ndarray:
+def lost_tracks(shape: tuple[int, ...]) -> np.ndarray:
     """Tracks [t k 2] float32 of which nothing is known: NaN."""
     return np.full((*shape, 2), np.nan, np.float32)
 

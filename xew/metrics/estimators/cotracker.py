@@ -19,7 +19,7 @@ from xew.metrics.estimators.adapters import (
     check_tracks,
     import_package,
     import_torch,
-    lost,
+    lost_tracks,
     query_frames,
     read_state_dict,
     torch_device,
@@ -56,7 +56,7 @@ class CoTracker:
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
         check_tracks(prediction, points, visible)
-        tracks = lost(visible.shape)
+        tracks = lost_tracks(visible.shape)
         frames = query_frames(visible)
         asked = np.flatnonzero(frames >= 0)
         if len(asked) == 0:

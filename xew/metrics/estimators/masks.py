@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from xew.metrics.estimators.alike import most_alike
+from xew.metrics.estimators.similarity import find_most_similar
 
 COLOR_BINS = 24
 """Per channel of Lab."""
@@ -73,7 +73,7 @@ def estimate_masks(
         [t h w] bool.
     """
     appearance = appearance or learn_appearance(target, target_mask)
-    alike, _ = most_alike(prediction, target)
+    alike, _ = find_most_similar(prediction, target)
     masks: list[np.ndarray] = []
     for t, frame in enumerate(prediction):
         # The mask of the frame itself comes first: where both explain a pixel equally well, it is the one that counts.
@@ -111,9 +111,9 @@ Reference = tuple[np.ndarray, np.ndarray]
 def _estimate_frame(
     appearance: Appearance, frame: np.ndarray, references: list[Reference], before: Reference | None
 ) -> np.ndarray:
-    gate, shape = functools.reduce(_better, (_carried_shape(frame, *reference) for reference in references))
+    gate, shape = functools.reduce(_choose_better, (_carry_shape(frame, *reference) for reference in references))
     if before is not None:
-        gate, shape = _filled_up((gate, shape), _carried_shape(frame, *before))
+        gate, shape = _fill_up((gate, shape), _carry_shape(frame, *before))
     looks = (1 - SHAPE_TRUST * gate) * _looks(appearance, frame)
     return _drop_specks(cv2.medianBlur((looks + SHAPE_WEIGHT * gate * shape > 0).astype(np.uint8), 3))
 
@@ -131,13 +131,13 @@ Shape = tuple[np.ndarray, np.ndarray]
 """How well flow explains each pixel, [h w] 0 to 1, and how surely the mask it carries is there, [h w] -1 to 1."""
 
 
-def _better(a: Shape, b: Shape) -> Shape:
+def _choose_better(a: Shape, b: Shape) -> Shape:
     """At each pixel the shape whose flow explains it better."""
     take = b[0] > a[0]
     return np.where(take, b[0], a[0]), np.where(take, b[1], a[1])
 
 
-def _filled_up(true: Shape, before: Shape) -> Shape:
+def _fill_up(true: Shape, before: Shape) -> Shape:
     """What true frames leave unexplained, by the predicted frame before: things that the true robot hides are in no true frame.
 
     It has a say only as far as it explains a pixel better, so that its errors do not live on where a true frame knows.
@@ -155,7 +155,7 @@ def _drop_specks(mask: np.ndarray) -> np.ndarray:
     return large[pieces]
 
 
-def _carried_shape(frame: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> Shape:
+def _carry_shape(frame: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> Shape:
     """A true frame's mask carried onto a predicted frame by flow."""
     gray, gray_target = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame, target))
     there, back = _flow(gray, gray_target), _flow(gray_target, gray)

@@ -108,7 +108,7 @@ def _open_authors(checkpoint: Path, side: int) -> Sam2:
         # It reads nothing but mp4 and JPEG, so our frames go in where its reader's would. Its progress bar stays quiet.
         ours = {"load_video_frames": lambda **_: (frames, *mask.shape), "tqdm": lambda order, **_: order}
         with _autocast():
-            with _replaced(module, ours):
+            with _replace_names(module, ours):
                 session = predictor.init_state(video_path="")
                 predictor.add_new_mask(session, frame_idx=start, obj_id=ROBOT, mask=mask)
                 order = predictor.propagate_in_video(session, start_frame_idx=start, reverse=backwards)
@@ -133,7 +133,7 @@ def _config_name(state: Mapping[str, Any], checkpoint: Path) -> str:
 
 
 @contextlib.contextmanager
-def _replaced(module: Any, names: Mapping[str, Any]) -> Iterator[None]:
+def _replace_names(module: Any, names: Mapping[str, Any]) -> Iterator[None]:
     """The module's names hold other things for a while, for one thread at a time."""
     with REPLACING:
         before = {name: getattr(module, name) for name in names}

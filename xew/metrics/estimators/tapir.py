@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from xew.config import ConfigError
-from xew.metrics.estimators.adapters import check_tracks, import_package, lost, query_frames
+from xew.metrics.estimators.adapters import check_tracks, import_package, lost_tracks, query_frames
 from xew.metrics.networks.pickles import read_arrays
 
 SIDE = 256
@@ -59,7 +59,7 @@ class Tapir:
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
         check_tracks(prediction, points, visible)
-        tracks = lost(visible.shape)
+        tracks = lost_tracks(visible.shape)
         frames = query_frames(visible)
         asked = np.flatnonzero(frames >= 0)
         if len(asked) == 0:

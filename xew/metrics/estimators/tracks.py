@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from xew.metrics.estimators.alike import most_alike
+from xew.metrics.estimators.similarity import find_most_similar
 
 PATCH = 12
 """Half the side of the patch round a point [pixels]."""
@@ -84,7 +84,7 @@ def estimate_tracks(prediction: np.ndarray, target: np.ndarray, points: np.ndarr
     if points.shape[1] == 0:
         return points
     grays, true_grays = (np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in v]) for v in (prediction, target))
-    alike, difference = most_alike(prediction, target)
+    alike, difference = find_most_similar(prediction, target)
     truth = [_TrueFrame(_soften(frame), *rest) for frame, *rest in zip(target, true_grays, points, visible, strict=True)]
     paths = _Paths()
     carried = np.repeat(points[0][:, None], 3 + PEAKS, axis=1)
@@ -143,14 +143,14 @@ def _improve(
     near = np.linalg.norm(fitted - start, axis=-1) < REFINEMENT
     fitted = np.where(near[:, None], fitted, start)
     like = likeness(frame, fitted, source.soft, source.points[point])
-    possible = _inside(fitted, frame) & ~_stands_there(frame, fitted, source.soft, source.points[point], like)
+    possible = _inside(fitted, frame) & ~_is_in_true_frame(frame, fitted, source.soft, source.points[point], like)
     price = np.where(possible, np.clip(1 - like, 0, 1), GIVEN_UP)
     better = price < cost[point, column]
     place[point[better], column[better]] = fitted[better]
     cost[point[better], column[better]] = price[better]
 
 
-def _stands_there(
+def _is_in_true_frame(
     frame: np.ndarray, places: np.ndarray, true_frame: np.ndarray, points: np.ndarray, like: np.ndarray
 ) -> np.ndarray:
     """[n] is what a frame shows far from the true point there in the true frame too? Then it is no point that came there."""
@@ -221,7 +221,7 @@ def _search(frame: np.ndarray, true_frame: np.ndarray, points: np.ndarray) -> np
     """[n PEAKS 2] the places within REACH that look most like the true frame's points [n 2]; NaN where there are fewer."""
     half, reach = PATCH // 2, REACH // 2
     margin = half + reach
-    small, true_small = (_halved(image, margin) for image in (frame, true_frame))
+    small, true_small = (_halve(image, margin) for image in (frame, true_frame))
     variance = _local_variance(small, 2 * half + 1)
     found = np.full((len(points), PEAKS, 2), np.nan, np.float32)
     for i, point in enumerate(points):
@@ -252,7 +252,7 @@ def _soften(image: np.ndarray) -> np.ndarray:
     return cv2.GaussianBlur(image, (0, 0), SOFTNESS)
 
 
-def _halved(image: np.ndarray, margin: int) -> np.ndarray:
+def _halve(image: np.ndarray, margin: int) -> np.ndarray:
     small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     return cv2.copyMakeBorder(small, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
 

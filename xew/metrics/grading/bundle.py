@@ -117,7 +117,7 @@ def disagreements(bundle: Bundle, key: tuple[Any, ...], values: dict[str, float]
     return found
 
 
-def demand_none(path: Path, found: Sequence[str]) -> None:
+def raise_if_any(path: Path, found: Sequence[str]) -> None:
     """Raise ConfigError that names the first few differences, if there are any."""
     if found:
         more = f"\n  and {len(found) - SHOWN} more" if len(found) > SHOWN else ""

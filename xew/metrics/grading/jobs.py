@@ -43,7 +43,7 @@ class Job:
         return self.rollout.folder if self.rollout else self.episode
 
 
-def plan(
+def list_jobs(
     rollouts: Sequence[Path],
     data: Path,
     settings: str,
@@ -78,7 +78,7 @@ def plan(
     results = tqdm(in_order(try_jobs, found, workers), total=len(found), desc="read", unit="video", disable=None, leave=False)
     for result in results:
         if isinstance(result, EpisodeError):
-            _tell(problems, str(result))
+            _raise_or_note(problems, str(result))
         else:
             jobs |= {job.cell: job for job in result}
     _check_horizons(jobs.values())
@@ -140,9 +140,9 @@ def _unique(roots: Sequence[Path], problems: list[str] | None) -> list[Rollout]:
     for rollout in (rollout for root in roots for rollout in find_rollouts(root, problems)):
         first = seen.setdefault((rollout.model, rollout.condition, rollout.task, rollout.seed, rollout.robot), rollout)
         if rollout.model in BASELINES:
-            _tell(problems, f"{rollout.folder}: the name {rollout.model} is a baseline's; give the model another.")
+            _raise_or_note(problems, f"{rollout.folder}: the name {rollout.model} is a baseline's; give the model another.")
         elif first is not rollout:
-            _tell(
+            _raise_or_note(
                 problems,
                 f"{first.folder} and {rollout.folder} are both model {rollout.model!r}, condition {rollout.condition!r}; "
                 "give them different names in rollout.json.",
@@ -150,14 +150,14 @@ def _unique(roots: Sequence[Path], problems: list[str] | None) -> list[Rollout]:
     return [rollout for rollout in seen.values() if rollout.model not in BASELINES]
 
 
-def _tell(problems: list[str] | None, message: str) -> None:
+def _raise_or_note(problems: list[str] | None, message: str) -> None:
     """Raise RolloutError, or add to the problems where there is a list of them."""
     if problems is None:
         raise RolloutError(message)
     problems.append(message)
 
 
-def prediction_of(job: Job, truth: Truth, allow: Collection[str] = (), frame_zero: str = "given") -> np.ndarray:
+def read_prediction(job: Job, truth: Truth, allow: Collection[str] = (), frame_zero: str = "given") -> np.ndarray:
     """The video to grade, of the truth's shape.
 
     Args:
@@ -187,7 +187,7 @@ def prediction_of(job: Job, truth: Truth, allow: Collection[str] = (), frame_zer
     return video
 
 
-def shown_of(job: Job, truth: Truth) -> np.ndarray | None:
+def estimator_view(job: Job, truth: Truth) -> np.ndarray | None:
     """What estimators see in place of a job's video: the true video softened, whose masks and points are still known."""
     if job.rollout is not None or job.cell.model != "ground_truth":
         return None

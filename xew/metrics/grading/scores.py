@@ -102,8 +102,8 @@ class CellStore:
         content = {name: getattr(cell, name) for name in KEY} | {
             "content": cell.content,
             "exact_frames": grades.exact_frames,
-            "values": {name: _finite(value) for name, value in values.items()},
-            "curves": {name: [_finite(value) for value in curve.tolist()] for name, curve in curves.items()},
+            "values": {name: _finite_or_none(value) for name, value in values.items()},
+            "curves": {name: [_finite_or_none(value) for value in curve.tolist()] for name, curve in curves.items()},
         }
         write_whole(self._path(cell), json.dumps(content).encode())
 
@@ -118,7 +118,7 @@ def check_out(path: Path) -> None:
         raise ConfigError(f"--out is {path}, expected a name that ends in .parquet.")
 
 
-def beside(path: Path, ending: str) -> Path:
+def path_beside(path: Path, ending: str) -> Path:
     """The name of what lies beside a score table, such as scores.curves.parquet."""
     return path.with_suffix(f".{ending}")
 
@@ -131,7 +131,7 @@ def write_tables(path: Path, attributes: dict[str, Any], cells: Sequence[Cell], 
     """
     metrics = list(attributes["metrics"])
     # The curves first: what is in the table always has its curves.
-    _write_table(beside(path, "curves.parquet"), CURVES, _curve_table, attributes, metrics, cells, store)
+    _write_table(path_beside(path, "curves.parquet"), CURVES, _curve_table, attributes, metrics, cells, store)
     _write_table(path, ROWS, _row_table, attributes, metrics, cells, store)
 
 
@@ -160,7 +160,7 @@ def _write_table(
 def _row_table(cell: Cell, grades: Grades, metrics: Sequence[str]) -> pa.Table:
     names = [name for name in metrics if math.isfinite(grades.values[name])]
     count = len(names)
-    columns = [*_repeated(cell, count), pa.array(names, pa.string()), pa.array([grades.values[name] for name in names])]
+    columns = [*_repeat_key(cell, count), pa.array(names, pa.string()), pa.array([grades.values[name] for name in names])]
     columns += [pa.repeat(pa.scalar(number, pa.int64()), count) for number in (cell.frames, grades.exact_frames)]
     return pa.table([*columns, pa.repeat(cell.content, count)], names=ROWS.names).cast(ROWS)
 
@@ -172,12 +172,12 @@ def _curve_table(cell: Cell, grades: Grades, metrics: Sequence[str]) -> pa.Table
         frames = np.arange(cell.frames - len(curve), cell.frames)
         finite = np.isfinite(curve)
         count = int(finite.sum())
-        columns = [*_repeated(cell, count), pa.repeat(name, count), pa.array(frames[finite]), pa.array(curve[finite])]
+        columns = [*_repeat_key(cell, count), pa.repeat(name, count), pa.array(frames[finite]), pa.array(curve[finite])]
         tables.append(pa.table(columns, names=CURVES.names).cast(CURVES))
     return pa.concat_tables(tables) if tables else CURVES.empty_table()
 
 
-def _repeated(cell: Cell, count: int) -> list[pa.Array]:
+def _repeat_key(cell: Cell, count: int) -> list[pa.Array]:
     return [pa.repeat(pa.scalar(getattr(cell, name), kind), count) for name, kind in _KEY_FIELDS[: len(KEY)]]
 
 
@@ -222,5 +222,5 @@ def describe(settings: dict[str, Any], metrics: tuple[str, ...]) -> dict[str, An
     return settings | {"metrics": described, "versions": {"xew": xew.__version__, "jax": jax.__version__}}
 
 
-def _finite(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None

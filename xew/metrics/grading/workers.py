@@ -1,4 +1,4 @@
-"""Metrics, many videos at once: worker threads, what each has for itself, and how far they run ahead.
+"""Many videos at once: worker threads, what each has for itself, and how far they run ahead.
 
 Threads and not processes: decoding, OpenCV and XLA let go of Python's lock, and compiled programs are shared.
 """
@@ -17,7 +17,7 @@ from xew.metrics.backends import Masker, Tracker
 from xew.metrics.estimators.adapters import use_torch_device
 
 MOST_WORKERS = 32
-"""A worker holds an episode and a prediction, a quarter of a gigabyte at full length."""
+"""Largest number of workers: each holds an episode and a prediction, a quarter of a gigabyte at full length."""
 
 
 def worker_count(asked: int) -> int:
@@ -41,14 +41,19 @@ class Bench(threading.local):
         self.masker, self.tracker = masker(self.device), tracker(self.device)
 
 
-def not_needed(_: jax.Device) -> Any:
-    """In place of an estimator that no metric asks."""
+def open_nothing(_: jax.Device) -> Any:
+    """Stand in for an estimator that no metric needs."""
+
+    def refuse(*arrays: np.ndarray) -> np.ndarray:
+        raise AssertionError("no metric needs this estimator, so none was opened")
+
+    return refuse
 
 
 E = TypeVar("E", bound=Callable[..., np.ndarray])
 
 
-def opener(
+def make_opener(
     name: str, registry: Any, open_: Callable[[str, Path | None], E], checkpoint: Path | None
 ) -> Callable[[jax.Device], E]:
     """How a thread on a device comes by an estimator: its own, or, of one with weights, the device's, used in turn."""
@@ -60,13 +65,13 @@ def opener(
     def of_device(device: jax.Device) -> E:
         with opening, jax.default_device(device):
             if device not in opened:
-                opened[device] = in_turn(open_(name, checkpoint))
+                opened[device] = serialize_calls(open_(name, checkpoint))
             return opened[device]
 
     return of_device
 
 
-def in_turn(estimator: E) -> E:
+def serialize_calls(estimator: E) -> E:
     """The same estimator for one thread at a time; estimators keep notes of the episode at hand."""
     turn = threading.Lock()
 

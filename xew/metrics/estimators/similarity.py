@@ -14,7 +14,7 @@ ROUNDING = 0.01
 """Squared levels by which frames that are the same may seem to differ: they stay with their own time."""
 
 
-def most_alike(prediction: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_most_similar(prediction: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """For each predicted frame the true frame that looks most like it.
 
     Args:

@@ -1,7 +1,7 @@
 """Metrics, calibration: renderings that are wrong in a known way, with their true masks, keypoints and object places.
 
 Reads  an episode's recorded states
-Writes `WrongVideo`s: the same scene with robot and objects moved otherwise, as a model that errs would show it
+Writes `Perturbation`s: the same scene with robot and objects moved otherwise, as a model that errs would show it
 
 An estimator sees the pixels only; what it says of them can be held against the truth that the renderer knows. The
 simulation is asked to render when a case is made, so that the metrics load without it. Frame 0 is every model's given
@@ -20,7 +20,7 @@ from xew.protocol import ARMS
 
 
 @dataclass(frozen=True)
-class WrongVideo:
+class Perturbation:
     """What a wrong motion looks like, and where everything truly is in it."""
 
     rgb: np.ndarray
@@ -33,27 +33,27 @@ class WrongVideo:
     """[t o 2] float32 [pixels], projected origins of the objects' poses."""
 
 
-def late(states: States, frames: int) -> States:
+def delay(states: States, frames: int) -> States:
     """Everything happens some frames too late."""
     shown = np.maximum(np.arange(states.frame_count) - frames, 0)
-    return _moved(states, states.joint_pos[shown], states.object_pose[shown], states.object_joint[shown])
+    return _replace_motion(states, states.joint_pos[shown], states.object_pose[shown], states.object_joint[shown])
 
 
-def frozen(states: States) -> States:
+def freeze(states: States) -> States:
     """Nothing ever moves."""
-    return late(states, states.frame_count)
+    return delay(states, states.frame_count)
 
 
-def biased(states: States, angle: float) -> States:
+def bias_joints(states: States, angle: float) -> States:
     """Every joint of both arms is off by an angle [rad] after frame 0; the objects are where they belong."""
     joints = states.joint_pos.copy()
     for arm, _ in ARMS:
         used = np.any(states.joint_pos[:, arm] != 0, axis=0)  # arms of six joints leave their seventh at zero
         joints[1:, arm] += np.float32(angle) * used
-    return _moved(states, joints, states.object_pose, states.object_joint)
+    return _replace_motion(states, joints, states.object_pose, states.object_joint)
 
 
-def half(states: States) -> States:
+def halve_motion(states: States) -> States:
     """Robot and objects move half as far from where they began."""
     joints, hinges = (0.5 * (values[:1] + values) for values in (states.joint_pos, states.object_joint))
     poses = states.object_pose.copy()
@@ -61,22 +61,22 @@ def half(states: States) -> States:
     for index in range(poses.shape[1]):
         first, turned = (Rotation.from_quat(states.object_pose[rows, index, 3:]) for rows in (0, slice(None)))
         poses[:, index, 3:] = (Rotation.from_rotvec(0.5 * (turned * first.inv()).as_rotvec()) * first).as_quat()
-    return _moved(states, joints, poses, hinges)
+    return _replace_motion(states, joints, poses, hinges)
 
 
 MOTIONS: dict[str, Callable[[States], States]] = {
     "as recorded": lambda states: states,
-    "3 frames late": lambda states: late(states, 3),
-    "8 frames late": lambda states: late(states, 8),
-    "joints off by 0.05 rad": lambda states: biased(states, 0.05),
-    "joints off by 0.12 rad": lambda states: biased(states, 0.12),
-    "half the motion": half,
-    "frozen": frozen,
+    "3 frames late": lambda states: delay(states, 3),
+    "8 frames late": lambda states: delay(states, 8),
+    "joints off by 0.05 rad": lambda states: bias_joints(states, 0.05),
+    "joints off by 0.12 rad": lambda states: bias_joints(states, 0.12),
+    "half the motion": halve_motion,
+    "frozen": freeze,
 }
 """How each case moves what it shows."""
 
 
-def wrong_videos(folder: Path) -> Iterator[tuple[str, WrongVideo]]:
+def render_perturbations(folder: Path) -> Iterator[tuple[str, Perturbation]]:
     """Every case of MOTIONS on one episode, rendered as soon as it is asked for.
 
     Raises:
@@ -85,10 +85,10 @@ def wrong_videos(folder: Path) -> Iterator[tuple[str, WrongVideo]]:
     demand_known(folder, "joint_pos", "object_pose", "object_joint")
     states = read_states(folder)
     for name, motion in MOTIONS.items():
-        yield name, render(folder, motion(states))
+        yield name, render_perturbation(folder, motion(states))
 
 
-def render(folder: Path, states: States) -> WrongVideo:
+def render_perturbation(folder: Path, states: States) -> Perturbation:
     """The scene of an episode with its robot and objects where other states have them."""
     # Only here: the metrics load without Warp.
     from xew.sim_warp.devices.workers import quiet_warp
@@ -106,8 +106,8 @@ def render(folder: Path, states: States) -> WrongVideo:
     seen = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
     view = observe(default_renderer(), [seen])[0]
     objects, _ = project(HEAD_CAMERA, states.object_pose[..., :3].astype(np.float64))
-    return WrongVideo(view.rgb, view.robot_mask, view.keypoints, objects.astype(np.float32))
+    return Perturbation(view.rgb, view.robot_mask, view.keypoints, objects.astype(np.float32))
 
 
-def _moved(states: States, joints: np.ndarray, poses: np.ndarray, hinges: np.ndarray) -> States:
+def _replace_motion(states: States, joints: np.ndarray, poses: np.ndarray, hinges: np.ndarray) -> States:
     return replace(states, joint_pos=joints, object_pose=poses, object_joint=hinges)
