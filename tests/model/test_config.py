@@ -8,6 +8,7 @@ import pytest
 
 from xew import config
 from xew.config import ConfigError
+from xew.model import train
 from xew.model.experiment import beside, load_experiment
 
 REPOSITORY = Path(__file__).parents[2]
@@ -165,3 +166,25 @@ def test_what_lies_beside_the_data_does_so_wherever_one_stands(tmp_path: Path, m
 def test_experiment_mistakes(overrides: list[str], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         load_experiment(MODEL_CONFIGS[0], overrides)
+
+
+@pytest.mark.parametrize("arguments", [["--help"], [str(Path(__file__).parents[2] / "configs/debug.yaml"), "--help"]])
+def test_help_lists_what_may_be_overridden(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        train.main(arguments)
+    said = capsys.readouterr().out
+    assert stop.value.code == 0
+    for option in ("--train.steps", "--clip.frames", "--model.action", "--resume", "--overwrite", "--memory-gb"):
+        assert option in said, option
+
+
+def test_a_command_without_a_config_or_with_two_wishes_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, said in (
+        ([], "name the CONFIG first"),
+        ([str(Path(__file__).parents[2] / "configs/debug.yaml"), "--resume", "--overwrite"], "give one of them"),
+        ([str(Path(__file__).parents[2] / "configs/debug.yaml"), "--train.stepz", "4"], "--train.steps"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            train.main(arguments)
+        assert stop.value.code == 2
+        assert said in capsys.readouterr().err

@@ -27,6 +27,7 @@ from xew.model.settings.network import Network
 from xew.model.settings.parts import ClipInputs, Encoding, EpisodeChoice, Instructions, Learning, pick_conditions
 from xew.model.settings.settings import AdaptSettings, Clip, ModelSettings, RolloutSettings, TrainSettings
 from xew.model.text.instructions import TEXT_ENCODERS, VOCABULARY, TextEncoder, TextSource
+from xew.model.training.optimizer import make_optimizer
 from xew.protocol import ACTION_DIM, SPLITS, Split
 
 F = TypeVar("F")
@@ -108,7 +109,7 @@ class Experiment:
 
     @property
     def learning(self) -> Learning:
-        return Learning(self.network, self.train, self.adapt.lora_rank)
+        return Learning(self.network, self.train, make_optimizer(self.train), self.adapt.lora_rank)
 
     @property
     def sampling(self) -> RolloutSettings:
@@ -139,7 +140,9 @@ def beside(data: Path, ending: str) -> Path:
 
 def load_experiment(path: Path | str, overrides: Sequence[str] = ()) -> Experiment:
     """Read and check a config. Raises ConfigError with a choice that does not exist or does not fit."""
-    return check_choices(load(Experiment, path, overrides), path)
+    experiment = load(Experiment, path, overrides)
+    check_experiment(experiment, str(path))
+    return experiment
 
 
 def parse_experiment(flags: type[F], arguments: Sequence[str] | None, prog: str, description: str) -> tuple[F, Experiment]:
@@ -152,14 +155,8 @@ def parse_experiment(flags: type[F], arguments: Sequence[str] | None, prog: str,
     command = parse_command(
         flags, Experiment, functools.partial(load, Experiment), arguments, prog=prog, description=description
     )
-    return command.flags, check_choices(command.config, command.path)
-
-
-def check_choices(experiment: Experiment, source: Path | str) -> Experiment:
-    """The experiment itself. Raises ConfigError, naming the source, if one of its choices does not exist or does not fit."""
-    check_experiment(experiment, str(source))
-    _ = experiment.size, experiment.robots
-    return experiment
+    check_experiment(command.config, str(command.path))
+    return command.flags, command.config
 
 
 def create_model(experiment: Experiment) -> WorldModel:

@@ -34,12 +34,13 @@ from xew.model.cache.scales import Scale, load_run_scales
 from xew.model.codecs.codec import Codec, codec_class
 from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
 from xew.model.episodes.choice import select_episodes, training_episodes
-from xew.model.experiment import Experiment, check_choices, parse_experiment
+from xew.model.experiment import Experiment, parse_experiment
 from xew.model.network.dit import cast_params
 from xew.model.network.dit_layouts import load_dit_params
 from xew.model.runs.checkpoint import restore_params
 from xew.model.runs.folder import load_run_codec, load_run_config
 from xew.model.sampling.predict import Prediction, Predictor
+from xew.model.settings.checks import check_experiment
 from xew.model.settings.settings import RolloutSettings
 from xew.model.training.step import make_learner
 from xew.model.video.frames import to_camera_size
@@ -299,7 +300,8 @@ def parse_rollout(arguments: Sequence[str] | None) -> tuple[Path, Flags, Experim
         metavar="RUN",
     )
     experiment = replace(load_run_config(command.path), rollout=command.config.rollout)
-    return command.path, command.flags, check_choices(experiment, command.path / "config.yaml")
+    check_experiment(experiment, str(command.path / "config.yaml"))
+    return command.path, command.flags, experiment
 
 
 if __name__ == "__main__":

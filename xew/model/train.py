@@ -28,7 +28,7 @@ from xew.model.training.data import ClipSource, make_dataset
 from xew.model.training.flops import flops_of_step
 from xew.model.training.loop import STOPPED, Meter, Timetable, run_steps
 from xew.model.training.memory import check_memory, estimate_memory
-from xew.model.training.optimizer import learning_rate, set_steps
+from xew.model.training.optimizer import learning_rate, make_optimizer, set_steps
 from xew.model.training.samples import log_samples
 from xew.model.training.start import begin_state, check_network
 from xew.model.training.step import StepResult, abstract_state, make_learner
@@ -102,7 +102,7 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     dataset = make_dataset(source, settings.batch, settings.seed, adapt.replay, own)
     settings = set_steps(settings, source.fresh, adapt.replay)
     rates = learning_rate(settings)
-    learner = make_learner(replace(experiment.learning, settings=settings), mesh)
+    learner = make_learner(replace(experiment.learning, settings=settings, optimizer=make_optimizer(settings)), mesh)
     flops = flops_of_step(learner.learning, encoding.inputs)
     check_memory(
         estimate_memory(learner.learning, learner.shapes, encoding, mesh.size, mesh.shape["fsdp"]), ignore=ignore_memory
@@ -120,7 +120,8 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
         take_step = learner.compile_step(source.cache.codec)
 
         def draw_samples(state: TrainState, step: int) -> None:
-            log_samples(session.log, replace(predictor, params=learner.average_params(state)), episodes.samples, step)
+            params = learner.average_params(state)
+            log_samples(session.log, replace(predictor, params=params), episodes.samples, step)
 
         meter = Meter(summarize, settings.batch, flops)
         state = run_steps(

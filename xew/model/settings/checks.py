@@ -1,20 +1,19 @@
 """Checks of an experiment: every number and choice that cannot be used is told before anything is done with it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from typing import Any, Protocol
 
 from xew.config import ConfigError, pick
 from xew.model.codecs.codec import CodecSettings, codec_class
+from xew.model.conditions import Condition
 from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES
-from xew.model.network.dit import (
-    PATCH,
-    STREAMS,
-)
+from xew.model.network.dit import PATCH, STREAMS, ModelSize
 from xew.model.network.mechanisms import MECHANISMS
 from xew.model.settings.parts import pick_conditions
 from xew.model.settings.settings import AdaptSettings, Clip, ModelSettings, RolloutSettings, TrainSettings, count_replayed
 from xew.model.video.frames import TEMPORAL_FACTOR
+from xew.protocol import Split
 
 LEAST = {
     "clip.height": 1,
@@ -54,6 +53,10 @@ class Settings(Protocol):
     def adapt(self) -> AdaptSettings: ...
     @property
     def rollout(self) -> RolloutSettings: ...
+    @property
+    def size(self) -> ModelSize: ...
+    @property
+    def robots(self) -> Split: ...
 
 
 def check_experiment(experiment: Settings, source: str) -> None:
@@ -62,10 +65,12 @@ def check_experiment(experiment: Settings, source: str) -> None:
     codec_class(experiment.codec).check(experiment.codec)
     pick(SAMPLERS, experiment.rollout.sampler, "sampler")
     pick(SCHEDULES, experiment.rollout.grid, "noise schedule")
-    _check_conditions(experiment, source)
+    _ = experiment.size, experiment.robots
+    conditions = pick_conditions(experiment.model)
+    _check_conditions(conditions, source)
     _check_sizes(experiment, source)
     _check_training(experiment, source)
-    _check_history(experiment, source)
+    _check_history(experiment.model, conditions, source)
 
 
 def check_least(least: Mapping[str, float], settings: Any, source: str) -> None:
@@ -76,9 +81,9 @@ def check_least(least: Mapping[str, float], settings: Any, source: str) -> None:
             raise ConfigError(f"{source}: {name} is {value:g}; it must be at least {smallest:g}.")
 
 
-def _check_conditions(experiment: Settings, source: str) -> None:
+def _check_conditions(conditions: Sequence[Condition], source: str) -> None:
     feeders: dict[str, str] = {}
-    for condition in pick_conditions(experiment.model):
+    for condition in conditions:
         if condition.stream == "rgb" or condition.stream not in {**STREAMS, **MECHANISMS}:
             known = ", ".join(name for name in (*STREAMS, *MECHANISMS) if name != "rgb")
             raise ConfigError(f"{source}: the condition {condition.name} feeds {condition.stream!r}; conditions feed {known}.")
@@ -121,12 +126,11 @@ def _check_training(experiment: Settings, source: str) -> None:
         )
 
 
-def _check_history(experiment: Settings, source: str) -> None:
-    settings = experiment.model
+def _check_history(settings: ModelSettings, conditions: Sequence[Condition], source: str) -> None:
     if any(frame >= 0 for frame in settings.history) or list(settings.history) != sorted(settings.history):
         found = f"{source}: model.history is {list(settings.history)}"
         raise ConfigError(f"{found}; give frames before the clip, the earliest first, as [-40, -20].")
-    streams = [condition.stream for condition in pick_conditions(settings)]
+    streams = [condition.stream for condition in conditions]
     framed = [name for name in streams if name in MECHANISMS and MECHANISMS[name].enters == "frame"]
     if settings.visibility == "one_way" and framed and settings.history:
         raise ConfigError(

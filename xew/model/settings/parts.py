@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import optax
 
 from xew.config import pick
 from xew.model.codecs.codec import CodecSettings
@@ -94,6 +95,8 @@ class Learning:
 
     network: Network
     settings: TrainSettings
+    optimizer: optax.GradientTransformation
+    """Optimizer of these settings."""
     lora_rank: int = 0
 
 

@@ -27,7 +27,6 @@ from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs.checkpoint import TrainState
 from xew.model.settings.parts import Learning
 from xew.model.training.data import Batch
-from xew.model.training.optimizer import make_optimizer
 
 HISTORY_KEY = 7
 """Folded into a sample's key for the noise of its earlier frames, which `training_pair` does not know of."""
@@ -92,7 +91,7 @@ class Learner:
         Args:
             codec: needed where `train.chunks` is 2, to decode and encode the first chunk's prediction.
         """
-        settings, graph, optimizer = self.learning.settings, self.graph, make_optimizer(self.learning.settings)
+        settings, graph, optimizer = self.learning.settings, self.graph, self.learning.optimizer
         places = list_shardings(self.network_shapes)
         objective = Objective(graph, places, settings.shift, settings.accumulate, settings.history_noise)
 
@@ -138,7 +137,7 @@ def _init(learning: Learning, start: Any) -> TrainState:
         base = params
         learned = init_lora(params, learning.lora_rank, jax.random.key(settings.seed))
     ema = jax.tree.map(jnp.copy, learned) if settings.ema_decay else None
-    return TrainState(jnp.int32(0), learned, make_optimizer(settings).init(learned), ema, base)
+    return TrainState(jnp.int32(0), learned, learning.optimizer.init(learned), ema, base)
 
 
 def list_shardings(shapes: Any) -> Any:
