@@ -24,10 +24,10 @@ from xew.model.network.dit import (
 from xew.model.network.mechanisms import MECHANISMS
 from xew.model.settings.checks import check_experiment
 from xew.model.settings.network import Network
+from xew.model.settings.optimizer import make_optimizer
 from xew.model.settings.parts import ClipInputs, Encoding, EpisodeChoice, Instructions, Learning, pick_conditions
 from xew.model.settings.settings import AdaptSettings, Clip, ModelSettings, RolloutSettings, TrainSettings
 from xew.model.text.instructions import TEXT_ENCODERS, VOCABULARY, TextEncoder, TextSource
-from xew.model.training.optimizer import make_optimizer
 from xew.protocol import ACTION_DIM, SPLITS, Split
 
 F = TypeVar("F")

@@ -38,10 +38,10 @@ from xew.model.runs.folder import check_one_of, claim_run
 from xew.model.runs.log import RunLog
 from xew.model.runs.session import open_session
 from xew.model.settings.checks import check_least
+from xew.model.settings.optimizer import learning_rate, make_optimizer
 from xew.model.settings.parts import EpisodeChoice
 from xew.model.settings.settings import Clip, TrainSettings
 from xew.model.training.loop import STOPPED, Meter, Timetable, run_steps
-from xew.model.training.optimizer import learning_rate, make_optimizer
 from xew.model.training.vae_data import Cut, check_streams, make_dataset, random_clips, video_files
 from xew.model.video.comparison import strip
 from xew.protocol import SPLITS, Split

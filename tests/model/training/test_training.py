@@ -24,11 +24,11 @@ from xew.model.experiment import Experiment, load_experiment
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs import checkpoint
 from xew.model.runs.checkpoint import TrainState
+from xew.model.settings.optimizer import learning_rate, set_steps
 from xew.model.training import data, memory
 from xew.model.training.data import Batch, ClipSource, fake_batch, make_dataset
 from xew.model.training.flops import flops_of_step
 from xew.model.training.memory import estimate_memory
-from xew.model.training.optimizer import learning_rate, set_steps
 from xew.model.training.start import start_params
 from xew.model.training.step import (
     abstract_state,

@@ -3,4 +3,4 @@
 `xew.model.experiment` puts them together; nothing here reads a file.
 """
 
-__all__ = ["checks", "network", "parts", "settings"]
+__all__ = ["checks", "network", "optimizer", "parts", "settings"]
