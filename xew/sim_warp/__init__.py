@@ -1,1 +1,26 @@
-"""Simulation: (task, seed) to episodes, by scenes, experts, physics and rendering on Newton and Warp. It never imports JAX."""
+"""Simulation: (task, seed) to episodes, by scenes, experts, physics and rendering on Newton and Warp. It never imports JAX.
+
+At its root lie the commands (`generate`, `inspect`, `manifest`, `yields`) and what a task is written with (`scene`, `objects`,
+`plan`, `stage`); one level down the way of a seed: `tasks`, `production`, `physics`, `rendering`, and what these build on.
+"""
+
+__all__ = [
+    "assets",
+    "devices",
+    "embodiment",
+    "generate",
+    "geometry",
+    "inspect",
+    "kinematics",
+    "manifest",
+    "objects",
+    "physics",
+    "plan",
+    "production",
+    "rendering",
+    "robots",
+    "scene",
+    "stage",
+    "tasks",
+    "yields",
+]
