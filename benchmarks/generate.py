@@ -4,7 +4,7 @@
 
 The first figure is that of `python -m xew.sim_warp.generate` with an empty folder, start of processes and failing seeds
 included: episodes of 320x240 frames with scene, robot-only render, states, keypoints and hashes on disk. The second part
-does every stage by itself, one after another, on some of the accepted seeds. Before a figure is printed, the work is
+does every step of the work by itself, one after another, on some of the accepted seeds. Before a figure is printed, the work is
 checked: as many episodes as asked for, all of them successes, and every video and array of a sample read back and
 compared with its hash. Kernels should be compiled already: give the command twice on a new machine.
 """
@@ -39,7 +39,7 @@ from xew.sim_warp.tasks import TASKS
 
 PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "numpy", "av")
 SAMPLE = 200
-"""Episodes that are read back and compared with their hashes."""
+"""Number of episodes that are read back and compared with their hashes."""
 
 
 @dataclass(frozen=True)
@@ -47,21 +47,21 @@ class Args:
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
     """Default: a GPU if Warp finds one."""
     batch: int = 256
-    """Worlds that a GPU steps together."""
+    """Number of worlds that a GPU steps together."""
     train_seeds: int = 1
-    """Accepted seeds of each task."""
+    """Number of accepted seeds of each task."""
     test_seeds: int = 0
     workers: int | None = None
-    """Processes; by default one a core, on a GPU one for two cores."""
+    """Number of processes; by default one a core, on a GPU one for two cores."""
     states_only: bool = False
     """Store no videos."""
-    stage_seeds: int = 1
-    """Seeds of each task that are done once more, stage by stage; 0 for none."""
+    timed_seeds: int = 1
+    """Number of seeds of each task that are done once more, step by step; 0 for none."""
     out: Path | None = None
     """An empty folder for the episodes, which stay there; by default a temporary one."""
 
 
-def whole_command(args: Args, out: Path) -> float:
+def time_command(args: Args, out: Path) -> float:
     """Seconds that `generate` takes from nothing to the last header."""
     begin = time.perf_counter()
     generate.generate(
@@ -93,33 +93,33 @@ def check(args: Args, out: Path) -> list[Record]:
 
 
 class Clock:
-    """Seconds by stage."""
+    """Seconds by step of the work."""
 
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self.seconds: dict[str, float] = {}
 
     @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
+    def measure(self, name: str) -> Iterator[None]:
         begin = time.perf_counter()
         yield
         wp.synchronize_device(self.device)
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
 
 
-def stages(jobs: list[Job], renderer: Renderer, out: Path, clock: Clock) -> int:
-    """Do some jobs stage by stage; the number of frames."""
+def run_steps(jobs: list[Job], renderer: Renderer, out: Path, clock: Clock) -> int:
+    """Do some jobs step by step; the number of frames."""
     device = renderer.device
-    with clock.stage("scene, plan, inverse kinematics"):
+    with clock.measure("scene, plan, inverse kinematics"):
         seeds = plan_cells(jobs)
-    with clock.stage("physics"):
+    with clock.measure("physics"):
         seeds = simulate_cells(seeds, device.alias)
     cells: list[Cell] = [cell for cells in seeds if not any(other.failure for other in cells) for cell in cells]
-    with clock.stage("scene render"):
+    with clock.measure("scene render"):
         views = observe(renderer, [cell.recording for cell in cells])
-    with clock.stage("robot-only render"):
+    with clock.measure("robot-only render"):
         renders = command_renders([(cell.robot, cell.commands.action) for cell in cells], renderer=renderer)
-    with clock.stage("writing"), ThreadPoolExecutor(1 if device.is_cpu else os.cpu_count()) as pool:
+    with clock.measure("writing"), ThreadPoolExecutor(1 if device.is_cpu else os.cpu_count()) as pool:
         pixels = zip(views, renders, strict=True)
         list(pool.map(lambda cell, seen: write_cell(cell, seen, out, device), cells, pixels))
     return sum(cell.path.frame_count for cell in cells)
@@ -132,7 +132,7 @@ def first_jobs(out: Path, count: int) -> list[Job]:
 
 
 def main(args: Args) -> None:
-    """Print episodes a minute, and milliseconds a frame by stage."""
+    """Print episodes a minute, and milliseconds a frame by step."""
     device = wp.get_device(args.device)
     batches = "" if device.is_cpu else f", batches of {args.batch}"
     print(f"{device.name} ({device.alias}), {args.workers or worker_count(device)} processes{batches}, {os.cpu_count()} cores")
@@ -140,7 +140,7 @@ def main(args: Args) -> None:
     print("kernels were compiled before" if has_kernels(device) else "kernels are compiled on the way")
     with tempfile.TemporaryDirectory() as folder:
         out = args.out or Path(folder) / "data"
-        seconds = whole_command(args, out)
+        seconds = time_command(args, out)
         records = check(args, out)
         frames = sum(record.frame_count for record in records)
         tried = len({(record.task, record.seed) for _, record in find_records(out)})
@@ -149,19 +149,19 @@ def main(args: Args) -> None:
         print(
             f"generate: {seconds:.1f} s, {60 * len(records) / seconds:.1f} episodes a minute, {frames / seconds:.1f} frames/s"
         )
-        if args.stage_seeds:
-            print_stages(first_jobs(out, args.stage_seeds), device, Path(folder) / "stages")
+        if args.timed_seeds:
+            print_steps(first_jobs(out, args.timed_seeds), device, Path(folder) / "steps")
 
 
-def print_stages(jobs: list[Job], device: wp.Device, out: Path) -> None:
-    """Milliseconds a frame by stage, in one process, after a first round that loads kernels."""
+def print_steps(jobs: list[Job], device: wp.Device, out: Path) -> None:
+    """Milliseconds a frame by step, in one process, after a first round that loads kernels."""
     renderer = Renderer(device.alias)
-    stages(jobs[:1], renderer, out, Clock(device))
+    run_steps(jobs[:1], renderer, out, Clock(device))
     clock = Clock(device)
     batches = [[job] for job in jobs] if device.is_cpu else [jobs]
-    frames = sum(stages(batch, renderer, out, clock) for batch in batches)
+    frames = sum(run_steps(batch, renderer, out, clock) for batch in batches)
     total = sum(clock.seconds.values())
-    print(f"\nstage by stage in one process, {frames} frames [ms/frame]")
+    print(f"\nstep by step in one process, {frames} frames [ms/frame]")
     for name, spent in clock.seconds.items():
         print(f"  {name:34s}{1000 * spent / frames:8.2f}  {100 * spent / total:3.0f} %")
     print(f"  {'together':34s}{1000 * total / frames:8.2f}")

@@ -26,12 +26,12 @@ from xew.sim_warp.kinematics.batched import BatchedKinematics
 from xew.sim_warp.robots import Urdf, get_robot, load_urdf
 
 TOLERANCE = 1e-5
-"""m, and elements of rotation matrices."""
+"""Largest difference between two of them [m, and elements of rotation matrices]."""
 COMPARED = 4096
-"""Configurations that are compared link by link."""
+"""Number of configurations that are compared link by link."""
 ROUNDS = 15
 CALLS = 20
-"""Calls of a round that is not waited for in between."""
+"""Number of calls of a round that are not waited for in between."""
 PACKAGES = ("warp-lang", "newton", "torch", "pytorch-kinematics", "numpy")
 Poses = dict[str, tuple[np.ndarray, np.ndarray]]
 """Positions [n 3] and rotation matrices [n 3 3] by link."""
@@ -43,7 +43,7 @@ class Args:
     """Default: a GPU if Warp finds one."""
     robots: tuple[str, ...] = ("franka_panda", "aloha_agilex")
     configurations: int = 0
-    """0 for 65,536 on a GPU and 1,024 on a CPU."""
+    """Number of configurations; 0 for 65,536 on a GPU and 1,024 on a CPU."""
     compiled: bool = False
     """Time pytorch-kinematics under torch.compile too."""
 
@@ -57,43 +57,45 @@ class Contender:
     """What the last run left, of the first `COMPARED` configurations."""
 
 
-def ours(urdf: Urdf, joint_pos: np.ndarray, device: str) -> Contender:
+def kernel_contender(urdf: Urdf, joint_pos: np.ndarray, device: str) -> Contender:
+    """Our kernel at configurations [n j] float32 rad."""
     batched = BatchedKinematics.of_urdf(urdf, device)
     rows = wp.array(joint_pos, device=device)
     out = batched.poses(rows)
 
     def poses() -> Poses:
         found = out.numpy()[:COMPARED]
-        return {link: separated(found[:, number]) for number, (_, link) in enumerate(batched.links[0])}
+        return {link: split_poses(found[:, number]) for number, (_, link) in enumerate(batched.links[0])}
 
     return Contender("xew kernel", lambda: batched.poses(rows, out=out), poses)
 
 
-def newtons(urdf: Urdf, joint_pos: np.ndarray, device: str) -> Contender:
-    """One world a configuration, built from the URDF without its shapes."""
+def newton_contender(urdf: Urdf, joint_pos: np.ndarray, device: str) -> Contender:
+    """Newton at configurations [n j] float32 rad: one world each, built from the URDF without its shapes."""
     one = newton.ModelBuilder()
-    one.add_urdf(without_shapes(urdf), floating=False, ignore_inertial_definitions=True)
+    one.add_urdf(remove_shapes(urdf), floating=False, ignore_inertial_definitions=True)
     all_worlds = newton.ModelBuilder()
     all_worlds.replicate(one, len(joint_pos))
     model = all_worlds.finalize(device=device)
     state = model.state()
-    order = [urdf.joint_names.index(name) for name in short(one.joint_label) if name in urdf.joint_names]
+    order = [urdf.joint_names.index(name) for name in shorten_labels(one.joint_label) if name in urdf.joint_names]
     assert one.joint_coord_count == len(order) == joint_pos.shape[1], "Newton has other joints than the URDF"
     joint_q = wp.array(joint_pos[:, order].ravel(), dtype=float, device=device)
     joint_qd = wp.zeros_like(joint_q)
 
     def poses() -> Poses:
         found = state.body_q.numpy().reshape(len(joint_pos), one.body_count, 7)[:COMPARED]
-        return {link: separated(found[:, number]) for number, link in enumerate(short(one.body_label))}
+        return {link: split_poses(found[:, number]) for number, link in enumerate(shorten_labels(one.body_label))}
 
     return Contender("newton.eval_fk", lambda: newton.eval_fk(model, joint_q, joint_qd, state), poses)
 
 
-def pytorchs(urdf: Urdf, joint_pos: np.ndarray, device: str, compiled: bool) -> Contender:
+def pytorch_contender(urdf: Urdf, joint_pos: np.ndarray, device: str, compiled: bool) -> Contender:
+    """pytorch-kinematics at configurations [n j] float32 rad."""
     import pytorch_kinematics
     import torch
 
-    chain = pytorch_kinematics.build_chain_from_urdf(without_shapes(urdf).encode())
+    chain = pytorch_kinematics.build_chain_from_urdf(remove_shapes(urdf).encode())
     chain = chain.to(dtype=torch.float32, device=device)
     names = chain.get_joint_parameter_names()
     columns = [urdf.joint_names.index(name) for name in names]
@@ -115,16 +117,16 @@ def pytorchs(urdf: Urdf, joint_pos: np.ndarray, device: str, compiled: bool) -> 
     return Contender("pytorch-kinematics" + (", torch.compile" if compiled else ""), run, poses)
 
 
-def separated(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def split_poses(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Poses [n 7] as positions and rotation matrices."""
     return pose[:, :3], Rotation.from_quat(pose[:, 3:]).as_matrix()
 
 
-def short(labels: list[str]) -> list[str]:
+def shorten_labels(labels: list[str]) -> list[str]:
     return [label.rsplit("/", 1)[-1] for label in labels]
 
 
-def without_shapes(urdf: Urdf) -> str:
+def remove_shapes(urdf: Urdf) -> str:
     """The XML of a URDF less what forward kinematics does not need."""
     root = ElementTree.parse(urdf.path).getroot()
     for link in root.iter("link"):
@@ -136,7 +138,7 @@ def without_shapes(urdf: Urdf) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def configurations(urdf: Urdf, count: int) -> np.ndarray:
+def draw_configurations(urdf: Urdf, count: int) -> np.ndarray:
     """[n j] float32, uniform within the limits, of joints without any within half a turn to either side."""
     joints = [urdf.joints[name] for name in urdf.joint_names]
     lower, upper = np.array([(max(joint.lower, -np.pi), min(joint.upper, np.pi)) for joint in joints]).T
@@ -179,7 +181,7 @@ def median_seconds(run: Callable[[], object], device: str, calls: int) -> float:
     return float(np.median(rounds))
 
 
-def installed(name: str) -> bool:
+def is_installed(name: str) -> bool:
     try:
         return bool(version(name))
     except PackageNotFoundError:
@@ -187,10 +189,10 @@ def installed(name: str) -> bool:
 
 
 def race(urdf: Urdf, count: int, device: str, compiled: bool) -> None:
-    joint_pos = configurations(urdf, count)
-    contenders = [ours(urdf, joint_pos, device), newtons(urdf, joint_pos, device)]
-    if installed("pytorch-kinematics"):
-        contenders += [pytorchs(urdf, joint_pos, device, kind) for kind in ((False, True) if compiled else (False,))]
+    joint_pos = draw_configurations(urdf, count)
+    contenders = [kernel_contender(urdf, joint_pos, device), newton_contender(urdf, joint_pos, device)]
+    if is_installed("pytorch-kinematics"):
+        contenders += [pytorch_contender(urdf, joint_pos, device, kind) for kind in ((False, True) if compiled else (False,))]
     else:
         print("pytorch-kinematics is not installed and left out; pip install 'xew[reference]' brings it")
     for contender in contenders:
@@ -212,7 +214,7 @@ def main(args: Args) -> None:
     device = wp.get_device(args.device)
     count = args.configurations or (65536 if device.is_cuda else 1024)
     print(f"{device.name} ({device.alias}), Python {platform.python_version()}, float32")
-    print(", ".join(f"{name} {version(name)}" for name in PACKAGES if installed(name)))
+    print(", ".join(f"{name} {version(name)}" for name in PACKAGES if is_installed(name)))
     for key in args.robots:
         race(load_urdf(get_robot(key).urdf), count, device.alias, args.compiled)
 

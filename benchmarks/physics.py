@@ -4,7 +4,7 @@
 
 The worlds are those of `generate`: the first seeds of every task on every robot, each along the commands of its expert,
 from the first frame to the last of the longest, with contacts and states recorded at every stored frame. Building (the
-Newton model, its conversion to MuJoCo Warp) is told apart from stepping, which begins with the first forward pass and ends
+Newton model, its conversion to MuJoCo Warp) is timed apart from stepping, which begins with the first forward pass and ends
 with the motions on the host. Before a figure is printed, the work is checked: nothing overflowed, and as many worlds as
 physics has in other batches, 90 % and more, end in success.
 
@@ -41,15 +41,15 @@ LEAST_SUCCESS = 0.9
 @dataclass(frozen=True)
 class Args:
     device: str | None = None
-    """Warp's name of it."""
+    """Name of the device in Warp."""
     batches: tuple[int, ...] = (64, 256, 1024, 4096)
     """Numbers of worlds."""
     frames: int | None = None
-    """Stored frames that are stepped; by default all."""
+    """Number of stored frames that are stepped; by default all."""
     tasks: tuple[str, ...] = ()
-    """Step each of these by itself, as `generate` does, whose batches hold one to three tasks."""
+    """Tasks that are stepped by themselves, as by `generate`, whose batches hold one to three tasks."""
     repeat: int = 0
-    """Worlds that are stepped again and again."""
+    """Number of worlds that are stepped again and again."""
 
 
 def cells_for(count: int, tasks: Sequence[str] = tuple(TASKS)) -> list[Cell]:
@@ -62,7 +62,8 @@ def cells_for(count: int, tasks: Sequence[str] = tuple(TASKS)) -> list[Cell]:
     return cells[:count]
 
 
-def succeeded(cells: Sequence[Cell], motions: Sequence[Motion]) -> np.ndarray:
+def find_successes(cells: Sequence[Cell], motions: Sequence[Motion]) -> np.ndarray:
+    """[n] bool, whether each cell with this motion ends in success."""
     return np.array([replace(cell, motion=motion).failure is None for cell, motion in zip(cells, motions, strict=True)])
 
 
@@ -72,26 +73,26 @@ def check(cells: list[Cell], motions: list[Motion], whole: bool) -> float:
     assert all(np.isfinite(motion.joint_pos).all() for motion in motions)
     if not whole:
         return float("nan")
-    share = float(succeeded(cells, motions).mean())
+    share = float(find_successes(cells, motions).mean())
     assert share > LEAST_SUCCESS, f"only {share:.2f} of the worlds end in success"
     return share
 
 
-def table(device: wp.Device, args: Args) -> None:
+def print_table(device: wp.Device, args: Args) -> None:
     """Print a row a number of worlds, and a row a task where tasks are named."""
     print("worlds  frames  build [s]  stepping [s]  world-steps/s  ms a step  with building  memory [GB]  success")
     begin = time.perf_counter()
     cells = cells_for(max(args.batches))
     planning = (time.perf_counter() - begin) / len(cells)
     for count in args.batches:
-        row(cells[:count], device, args.frames)
+        print_batch(cells[:count], device, args.frames)
     for task in args.tasks:
         print(f"{task} alone:")
-        row(cells_for(args.batches[0], [get_task(task).name]), device, args.frames)
+        print_batch(cells_for(args.batches[0], [get_task(task).name]), device, args.frames)
     print(f"planning and inverse kinematics: {1000 * planning:.1f} ms a world")
 
 
-def row(cells: list[Cell], device: wp.Device, frames: int | None) -> None:
+def print_batch(cells: list[Cell], device: wp.Device, frames: int | None) -> None:
     """Step one batch and print what it cost."""
     worlds = [World(cell.robot, cell.scene, cell.commands.action[:frames]) for cell in cells]
     Batch([World(w.robot, w.scene, w.action[:2]) for w in worlds], device).run()  # loads or compiles kernels
@@ -115,18 +116,18 @@ def row(cells: list[Cell], device: wp.Device, frames: int | None) -> None:
 
 
 def used_memory(device: wp.Device) -> float:
-    """Of the device [GB]."""
+    """Memory of the device that is in use [GB]."""
     return wp.get_mempool_used_mem_current(device) / 1e9 if device.is_cuda else float("nan")
 
 
 def compare(label: str, cells: Sequence[Cell], ours: Sequence[Motion], others: Sequence[Motion]) -> None:
-    """A row of the table."""
+    """Print a row of the table."""
     pairs = list(zip(ours, others, strict=True))
     same = np.mean([(a.joint_pos == b.joint_pos).all() and (a.object_pose == b.object_pose).all() for a, b in pairs])
     joints = [1000 * np.abs(a.joint_pos - b.joint_pos)[:, [*range(7), *range(8, 15)]].max() for a, b in pairs]
     things = [1000 * np.linalg.norm(a.object_pose[..., :3] - b.object_pose[..., :3], axis=-1) for a, b in pairs]
     anywhere, at_last = [thing.max() for thing in things], [thing[-1].max() for thing in things]
-    alike = int((succeeded(cells, ours) == succeeded(cells, others)).sum())
+    alike = int((find_successes(cells, ours) == find_successes(cells, others)).sum())
     print(
         f"{label:34s}  {same:6.1%}  {np.median(joints):7.3f} {np.max(joints):8.3f}  {np.median(anywhere):7.3f} "
         f"{np.max(anywhere):8.1f}  {np.median(at_last):7.3f} {np.max(at_last):8.1f}  {alike:4d} of {len(cells)}",
@@ -134,7 +135,7 @@ def compare(label: str, cells: Sequence[Cell], ours: Sequence[Motion], others: S
     )
 
 
-def repeatability(device: wp.Device, count: int, batch: int, other_batch: int) -> None:
+def print_repeatability(device: wp.Device, count: int, batch: int, other_batch: int) -> None:
     """Print a row a pair of runs."""
     cells = cells_for(count)
     worlds = [World(cell.robot, cell.scene, cell.commands.action) for cell in cells]
@@ -152,9 +153,9 @@ def main(args: Args) -> None:
     print(f"{device.name} ({device.alias}), {os.cpu_count()} cores, Python {platform.python_version()}")
     print(", ".join(f"{name} {version(name)}" for name in PACKAGES))
     if args.batches:
-        table(device, args)
+        print_table(device, args)
     if args.repeat:
-        repeatability(device, args.repeat, 256, 1024)
+        print_repeatability(device, args.repeat, 256, 1024)
 
 
 if __name__ == "__main__":

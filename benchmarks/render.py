@@ -8,7 +8,7 @@ optical flow). It is drawn with capsules for links, with the robot's own meshes,
 SensorCamera is called once for each of the two: color (MSAA 4; in the scene with the shadows of one light, where ours has
 three), shape index for the mask, and depth, from which visibility and flow would have to be computed; that is not timed.
 Capsules are primitives to it and triangles to us. "kernels" is the time on the device, "with copies" until all images are on
-the host; on a CPU the two are one. Before a figure is told, the silhouettes of both are compared.
+the host; on a CPU the two are one. Before a figure is printed, the silhouettes of both are compared.
 """
 
 import platform
@@ -41,14 +41,14 @@ from xew.sim_warp.stage import stage_mesh
 FRAMES_PER_WORLD = 24
 ROUNDS = 5
 PER_LINK = 2000
-"""Triangles of a link in the heaviest workload."""
+"""Number of triangles of a link in the heaviest workload."""
 VIEWS = {"cpu": 4, "cuda": 256}
-"""Frames that SensorCamera renders in a call."""
+"""Number of frames that SensorCamera renders in a call."""
 AGREEMENT = 0.95
 """Least intersection over union of the silhouettes of robot and things in the pictures of both."""
 WHITE = 0xFFFFFFFF
 LIGHT = 0.6
-"""Of SensorCamera's one light: a white table stays below white."""
+"""Strength of SensorCamera's one light: a white table stays below white."""
 JOINTS_BEFORE = (
     np.array((-0.061, -0.046, -0.122, -2.320, 0.247, 2.781, 0.392)),
     np.array((0.151, 0.255, -0.037, -2.013, -0.142, 2.785, 1.023)),
@@ -57,7 +57,7 @@ JOINTS_AFTER = (
     np.array((-0.335, 0.433, 0.094, -1.765, 0.209, 2.696, 0.359)),
     np.array((0.235, 0.479, -0.052, -1.588, -0.137, 2.578, 1.077)),
 )
-"""rad, left and right: two tools that go over the table and down to it."""
+"""Joint positions of the left and right arm [rad], between which two tools go over the table and down to it."""
 PACKAGES = ("warp-lang", "newton", "numpy")
 
 
@@ -66,7 +66,7 @@ class Args:
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
     """Default: a GPU if Warp finds one."""
     frames: int = 0
-    """Frames of a batch of ours, 0 for 24 on a CPU and 6144 on a GPU."""
+    """Number of frames of a batch of ours, 0 for 24 on a CPU and 6144 on a GPU."""
     pictures: Path | None = None
     """Folder for pictures of both side by side, one a workload."""
     first: int = 0
@@ -142,12 +142,12 @@ def workloads() -> list[Workload]:
     shapes = (Capsule(0.03, 0.0, 2, (0, 0, 0)), Capsule(0.04, 0.0, 2, (0, 0, 0)), Capsule(0.025, 0.03, 2, (0, 0, 0)))
     colors: tuple[Color, ...] = ((200, 60, 60), (60, 160, 60), (60, 60, 200))
     things = [Thing(shape.mesh(color), False, shape) for shape, color in zip(shapes, colors, strict=True)]
-    links = [one_color(body.mesh) for body in robot_bodies(robot)]
-    fitted = [fitting_capsule(mesh) for mesh in links]
+    links = [paint_one_color(body.mesh) for body in robot_bodies(robot)]
+    fitted = [fit_capsule(mesh) for mesh in links]
     drawn = {
         "capsules": [Thing(capsule.mesh(main_color(mesh)), True, capsule) for capsule, mesh in zip(fitted, links, strict=True)],
         "own meshes": [Thing(mesh, True) for mesh in links],
-        f"{PER_LINK} triangles a link": [Thing(refined(mesh, PER_LINK), True) for mesh in links],
+        f"{PER_LINK} triangles a link": [Thing(refine(mesh, PER_LINK), True) for mesh in links],
     }
     return [Workload(name, parts, things, pose, together, points) for name, parts in drawn.items()]
 
@@ -158,13 +158,13 @@ def main_color(mesh: Mesh) -> Color:
     return red, green, blue
 
 
-def one_color(mesh: Mesh) -> Mesh:
+def paint_one_color(mesh: Mesh) -> Mesh:
     """A shape of Newton's has one color, so all have."""
     colors = np.tile(np.array(main_color(mesh), np.uint8), (len(mesh.triangles), 1))
     return Mesh(mesh.vertices, mesh.triangles, colors, mesh.normals)
 
 
-def fitting_capsule(mesh: Mesh) -> Capsule:
+def fit_capsule(mesh: Mesh) -> Capsule:
     """About the size of a link: along its longest side, as thick as the mean of the others."""
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     size, center = high - low, (low + high) / 2
@@ -174,21 +174,21 @@ def fitting_capsule(mesh: Mesh) -> Capsule:
     return Capsule(radius, max(0.01, float(size[axis]) / 2 - radius), axis, (x, y, z))
 
 
-def refined(mesh: Mesh, wanted: int) -> Mesh:
+def refine(mesh: Mesh, wanted: int) -> Mesh:
     """The same surface in more triangles: the largest are quartered until there are enough."""
     while len(mesh.triangles) < wanted:
         corners = mesh.vertices[mesh.triangles]
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         split = np.argsort(-area)[: -(-(wanted - len(area)) // 3)]
         kept = np.setdiff1d(np.arange(len(area)), split)
-        vertices = np.concatenate([corners[kept].reshape(-1, 3), _quarters(corners[split]).reshape(-1, 3)])
-        normals = np.concatenate([mesh.normals[kept], _quarters(mesh.normals[split])])
+        vertices = np.concatenate([corners[kept].reshape(-1, 3), _quarter(corners[split]).reshape(-1, 3)])
+        normals = np.concatenate([mesh.normals[kept], _quarter(mesh.normals[split])])
         colors = np.concatenate([mesh.colors[kept], mesh.colors[split].repeat(4, 0)])
         mesh = Mesh(vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3), colors, normals)
     return mesh
 
 
-def _quarters(corners: np.ndarray) -> np.ndarray:
+def _quarter(corners: np.ndarray) -> np.ndarray:
     """[f 3 3] -> [4f 3 3]."""
     a, b, c = corners.swapaxes(0, 1)
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
@@ -287,6 +287,7 @@ class Sensor:
         wp.synchronize_device(self.device)
 
     def render_to_host(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Color [n h w] uint32, shape index [n h w] and depth [n h w] m of all views."""
         self.render()
         return self.color.numpy(), self.shape_index.numpy(), self.depth.numpy()
 
@@ -327,7 +328,7 @@ def is_copy(name: str) -> bool:
 
 
 def agreement(first: np.ndarray, second: np.ndarray) -> float:
-    """Intersection over union."""
+    """Intersection over union of two masks [h w] bool."""
     return float((first & second).sum() / (first | second).sum())
 
 
@@ -343,12 +344,14 @@ class Cost:
 
 
 def our_cost(name: str, action: Callable[[], object], count: int) -> Cost:
-    """Prints what each kernel takes on a GPU."""
+    """What our frames cost; prints what each kernel takes on a GPU."""
     whole = median_seconds(action) / count
     spent = kernel_seconds(action)
-    stages = {kernel: seconds for kernel, seconds in sorted(spent.items(), key=lambda item: -item[1]) if seconds / count > 5e-8}
-    if stages:
-        listed = ", ".join(f"{kernel} {1e6 * seconds / count:.2f}" for kernel, seconds in stages.items())
+    spent_by_kernel = {
+        kernel: seconds for kernel, seconds in sorted(spent.items(), key=lambda item: -item[1]) if seconds / count > 5e-8
+    }
+    if spent_by_kernel:
+        listed = ", ".join(f"{kernel} {1e6 * seconds / count:.2f}" for kernel, seconds in spent_by_kernel.items())
         print(f"  {name} [us/frame]: {listed}")
     on_device = sum(seconds for kernel, seconds in spent.items() if not is_copy(kernel)) / count
     return Cost(on_device or whole, whole)
@@ -387,7 +390,7 @@ def race(work: Workload, renderer: Renderer, worlds: int, pictures: Path | None)
 
 
 def save_pictures(path: Path, panels: dict[str, np.ndarray]) -> None:
-    """Pictures side by side at twice their size, two a row, with labels."""
+    """Write pictures [h w 3] uint8 side by side at twice their size, two a row, with labels."""
     path.parent.mkdir(parents=True, exist_ok=True)
     labeled = []
     for label, image in panels.items():

@@ -8,7 +8,8 @@ RoboTwin. SAPIEN runs as its users run it, one scene frame by frame: `set_qpos`,
 `get_picture`. Rasterized is its shader pack "default", ray traced its "rt" with 32 samples a pixel, path depth 8 and the
 denoiser OIDN, as in RoboTwin. Ours is `Renderer.render_batch` with shadows of all three lights and robot mask, up to images
 on the host. Physics: SAPIEN's PhysX on the CPU, one world, 4 ms a step, driven along the same commands; ours in MuJoCo's C
-engine, one world, and on a GPU in MuJoCo Warp. Before a figure is told, the robot's silhouettes in both pictures are compared.
+engine, one world, and on a GPU in MuJoCo Warp. Before a figure is printed, the robot's silhouettes in both
+pictures are compared.
 """
 
 import platform
@@ -90,6 +91,7 @@ class Episode:
 
     @property
     def things(self) -> tuple[list[Body], np.ndarray]:
+        """All bodies but the robot's, and their poses [t b 7], world."""
         return scene_things(self.scene, self.motion.object_pose, self.motion.object_joint)
 
     @property
@@ -150,7 +152,7 @@ class Theirs:
     def prepare(self) -> None:
         """Put the recorded states into SAPIEN's order, outside of what is timed."""
         measured = joint_positions(self.episode.robot, self.episode.motion.joint_pos)
-        self.joint_pos = [self._ordered(robot, pos) for robot, pos in zip(self.robots, measured, strict=True)]
+        self.joint_pos = [self._reorder(robot, pos) for robot, pos in zip(self.robots, measured, strict=True)]
         poses = self.episode.things[1]
         self.thing_pose = [[self._pose(pose) for pose in poses[:, index]] for index in range(poses.shape[1])]
 
@@ -162,7 +164,7 @@ class Theirs:
     def drive(self) -> Callable[[int], None]:
         """A function that takes the commands of a frame and steps on to the next."""
         commands = joint_positions(self.episode.robot, self.episode.action)
-        targets = [self._ordered(robot, pos) for robot, pos in zip(self.robots, commands, strict=True)]
+        targets = [self._reorder(robot, pos) for robot, pos in zip(self.robots, commands, strict=True)]
         joints = [robot.active_joints for robot in self.robots]
         for robot, own, positions in zip(self.robots, joints, targets, strict=True):
             robot.set_qpos(positions[0])
@@ -178,17 +180,17 @@ class Theirs:
 
         return advance
 
-    def off_course(self) -> float:
+    def distance_off_course(self) -> float:
         """Largest distance of a joint of the arms from its last command [rad]."""
         commands = joint_positions(self.episode.robot, self.episode.action[-1:])
         own = {name for arm in self.episode.robot.arms for name in arm.joints}
         off = [
-            np.abs(robot.get_qpos() - self._ordered(robot, pos)[0])[[joint.name in own for joint in robot.active_joints]].max()
+            np.abs(robot.get_qpos() - self._reorder(robot, pos)[0])[[joint.name in own for joint in robot.active_joints]].max()
             for robot, pos in zip(self.robots, commands, strict=True)
         ]
         return float(max(off))
 
-    def _ordered(self, robot: Any, joint_pos: np.ndarray) -> np.ndarray:
+    def _reorder(self, robot: Any, joint_pos: np.ndarray) -> np.ndarray:
         names = load_urdf(self.episode.robot.urdf).joint_names
         return joint_pos[:, [names.index(joint.name) for joint in robot.active_joints]].astype(np.float32)
 
@@ -279,7 +281,7 @@ class Theirs:
 
 
 def one_color_parts(mesh: Mesh) -> list[tuple[trimesh.Trimesh, np.ndarray]]:
-    """The triangles of each color, with a vertex and a normal for every corner."""
+    """The triangles of each color, with a vertex and a normal for every corner, and the color [3] uint8."""
     parts = []
     for color in np.unique(mesh.colors, axis=0):
         own = (mesh.colors == color).all(1)
@@ -312,7 +314,7 @@ def load_sapien(args: Args) -> Any:
     return sapien
 
 
-def their_frames(scene: Theirs, frames: Sequence[int]) -> float:
+def measure_their_frames(scene: Theirs, frames: Sequence[int]) -> float:
     """Frames a second, the median of a few rounds after a frame that compiles shaders."""
     scene.show(frames[0])
     rates = []
@@ -324,7 +326,7 @@ def their_frames(scene: Theirs, frames: Sequence[int]) -> float:
     return statistics.median(rates)
 
 
-def their_batched_frames(sapien: Any, episode: Episode, folder: Path, scenes: int) -> float:
+def measure_their_batches(sapien: Any, episode: Episode, folder: Path, scenes: int) -> float:
     """Frames a second of SAPIEN's RenderSystemGroup, poses from a CUDA buffer, pictures left on the GPU.
 
     Every scene is posed as at a frame of the episode; the buffer is what its GPU physics would have filled.
@@ -332,7 +334,7 @@ def their_batched_frames(sapien: Any, episode: Episode, folder: Path, scenes: in
     import torch
 
     copies = [Theirs(sapien, episode, folder) for _ in range(scenes)]
-    rows: list[list[float]] = []
+    poses: list[list[float]] = []
     for number, copy in enumerate(copies):
         copy.prepare()
         copy.show(number % len(episode.action))
@@ -341,11 +343,11 @@ def their_batched_frames(sapien: Any, episode: Episode, folder: Path, scenes: in
             body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
             if body is not None:
                 for shape in body.render_shapes:
-                    shape.set_gpu_pose_batch_index(len(rows))
-            rows.append([*entity.pose.p, *entity.pose.q, *([0.0] * 6)])
+                    shape.set_gpu_pose_batch_index(len(poses))
+            poses.append([*entity.pose.p, *entity.pose.q, *([0.0] * 6)])
     group = sapien.render.RenderSystemGroup([copy.scene.render_system for copy in copies])
     cameras = group.create_camera_group([copy.camera for copy in copies], ["Color"])
-    buffer = torch.tensor(rows, dtype=torch.float32, device="cuda")
+    buffer = torch.tensor(poses, dtype=torch.float32, device="cuda")
     group.set_cuda_poses(sapien.CudaArray(buffer))
 
     def take() -> None:
@@ -365,7 +367,7 @@ def their_batched_frames(sapien: Any, episode: Episode, folder: Path, scenes: in
     return scenes / statistics.median(seconds)
 
 
-def their_steps(sapien: Any, episode: Episode, folder: Path) -> tuple[float, float]:
+def measure_their_steps(sapien: Any, episode: Episode, folder: Path) -> tuple[float, float]:
     """Physics steps a second of one world along the whole episode, and how far things end from where they end in ours [m]."""
     rates = []
     for _ in range(ROUNDS):
@@ -375,7 +377,9 @@ def their_steps(sapien: Any, episode: Episode, folder: Path) -> tuple[float, flo
         for frame in range(1, len(episode.action)):
             advance(frame)
         rates.append((len(episode.action) - 1) * STEPS_PER_FRAME / (time.perf_counter() - start))
-        assert scene.off_course() < OFF_COURSE, f"SAPIEN's robot is {scene.off_course():.2f} rad off its last command"
+        assert scene.distance_off_course() < OFF_COURSE, (
+            f"SAPIEN's robot is {scene.distance_off_course():.2f} rad off its last command"
+        )
     ours = [
         pose for thing, pose in zip(episode.scene.objects, episode.motion.object_pose[-1], strict=True) if thing.shape.hulls
     ]
@@ -386,7 +390,7 @@ def their_steps(sapien: Any, episode: Episode, folder: Path) -> tuple[float, flo
 # ---- our side
 
 
-def our_frames(renderer: Renderer, episode: Episode, count: int) -> float:
+def measure_our_frames(renderer: Renderer, episode: Episode, count: int) -> float:
     """Frames a second, images on the host, of about `count` at a time."""
     worlds = [episode.world] * max(1, round(count / len(episode.action)))
     renderer.render_batch(worlds)
@@ -398,7 +402,7 @@ def our_frames(renderer: Renderer, episode: Episode, count: int) -> float:
     return statistics.median(rates)
 
 
-def our_steps(episode: Episode, worlds: int, device: str) -> float:
+def measure_our_steps(episode: Episode, worlds: int, device: str) -> float:
     """World-steps a second: what a longer episode takes more than a shorter one, so that building the model does not count."""
     long = np.concatenate([episode.action, episode.action[::-1], episode.action])
     seconds = []
@@ -415,16 +419,17 @@ def our_steps(episode: Episode, worlds: int, device: str) -> float:
 
 
 def agreement(theirs: np.ndarray, ours: np.ndarray) -> float:
-    """Intersection over union of two masks."""
+    """Intersection over union of two masks [h w] bool."""
     return float((theirs & ours).sum() / (theirs | ours).sum())
 
 
-def picture(image: np.ndarray) -> np.ndarray:
-    """SAPIEN's float RGBA as RoboTwin stores it: uint8 RGB."""
+def to_rgb(image: np.ndarray) -> np.ndarray:
+    """SAPIEN's RGBA [h w 4] float32 as RoboTwin stores it: [h w 3] uint8."""
     return (image[..., :3] * 255).clip(0, 255).astype(np.uint8)
 
 
 def save_pictures(folder: Path, panels: dict[str, np.ndarray]) -> None:
+    """Write pictures [h w 3] uint8 side by side at twice their size, with labels."""
     folder.mkdir(parents=True, exist_ok=True)
     labeled = []
     for label, image in panels.items():
@@ -433,7 +438,7 @@ def save_pictures(folder: Path, panels: dict[str, np.ndarray]) -> None:
     cv2.imwrite(str(folder / "sapien.png"), cv2.cvtColor(np.hstack(labeled), cv2.COLOR_RGB2BGR))
 
 
-def tell(label: str, rate: float, own: float | None, unit: str) -> None:
+def print_rate(label: str, rate: float, own: float | None, unit: str) -> None:
     beside = f"{own / rate:9.1f} times" if own else ""
     print(f"  {label:62s}{rate:12,.1f} {unit:10s}{beside}")
 
@@ -452,31 +457,31 @@ def compare_frames(args: Args, sapien: Any, episode: Episode, folder: Path, rend
             same = agreement(scene.robot_mask(middle), own_frames.robot_mask[middle])
             assert same > AGREEMENT, f"the robot's silhouettes agree only to {same:.3f}"
             print(f"frame {middle}: the robot's silhouettes agree to {same:.3f} (intersection over union)")
-        panels[f"SAPIEN {label}"] = picture(scene.show(middle))
+        panels[f"SAPIEN {label}"] = to_rgb(scene.show(middle))
         frames = np.linspace(0, len(episode.action) - 1, most).astype(int).tolist()
-        rates[label] = their_frames(scene, frames)
-    own = our_frames(renderer, episode, args.batch or (6144 if on_gpu else 24))
+        rates[label] = measure_their_frames(scene, frames)
+    own = measure_our_frames(renderer, episode, args.batch or (6144 if on_gpu else 24))
     print("\nframes of 320x240 on the host                                                                       ours is")
-    tell("xew, shadows of three lights, anti-aliased, with robot mask", own, None, "frames/s")
-    tell("SAPIEN, rasterized, one scene", rates["rasterized"], own, "frames/s")
+    print_rate("xew, shadows of three lights, anti-aliased, with robot mask", own, None, "frames/s")
+    print_rate("SAPIEN, rasterized, one scene", rates["rasterized"], own, "frames/s")
     label = f"SAPIEN, ray traced, {args.samples} samples, depth {PATH_DEPTH}, denoiser {args.denoiser}, one scene"
-    tell(label, rates["ray traced"], own, "frames/s")
+    print_rate(label, rates["ray traced"], own, "frames/s")
     if args.scenes:
-        batched = their_batched_frames(sapien, episode, folder, args.scenes)
-        tell(f"SAPIEN, rasterized, {args.scenes} scenes in a batch, left on the GPU", batched, own, "frames/s")
+        batched = measure_their_batches(sapien, episode, folder, args.scenes)
+        print_rate(f"SAPIEN, rasterized, {args.scenes} scenes in a batch, left on the GPU", batched, own, "frames/s")
     if args.pictures:
         save_pictures(args.pictures, panels)
 
 
 def compare_steps(args: Args, sapien: Any, episode: Episode, folder: Path, device: wp.Device) -> None:
-    theirs, off = their_steps(sapien, episode, folder)
-    one = our_steps(episode, 1, "cpu")
+    theirs, off = measure_their_steps(sapien, episode, folder)
+    one = measure_our_steps(episode, 1, "cpu")
     print(f"\nphysics, steps of {1000 * TIME_STEP:.0f} ms; in the two engines things end at most {1000 * off:.0f} mm apart")
-    tell("SAPIEN, PhysX on the CPU, one world", theirs, None, "steps/s")
-    tell("xew, MuJoCo's C engine on the CPU, one world", one, None, "steps/s")
+    print_rate("SAPIEN, PhysX on the CPU, one world", theirs, None, "steps/s")
+    print_rate("xew, MuJoCo's C engine on the CPU, one world", one, None, "steps/s")
     if device.is_cuda:
-        many = our_steps(episode, args.worlds, device.alias)
-        tell(f"xew, MuJoCo Warp, {args.worlds} worlds", many, None, "steps/s")
+        many = measure_our_steps(episode, args.worlds, device.alias)
+        print_rate(f"xew, MuJoCo Warp, {args.worlds} worlds", many, None, "steps/s")
         print(f"  xew on the GPU makes {many / theirs:.1f} times SAPIEN's steps, on one CPU core {one / theirs:.2f} times")
     else:
         print(f"  xew makes {one / theirs:.2f} times SAPIEN's steps")

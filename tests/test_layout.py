@@ -47,7 +47,7 @@ FORBIDDEN = {
     "analysis": {"jax", "flax", "warp", "newton", "mujoco"},
 }
 """Libraries that a room does not import, inside functions neither."""
-WITH_TORCH = ("xew.model.weights.tensors",)
+WITH_TORCH = ("xew.model.weights.reading",)
 """Modules of `model` that may import PyTorch inside functions: files of weights that only it can read."""
 REGISTRIES = {"analysis": "xew.model.conditions"}
 """Registry of another room that a room may read at once, for titles; it loads without JAX and Warp."""

@@ -234,13 +234,14 @@ def read_states(folder: Path) -> States:
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an .npz by name; threads may call it. Raises what zipfile, zlib and NumPy raise."""
-    with PARSING, np.load(path) as stored:
+    """All arrays of an .npz by name [any shapes]; threads may call it. Raises what zipfile, zlib and NumPy raise."""
+    # Opened here, since np.load leaves a file that is no archive open.
+    with PARSING, path.open("rb") as file, np.load(file) as stored:
         return {name: stored[name] for name in stored.files}
 
 
 def write_video(path: Path, video: np.ndarray, frame_rate: float = 1000 / 60) -> None:
-    """Write uint8 RGB [t h w 3] losslessly: H.264 in RGB at quantiser 0, in Matroska.
+    """Write uint8 RGB [t h w 3] losslessly: H.264 in RGB at quantizer 0, in Matroska.
 
     Scenes stand still but for the robot, which a codec that looks at the frame before writes in a quarter of the time that
     FFV1 takes, at 1.3 times the size.

@@ -1,21 +1,22 @@
-"""Who is held out of what, what a study trains and what it grades: robots' roles, splits, seeds, variants, counts.
+"""The protocol of a study as plain data: roles of robots, splits, seeds, variants, counts, and the layout of a command.
 
-Plain data after the paper's protocol (section 3 and its appendix); every room may read it, it imports nothing of ours. Also
-the canonical 16-number joint layout.
+It follows the paper's section 3 and its appendix. Every room may read this file, which imports nothing of ours.
 """
 
 from dataclasses import dataclass
 
 ROBOT_NAMES = ("aloha_agilex", "arx_x5", "ur5_wsg", "franka_panda", "piper")
+"""Keys of the five robots of the paper, in its order."""
 SEEN_ROBOTS = ("aloha_agilex", "arx_x5", "ur5_wsg")
 HELD_OUT_ROBOTS = ("franka_panda", "piper")
-"""The fixed split: three robots train, two are held out and reported apart, never averaged."""
+"""Roles in the fixed split: three robots train, two are held out and reported apart, never averaged."""
 
 ACTION_DIM = 16
-"""Left arm 7 joints [rad], left gripper, right arm 7 joints [rad], right gripper; grippers 0 closed to 1 open.
-Arms of six joints leave their seventh at zero."""
+"""Length of a command: left arm 7 joints [rad], left gripper, right arm 7 joints [rad], right gripper. Grippers go from 0,
+closed, to 1, open. Arms of six joints leave their seventh at zero."""
 LEFT_ARM, LEFT_GRIPPER, RIGHT_ARM, RIGHT_GRIPPER = slice(0, 7), 7, slice(8, 15), 15
 ARMS = ((LEFT_ARM, LEFT_GRIPPER), (RIGHT_ARM, RIGHT_GRIPPER))
+"""Places of each arm's joints and gripper in a command."""
 
 DIMENSION_TITLES = {
     "visual": "Visual quality",
@@ -23,37 +24,43 @@ DIMENSION_TITLES = {
     "kinematics": "Robot kinematics",
     "objects": "Object dynamics",
 }
-"""What a group of metrics speaks of; dimensions are reported side by side, never as one number."""
+"""Titles of the dimensions, the groups of metrics; they are reported side by side, never as one number."""
 
 FRAME_RATE = 1000 / 60
-"""Stored frames a second: one every 15 physics steps of 4 ms."""
+"""Number of stored frames per second [Hz]: one every 15 physics steps of 4 ms."""
 TASK_COUNT = 25
+"""Number of tasks."""
 TRAIN_SEEDS_PER_TASK = 50
+"""Number of accepted training seeds of each task."""
 TEST_SEEDS_PER_TASK = 20
+"""Number of accepted test seeds of each task."""
 
 TEST_SEED_START = 1_000_000
-"""Training seeds count up from 0, test seeds from here, so that no number of either ever meets the other."""
+"""First test seed. Training seeds count up from 0 and never reach it."""
 
 
 @dataclass(frozen=True)
 class Split:
-    """Robots that a model trains on and robots that it is asked to render unseen."""
+    """Robots that a model trains on, and robots that it must render unseen."""
 
     train_robots: tuple[str, ...]
     held_out_robots: tuple[str, ...]
 
 
 FIXED = Split(SEEN_ROBOTS, HELD_OUT_ROBOTS)
+"""Split of most tables: three robots train, two are held out."""
 LOEO = {held_out: Split(tuple(r for r in ROBOT_NAMES if r != held_out), (held_out,)) for held_out in ROBOT_NAMES}
-"""Leave-one-embodiment-out: five folds, each named by the robot that it holds out."""
+"""Leave-one-embodiment-out (LOEO): five folds, each named by the robot that it holds out."""
 SPLITS = {"fixed": FIXED} | {f"loeo_{robot}": split for robot, split in LOEO.items()}
+"""All splits by key."""
 
 SHOTS = (1, 2, 3)
-"""M: training episodes of each task that a model is adapted with; the first accepted seeds."""
+"""Numbers of training episodes of each task that a model is adapted with (M); they are of the first accepted seeds."""
 FORGETTING_ROBOT = "ur5_wsg"
-"""On its test episodes, the same for every adapted model, forgetting is measured."""
+"""Robot whose test episodes measure forgetting, the same for every adapted model."""
 BASELINES = COPY_FIRST_FRAME, GROUND_TRUTH = ("copy_first_frame", "ground_truth")
-"""Rows of a score table that no model made, with the empty variant: a score of nothing, and the estimators' own error."""
+"""Predictions that no model made, with the empty variant in a score table: the frozen first frame, and the true video, whose
+score shows the estimators' own error."""
 
 
 @dataclass(frozen=True)
@@ -61,35 +68,35 @@ class Variant:
     """One trained or adapted model of a study."""
 
     name: str
-    """Unique, and fit to be a folder's name."""
+    """Unique name, which is also a folder's name."""
     system: str = "reference"
-    """reference, irasim, ctrl_world, enerverse_ac, bwm, or an outside model's name."""
+    """Key of the world model: reference, irasim, ctrl_world, enerverse_ac, bwm, or an outside model's name."""
     split: str = "fixed"
-    """A key of SPLITS."""
+    """Key of SPLITS."""
     action: str = "optical_flow"
-    """A key of the model's ACTIONS: how the commanded motion is shown."""
+    """Key of the model's ACTIONS: the condition that shows the commanded motion."""
     embodiment: str = "none"
-    """A key of the model's CONDITIONS: how the robot's looks are shown."""
+    """Key of the model's CONDITIONS: the condition that shows the robot's looks."""
     target: str | None = None
-    """Robot that it was adapted to."""
+    """Robot that it was adapted to, if any."""
     shots: int = 0
-    """M, episodes of each task in the adaptation."""
+    """Number of episodes of each task in the adaptation (M)."""
     remedy: str = "full"
-    """How it was adapted: full (all weights, as in the paper), replay (of training robots' episodes) or lora."""
+    """Kind of adaptation: full (all weights, as in the paper), replay (of training robots' episodes) or lora."""
 
     @property
     def graded_robots(self) -> tuple[str, ...]:
-        """Whose test episodes it predicts: all robots', after an adaptation the target's and those that show forgetting."""
+        """Robots whose test episodes it predicts: all; after an adaptation the target and FORGETTING_ROBOT."""
         return ROBOT_NAMES if self.target is None else (FORGETTING_ROBOT, self.target)
 
     @property
     def seen_robots(self) -> tuple[str, ...]:
-        """Graded robots that its (first) training had."""
+        """Graded robots that its first training had."""
         return tuple(robot for robot in self.graded_robots if robot in SPLITS[self.split].train_robots)
 
     @property
     def held_out_robots(self) -> tuple[str, ...]:
-        """Graded robots that its (first) training had not: reported apart, never averaged."""
+        """Graded robots that its first training did not have; they are reported apart, never averaged."""
         return tuple(robot for robot in self.graded_robots if robot in SPLITS[self.split].held_out_robots)
 
     @property
@@ -104,19 +111,19 @@ def reference(split: str = "fixed", action: str = "optical_flow", embodiment: st
 
 
 def system(name: str) -> Variant:
-    """Another project's way to be told actions, on the fixed split."""
+    """Another project's way to condition on actions, in our network and on the fixed split."""
     return Variant(f"fixed-{name}", name, "fixed", name)
 
 
-def adapted(target: str, shots: int, remedy: str = "full") -> Variant:
+def adaptation(target: str, shots: int, remedy: str = "full") -> Variant:
     """The nine-view model of the fixed split after training on `shots` episodes of each task of an unseen robot."""
     ending = "" if remedy == "full" else f"-{remedy}"
     return Variant(f"few_shot-{target}-{shots}{ending}", "reference", "fixed", *MULTI_VIEW, target, shots, remedy)
 
 
 MULTI_VIEW = ("optical_flow", "nine_views")
-"""Action and embodiment of the model that adaptations start from (the paper's appendix on few-shot adaptation)."""
-_FEW_SHOT = tuple(adapted(target, shots) for target in HELD_OUT_ROBOTS for shots in SHOTS)
+"""Conditions on action and looks of the model that adaptations start from (the paper's appendix on few-shot adaptation)."""
+_FEW_SHOT = tuple(adaptation(target, shots) for target in HELD_OUT_ROBOTS for shots in SHOTS)
 _RENDERED = reference(embodiment="robot_render")
 
 PARTS: dict[str, tuple[Variant, ...]] = {
@@ -125,20 +132,22 @@ PARTS: dict[str, tuple[Variant, ...]] = {
     "ladder": tuple(
         reference(embodiment=name) for name in ("none", "reference_image", "nine_views", "articulation_clip", "robot_render")
     ),
-    # The paper does not say what its folds are told; their Franka and Piper scores lie at those of nine views.
+    # The paper does not say which conditions its folds get; their Franka and Piper scores agree with those of nine views.
     "loeo": tuple(reference(f"loeo_{robot}", *MULTI_VIEW) for robot in ROBOT_NAMES),
     "few_shot": (reference("fixed", *MULTI_VIEW), *_FEW_SHOT, _RENDERED),
     "forgetting": (reference("fixed", *MULTI_VIEW), *_FEW_SHOT),
     "baselines": (*(system(name) for name in ("irasim", "ctrl_world", "enerverse_ac")), reference()),
     # Ours; the paper leaves them open.
     "remedies": tuple(
-        adapted(target, shots, remedy) for remedy in ("replay", "lora") for target in HELD_OUT_ROBOTS for shots in SHOTS
+        adaptation(target, shots, remedy) for remedy in ("replay", "lora") for target in HELD_OUT_ROBOTS for shots in SHOTS
     ),
     "more_systems": (system("bwm"),),
 }
-"""Which variants each table compares, in the order of its rows. A variant may be in several."""
+"""Variants that each table compares, in the order of its rows. A variant may be in several parts."""
 PAPER_PARTS = ("fixed", "actions", "ladder", "loeo", "few_shot", "forgetting", "baselines")
+"""Parts that the paper has, in its order."""
 VARIANTS = {variant.name: variant for variants in PARTS.values() for variant in variants}
+"""All variants by name."""
 
 
 def expected_counts(
@@ -147,10 +156,13 @@ def expected_counts(
     test_seeds: int = TEST_SEEDS_PER_TASK,
     robots: tuple[str, ...] = ROBOT_NAMES,
 ) -> dict[str, int]:
-    """Scored episodes of each robot in a complete table: 500 in the paper, or as many as a smaller study has.
+    """Number of scored episodes of each robot in a complete table: 500 in the paper, fewer in a smaller study.
 
     Args:
-        tasks, test_seeds, robots: of the study; the paper's where left out.
+        variant: the model.
+        tasks: number of the study's tasks.
+        test_seeds: number of its test seeds of each task.
+        robots: its robots.
     """
     return {robot: tasks * test_seeds for robot in variant.graded_robots if robot in robots}
 
@@ -161,12 +173,12 @@ def training_counts(
     train_seeds: int = TRAIN_SEEDS_PER_TASK,
     robots: tuple[str, ...] = ROBOT_NAMES,
 ) -> dict[str, int]:
-    """Episodes of each robot that a variant learns from; after an adaptation, those of the adaptation (replay not counted)."""
+    """Number of episodes of each robot that a variant learns from; of an adaptation, those of the target without replay."""
     if variant.target is not None:
         return {variant.target: tasks * variant.shots} if variant.target in robots else {}
     return {robot: tasks * train_seeds for robot in SPLITS[variant.split].train_robots if robot in robots}
 
 
 def seed_split(seed: int) -> str:
-    """'train' or 'test', the family that a scene seed belongs to."""
+    """The family that a scene seed belongs to, 'train' or 'test'."""
     return "test" if seed >= TEST_SEED_START else "train"

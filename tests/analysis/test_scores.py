@@ -27,6 +27,18 @@ METRICS = {
 ATTRIBUTES = {"protocol": 2, "metrics": METRICS, "versions": {"xew": "1.0"}, "estimators": {"masks": "default"}}
 
 
+def test_tables_without_titles_keep_those_that_they_were_shown_with(tmp_path: Path) -> None:
+    """Tables that were written before they carried titles, and metrics that nobody gave one."""
+    table = graded(baselines=False).replace({"metric": {"pck": "wobble"}})
+    table.attrs = ATTRIBUTES | {"metrics": {"lpips": METRICS["lpips"], "wobble": METRICS["pck"]}}
+    for path in (tmp_path / "scores.parquet", tmp_path / "scores.curves.parquet"):
+        table.to_parquet(path, index=False)
+    assert {metric.name: metric.title for metric in read_scores(tmp_path / "scores.parquet").metrics} == {
+        "lpips": "LPIPS",
+        "wobble": "wobble",
+    }
+
+
 def graded(model: str = "flow", robots: tuple[str, ...] = ("ur5_wsg", "piper"), baselines: bool = True) -> pd.DataFrame:
     """Two tasks with one seed each; every value differs."""
     models = [model, *((COPY, TRUTH) if baselines else ())]

@@ -165,7 +165,7 @@ def test_a_robot_that_moved_is_told(tmp_path: Path) -> None:
         file["endpose/left_endpose"][:, 0] += 0.05
     records, refused = import_all([tmp_path / LEGACY, moved], Args(tmp_path, tmp_path / "out"))
     assert len(records) == 1 and len(refused) == 1
-    assert "ARX X5 stands 50 mm from where it stood" in refused[0] and "another --out" in refused[0]
+    assert "ARX-X5 stands 50 mm from where it stood" in refused[0] and "another --out" in refused[0]
 
 
 def test_end_poses_may_be_absent(tmp_path: Path) -> None:

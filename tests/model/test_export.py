@@ -10,13 +10,14 @@ from flax import nnx
 from safetensors.numpy import load_file, save_file
 
 from xew.config import ConfigError
-from xew.model import export, train
+from xew.model import export
 from xew.model.devices.sharding import make_mesh
 from xew.model.experiment import create_model, load_experiment
 from xew.model.network.dit_layouts import load_dit
 from xew.model.runs.checkpoint import TrainState, open_checkpoints, save_state
+from xew.model.training.start import check_network, start_params
 from xew.model.training.step import make_learner
-from xew.model.weights.tensors import read_tensors
+from xew.model.weights.reading import read_tensors
 
 CONFIG = """
 data: data
@@ -86,8 +87,8 @@ def test_training_starts_from_published_weights(run: Path, tmp_path: Path) -> No
     only_wan = {key: array for key, array in tensors.items() if not key.startswith("stream")}
     save_file(only_wan, tmp_path / "wan.safetensors")
     experiment = load_experiment(run / "config.yaml", ["--model.weights", str(tmp_path / "wan.safetensors")])
-    train.check_network(experiment.network)
-    params = train.start_params(experiment, make_learner(experiment.learning, make_mesh(experiment.mesh)))
+    check_network(experiment.network)
+    params = start_params(make_learner(experiment.learning, make_mesh(experiment.mesh)), None, run)
     expected = nnx.state(create_model(experiment), nnx.Param)
     np.testing.assert_array_equal(
         params["blocks"]["ffn"]["first"]["kernel"][...], expected["blocks"]["ffn"]["first"]["kernel"][...] + 2
@@ -100,9 +101,9 @@ def test_networks_that_cannot_be_trained_are_told_first(run: Path, tmp_path: Pat
     export.export(run, tmp_path / "wan.safetensors", "official")
     foreign = ["--model.weights", str(tmp_path / "wan.safetensors"), "--model.size", "debug"]
     with pytest.raises(ConfigError, match=r"wan\.safetensors does not fit the model: .* missing"):
-        train.check_network(load_experiment(run / "config.yaml", foreign).network)
+        check_network(load_experiment(run / "config.yaml", foreign).network)
     with pytest.raises(ConfigError, match="there are no weights at nowhere"):
-        train.check_network(load_experiment(run / "config.yaml", ["--model.weights", "nowhere"]).network)
+        check_network(load_experiment(run / "config.yaml", ["--model.weights", "nowhere"]).network)
     if jax.default_backend() == "cpu":
         with pytest.raises(ConfigError, match="cudnn cannot be used: it needs a CUDA GPU and JAX runs on cpu"):
-            train.check_network(load_experiment(run / "config.yaml", ["--model.attention", "cudnn"]).network)
+            check_network(load_experiment(run / "config.yaml", ["--model.attention", "cudnn"]).network)

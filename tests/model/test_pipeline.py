@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from tests import synthetic
-from xew.dataset import find_records
+from xew.dataset import find_records, read_dataset
 from xew.episode import HEIGHT, WIDTH, read_video
 from xew.model import latents, rollout, train
 from xew.model.cache.clips import clip_starts
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment, load_experiment
+from xew.model.runs.log import RunLog
 from xew.model.training.data import ClipSource, fake_batch, make_dataset
-from xew.model.training.tensorboard import RunLog
 from xew.protocol import SEEN_ROBOTS
 from xew.rollout import find_rollouts, read_rollout_video
 
@@ -145,7 +145,7 @@ def test_stale_stream_is_an_error(
 
 
 def test_training_sees_training_robots_and_seeds_only(experiment: Experiment) -> None:
-    episodes = training_episodes(experiment.choice)
+    episodes = training_episodes(read_dataset(experiment.data), experiment.choice)
     assert {record.robot for _, record in episodes} == set(SEEN_ROBOTS)
     assert {record.seed for _, record in episodes} == {0}
 
@@ -158,14 +158,14 @@ def test_encoding_again_writes_nothing(world: Path, experiment: Experiment) -> N
 
 
 def test_batches_have_the_declared_shapes_and_resume(experiment: Experiment) -> None:
-    episodes = training_episodes(experiment.choice)
+    episodes = training_episodes(read_dataset(experiment.data), experiment.choice)
     source = ClipSource.open(experiment.encoding, experiment.instructions, episodes)
     assert len(source) == len(episodes) * len(clip_starts(FRAMES, 5))
     batches = iter(make_dataset(source, 2, seed=0))
     first, position = next(batches), batches.get_state()
     second = next(batches)
     fake = fake_batch(experiment.inputs, 2)
-    assert first.latents.shape == fake.latents.shape == (2, *experiment.latent_shape)
+    assert first.latents.shape == fake.latents.shape == (2, *experiment.inputs.latent_shape)
     assert {k: v.shape for k, v in first.conditions.items()} == {k: v.shape for k, v in fake.conditions.items()}
     assert first.text.shape == fake.text.shape
     continued = iter(make_dataset(source, 2, seed=0))
@@ -183,7 +183,7 @@ def test_threads_parse_no_python(experiment: Experiment, monkeypatch: pytest.Mon
         return parse(*args, **kwargs)
 
     monkeypatch.setattr(ast, "parse", noted)
-    episodes = training_episodes(experiment.choice)
+    episodes = training_episodes(read_dataset(experiment.data), experiment.choice)
     source = ClipSource.open(experiment.encoding, experiment.instructions, episodes)
     parsed.clear()
     batches = iter(make_dataset(source, 2, seed=0))

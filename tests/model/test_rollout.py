@@ -14,11 +14,11 @@ import pytest
 from flax import nnx
 
 from tests import synthetic
+from xew.dataset import Episode, read_dataset
 from xew.episode import EpisodeError, read_video
 from xew.model import latents, rollout
 from xew.model.cache.codecs import load_codec
 from xew.model.codecs.codec import encode_pictures
-from xew.model.episodes.choice import test_episodes as choose_tests
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment, create_model, load_experiment
 from xew.model.network.dit_layouts import save_dit
@@ -55,11 +55,15 @@ def predictor(world: Path) -> Predictor:
 
 def make_predictor(experiment: Experiment) -> Predictor:
     """A network whose output depends on all that it is given: nothing of it is zero."""
-    codec = load_codec(experiment.encoding, training_episodes(experiment.choice))
+    codec = load_codec(experiment.encoding, training_episodes(read_dataset(experiment.data), experiment.choice))
     graph, params = nnx.split(create_model(experiment), nnx.Param)
     keys = iter(jax.random.split(jax.random.key(3), 200))
     noisy = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(next(keys), leaf.shape, leaf.dtype), params)
     return Predictor(experiment.inputs, experiment.instructions, experiment.sampling, codec, graph, noisy)
+
+
+def choose_tests(data: Path) -> list[Episode]:
+    return read_dataset(data).select(robots=ROBOT_NAMES, split="test")
 
 
 def near(found: np.ndarray, expected: np.ndarray) -> bool:
@@ -69,7 +73,7 @@ def near(found: np.ndarray, expected: np.ndarray) -> bool:
 
 
 def test_an_episode_does_not_depend_on_its_batch(predictor: Predictor, world: Path) -> None:
-    episodes = choose_tests(world / "data", ROBOT_NAMES)[:3]
+    episodes = choose_tests(world / "data")[:3]
     together = predictor.predict(episodes, FRAMES)
     assert together.shape == (3, FRAMES, 64, 80, 3) and together.dtype == np.uint8
     assert np.abs(together[0].astype(int) - together[1]).mean() > 1
@@ -81,7 +85,7 @@ def test_later_chunks_continue_the_predicted_and_never_read_the_recorded(
     predictor: Predictor, world: Path, tmp_path: Path
 ) -> None:
     """All but the first frame of the scene is replaced: the prediction stays."""
-    episode = choose_tests(world / "data", ROBOT_NAMES)[0]
+    episode = choose_tests(world / "data")[0]
     before = predictor.predict([episode], FRAMES)
     folder, record = episode
     video = read_video(folder / "rgb.mkv")
@@ -118,7 +122,7 @@ def test_guidance_of_one_is_none_and_more_goes_away_from_the_negative(predictor:
 
 
 def test_guidance_reaches_the_rollout(predictor: Predictor, world: Path) -> None:
-    episodes = choose_tests(world / "data", ROBOT_NAMES)[:1]
+    episodes = choose_tests(world / "data")[:1]
     plain = predictor.predict(episodes, 5)
     settings = replace(predictor.settings, guidance=6.0, negative_prompt="blurred")
     guided = replace(predictor, settings=settings)
@@ -138,14 +142,14 @@ def test_one_way_streams_are_computed_once_with_the_same_result(world: Path) -> 
     cached = jax.jit(lambda: guided_velocity(model, inputs, 1.0)(latents_, level))()
     whole = jax.jit(lambda: model(latents_, conditions, level, inputs.text))()
     np.testing.assert_allclose(cached, whole, atol=1e-5)
-    episode = choose_tests(world / "data", ROBOT_NAMES)[:1]
+    episode = choose_tests(world / "data")[:1]
     assert one_way.predict(episode, FRAMES).shape == (1, FRAMES, 64, 80, 3)
 
 
 def test_sampler_and_grid_are_chosen_by_name(predictor: Predictor, world: Path) -> None:
     settings = replace(predictor.settings, sampler="unipc", grid="wan_official")
     other = replace(predictor, settings=settings)
-    episodes = choose_tests(world / "data", ROBOT_NAMES)[:1]
+    episodes = choose_tests(world / "data")[:1]
     plain = predictor.predict(episodes, 5)
     assert np.abs(other.predict(episodes, 5).astype(int) - plain).max() > 0
     settings = replace(settings, sampler="xew.model.diffusion.samplers:euler", grid="xew.model.diffusion.samplers:flowwam")
@@ -157,7 +161,7 @@ def test_a_codec_may_come_from_outside(world: Path) -> None:
     config = [str(world / "config.yaml"), "--codec.name", "xew.model.codecs.codec:PatchCodec"]
     latents.main(config)
     experiment = load_experiment(config[0], config[1:])
-    assert load_codec(experiment.encoding, training_episodes(experiment.choice)).channels == 4
+    assert load_codec(experiment.encoding, training_episodes(read_dataset(experiment.data), experiment.choice)).channels == 4
 
 
 DEVICES = """
@@ -165,7 +169,7 @@ import sys
 sys.path[:0] = {path!r}
 import jax, numpy as np
 from pathlib import Path
-from tests.model.test_rollout import FRAMES, ROBOT_NAMES, choose_tests, load_experiment, make_predictor
+from tests.model.test_rollout import FRAMES, choose_tests, load_experiment, make_predictor
 from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
 from dataclasses import replace
 assert len(jax.devices()) == 2
@@ -173,7 +177,7 @@ experiment = load_experiment({config!r})
 predictor = make_predictor(experiment)
 mesh = make_mesh(MeshSettings())
 predictor = replace(predictor, params=jax.device_put(predictor.params, replicated_sharding(mesh)))
-episodes = choose_tests(experiment.data, ROBOT_NAMES)[:3]
+episodes = choose_tests(experiment.data)[:3]
 begun = predictor.begin(episodes, FRAMES)
 assert len(begun.chunks[0].sharding.device_set) == 2 and begun.chunks[0].shape[0] == 4
 np.save({out!r}, begun.fetch())
@@ -187,7 +191,7 @@ def test_two_devices_share_a_batch_and_give_the_same(predictor: Predictor, world
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
-    episodes = choose_tests(world / "data", ROBOT_NAMES)[:3]
+    episodes = choose_tests(world / "data")[:3]
     assert near(np.load(tmp_path / "frames.npy"), predictor.predict(episodes, FRAMES))
 
 
@@ -238,7 +242,7 @@ def test_mistakes_end_in_one_clear_error(
 
 def test_rollouts_never_take_the_place_of_episodes(world: Path, published: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "rollouts would replace them" in fails([str(published), "--out", str(world / "data")], capsys)
-    assert choose_tests(world / "data", ROBOT_NAMES)
+    assert choose_tests(world / "data")
 
 
 def test_rollouts_are_called_as_their_run() -> None:
@@ -272,7 +276,7 @@ def test_a_run_allows_rollout_overrides_only(world: Path, tmp_path: Path, capsys
 
 
 def test_a_failed_write_is_told(world: Path, tmp_path: Path) -> None:
-    _, record = choose_tests(world / "data", ROBOT_NAMES)[0]
+    _, record = choose_tests(world / "data")[0]
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(EpisodeError, match="cannot write the rollout"), RolloutWriter(tmp_path / "file", list) as writer:
         writer.write(record, np.zeros((2, 64, 80, 3), np.uint8), {})

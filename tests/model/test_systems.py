@@ -11,7 +11,7 @@ from flax import nnx
 
 from tests import synthetic
 from xew.config import ConfigError
-from xew.dataset import find_accepted
+from xew.dataset import find_accepted, read_dataset
 from xew.episode import read_record, read_states, read_video, write_episode
 from xew.model import latents, rollout, train
 from xew.model.cache.codecs import load_codec
@@ -67,7 +67,7 @@ def test_a_system_is_trained_and_rolled_out(world: Path, name: str) -> None:
 def test_what_is_cached_has_the_declared_shapes(world: Path, name: str) -> None:
     latents.main([str(world / f"{name}.yaml")])
     experiment = load_experiment(world / f"{name}.yaml")
-    episodes = training_episodes(experiment.choice)
+    episodes = training_episodes(read_dataset(experiment.data), experiment.choice)
     source = ClipSource.open(experiment.encoding, experiment.instructions, episodes)
     fake = fake_batch(experiment.inputs, 1).conditions
     assert {key: (1, *value.shape) for key, value in source[0].conditions.items()} == {k: v.shape for k, v in fake.items()}
@@ -82,7 +82,7 @@ def test_a_rollout_s_history_is_its_own(world: Path, tmp_path: Path) -> None:
     """
     experiment = load_experiment(world / "ctrl_world.yaml")
     latents.main([str(world / "ctrl_world.yaml")])
-    episodes = training_episodes(experiment.choice)
+    episodes = training_episodes(read_dataset(experiment.data), experiment.choice)
     graph, params = nnx.split(create_model(experiment), nnx.Param)
     leaves, tree = jax.tree.flatten(params)
     keys = jax.random.split(jax.random.key(1), len(leaves))
@@ -111,7 +111,7 @@ def test_what_a_system_needs_and_lacks_is_told(world: Path, tmp_path: Path, caps
     config = world / "bwm.yaml"
     latents.main([str(config)])
     experiment = load_experiment(config)
-    scales_path(experiment.encoding, training_episodes(experiment.choice)).unlink()
+    scales_path(experiment.encoding, training_episodes(read_dataset(experiment.data), experiment.choice)).unlink()
     with pytest.raises(SystemExit) as stop:
         train.main([str(config), "--out", str(tmp_path / "run")])
     said = capsys.readouterr().err

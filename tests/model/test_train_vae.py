@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from tests import synthetic
-from xew.dataset import find_accepted
+from xew.dataset import find_accepted, read_dataset
 from xew.episode import EpisodeError, read_video
 from xew.model import latents, train_vae
 from xew.model.cache.store import open_cache
 from xew.model.codecs.codec import CodecSettings, WanVaeCodec
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import load_experiment
+from xew.model.settings.parts import EpisodeChoice
 from xew.model.train_vae import init_vae_state, load_vae_experiment, make_vae_step
 from xew.model.training.vae_data import Cut, make_dataset, random_clips, read_frames, video_files
 from xew.model.video.frames import to_model_size
@@ -82,7 +83,11 @@ def test_what_is_written_is_a_codec(run: Path) -> None:
     codec = WanVaeCodec.prepare(settings, list)
     assert codec.hash == report["hash"]
     experiment = load_vae_experiment(run / "config.yaml")
-    files = video_files(experiment.streams, training_episodes(experiment.choice), experiment.cache_folder)
+    files = video_files(
+        experiment.streams,
+        training_episodes(read_dataset(experiment.data), EpisodeChoice(experiment.robots)),
+        experiment.cache_folder,
+    )
     clips = [random_clips(*file, experiment.cut(whole=True), np.random.default_rng(1))[0] for file in files]
     encoded = np.concatenate([codec.encode(clip).reshape(-1, codec.channels) for clip in clips])
     assert np.abs(encoded.mean(0)).max() < 0.3
@@ -101,7 +106,7 @@ train: {{steps: 1, batch: 1}}
 """)
     latents.main([str(config)])
     experiment = load_experiment(config)
-    episodes = training_episodes(experiment.choice)
+    episodes = training_episodes(read_dataset(experiment.data), EpisodeChoice(experiment.robots))
     cache = open_cache(experiment.encoding, episodes)
     codec = cache.codec
     stored = cache.read(episodes[0][1], "rgb", 0)
@@ -118,7 +123,9 @@ def test_steps_learn(world: Path) -> None:
     experiment = load_vae_experiment(world / "vae.yaml", ["--train.steps", "100", "--train.lpips", "0.2"])
     graph, statistics, state = init_vae_state(experiment)
     step = make_vae_step(graph, statistics, experiment)
-    files = video_files(("rgb",), training_episodes(experiment.choice), experiment.cache_folder)
+    files = video_files(
+        ("rgb",), training_episodes(read_dataset(experiment.data), EpisodeChoice(experiment.robots)), experiment.cache_folder
+    )
     pictures = next(iter(make_dataset(files, experiment.cut(), 2, 0)))
     psnr, perceptual = [], []
     for _ in range(25):
@@ -133,7 +140,7 @@ def test_steps_learn(world: Path) -> None:
 
 def test_only_training_robots_and_seeds_are_seen(world: Path) -> None:
     experiment = load_vae_experiment(world / "vae.yaml")
-    chosen = training_episodes(experiment.choice)
+    chosen = training_episodes(read_dataset(experiment.data), EpisodeChoice(experiment.robots))
     everything = find_accepted(experiment.data)
     robots = {record.robot for _, record in chosen}
     assert robots == set(experiment.robots.train_robots) and len(chosen) == 3 < len(everything)

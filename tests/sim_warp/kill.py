@@ -95,7 +95,7 @@ def _accepted(out: Path) -> list[tuple[Path, Record]]:
 
 
 @contextmanager
-def reading(out: Path) -> Iterator[Reading]:
+def read_beside(out: Path) -> Iterator[Reading]:
     """A reader at work in another process; what it saw is filled in at the end."""
     context = multiprocessing.get_context("spawn")
     stop, result, seen = context.Event(), context.Queue(), Reading()
@@ -114,7 +114,7 @@ def count(out: Path) -> int:
     return sum(len(names) for _, _, names in os.walk(out))
 
 
-def killed(out: Path, files: int, rng: random.Random) -> str | None:
+def kill_at_random(out: Path, files: int, rng: random.Random) -> str | None:
     """Start, and kill at a random moment of what is left to do; a line about it, or None if the run ended before.
 
     Args:
@@ -138,7 +138,7 @@ def killed(out: Path, files: int, rng: random.Random) -> str | None:
     return None
 
 
-def undisturbed(out: Path) -> dict[str, str]:
+def make_undisturbed(out: Path) -> dict[str, str]:
     """The files of a run without a kill."""
     finish(start(out))
     return contents(out)
@@ -155,14 +155,14 @@ class Args:
 def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     with tempfile.TemporaryDirectory() as folder:
-        expected = undisturbed(Path(folder) / "undisturbed")
+        expected = make_undisturbed(Path(folder) / "undisturbed")
         print(f"undisturbed: {len(expected)} files", flush=True)
         rng, kills, sets, rounds, episodes = random.Random(args.seed), 0, 0, 0, 0
         while kills < args.kills:
             out, sets = Path(folder) / f"killed{sets}", sets + 1
-            with reading(out) as reader:
+            with read_beside(out) as reader:
                 for _ in range(min(rng.randint(3, 6), args.kills - kills)):
-                    if told := killed(out, len(expected), rng):
+                    if told := kill_at_random(out, len(expected), rng):
                         kills += 1
                         print(f"{kills}: data set {sets}: {told}", flush=True)
                 finish(start(out))

@@ -32,9 +32,9 @@ def test_kinematics_agree_before_they_are_timed(monkeypatch: pytest.MonkeyPatch,
 def test_kinematics_that_differ_are_refused() -> None:
     module = benchmark("kinematics")
     urdf = module.load_urdf(module.get_robot("piper").urdf)
-    joint_pos = module.configurations(urdf, 64)
-    right = module.ours(urdf, joint_pos, "cpu")
-    wrong = module.ours(urdf, joint_pos + 1e-3, "cpu")
+    joint_pos = module.draw_configurations(urdf, 64)
+    right = module.kernel_contender(urdf, joint_pos, "cpu")
+    wrong = module.kernel_contender(urdf, joint_pos + 1e-3, "cpu")
     assert module.check(urdf, [right, right]) == 0
     with pytest.raises(AssertionError, match="differs from xew kernel"):
         module.check(urdf, [right, wrong])

@@ -7,15 +7,15 @@ import random
 import threading
 from pathlib import Path
 
-from tests.sim_warp.kill import contents, finish, killed, reading, start, undisturbed
+from tests.sim_warp.kill import contents, finish, kill_at_random, make_undisturbed, read_beside, start
 from xew.dataset import find_records
 from xew.episode import Record, complete_folder, episode_folder, write_episode
 
 
 def test_kills_change_no_byte(tmp_path: Path) -> None:
-    expected, out, rng = undisturbed(tmp_path / "undisturbed"), tmp_path / "killed", random.Random(0)
-    with reading(out) as reader:
-        told = [killed(out, len(expected), rng) for _ in range(2)]
+    expected, out, rng = make_undisturbed(tmp_path / "undisturbed"), tmp_path / "killed", random.Random(0)
+    with read_beside(out) as reader:
+        told = [kill_at_random(out, len(expected), rng) for _ in range(2)]
         finish(start(out))
     assert any(told), "both runs ended before they were killed"
     assert not reader.wrong and reader.episodes, reader.wrong

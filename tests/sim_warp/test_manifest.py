@@ -120,3 +120,44 @@ def test_the_command_writes_where_it_is_told_to(
             main()
         assert left.value.code == 2 and told in capsys.readouterr().err
     assert PACKAGED.read_bytes() == packaged
+
+
+def test_seeds_that_some_robot_has_not_tried_are_neither_accepted_nor_rejected() -> None:
+    seeds = manifest_of([*RECORDS, header(9, "ur5_wsg", "slip")]).tasks["grab_roller"]
+    assert 9 not in seeds.train and "9" not in seeds.rejected
+
+
+def test_a_manifest_says_what_it_was_found_with() -> None:
+    manifest = manifest_of(RECORDS)
+    assert (manifest.robots, manifest.device, manifest.versions) == (ROBOTS, "here", {"xew": "0"})
+    assert manifest_of([]) == Manifest()
+
+
+def test_a_change_of_one_seed_changes_one_line() -> None:
+    before = to_json(manifest_of(RECORDS)).splitlines()
+    after = to_json(manifest_of([*RECORDS, *(header(8, robot) for robot in ROBOTS)])).splitlines()
+    changed = [(old, new) for old, new in zip(before, after, strict=True) if old != new]
+    assert [(old.strip(), new.strip()) for old, new in changed] == [('"train": [0, 2, 5],', '"train": [0, 2, 5, 8],')]
+
+
+def test_tasks_stand_in_order_of_their_names_whatever_was_made_first() -> None:
+    later = Record("a_task", 0, "piper", True, device="here", versions={"xew": "0"})
+    assert list(manifest_of([*RECORDS, later]).tasks) == ["a_task", "grab_roller"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"train": [0, -1]}, "grab_roller: seeds must be whole, ascending and from 0 to 999999, found (0, -1)…"),
+        ({"test": [3]}, "from 1000000 to 1999999, found (3,)…"),
+        ({"rejected": {"../1": {"piper": "plan"}}}, "rejected seeds must be whole numbers, found '../1'"),
+        ({"rejected": {"0": {"piper": "plan"}}}, "seeds ['0'] are accepted and rejected"),
+        ({"train": [True]}, "found True, expected a whole number"),
+    ],
+)
+def test_the_line_says_what_is_wrong_and_how_to_make_another(changes: dict[str, object], told: str, tmp_path: Path) -> None:
+    path = tmp_path / "seeds.json"
+    path.write_text(broken(**changes))
+    with pytest.raises(EpisodeError) as error:
+        read_manifest(path)
+    assert told in str(error.value) and str(error.value).endswith(f"python -m xew.sim_warp.manifest DATA --out {path}")

@@ -104,7 +104,7 @@ def test_a_vessel_shows_its_outer_and_its_inner_color() -> None:
 
 def test_a_moved_shape_moves_looks_and_hulls_alike() -> None:
     shape, offset = SHAPES["block"], np.array([0.1, -0.2, 0.3], np.float32)
-    moved = objects.moved(shape, tuple(offset.tolist()))
+    moved = objects.move(shape, tuple(offset.tolist()))
     np.testing.assert_allclose(moved.mesh.vertices, shape.mesh.vertices + offset, atol=1e-6)
     np.testing.assert_allclose(hulls_of(moved), hulls_of(shape) + offset, atol=1e-6)
     np.testing.assert_array_equal(moved.mesh.normals, shape.mesh.normals)
@@ -118,8 +118,8 @@ def test_pieces_that_are_merged_are_all_seen_and_all_collide() -> None:
 
 
 def test_darker_colors_keep_their_hue() -> None:
-    assert objects.darker((200, 100, 50), 0.5) == (100, 50, 25)
-    assert objects.darker(RED, 1.0) == RED
+    assert objects.darken((200, 100, 50), 0.5) == (100, 50, 25)
+    assert objects.darken(RED, 1.0) == RED
 
 
 def test_colors_of_the_palette_can_be_told_apart() -> None:

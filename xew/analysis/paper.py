@@ -99,7 +99,7 @@ class PublishedChange:
     """Place of the value after."""
     percent: float
     word: Literal["rounded", "about", "less than"] = "rounded"
-    """How exact the text is. 'about': it rounds to tens ("roughly", "nearly"). 'less than': the change is smaller."""
+    """Exactness of the text. 'about': it rounds to tens ("roughly", "nearly"). 'less than': the change is smaller."""
     toward: str | None = None
     """Place of a goal, if any: then `percent` is the share of the way from `before` to it."""
 

@@ -1,9 +1,9 @@
-"""A score table to one page that opens without a network.
+"""The report of a score table: one page that opens without a network.
 
 Reads  scores.parquet and its curves; the data set and the rollouts for pictures
 Writes <out>/index.html (self-contained), report.md with figures/, tables/ (LaTeX, CSV) and summary.csv; of a study findings.csv
 
-A table with the column `variant` is a study's (xew.analysis.study writes it) and becomes the report of `report_study`.
+A table with the column `variant` is a study's (xew.analysis.study writes it) and becomes the report of `reports/study.py`.
 
     python -m xew.analysis.report demo/scores.parquet --data demo/data --rollouts demo/rollouts --out demo/report
 
@@ -44,14 +44,16 @@ from xew.statistics import MIN_SCENES
 
 TITLE = "Can the model render a robot that it has never seen?"
 STRIP_METRIC = "lpips"
-"""By which episodes are ranked, so that strips show the best, the median and the worst."""
+"""Metric that ranks episodes, so that strips show the best, the median and the worst."""
 FRAME_ZERO = {
     "given": "frame 0 is given to the model and never scored",
     "absent": "frame 0, which the model was given and its videos leave out, is never scored",
     "predicted": "frame 0 is predicted too, and scored as all others",
 }
 CURVE_METRICS = ("lpips", "psnr", "mask_iou")
+"""Metrics whose error is drawn by frame."""
 SHEET_TASKS = 8
+"""Largest number of tasks on the contact sheet."""
 
 
 @dataclass(frozen=True)
@@ -59,17 +61,17 @@ class Args:
     """Turn a score table into one HTML page, with Markdown and CSV beside it."""
 
     scores: Annotated[Path | None, tyro.conf.Positional] = None
-    """Made by python -m xew.metrics.evaluate; needed unless --paper is given."""
+    """Score table that python -m xew.metrics.evaluate made; needed unless --paper is given."""
     data: Path | None = None
-    """The data set, for pictures and for the number of episodes that a complete table has."""
+    """Data set, for pictures and for the number of episodes that a complete table has."""
     rollouts: tuple[Path, ...] = ()
-    """The graded rollouts, for pictures."""
+    """Graded rollouts, for pictures."""
     out: Path = Path("report")
     """Folder to write."""
     held_out: tuple[str, ...] = HELD_OUT_ROBOTS
     """Robots that the models have not seen; each has a table of its own, as have all robots that are not the paper's."""
     distances: Path | None = None
-    """Folder that python -m xew.analysis.distance wrote; for a study. Without it the paper's distances stand in."""
+    """Folder that python -m xew.analysis.distance wrote, for a study; without it the paper's distances are used."""
     paper: bool = False
     """Instead of scores: rebuild the paper's distance table from the paper's own scores and distances."""
 
@@ -80,13 +82,13 @@ class Picture:
 
     name: str
     image: bytes
-    """PNG."""
+    """PNG file."""
     html: Markup
 
 
 @user_errors
 def main(args: Args) -> None:
-    """Read everything, then write the page."""
+    """Read the scores, make the report and write it."""
     if args.paper:
         _report_paper(args)
     elif args.scores:
@@ -136,7 +138,7 @@ def _report_scores(args: Args, scores: Scores) -> None:
         *map(page.note, report_study.missing_note(missing)),
         _held_out_section(held_out, scores.metrics),
         _strip_section(strips),
-        page.section("How the error grows with time", page.chart(curves)),
+        page.section("How the error grows with time", page.chart(curves)) if curves.panels else None,
         _seen_section(seen, scores.metrics),
         _data_section(sheets, records),
         _method_section(scores, args),
@@ -188,7 +190,7 @@ def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo
 
 
 def _caution_notes(tables: Sequence[RobotTable]) -> list[str]:
-    """What to say of few episodes; none where there are enough."""
+    """A note where episodes are few; none where there are enough."""
     few = min((table.count for table in tables), default=np.inf)
     if few < MIN_SCENES:
         return [f"Fewer than {MIN_SCENES} scenes: no intervals, and nothing is resolved."]
@@ -271,7 +273,7 @@ def _method_section(scores: Scores, args: Args) -> Markup:
 
 
 def _make_strips(scores: Scores, args: Args) -> list[Picture]:
-    """Up to three strips for each held-out robot and model."""
+    """Make up to three strips for each held-out robot and model."""
     assert args.data is not None
     rollouts = {(r.model, r.condition, r.task, r.seed, r.robot): r for root in args.rollouts for r in find_rollouts(root)}
     rows = scores.rows[(scores.rows["metric"] == STRIP_METRIC) & scores.rows["robot"].isin(args.held_out)]
@@ -357,7 +359,7 @@ def _write_markdown(
     figures: Sequence[Picture],
     charts: Mapping[str, bytes],
 ) -> tuple[str, dict[str, bytes]]:
-    """report.md and the files that it shows."""
+    """The text of report.md, and the files beside it."""
     lines = [f"# {TITLE}", "", *(f"- {sentence}" for sentence in sentences), *(f"\n> {note}" for note in notes)]
     for heading, tables in (("Robots never seen in training", held_out), ("Robots seen in training", seen)):
         lines += ["", f"## {heading}"]
@@ -373,7 +375,7 @@ def _write_markdown(
 
 
 def _write_report(out: Path, html: str, markdown: tuple[str, Mapping[str, bytes]], summary: pd.DataFrame) -> None:
-    """The page last, so that where it stands all that it speaks of stands too."""
+    """Write all files, the page last, so that everything it speaks of exists once it does."""
     text, files = markdown
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Score tables, read, checked and merged. Cells that are wrong are named, never averaged over.
+"""Score tables: reading, checking and merging them. Rows that are wrong are named, never averaged over.
 
 A study's table is several runs' tables as one: `merge_scores` adds the column `variant`, which names the trained model of
 each row (xew.protocol.Variant) and is empty for the two baselines, which belong to no model.
@@ -21,15 +21,15 @@ VARIANT = "variant"
 EPISODE = ["task", "seed", "robot"]
 KEY = ["model", "condition", *EPISODE]
 NAMES = [VARIANT, "model", "condition", "task", "robot", "metric"]
-"""Columns of text."""
+"""Names of the columns of text."""
 COLUMNS = [*KEY, "metric", "value", "frames", "exact_frames"]
 COPY, TRUTH = BASELINES
-"""The two models that every other is read against: a score of nothing, and the ceiling."""
+"""Names of both baselines: the frozen first frame, and the true video, which is the ceiling."""
 COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero")
-"""What a table says of how it was graded; tables that differ in it do not compare."""
+"""Attributes that say how a table was graded; tables that differ in one cannot be compared."""
 DEFINITION = ("dimension", "unit", "higher_is_better", "low", "high", "reference")
-"""What a table says of each metric, and has always said."""
-TITLES_OF_0_1 = {
+"""Attributes of each metric that every table has, old ones too."""
+EARLIER_TITLES = {
     "psnr": "PSNR",
     "ssim": "SSIM",
     "lpips": "LPIPS",
@@ -44,16 +44,16 @@ TITLES_OF_0_1 = {
     "trajectory_error": "Object error",
     "object_coverage": "Objects found",
 }
-"""Titles of metrics in tables of version 0.1.0, which do not say them."""
+"""Titles of metrics in score tables that were written before tables carried them."""
 LISTED = 20
-"""Cells that an error names of each kind; it counts the others."""
+"""Largest number of rows of each kind that an error names; it counts the others."""
 
 EVALUATE = "python -m xew.metrics.evaluate ROLLOUTS --data DATA --out {path}"
 
 
 @dataclass(frozen=True)
 class MetricInfo:
-    """What the score table says of a metric."""
+    """A metric as the score table describes it."""
 
     name: str
     dimension: str
@@ -63,15 +63,15 @@ class MetricInfo:
     high: float | None
     reference: str
     title: str = ""
-    """What tables and charts call it; its name where the table does not say."""
+    """Title in tables and charts; its name where the table gives none."""
     estimated: bool = False
-    """Does it need an estimator, so that even the true video does not get the best score?"""
+    """Whether it needs an estimator, so that even the true video does not get the best score."""
     reported: bool = False
-    """Does a study's full table show it, beside the metrics of the paper?"""
+    """Whether a study's full tables show it beside the metrics of the paper."""
 
     def __post_init__(self) -> None:
         if not self.title:
-            object.__setattr__(self, "title", self.name)
+            object.__setattr__(self, "title", EARLIER_TITLES.get(self.name, self.name))
 
     @property
     def best(self) -> float | None:
@@ -84,12 +84,12 @@ class Scores:
     """A checked score table."""
 
     rows: pd.DataFrame
-    """One row per model, condition, task, seed, robot and metric; of a study also per variant."""
+    """Table with one row per model, condition, task, seed, robot and metric; of a study also per variant."""
     curves: pd.DataFrame
-    """The same by frame."""
+    """Table of the same scores by frame."""
     metrics: tuple[MetricInfo, ...]
     attributes: Mapping[Hashable, Any]
-    """What the table says of itself: protocol, metrics, versions, estimators, frame_zero."""
+    """Attributes of the table: protocol, metrics, versions, estimators, frame_zero."""
 
     @property
     def protocol(self) -> int:
@@ -101,24 +101,24 @@ class Scores:
 
     @property
     def frame_zero(self) -> str:
-        """What became of frame 0: given (and not scored), absent from the videos, or predicted."""
+        """Treatment of frame 0: given (and not scored), absent from the videos, or predicted."""
         return self.attributes.get("frame_zero", "given")
 
     @property
     def measured_by(self) -> dict[str, str]:
-        """What a reader has to know of how it was graded, in words."""
+        """How the table was graded, as names and texts."""
         estimators = {f"estimator of {name}": str(used) for name, used in self.attributes.get("estimators", {}).items()}
         allowed = ", ".join(self.attributes.get("allowed", ())) or "nothing"
         return {"protocol": str(self.protocol), **estimators, "frame 0": self.frame_zero, "changed to fit": allowed}
 
     @property
     def of_study(self) -> bool:
-        """Does the table hold several variants, or one ordinary run?"""
+        """Whether the table is a study's, with several variants, and not of one run."""
         return VARIANT in self.rows
 
     @property
     def models(self) -> list[tuple[str, str]]:
-        """(model, condition) of all that is not a baseline, in order."""
+        """Model and condition of all rows that are no baseline, each pair once, in order."""
         pairs = self.rows[["model", "condition"]].drop_duplicates().itertuples(index=False, name=None)
         return [pair for pair in pairs if pair[0] not in (COPY, TRUTH)]
 
@@ -189,7 +189,7 @@ def merge_scores(tables: Sequence[tuple[str, Path]], own_robots: Sequence[str] =
 
 
 def write_scores(scores: Scores, path: Path) -> None:
-    """Write a table and its curves so that `read_scores` reads them back; never half of one.
+    """Write a table and its curves, each file whole or not at all, so that `read_scores` reads them back.
 
     Raises:
         ConfigError: they cannot be written there.
@@ -205,7 +205,7 @@ def write_scores(scores: Scores, path: Path) -> None:
 
 
 def find_missing_scores(rows: pd.DataFrame) -> pd.DataFrame:
-    """What some graded and others did not: means over such cells would compare different episodes.
+    """Find scores that some models have and others lack: means over such cells would compare different episodes.
 
     A model (of a variant and condition) that has a score of a robot is expected to have all scores that any other has of
     this robot. Whole robots that it was never asked for are the protocol's to count (xew.protocol).
@@ -222,7 +222,7 @@ def find_missing_scores(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def describe_scores(cells: pd.DataFrame, most: int = LISTED) -> str:
-    """Such as 'reference flow open_laptop 1000003 piper lpips; …', and how many more there are."""
+    """Text such as 'reference flow open_laptop 1000003 piper lpips; …', with the number of those left out."""
     columns = [column for column in (VARIANT, *KEY, "metric") if column in cells]
     shown = "; ".join(" ".join(str(part) for part in cell if part != "") for cell in cells[columns].head(most).to_numpy())
     return shown + (f"; and {len(cells) - most} more" if len(cells) > most else "")
@@ -240,21 +240,20 @@ def _read(path: Path, command: str) -> pd.DataFrame:
 
 
 def _read_metric_infos(path: Path, described: Mapping[str, Mapping[str, Any]]) -> tuple[MetricInfo, ...]:
-    """What a table says of its metrics; more than is asked for here is left alone."""
+    """Read the descriptions of a table's metrics; further entries are ignored."""
     for metric, info in described.items():
         if missing := [name for name in DEFINITION if name not in info]:
             raise ConfigError(f"{path} does not say the {', '.join(missing)} of {metric}; it is no score table of this xew.")
     known = {field.name for field in fields(MetricInfo)}
     return tuple(
-        MetricInfo(name=metric, **_of_0_1(metric, info) | {k: v for k, v in info.items() if k in known})
+        MetricInfo(name=metric, **{"estimated": _guess_estimated(metric, info)} | {k: v for k, v in info.items() if k in known})
         for metric, info in described.items()
     )
 
 
-def _of_0_1(metric: str, info: Mapping[str, Any]) -> dict[str, Any]:
-    """What tables of version 0.1.0 do not say of a metric: its title, and that of whole pictures nothing was estimated."""
-    estimated = info["dimension"] != "visual" and metric != "region_lpips"
-    return {"title": TITLES_OF_0_1.get(metric, ""), "estimated": estimated}
+def _guess_estimated(metric: str, info: Mapping[str, Any]) -> bool:
+    """Whether a metric is estimated, for tables that were written before they said so: metrics of whole pictures are not."""
+    return info["dimension"] != "visual" and metric != "region_lpips"
 
 
 def _have_same_metrics(one: Mapping[str, Mapping[str, Any]], other: Mapping[str, Mapping[str, Any]]) -> bool:

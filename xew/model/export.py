@@ -5,26 +5,28 @@ Writes a folder of safetensors with config.json, as `WanTransformer3DModel.from_
 Command: python -m xew.model.export RUN --out FOLDER [--naming official] [--dtype bfloat16]
 """
 
-import argparse
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
+import tyro
 from flax import nnx
 
 from xew.config import ConfigError, user_errors
 from xew.model.network.dit import parameter_count
 from xew.model.network.dit_layouts import Naming, save_dit, wan_layout
 from xew.model.network.tokens import WAVELENGTH_BASE
+from xew.model.runs.checkpoint import restore_params
 from xew.model.runs.folder import load_run_config
-from xew.model.runs.start import restore_params
-from xew.model.weights.tensors import checkpoint_shapes
+from xew.model.weights.layout import checkpoint_shapes
 
 
 def export(run: Path, out: Path, naming: Naming = "diffusers", dtype: str = "float32", step: int | None = None) -> int:
-    """Write the network of a run, and tell the step of the checkpoint that it is of.
+    """Write the network of a run, and return the step of the checkpoint that it is of.
 
     Raises:
         ConfigError: there is no such run or checkpoint, or the place is taken or cannot be written.
@@ -48,15 +50,26 @@ def export(run: Path, out: Path, naming: Naming = "diffusers", dtype: str = "flo
     return step
 
 
+@dataclass(frozen=True)
+class Args:
+    """Which run to export, and how."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Folder of a trained run."""
+    out: Path
+    """Folder, or a file that ends in .safetensors."""
+    naming: Naming = "diffusers"
+    """Names of the weights: diffusers' or those of Wan's own code."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Type of the weights."""
+    checkpoint: int | None = None
+    """Step of the checkpoint; the latest where left out."""
+
+
 @user_errors
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="python -m xew.model.export", description=__doc__.splitlines()[0])
-    parser.add_argument("run", type=Path, help="folder of a trained run")
-    parser.add_argument("--out", type=Path, required=True, help="folder, or a file that ends in .safetensors")
-    parser.add_argument("--naming", choices=("diffusers", "official"), default="diffusers", help="default: diffusers")
-    parser.add_argument("--dtype", choices=("float32", "bfloat16"), default="float32", help="default: float32")
-    parser.add_argument("--checkpoint", type=int, metavar="STEP", help="default: the latest")
-    args = parser.parse_args(arguments)
+    """Write the network of a run."""
+    args = tyro.cli(Args, args=arguments, prog="python -m xew.model.export", description=__doc__.splitlines()[0])
     export(args.run, args.out, args.naming, args.dtype, args.checkpoint)
 
 

@@ -8,40 +8,44 @@ KEY names the codec, the source data and the cut into clips, so that what is sta
 Command: python -m xew.model.latents CONFIG [--data … and other overrides]
 """
 
-import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from xew.config import ConfigError, user_errors
-from xew.dataset import Episode, read_dataset
+from xew.dataset import Dataset, Episode, read_dataset
 from xew.model.cache.codecs import prepare_codec
 from xew.model.cache.encode import encode_episodes
 from xew.model.cache.keys import CACHE_VERSION
 from xew.model.cache.scales import keep_scales
 from xew.model.cache.store import LatentCache
 from xew.model.codecs.ceiling import choose_evenly, measure_ceiling
-from xew.model.episodes.choice import replay_episodes, test_episodes, training_episodes
-from xew.model.experiment import Experiment, load_experiment
+from xew.model.episodes.choice import replay_episodes, training_episodes
+from xew.model.experiment import Experiment, parse_experiment
 from xew.model.video.pixels import PixelSource, rendered_pixels, stored_pixels
 
 CEILING_CLIPS = 8
 """Number of clips that the codec's reconstruction is measured on."""
 
 
+@dataclass(frozen=True)
+class Flags:
+    """Options of the command itself."""
+
+    from_states: bool = False
+    """Render the episodes anew; no video needs to be there."""
+    batch: int = 4
+    """Number of clips that the codec encodes at once."""
+
+
 @user_errors
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="python -m xew.model.latents", description=__doc__.splitlines()[0])
-    parser.add_argument("config", type=Path, help="a YAML file such as configs/debug.yaml")
-    parser.add_argument("--from-states", action="store_true", help="render the episodes anew; no video needs to be there")
-    parser.add_argument("--batch", type=int, default=4, help="clips that the codec encodes at once (default: 4)")
-    args, overrides = parser.parse_known_args(arguments)
-    if args.batch < 1:
-        raise ConfigError(f"--batch is {args.batch}; expected at least one clip.")
-    experiment = load_experiment(args.config, overrides)
-    encode_experiment(experiment, rendered_pixels() if args.from_states else stored_pixels, args.batch)
+    """Encode what the training of an experiment reads."""
+    flags, experiment = parse_experiment(Flags, arguments, "python -m xew.model.latents", __doc__.splitlines()[0])
+    if flags.batch < 1:
+        raise ConfigError(f"--batch is {flags.batch}; expected at least one clip.")
+    encode_experiment(experiment, rendered_pixels() if flags.from_states else stored_pixels, flags.batch)
 
 
 def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixels, batch: int = 4) -> None:
@@ -51,15 +55,15 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
         source: where the episodes' pixels come from.
         batch: clips that the codec encodes at once.
     """
-    encoding = experiment.encoding
-    episodes = training_episodes(experiment.choice)
+    encoding, dataset = experiment.encoding, read_dataset(experiment.data)
+    episodes = training_episodes(dataset, experiment.choice)
     codec = prepare_codec(encoding, episodes, source)
     keep_scales(encoding, episodes)
-    experiment.instructions.encode(record.instruction for _, record in read_dataset(experiment.data).accepted)
+    experiment.instructions.encode(record.instruction for _, record in dataset.accepted)
     cache = LatentCache(encoding, codec)
-    written = encode_episodes(cache, [*episodes, *replay_episodes(experiment.choice)], source, batch)
+    written = encode_episodes(cache, [*episodes, *replay_episodes(dataset, experiment.choice)], source, batch)
     header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip), "streams": list(cache.streams)}
-    header |= {"episodes": len(episodes), "ceiling": report_ceiling(experiment, cache, episodes, source)}
+    header |= {"episodes": len(episodes), "ceiling": report_ceiling(experiment, cache, dataset, episodes, source)}
     (encoding.folder / "header.json").write_text(json.dumps(header, indent=1) + "\n")
     robots, streams = sorted({record.robot for _, record in episodes}), ", ".join(cache.streams)
     print(f"{encoding.folder}: {len(episodes)} episodes of {', '.join(robots)}")
@@ -67,10 +71,10 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
 
 
 def report_ceiling(
-    experiment: Experiment, cache: LatentCache, episodes: Sequence[Episode], source: PixelSource
+    experiment: Experiment, cache: LatentCache, dataset: Dataset, episodes: Sequence[Episode], source: PixelSource
 ) -> dict[str, Any]:
     """Measure the codec's reconstruction on test seeds of held-out robots, or on training data where there are none."""
-    held_out = test_episodes(experiment.data, experiment.robots.held_out_robots)
+    held_out = dataset.select(robots=experiment.robots.held_out_robots, split="test")
     chosen = choose_evenly(held_out or episodes, CEILING_CLIPS)
     videos = (source(folder, record, ("rgb",))["rgb"] for folder, record in chosen)
     measured = measure_ceiling(cache.codec, videos, **asdict(experiment.clip))

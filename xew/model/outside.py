@@ -10,16 +10,16 @@ Rollouts that are there are not made again: where the model has changed, delete 
 Command: python -m xew.model.outside module:NAME --data DATA --split test --out rollouts/NAME
 """
 
-import argparse
 import importlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
+import tyro
 from tqdm import tqdm
 
 from xew.config import ConfigError, user_errors
@@ -156,25 +156,38 @@ def predict(model: OutsideModel, name: str, inputs: EpisodeInputs) -> np.ndarray
     return video
 
 
+@dataclass(frozen=True)
+class Args:
+    """What to predict, with what, and where it goes."""
+
+    model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="module:NAME")]
+    """A function or class, such as examples.own_model:freeze."""
+    data: Path
+    """Episodes."""
+    split: Literal["test", "train"] = "test"
+    """Seed family."""
+    robots: tuple[str, ...] = ()
+    """Robots to predict; all of the data where left out."""
+    max_frames: int = 0
+    """Predict only the first so many frames; 0 predicts all."""
+    condition: str = ""
+    """What the model is told of the robot, for the tables."""
+    out: Path | None = None
+    """Folder to write to; rollouts/NAME where left out."""
+
+
 @user_errors
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="python -m xew.model.outside", description=__doc__.splitlines()[0])
-    parser.add_argument("model", metavar="module:NAME", help="a function or class, such as examples.own_model:freeze")
-    parser.add_argument("--data", type=Path, required=True, help="episodes")
-    parser.add_argument("--split", choices=("test", "train"), default="test", help="seed family (default: test)")
-    parser.add_argument("--robots", nargs="+", metavar="ROBOT", help="default: all of the data")
-    parser.add_argument("--max-frames", type=int, default=0, help="predict only the first so many frames")
-    parser.add_argument("--condition", default="", help="what the model is told of the robot, for the tables")
-    parser.add_argument("--out", type=Path, help="default: rollouts/NAME")
-    args = parser.parse_args(arguments)
+    """Predict episodes with a model from outside, and write them."""
+    args = tyro.cli(Args, args=arguments, prog="python -m xew.model.outside", description=__doc__.splitlines()[0])
     if args.max_frames < 0:
         raise ConfigError(f"--max-frames is {args.max_frames}; expected a number of frames, or 0 for all.")
     name = args.model.rpartition(":")[2]
     out = args.out or Path("rollouts") / name
     check_out(out, args.data)
-    episodes = select_episodes(args.data, args.split, args.robots)
-    told = [(e, common_header(name, args.condition, e[1], args.max_frames) | {"outside": args.model}) for e in episodes]
-    pending = [item for item in told if not is_done(out, *item)]
+    episodes = select_episodes(args.data, args.split, args.robots or None)
+    items = [(e, common_header(name, args.condition, e[1], args.max_frames) | {"outside": args.model}) for e in episodes]
+    pending = [item for item in items if not is_done(out, *item)]
     model = load_model(args.model)
     with (
         tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
@@ -182,7 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ):
         for episode, header in pending:
             writer.write(episode[1], predict(model, args.model, read_inputs(episode, args.max_frames)), header)
-    print(f"{out}: {len(pending)} rollouts new, {len(told) - len(pending)} there before, {args.model}")
+    print(f"{out}: {len(pending)} rollouts new, {len(items) - len(pending)} there before, {args.model}")
 
 
 if __name__ == "__main__":

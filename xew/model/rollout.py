@@ -7,16 +7,15 @@ Episodes are predicted in batches over all devices; while these work on one, the
 Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … --out … --rollout.steps …]
 """
 
-import argparse
 import json
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -24,9 +23,10 @@ from flax import nnx
 from jax.sharding import Mesh
 from tqdm import tqdm
 
+from xew.command_line import find_path, parse_command
 from xew.compilation import keep_compiled_programs
 from xew.config import CONVERTER, ConfigError, user_errors
-from xew.dataset import Episode
+from xew.dataset import Episode, read_dataset
 from xew.episode import Record, episode_folder
 from xew.files import checkpoint_time
 from xew.model.cache.codecs import load_codec
@@ -34,13 +34,14 @@ from xew.model.cache.scales import Scale, load_run_scales
 from xew.model.codecs.codec import Codec, codec_class
 from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
 from xew.model.episodes.choice import select_episodes, training_episodes
-from xew.model.experiment import Experiment, load_experiment
+from xew.model.experiment import Experiment, check_choices, parse_experiment
 from xew.model.network.dit import cast_params
 from xew.model.network.dit_layouts import load_dit_params
-from xew.model.runs.folder import load_run
-from xew.model.runs.start import restore_params
+from xew.model.runs.checkpoint import restore_params
+from xew.model.runs.folder import load_run_codec, load_run_config
 from xew.model.sampling.predict import Prediction, Predictor
-from xew.model.training.step import random_params
+from xew.model.settings.settings import RolloutSettings
+from xew.model.training.step import make_learner
 from xew.model.video.frames import to_camera_size
 from xew.rollout import write_rollout
 
@@ -52,38 +53,25 @@ WAITING = 16
 """Videos that may wait for a writer before predicting waits too."""
 
 
-class LoadedModel(NamedTuple):
-    """A model that is ready to predict."""
-
-    predictor: Predictor
-    experiment: Experiment
-    step: int | None
-    """Step of the run's checkpoint; None of published weights."""
-
-
-def load_predictor(run: Path, step: int | None = None, overrides: Sequence[str] = ()) -> LoadedModel:
-    """Load a model, with a copy of it on each device.
+def load_predictor(run: Path, experiment: Experiment, step: int | None = None) -> tuple[Predictor, int | None]:
+    """Load a model, with a copy of it on each device, and the step of its checkpoint.
 
     Args:
-        run: folder of a trained run; or a config, whose `model.weights` are then taken as they are.
+        run: folder of a trained run; or a config, whose `model.weights` are then taken as they are (the step is None).
+        experiment: the config of the run, with what is chosen anew for sampling.
         step: of the run's checkpoint; the latest where left out.
-        overrides: such as --rollout.steps 20. Of a run only what begins with --rollout can still be chosen.
 
     Raises:
-        ConfigError: there is no such run, checkpoint or weights, or an override would make it another model.
+        ConfigError: there is no such checkpoint, or there are no such weights.
     """
     if is_config(run):
-        experiment = load_experiment(run, list(overrides))
-        return LoadedModel(load_published(experiment, run), experiment, None)
-    experiment, codec = load_run(run)
-    _check_overrides(overrides)
-    experiment = replace(experiment, rollout=load_experiment(run / "config.yaml", list(overrides)).rollout)
-    mesh = make_mesh(MeshSettings())
+        return load_published(experiment, run), None
+    mesh, codec = make_mesh(MeshSettings()), load_run_codec(run, experiment.codec)
     graph, shapes = nnx.split(nnx.eval_shape(experiment.network.create), nnx.Param)
     like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=replicated_sharding(mesh)), shapes)
     params, step = restore_params(run, like, step)
     scales = load_run_scales(experiment.conditions, run)
-    return LoadedModel(_make_predictor(experiment, codec, graph, params, mesh, scales), experiment, step)
+    return _make_predictor(experiment, codec, graph, params, mesh, scales), step
 
 
 def _make_predictor(
@@ -117,16 +105,12 @@ def load_published(experiment: Experiment, source: Path) -> Predictor:
     if scaled:
         raise ConfigError(f"{source}: {', '.join(scaled)} is scaled by training episodes; train a run and roll that out.")
     mesh = make_mesh(MeshSettings())
-    graph, params = random_params(experiment.network, mesh)
+    graph, params = make_learner(experiment.learning, mesh).random_network()
     params = load_dit_params(graph, params, experiment.model.weights)
-    episodes = training_episodes(experiment.choice) if codec_class(experiment.codec).fitted else ()
+    episodes = (
+        training_episodes(read_dataset(experiment.data), experiment.choice) if codec_class(experiment.codec).fitted else ()
+    )
     return _make_predictor(experiment, load_codec(experiment.encoding, episodes), graph, params, mesh, {})
-
-
-def _check_overrides(overrides: Sequence[str]) -> None:
-    wrong = [word for word in overrides if word.startswith("--") and not word.startswith("--rollout.")]
-    if wrong:
-        raise ConfigError(f"{' '.join(wrong)}: of a trained run only --rollout.… can be chosen anew (see --help for the rest).")
 
 
 def check_out(out: Path, data: Path) -> None:
@@ -247,22 +231,39 @@ def predict_and_write(predictor: Predictor, pending: Sequence[Item], writer: Rol
         begun.hand_over(writer)
 
 
+@dataclass(frozen=True)
+class Flags:
+    """Options of the command itself."""
+
+    checkpoint: int | None = None
+    """Step of the run's checkpoint; the latest where left out."""
+    data: Path | None = None
+    """Episodes; those of the run's config where left out."""
+    split: Literal["test", "train"] = "test"
+    """Seed family."""
+    robots: tuple[str, ...] = ()
+    """Robots to predict; all of the data where left out."""
+    out: Path | None = None
+    """Folder to write to; rollouts/<name of the run> where left out."""
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """All that can be chosen anew of a trained run."""
+
+    rollout: RolloutSettings = field(default_factory=RolloutSettings)
+
+
 @user_errors
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="python -m xew.model.rollout", description=__doc__.splitlines()[0])
-    parser.add_argument("run", type=Path, help="folder of a trained run, or a config with published model.weights")
-    parser.add_argument("--checkpoint", type=int, metavar="STEP", help="of the run (default: the latest)")
-    parser.add_argument("--data", type=Path, help="episodes (default: those of the run's config)")
-    parser.add_argument("--split", choices=("test", "train"), default="test", help="seed family (default: test)")
-    parser.add_argument("--robots", nargs="+", metavar="ROBOT", help="default: all of the data")
-    parser.add_argument("--out", type=Path, help="default: rollouts/<name of the run>")
-    args, overrides = parser.parse_known_args(arguments)
+    """Predict episodes and write them."""
+    run, flags, experiment = parse_rollout(arguments)
     keep_compiled_programs()
-    predictor, experiment, step = load_predictor(args.run, args.checkpoint, overrides)
-    data, out = args.data or experiment.data, args.out or Path("rollouts") / name_of(args.run)
+    predictor, step = load_predictor(run, experiment, flags.checkpoint)
+    data, out = flags.data or experiment.data, flags.out or Path("rollouts") / name_of(run)
     check_out(out, data)
-    episodes = select_episodes(data, args.split, args.robots)
-    saved = None if step is None else checkpoint_time(args.run, step)
+    episodes = select_episodes(data, flags.split, flags.robots or None)
+    saved = None if step is None else checkpoint_time(run, step)
     headers = [(episode, rollout_header(experiment, step, saved, episode)) for episode in episodes]
     pending = [item for item in headers if not is_done(out, *item)]
     experiment.instructions.encode([record.instruction for (_, record), _ in pending])  # all at once, where that costs
@@ -271,8 +272,34 @@ def main(arguments: Sequence[str] | None = None) -> None:
         RolloutWriter(out, progress.update) as writer,
     ):
         predict_and_write(predictor, pending, writer)
-    shown = "published weights" if step is None else f"checkpoint {step}"
-    print(f"{out}: {len(pending)} rollouts new, {len(headers) - len(pending)} there before, {shown}")
+    source = "published weights" if step is None else f"checkpoint {step}"
+    print(f"{out}: {len(pending)} rollouts new, {len(headers) - len(pending)} there before, {source}")
+
+
+def parse_rollout(arguments: Sequence[str] | None) -> tuple[Path, Flags, Experiment]:
+    """Parse the command line: the run or config, the command's flags, and the experiment with its overrides.
+
+    Of a run only --rollout.… can be chosen anew; of a config with published weights all but what is also a flag.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    path, prog, description = find_path(words, Flags), "python -m xew.model.rollout", __doc__.splitlines()[0]
+    if path is not None and is_config(path):
+        flags, experiment = parse_experiment(Flags, words, prog, description)
+        return path, flags, experiment
+    wrong = [word for word in words if word.startswith("--") and "." in word and not word.startswith("--rollout.")]
+    if path is not None and wrong:
+        raise ConfigError(f"{' '.join(wrong)}: of a trained run only --rollout.… can be chosen anew (see --help for the rest).")
+    command = parse_command(
+        Flags,
+        Sampling,
+        lambda run: Sampling(load_run_config(run).rollout),
+        words,
+        prog=prog,
+        description=description,
+        metavar="RUN",
+    )
+    experiment = replace(load_run_config(command.path), rollout=command.config.rollout)
+    return command.path, command.flags, check_choices(experiment, command.path / "config.yaml")
 
 
 if __name__ == "__main__":

@@ -7,11 +7,10 @@ The loss is L1 + LPIPS + a small KL divergence, without an adversary: frames are
 Command: python -m xew.model.train_vae CONFIG [--resume | --overwrite] [--train.steps … and other overrides]
 """
 
-import argparse
 import functools
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -23,23 +22,28 @@ import optax
 from flax import nnx
 from tqdm import tqdm
 
+from xew.command_line import parse_command
 from xew.compilation import keep_compiled_programs
 from xew.config import ConfigError, load, pick, user_errors
-from xew.dataset import Episode
+from xew.dataset import Dataset, Episode, read_dataset
 from xew.episode import read_video
 from xew.model.codecs.ceiling import Ceiling, choose_evenly, measure_ceiling
 from xew.model.codecs.codec import WanVaeCodec, to_signed
 from xew.model.codecs.vae import VAES, LatentStatistic, VaeSize, VideoVae
 from xew.model.codecs.vae_layouts import save_vae
-from xew.model.episodes.choice import test_episodes, training_episodes
-from xew.model.experiment import Clip, EpisodeChoice, TrainSettings, beside, check_least
+from xew.model.episodes.choice import training_episodes
+from xew.model.experiment import beside
 from xew.model.runs.checkpoint import TrainState, restore_state
-from xew.model.runs.folder import claim_run
-from xew.model.training.loop import STOPPED, Meter, Timetable, open_session, run_steps
+from xew.model.runs.folder import check_one_of, claim_run
+from xew.model.runs.log import RunLog
+from xew.model.runs.session import open_session
+from xew.model.settings.checks import check_least
+from xew.model.settings.parts import EpisodeChoice
+from xew.model.settings.settings import Clip, TrainSettings
+from xew.model.training.loop import STOPPED, Meter, Timetable, run_steps
 from xew.model.training.optimizer import learning_rate, make_optimizer
-from xew.model.training.samples import strip
-from xew.model.training.tensorboard import RunLog
 from xew.model.training.vae_data import Cut, check_streams, make_dataset, random_clips, video_files
+from xew.model.video.comparison import strip
 from xew.protocol import SPLITS, Split
 
 CEILING_CLIPS = 16
@@ -108,10 +112,6 @@ class VaeExperiment:
         return pick(SPLITS, self.split, "split")
 
     @property
-    def choice(self) -> EpisodeChoice:
-        return EpisodeChoice(self.data, self.robots)
-
-    @property
     def cache_folder(self) -> Path:
         return self.cache or beside(self.data, "frames")
 
@@ -150,9 +150,13 @@ LEAST = {
 """Numbers of a config that mean nothing below."""
 
 
-def load_vae_experiment(path: Path | str, overrides: list[str] | None = None) -> VaeExperiment:
+def load_vae_experiment(path: Path | str, overrides: Sequence[str] = ()) -> VaeExperiment:
     """Read and check a config. Raises ConfigError with what does not exist or does not fit."""
-    experiment = load(VaeExperiment, path, overrides or [])
+    return check_choices(load(VaeExperiment, path, overrides), path)
+
+
+def check_choices(experiment: VaeExperiment, path: Path | str) -> VaeExperiment:
+    """The experiment itself. Raises ConfigError, naming its path, if one of its choices does not exist or does not fit."""
     check_least(LEAST, experiment, str(path))
     check_streams(experiment.streams)
     _ = experiment.robots
@@ -187,7 +191,7 @@ class Losses(NamedTuple):
 
 def vae_losses(vae: VideoVae, frames: jax.Array, key: jax.Array, settings: VaeTrainSettings) -> Losses:
     """The loss of frames [b t h w 3] in [-1, 1], with latents drawn from what the encoder gives."""
-    from xew.metrics import lpips
+    from xew.metrics import lpips  # only here: the model room does without metrics
 
     mean, log_variance = vae.moments(frames)
     latents = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
@@ -248,17 +252,26 @@ def init_vae_state(experiment: VaeExperiment) -> tuple[nnx.GraphDef, Any, TrainS
     return graph, statistics, state
 
 
+@dataclass(frozen=True)
+class Flags:
+    """Options of the command itself."""
+
+    resume: bool = False
+    """Continue the run in --out if there is one."""
+    overwrite: bool = False
+    """Replace the run in --out."""
+
+
 @user_errors
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="python -m xew.model.train_vae", description=__doc__.splitlines()[0])
-    parser.add_argument("config", type=Path, help="a YAML file; every field may be overridden, as in --train.steps 100")
-    existing = parser.add_mutually_exclusive_group()
-    existing.add_argument("--resume", action="store_true", help="continue the run in --out if there is one")
-    existing.add_argument("--overwrite", action="store_true", help="replace the run in --out")
-    args, overrides = parser.parse_known_args(arguments)
-    experiment = load_vae_experiment(args.config, overrides)
+    """Train an autoencoder."""
+    read = functools.partial(load, VaeExperiment)
+    prog = "python -m xew.model.train_vae"
+    command = parse_command(Flags, VaeExperiment, read, arguments, prog=prog, description=__doc__.splitlines()[0])
+    experiment, flags = check_choices(command.config, command.path), command.flags
+    check_one_of(flags.resume, flags.overwrite)
     keep_compiled_programs()
-    if not train_vae(experiment, resume=args.resume, overwrite=args.overwrite):
+    if not train_vae(experiment, resume=flags.resume, overwrite=flags.overwrite):
         sys.exit(STOPPED)
 
 
@@ -269,13 +282,15 @@ def train_vae(experiment: VaeExperiment, *, resume: bool = False, overwrite: boo
         Whether the last step was reached.
     """
     settings, rates = experiment.train, learning_rate(experiment.optimizer)
-    episodes = training_episodes(experiment.choice)
+    dataset = read_dataset(experiment.data)
+    episodes = training_episodes(dataset, EpisodeChoice(experiment.robots))
     files = video_files(experiment.streams, episodes, experiment.cache_folder)
     batches = iter(make_dataset(files, experiment.cut(), settings.batch, settings.seed))
     claim_run(experiment.out, experiment, load_vae_experiment, resume=resume, overwrite=overwrite)
 
     graph, statistics, state = init_vae_state(experiment)
-    sample = sample_clip(experiment, episodes)
+    reported = report_episodes(dataset, experiment.robots)
+    sample = sample_clip(experiment, next(iter(reported.values()), episodes)[0])
     timetable = Timetable(settings.steps, settings.log_every, settings.save_every, settings.sample_every, rates)
     with open_session(experiment.out, settings.keep_checkpoints) as session:
         log = session.log
@@ -292,7 +307,7 @@ def train_vae(experiment: VaeExperiment, *, resume: bool = False, overwrite: boo
         state = run_steps(timetable, session, Meter(summarize, settings.batch), take_step, state, batches, draw_samples)
         ended = int(state.step) >= settings.steps
         if ended:
-            finish(experiment, nnx.merge(graph, state.ema, statistics), files, log)
+            finish(experiment, nnx.merge(graph, state.ema, statistics), files, reported, log)
     return ended
 
 
@@ -303,30 +318,35 @@ def summarize(results: Sequence[Losses]) -> dict[str, float]:
     return {"train/loss": means.pop("total")} | {f"train/{name}": value for name, value in means.items()}
 
 
-def report_episodes(experiment: VaeExperiment) -> dict[str, list[Episode]]:
+def report_episodes(dataset: Dataset, robots: Split) -> dict[str, list[Episode]]:
     """What the report is of: test seeds of held-out and of seen robots, where there are any."""
-    robots = experiment.robots
     found = {
-        "unseen": test_episodes(experiment.data, robots.held_out_robots),
-        "seen": test_episodes(experiment.data, robots.train_robots),
+        "unseen": dataset.select(robots=robots.held_out_robots, split="test"),
+        "seen": dataset.select(robots=robots.train_robots, split="test"),
     }
     return {name: choose_evenly(episodes, CEILING_CLIPS) for name, episodes in found.items() if episodes}
 
 
-def sample_clip(experiment: VaeExperiment, episodes: Sequence[Episode]) -> np.ndarray:
-    """The clip that is shown in training, uint8 [t h w 3] at the model's size: unseen if there is any."""
-    folder, record = next(iter(report_episodes(experiment).values()), episodes)[0]
+def sample_clip(experiment: VaeExperiment, episode: Episode) -> np.ndarray:
+    """The clip that is shown in training, [t h w 3] uint8 at the model's size."""
+    folder, record = episode
     return random_clips(folder / "rgb.mkv", record.frame_count, experiment.cut(whole=True), np.random.default_rng(0))[0]
 
 
-def finish(experiment: VaeExperiment, vae: VideoVae, files: Sequence[tuple[Path, int]], log: RunLog) -> None:
+def finish(
+    experiment: VaeExperiment,
+    vae: VideoVae,
+    files: Sequence[tuple[Path, int]],
+    reported: Mapping[str, Sequence[Episode]],
+    log: RunLog,
+) -> None:
     """Compute the statistics of the latents, measure the reconstruction, and write the weights with both."""
     mean, std = latent_statistics(vae, files, experiment)
     vae.latents_mean.set_value(mean)
     vae.latents_std.set_value(std)
     save_vae(vae, experiment.out / "vae.safetensors")
     codec = WanVaeCodec.from_vae(vae)
-    ceilings = {name: ceiling_of(experiment, codec, chosen) for name, chosen in report_episodes(experiment).items()}
+    ceilings = {name: ceiling_of(experiment, codec, chosen) for name, chosen in reported.items()}
     for name, ceiling in ceilings.items():
         print(f"{name} robots, test seeds: {ceiling}")
         log.scalars(experiment.train.steps, {f"ceiling/{name}/psnr": ceiling.psnr, f"ceiling/{name}/lpips": ceiling.lpips})

@@ -50,7 +50,7 @@ class Args:
     robots: tuple[str, ...] = tuple(ROBOTS)
     """Keys of the registry, module:NAME, or paths of your own (docs/add_a_robot.md)."""
     robot: Path | None = None
-    """The only robot to make, one of your own: a URDF, a folder with a robot.yaml, or a RoboTwin embodiment folder."""
+    """Path of a robot of your own, then the only one: a URDF, a folder with a robot.yaml, or a RoboTwin embodiment folder."""
     train_seeds: int = TRAIN_SEEDS_PER_TASK
     """Number of accepted training seeds a task."""
     test_seeds: int = TEST_SEEDS_PER_TASK

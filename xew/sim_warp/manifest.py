@@ -1,11 +1,11 @@
-"""The manifest: which seeds make the data set, found once in physics so that nobody has to search again.
+"""The manifest: which seeds make the data set, found once in physics so that no user has to search again.
 
 Reads  seeds.json in this folder, or a file of the same form; headers of a data set
 Writes a manifest from the headers of a data set: accepted training and test seeds of each task and, of the others, which
        robots failed and why
 
 A seed in the manifest is not a promise: where physics differs a little (another GPU) one may fail, and generate goes on
-to seeds that nobody has tried.
+to seeds that have not been tried.
 
 Command: python -m xew.sim_warp.manifest data --out seeds.json
 """

@@ -125,7 +125,7 @@ def draw_units(count: int) -> np.ndarray:
     """[1 + DRAWS count] float64, how often each unit is drawn: once each in the first row, then at random with replacement."""
     drawn = np.random.default_rng(SEED).multinomial(count, np.full(count, 1 / count), DRAWS)
     weights = np.concatenate([np.ones((1, count)), drawn])
-    weights.flags.writeable = False
+    weights.setflags(write=False)
     return weights
 
 

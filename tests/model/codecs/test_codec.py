@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
@@ -103,7 +104,7 @@ def test_latents_are_of_unit_size(codec: PatchCodec) -> None:
 
 def test_patches_are_lossless() -> None:
     videos = np.random.default_rng(0).integers(0, 256, (2, 9, 16, 24, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(to_pictures(join_patches(*cut_patches(to_signed(videos), 8), 8)), videos)
+    np.testing.assert_array_equal(to_pictures(join_patches(*cut_patches(to_signed(jnp.asarray(videos)), 8), 8)), videos)
 
 
 def test_refuses_clips_that_do_not_fit(codec: PatchCodec) -> None:

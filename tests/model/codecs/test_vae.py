@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae, double_sides, even_chunk, patchify, unpatchify
+from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae
+from xew.model.codecs.vae_chunks import even_chunk
+from xew.model.codecs.vae_layers import double_sides, patchify, unpatchify
 
 CHANNELS = VAES["tiny"].channels
 FOUR_STAGES = VaeSize(4, encoder_dim=8, decoder_dim=8, multipliers=(1, 2, 4, 4), halve_time=(False, True, True), blocks=1)

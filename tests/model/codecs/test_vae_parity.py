@@ -12,7 +12,8 @@ from flax import nnx
 from xew.config import ConfigError
 from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae
 from xew.model.codecs.vae_layouts import diffusers_layout, load_vae, official_layout
-from xew.model.weights.tensors import checkpoint_shapes, save_weights
+from xew.model.weights.layout import checkpoint_shapes
+from xew.model.weights.writing import save_weights
 
 torch = pytest.importorskip("torch")
 diffusers = pytest.importorskip("diffusers")

@@ -67,14 +67,14 @@ def test_one_stream_is_the_plain_block_stack(inputs: tuple[jax.Array, jax.Array,
     """Scan over stacked layers = calling each layer's block in turn."""
     latents, sigma, text = inputs
     model = tiny()
-    tokens, rows, rotary = model.embed_streams(latents, {})
+    tokens, levels, rotary = model.embed_streams(latents, {})
     time = model.time_embedding(dit.sinusoid(jnp.stack([jnp.zeros(2), 1000 * sigma], 1)))
     modulation, context = model.modulation(time), model.text_embedding(text)
     graph, layers = nnx.split(model.blocks)
     for layer in range(MODELS["tiny"].depth):
         block = nnx.merge(graph, jax.tree.map(lambda leaf, layer=layer: leaf[layer], layers))
-        tokens = block(tokens, modulation, rows, rotary, context)
-    expected = dit.unpatchify(model.head(tokens, time, rows), latents.shape)
+        tokens = block(tokens, modulation, levels, rotary, context)
+    expected = dit.unpatchify(model.head(tokens, time, levels), latents.shape)
     np.testing.assert_allclose(model(latents, {}, sigma, text), expected, atol=TOLERANCE)
 
 
@@ -96,7 +96,7 @@ def test_streams_are_one_sequence(inputs: tuple[jax.Array, jax.Array, jax.Array]
     """A stream equals the same tokens appended to RGB's, with their own positions."""
     latents, *_ = inputs
     model, condition = tiny(("embodiment",)), normal(4, 2, 1, 4, 6, CHANNELS)
-    tokens, rows, (cos, _) = model.embed_streams(latents, {"embodiment": condition})
+    tokens, levels, (cos, _) = model.embed_streams(latents, {"embodiment": condition})
     rgb_tokens, _, (rgb_cos, _) = tiny().embed_streams(latents, {})
     np.testing.assert_allclose(tokens[:, :18], model.patch_embedding(dit.patchify(latents)), atol=TOLERANCE)
     assert rgb_tokens.shape == tokens[:, :18].shape
@@ -105,7 +105,7 @@ def test_streams_are_one_sequence(inputs: tuple[jax.Array, jax.Array, jax.Array]
     assert tokens.shape[1] == 3 * 2 * 3 + 1 * 2 * 3
     own = model.stream_inputs["embodiment"](dit.patchify(condition)) + model.stream_embeddings["embodiment"][None, None]
     np.testing.assert_allclose(tokens[:, 18:], own, atol=TOLERANCE)
-    np.testing.assert_array_equal(rows, [0] * 6 + [1] * 12 + [0] * 6)
+    np.testing.assert_array_equal(levels, [0] * 6 + [1] * 12 + [0] * 6)
 
 
 def test_conditions_matter_and_rgb_alone_is_predicted(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
@@ -119,11 +119,11 @@ def test_conditions_matter_and_rgb_alone_is_predicted(inputs: tuple[jax.Array, j
         assert np.abs(moved - velocity).max() > 1e-3, name
 
 
-def test_two_rows_equal_a_timestep_for_every_token(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+def test_two_levels_equal_a_timestep_for_every_token(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
     latents, sigma, text = inputs
     model, conditions = tiny(("action",)), {"action": normal(4, *SHAPE)}
-    tokens, rows, rotary = model.embed_streams(latents, conditions)
-    timesteps = jnp.where(rows[None] == 0, 0.0, 1000 * sigma[:, None])
+    tokens, levels, rotary = model.embed_streams(latents, conditions)
+    timesteps = jnp.where(levels[None] == 0, 0.0, 1000 * sigma[:, None])
     time = model.time_embedding(dit.sinusoid(timesteps))
     every = np.arange(tokens.shape[1])
     tokens = model.apply_blocks(tokens, model.modulation(time), every, rotary, model.text_embedding(text))
@@ -214,9 +214,9 @@ def test_one_way_conditions_do_not_see_rgb() -> None:
     latents, text, conditions = normal(2, *SHAPE), normal(3, 2, 8, 16), {"action": normal(4, *SHAPE)}
 
     def tokens(model: WorldModel, latents: jax.Array, sigma: float) -> np.ndarray:
-        embedded, rows, rotary = model.embed_streams(latents, conditions)
+        embedded, levels, rotary = model.embed_streams(latents, conditions)
         modulation = model.modulation(model.embed_time(jnp.full(2, sigma, jnp.float32)))
-        return np.asarray(model.apply_blocks(embedded, modulation, rows, rotary, model.context(text), rgb=18))
+        return np.asarray(model.apply_blocks(embedded, modulation, levels, rotary, model.context(text), rgb=18))
 
     for visibility in ("joint", "one_way"):
         model = tiny(("action",), visibility=visibility)

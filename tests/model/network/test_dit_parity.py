@@ -114,27 +114,32 @@ def test_streams_are_plain_blocks_on_concatenated_tokens(
     model = ours(theirs, size, tmp_path / "weights.safetensors", *streams, visibility=visibility)
     latents = jnp.asarray(normal(2, 2, *grid, CHANNELS))
     conditions = {name: jnp.asarray(normal(4 + n, 2, *grid, CHANNELS)) for n, name in enumerate(streams)}
-    tokens, rows, (cos, sin) = model.embed_streams(latents, conditions)
+    tokens, levels, (cos, sin) = model.embed_streams(latents, conditions)
     rgb = tokens.shape[1] // (1 + len(streams))
 
     # Diffusers, from the same tokens: its own positions for one stream, laid end to end.
     with torch.no_grad():
         rotary = theirs.rope(channels_first(np.asarray(latents)))
         rotary = tuple(torch.cat([table] * (1 + len(streams)), dim=1) for table in rotary)
-        timesteps = torch.tensor(np.where(rows[None] == 0, np.float32(0), np.float32(1000) * LEVELS[:, None]))
+        timesteps = torch.tensor(np.where(levels[None] == 0, np.float32(0), np.float32(1000) * LEVELS[:, None]))
         condition = theirs.condition_embedder
-        _, projected, context, _ = condition(timesteps.flatten(), torch.tensor(text), timestep_seq_len=rows.size)
+        _, projected, context, _ = condition(timesteps.flatten(), torch.tensor(text), timestep_seq_len=levels.size)
         projected = projected.unflatten(2, (6, -1))
         hidden = torch.tensor(np.array(tokens))
         for block in theirs.blocks:
             if visibility == "one_way":
-                mask = np.ones((rows.size, rows.size), bool)
+                mask = np.ones((levels.size, levels.size), bool)
                 mask[rgb:, :rgb] = False
                 block.attn1.forward = masked(block.attn1, torch.tensor(mask))
             hidden = block(hidden, context, projected, rotary)
 
     found = model.apply_blocks(
-        tokens, model.modulation(model.embed_time(jnp.asarray(LEVELS))), rows, (cos, sin), model.context(jnp.asarray(text)), rgb
+        tokens,
+        model.modulation(model.embed_time(jnp.asarray(LEVELS))),
+        levels,
+        (cos, sin),
+        model.context(jnp.asarray(text)),
+        rgb,
     )
     assert np.abs(hidden.numpy()).max() > 2
     np.testing.assert_allclose(found, hidden.numpy(), atol=EXACT_TOLERANCE)

@@ -23,7 +23,7 @@ from xew.model.network import dit
 from xew.model.network.dit import MODELS, STREAMS, WorldModel
 from xew.model.network.dit_layouts import dit_layout, load_dit
 from xew.model.network.mechanisms import MECHANISMS, frames_of_groups, ray_maps
-from xew.model.weights.tensors import checkpoint_shapes
+from xew.model.weights.layout import checkpoint_shapes
 
 ROOT = Path(__file__).parents[3]
 CHANNELS = 3
@@ -119,23 +119,23 @@ def test_new_parts_that_can_start_at_zero_do() -> None:
 
 
 def test_each_frame_is_told_its_own_vector() -> None:
-    """The rows of time are the noise levels', then a sum for each frame; a stream's tokens keep the noise levels."""
+    """Embeddings of time are those of the noise levels, then a sum for each frame; a stream's tokens keep the noise levels."""
     model, conditions = model_of(("action", "pose_time")), told(("action", "pose_time"))
-    tokens, rows, _ = model.embed_streams(LATENTS, conditions)
+    tokens, levels, _ = model.embed_streams(LATENTS, conditions)
     time = model.embed_time(SIGMA)
-    framed, told_rows = model.add_frame_vectors(time, rows, LATENTS.shape, conditions)
+    framed, of_tokens = model.add_frame_vectors(time, levels, LATENTS.shape, conditions)
     vectors = model.mechanisms["pose_time"](conditions["pose_time"])
     np.testing.assert_allclose(framed[:, 2], time[:, 0] + vectors[:, 0], atol=1e-5)
     np.testing.assert_allclose(framed[:, 3:], time[:, 1:] + vectors[:, 1:], atol=1e-5)
-    assert told_rows.tolist() == [2] * 6 + [3] * 6 + [4] * 6 + [0] * 6 + [1] * 12
-    assert tokens.shape[1] == len(told_rows)
+    assert of_tokens.tolist() == [2] * 6 + [3] * 6 + [4] * 6 + [0] * 6 + [1] * 12
+    assert tokens.shape[1] == len(of_tokens)
 
 
-def test_frame_rows_equal_a_timestep_of_every_token() -> None:
+def test_levels_of_frames_equal_a_timestep_of_every_token() -> None:
     model, conditions = model_of(("pose_time",)), told(("pose_time",))
-    tokens, rows, rotary = model.embed_streams(LATENTS, conditions)
-    time, rows = model.add_frame_vectors(model.embed_time(SIGMA), rows, LATENTS.shape, conditions)
-    every, of_tokens = np.arange(tokens.shape[1]), time[:, rows]
+    tokens, levels, rotary = model.embed_streams(LATENTS, conditions)
+    time, levels = model.add_frame_vectors(model.embed_time(SIGMA), levels, LATENTS.shape, conditions)
+    every, of_tokens = np.arange(tokens.shape[1]), time[:, levels]
     seen = model.apply_blocks(tokens, model.modulation(of_tokens), every, rotary, model.context(TEXT), len(every))
     expected = dit.unpatchify(model.head(seen, of_tokens, every), LATENTS.shape)
     np.testing.assert_allclose(model(LATENTS, conditions, SIGMA, TEXT), expected, atol=2e-5)
@@ -241,10 +241,10 @@ def test_rays_go_through_the_pixels_they_belong_to() -> None:
 
 def test_earlier_frames_are_rgb_at_their_own_times() -> None:
     model, conditions = model_of(("action", "history")), told(("action", "history"))
-    tokens, rows, (cos, _) = model.embed_streams(LATENTS, conditions)
+    tokens, levels, (cos, _) = model.embed_streams(LATENTS, conditions)
     embedded = model.patch_embedding(dit.patchify(conditions["history"])) + model.stream_embeddings["history"][...][None, None]
     np.testing.assert_allclose(tokens[:, 18:30], embedded, atol=1e-5)
-    assert rows[18:30].tolist() == [0] * 12
+    assert levels[18:30].tolist() == [0] * 12
     angles = dit.rotary_angles((2, 2, 3), 16, times=EARLIER)
     np.testing.assert_allclose(cos[18:30], np.cos(angles), atol=1e-6)
     assert not np.allclose(cos[18:24], cos[:6])

@@ -13,7 +13,7 @@ from xew.config import ConfigError
 from xew.model.experiment import Experiment, create_model, load_experiment
 from xew.model.text.instructions import VOCABULARY, clean, load_tokenizer, token_ids
 from xew.model.text.umt5 import UMT5S, Umt5Encoder, official_layout
-from xew.model.weights.tensors import save_weights
+from xew.model.weights.writing import save_weights
 
 TEXTS = ("Place the empty cup on the coaster.", "beat the block with the hammer", "stack three bowls", "")
 CONFIG = """

@@ -13,7 +13,8 @@ from safetensors.numpy import save_file
 from xew.config import ConfigError
 from xew.model.network.dit import parameter_count
 from xew.model.text.umt5 import HF_DUPLICATE, UMT5S, Umt5Encoder, hf_layout, load_umt5, official_layout, relative_buckets
-from xew.model.weights.tensors import checkpoint_shapes, save_weights
+from xew.model.weights.layout import checkpoint_shapes
+from xew.model.weights.writing import save_weights
 
 TINY = UMT5S["tiny"]
 REFERENCE = Path(__file__).parents[1] / "reference"

@@ -15,18 +15,21 @@ from flax import nnx
 
 from tests import synthetic
 from xew.config import ConfigError, save
+from xew.dataset import read_dataset
 from xew.model import latents, train
 from xew.model.devices.sharding import make_mesh, place_batch
 from xew.model.diffusion.flow_matching import sample_losses
 from xew.model.episodes.choice import first_of_each, replay_episodes, sample_episodes, training_episodes
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.network.lora import apply_lora, init_lora
-from xew.model.runs import start as run_start
+from xew.model.runs import checkpoint
 from xew.model.runs.checkpoint import TrainState
 from xew.model.training import data, memory
 from xew.model.training.data import Batch, ClipSource, fake_batch, make_dataset
+from xew.model.training.flops import flops_of_step
 from xew.model.training.memory import estimate_memory
 from xew.model.training.optimizer import learning_rate, set_steps
+from xew.model.training.start import start_params
 from xew.model.training.step import (
     abstract_state,
     cut_samples,
@@ -87,7 +90,7 @@ def fails(command: Callable[[list[str]], None], arguments: list[str], capsys: py
 def network(run: Path) -> tuple[Any, int]:
     """Parameters of a run, and of which step they are."""
     experiment = load_experiment(run / "config.yaml")
-    return run_start.restore_params(run, make_learner(experiment.learning, make_mesh(experiment.mesh)).network_shapes)
+    return checkpoint.restore_params(run, make_learner(experiment.learning, make_mesh(experiment.mesh)).network_shapes)
 
 
 def changed(experiment: Experiment, **settings: Any) -> Experiment:
@@ -224,7 +227,7 @@ def test_two_chunks_from_latents_to_a_run(world: Path, tmp_path: Path) -> None:
     train.main([*config, "--out", str(tmp_path / "run")])
     assert len(lines(tmp_path / "run", "train/loss")) == 2
     experiment = load_experiment(tmp_path / "run" / "config.yaml")
-    episodes = training_episodes(experiment.choice)
+    episodes = training_episodes(read_dataset(experiment.data), experiment.choice)
     source = ClipSource.open(experiment.encoding, experiment.instructions, episodes)
     batch = next(iter(make_dataset(source, 3, seed=0)))
     assert jax.tree.map(np.shape, batch) == jax.tree.map(np.shape, fake_batch(experiment.inputs, 3))
@@ -264,7 +267,7 @@ def test_log_lines_hold_what_a_run_is_watched_by(world: Path) -> None:
 def estimate(experiment: Experiment, devices: int) -> memory.Memory:
     """Memory of each device where the state is cut over all of them."""
     learning = experiment.learning
-    return estimate_memory(learning, abstract_state(learning)[1], experiment.inputs, experiment.codec, devices, devices)
+    return estimate_memory(learning, abstract_state(learning)[1], experiment.encoding, devices, devices)
 
 
 def test_projection_is_that_of_the_arithmetic() -> None:
@@ -373,7 +376,7 @@ def test_the_rate_has_decayed_at_the_last_step(experiment: Experiment) -> None:
 
 def test_arithmetic_that_one_way_streams_save_is_not_counted(experiment: Experiment) -> None:
     one_way = replace(experiment, model=replace(experiment.model, visibility="one_way"))
-    assert memory.flops_of_step(one_way.learning, one_way.inputs) < memory.flops_of_step(experiment.learning, experiment.inputs)
+    assert flops_of_step(one_way.learning, one_way.inputs) < flops_of_step(experiment.learning, experiment.inputs)
 
 
 def test_episodes_without_videos_are_told_before_training(
@@ -427,11 +430,14 @@ def adapt(world: Path, out: Path, *options: str) -> list[str]:
 
 def test_adaptation_learns_from_few_episodes_of_the_target(world: Path, experiment: Experiment) -> None:
     adapted = replace(experiment, adapt=replace(experiment.adapt, start_from=world / "run", robots=("piper",), episodes=1))
-    chosen = {(record.task, record.robot, record.seed) for _, record in training_episodes(adapted.choice)}
+    chosen = {
+        (record.task, record.robot, record.seed) for _, record in training_episodes(read_dataset(adapted.data), adapted.choice)
+    }
     assert chosen == {("place_empty_cup", "piper", 0), ("shake_bottle", "piper", 0)}
-    assert replay_episodes(adapted.choice) == []
+    assert replay_episodes(read_dataset(adapted.data), adapted.choice) == []
     with pytest.raises(ConfigError, match=r"adapt.episodes is 3, there are only 2 training episodes of piper"):
-        first_of_each(training_episodes(replace(adapted, adapt=replace(adapted.adapt, episodes=2)).choice), 3)
+        more = replace(adapted, adapt=replace(adapted.adapt, episodes=2)).choice
+        first_of_each(training_episodes(read_dataset(adapted.data), more), 3)
 
 
 def test_adapted_run_starts_from_the_trained_weights(world: Path, tmp_path: Path) -> None:
@@ -439,7 +445,7 @@ def test_adapted_run_starts_from_the_trained_weights(world: Path, tmp_path: Path
     train.main([*arguments, "--train.steps", "1", "--resume"])  # of nothing: it begins, and notes where
     adapted = load_experiment(tmp_path / "run" / "config.yaml")
     learner = make_learner(adapted.learning, make_mesh(adapted.mesh))
-    start, base = train.start_params(adapted, learner), network(world / "run")[0]
+    start, base = start_params(learner, adapted.adapt.start_from, tmp_path / "run"), network(world / "run")[0]
     jax.tree.map(np.testing.assert_array_equal, start, base)
     after = network(tmp_path / "run")[0]
     moved = [float(np.abs(np.asarray(a - b)).max()) for a, b in zip(*map(jax.tree.leaves, (after, start)), strict=True)]
@@ -448,7 +454,7 @@ def test_adapted_run_starts_from_the_trained_weights(world: Path, tmp_path: Path
 
 def test_samples_of_an_adapted_run_are_named_by_role(experiment: Experiment) -> None:
     adapted = replace(experiment, adapt=replace(experiment.adapt, start_from=Path("runs/x"), robots=("piper",)))
-    names = sample_episodes(adapted.choice)
+    names = sample_episodes(read_dataset(adapted.data), adapted.choice)
     seen = {"seen/aloha_agilex", "seen/arx_x5", "seen/ur5_wsg"}
     assert set(names) == seen | {"target/piper", "unseen/franka_panda"}
 
@@ -462,7 +468,10 @@ def test_adapting_another_network_is_told(world: Path, tmp_path: Path, capsys: p
 def test_replay_is_a_part_of_every_batch(world: Path, experiment: Experiment) -> None:
     settings = replace(experiment.adapt, start_from=world / "run", robots=("piper",), episodes=2, replay=0.25)
     adapted = replace(experiment, adapt=settings)
-    old, new = replay_episodes(adapted.choice), training_episodes(adapted.choice)
+    old, new = (
+        replay_episodes(read_dataset(adapted.data), adapted.choice),
+        training_episodes(read_dataset(adapted.data), adapted.choice),
+    )
     assert {record.robot for _, record in old} == {"aloha_agilex", "arx_x5", "ur5_wsg"}
 
     class Names(ClipSource):
@@ -536,7 +545,7 @@ def test_run_with_corrections_resumes_and_is_read(world: Path, tmp_path: Path, c
 
 def test_checkpoint_of_a_step_that_is_not_there_is_told(world: Path) -> None:
     with pytest.raises(ConfigError, match=r"has no checkpoint of step 9; it has 1, 2\."):
-        run_start.restore_params(world / "run", network(world / "run")[0], 9)
+        checkpoint.restore_params(world / "run", network(world / "run")[0], 9)
 
 
 def test_fake_batches_have_a_second_chunk_only_where_asked(experiment: Experiment) -> None:

@@ -26,8 +26,10 @@ from xew.model.network.dit_layouts import (
     wan_layout,
 )
 from xew.model.network.mechanisms import MECHANISMS
-from xew.model.weights import tensors as weights
-from xew.model.weights.tensors import Source, checkpoint_shapes, fill, read_tensors, save_weights
+from xew.model.weights import reading, writing
+from xew.model.weights.layout import Source, checkpoint_shapes
+from xew.model.weights.reading import fill, read_tensors
+from xew.model.weights.writing import save_weights
 
 REFERENCE = Path(__file__).parents[1] / "reference"
 CHANNELS = 3
@@ -146,8 +148,8 @@ def test_types_of_files(dtype: type, arrays: Arrays, tmp_path: Path) -> None:
 def test_reading_is_lazy(arrays: Arrays, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_file(arrays, tmp_path / "in.safetensors")
     read: list[str] = []
-    whole = weights._SafetensorsEntry.read
-    monkeypatch.setattr(weights._SafetensorsEntry, "read", lambda self: (read.append(self.key), whole(self))[1])
+    whole = reading._SafetensorsEntry.read
+    monkeypatch.setattr(reading._SafetensorsEntry, "read", lambda self: (read.append(self.key), whole(self))[1])
     tensors = read_tensors(tmp_path / "in.safetensors")
     assert tensors.shape("conv") == (5, 2, 3, 1, 2) and "nothing" not in tensors and len(tensors) == len(arrays)
     assert not read
@@ -245,7 +247,7 @@ def test_nothing_is_unpickled(tmp_path: Path) -> None:
 
 
 def test_prefixes_are_taken_off(arrays: Arrays, tmp_path: Path) -> None:
-    for prefix in weights.PREFIXES:
+    for prefix in reading.PREFIXES:
         save_file({prefix + key: array for key, array in arrays.items()}, tmp_path / "in.safetensors")
         assert read_tensors(tmp_path / "in.safetensors").keys() == arrays.keys()
     save_file({"model.gamma": arrays["gamma"], "gamma": arrays["gamma"]}, tmp_path / "in.safetensors")
@@ -287,7 +289,7 @@ def test_layouts_that_do_not_fit_the_module() -> None:
 def test_shards_are_written_under_their_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = Leaves(nnx.Rngs(0))
     save_weights(module, tmp_path / "one.safetensors", LAYOUT)
-    monkeypatch.setattr(weights, "SHARD_BYTES", 150)
+    monkeypatch.setattr(writing, "SHARD_BYTES", 150)
     save_weights(module, tmp_path / "many", LAYOUT)
     index = json.loads((tmp_path / "many" / "diffusion_pytorch_model.safetensors.index.json").read_text())
     shards = sorted(set(index["weight_map"].values()))

@@ -143,7 +143,7 @@ def test_a_hand_driven_into_the_table_is_seen() -> None:
     timeline = Timeline()
     timeline.follow(LEFT, [HOME[LEFT].moved(z=-0.22)], seconds=1.2)
     cell = driven(ROBOTS["franka_panda"], timeline)
-    assert cell.moved.table_overlap > DEEPEST_IN_TABLE
+    assert cell.known_motion.table_overlap > DEEPEST_IN_TABLE
     reason, words = cell.failure or ("", "")
     assert reason == "plan" and "into the table" in words
 

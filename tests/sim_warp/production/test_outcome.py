@@ -53,7 +53,7 @@ def cell() -> Cell:
 
 
 def with_motion(cell: Cell, **changes: object) -> Cell:
-    return replace(cell, motion=replace(cell.moved, **changes))  # type: ignore[arg-type]
+    return replace(cell, motion=replace(cell.known_motion, **changes))  # type: ignore[arg-type]
 
 
 def test_a_motion_that_ends_in_success_has_no_failure(cell: Cell) -> None:
@@ -67,7 +67,7 @@ def test_a_robot_that_cannot_follow_fails_in_its_plan(cell: Cell) -> None:
 
 def test_a_cell_without_a_motion_has_none_to_give(cell: Cell) -> None:
     with pytest.raises(AssertionError, match="piper cannot follow the plan of lift/0"):
-        _ = replace(cell, motion=None).moved
+        _ = replace(cell, motion=None).known_motion
 
 
 @pytest.mark.parametrize(
@@ -87,33 +87,33 @@ def test_a_brush_of_the_table_passes(cell: Cell) -> None:
 
 
 def test_what_is_solved_before_it_begins_does_not_count(cell: Cell) -> None:
-    pose = cell.moved.object_pose.copy()
+    pose = cell.known_motion.object_pose.copy()
     pose[:, 0, 2] += np.float32(0.1)
     assert with_motion(cell, object_pose=pose).failure == ("plan", "the scene is solved before it begins")
 
 
 def dropped(cell: Cell, *holds: Hold, contact: np.ndarray | None = None) -> Cell:
     """The same cell, in which the cube stays on the table."""
-    still = np.repeat(cell.moved.object_pose[:1], FRAMES, 0)
+    still = np.repeat(cell.known_motion.object_pose[:1], FRAMES, 0)
     held = replace(cell, path=replace(cell.path, holds=holds))
-    return with_motion(held, object_pose=still, contact=cell.moved.contact if contact is None else contact)
+    return with_motion(held, object_pose=still, contact=cell.known_motion.contact if contact is None else contact)
 
 
 def test_what_was_never_touched_was_not_grasped(cell: Cell) -> None:
-    none = np.zeros_like(cell.moved.contact)
+    none = np.zeros_like(cell.known_motion.contact)
     assert dropped(cell, HOLD, contact=none).failure == ("grasp", "the left hand never touched the cube")
     other = replace(HOLD, arm=RIGHT)
     assert dropped(cell, other).failure == ("grasp", "the right hand never touched the cube")
 
 
 def test_what_is_touched_before_its_hold_alone_was_not_grasped(cell: Cell) -> None:
-    early = np.zeros_like(cell.moved.contact)
+    early = np.zeros_like(cell.known_motion.contact)
     early[:6, LEFT, 0] = True
     assert (dropped(cell, HOLD, contact=early).failure or ("",))[0] == "grasp"
 
 
 def test_what_was_lost_before_the_end_of_its_hold_slipped(cell: Cell) -> None:
-    contact = cell.moved.contact.copy()
+    contact = cell.known_motion.contact.copy()
     contact[13:] = False
     assert dropped(cell, HOLD, contact=contact).failure == ("slip", "the left hand lost the cube")
     contact[13] = True
@@ -131,7 +131,7 @@ def test_the_first_hold_that_failed_is_named(cell: Cell) -> None:
 
 
 def test_success_by_what_cannot_happen_is_refused(cell: Cell) -> None:
-    sunk = cell.moved.penetration.copy()
+    sunk = cell.known_motion.penetration.copy()
     sunk[5:15, 0] = 0.008
     assert with_motion(cell, penetration=sunk).failure == ("physics", "the cube sank 8 mm into something")
 
@@ -142,12 +142,12 @@ def test_every_reason_is_one_of_the_contract_s(cell: Cell) -> None:
 
 
 def test_a_moment_is_one_frame_of_everything(cell: Cell) -> None:
-    tools = measured_tools(ROBOT, cell.moved.joint_pos)
+    tools = measured_tools(ROBOT, cell.known_motion.joint_pos)
     action = cell.commands.action.copy()
     action[7, [7, 15]] = (0.25, 0.75)
-    now = moment(action, cell.moved, tools, 7)
+    now = moment(action, cell.known_motion, tools, 7)
     assert now.gripper.tolist() == [0.25, 0.75]
-    np.testing.assert_array_equal(now.object_pose, cell.moved.object_pose[7])
+    np.testing.assert_array_equal(now.object_pose, cell.known_motion.object_pose[7])
     np.testing.assert_array_equal(now.tool_pose, tools[7])
     assert now.contact[LEFT].tolist() == [True, False]
 

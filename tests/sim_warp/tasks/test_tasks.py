@@ -34,7 +34,7 @@ def solved() -> dict[str, Cell]:
 
 
 def at(cell: Cell, frame: int) -> Moment:
-    return moment(cell.commands.action, cell.moved, cell.tool_pose, frame)
+    return moment(cell.commands.action, cell.known_motion, cell.tool_pose, frame)
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -51,7 +51,7 @@ def test_hands_hold_what_the_plan_says_they_hold(name: str, solved: dict[str, Ce
     assert cell.path.holds
     for hold in cell.path.holds:
         end = int(hold.end * cell.path.frame_rate)
-        touched = cell.moved.contact[end - 8 : end, hold.arm, cell.scene.index(hold.name)]
+        touched = cell.known_motion.contact[end - 8 : end, hold.arm, cell.scene.index(hold.name)]
         assert touched.any(), f"the {('left', 'right')[hold.arm]} hand does not touch the {hold.name}"
 
 
@@ -60,9 +60,10 @@ def test_an_expert_that_closes_no_hand_is_told_so(name: str, solved: dict[str, C
     """Success is not for free: with nothing moved it fails, and the reason is one of the contract's."""
     cell = solved[name]
     still = {
-        field: np.repeat(getattr(cell.moved, field)[:1], cell.path.frame_count, 0) for field in ("object_pose", "object_joint")
+        field: np.repeat(getattr(cell.known_motion, field)[:1], cell.path.frame_count, 0)
+        for field in ("object_pose", "object_joint")
     }
-    idle = replace(cell, motion=replace(cell.moved, **still, contact=np.zeros_like(cell.moved.contact)))
+    idle = replace(cell, motion=replace(cell.known_motion, **still, contact=np.zeros_like(cell.known_motion.contact)))
     reason, words = idle.failure or ("", "")
     assert reason == "grasp" and reason in FAILURES and "never touched" in words
 
@@ -70,16 +71,16 @@ def test_an_expert_that_closes_no_hand_is_told_so(name: str, solved: dict[str, C
 def test_what_is_lost_on_the_way_is_a_slip(solved: dict[str, Cell]) -> None:
     cell = solved["place_empty_cup"]
     hold = cell.path.holds[0]
-    contact = cell.moved.contact.copy()
+    contact = cell.known_motion.contact.copy()
     contact[int(hold.end * cell.path.frame_rate) - 12 :] = False
-    pose = np.repeat(cell.moved.object_pose[:1], cell.path.frame_count, 0)
-    lost = replace(cell, motion=replace(cell.moved, contact=contact, object_pose=pose))
+    pose = np.repeat(cell.known_motion.object_pose[:1], cell.path.frame_count, 0)
+    lost = replace(cell, motion=replace(cell.known_motion, contact=contact, object_pose=pose))
     assert lost.failure == ("slip", f"the {('left', 'right')[hold.arm]} hand lost the cup")
 
 
 def test_an_overflow_and_an_early_success_are_told(solved: dict[str, Cell]) -> None:
     cell = solved["grab_roller"]
-    assert (replace(cell, motion=replace(cell.moved, overflow=True)).failure or ("",))[0] == "overflow"
+    assert (replace(cell, motion=replace(cell.known_motion, overflow=True)).failure or ("",))[0] == "overflow"
     early = replace(cell, task=replace(cell.task, success=lambda scene, now: True))
     assert early.failure == ("plan", "the scene is solved before it begins")
     late = replace(cell, task=replace(cell.task, success=lambda scene, now: False))

@@ -1,4 +1,4 @@
-"""The report's charts. A chart is panels beside one another, and the numbers that they draw.
+"""Charts of a report: panels with one legend, and the numbers that they draw.
 
 On the page each panel is an SVG of its own, so that they stand one below the other on a narrow screen, and takes its colors
 from the page, light or dark. For Markdown and LaTeX all panels are one PNG and one PDF.
@@ -20,11 +20,11 @@ from matplotlib.lines import Line2D
 
 INK, SOFT, LINE, GROUND = "#1f2328", "#57606a", "#d0d7de", "#ffffff"
 SERIES = ("#1f6feb", "#c2410c", "#15803d", "#7e22ce", "#a16207", "#0e7490")
-"""Of series in order; baselines are SOFT. The page has a lighter one for each in the dark."""
+"""Colors of series in order; baselines are SOFT. In dark mode the page has a lighter one for each."""
 THEME = {INK: "ink", SOFT: "soft", LINE: "line", GROUND: "page"} | {color: f"c{i}" for i, color in enumerate(SERIES)}
-"""The page's variable for each color."""
+"""Variable of the page's style for each color."""
 PANEL = (3.5, 2.5)
-"""Inches."""
+"""Width and height of a panel [inches]."""
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "font.size": 9,
@@ -51,20 +51,23 @@ STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Series:
-    """A line of the legend."""
+    """How a series is drawn, and its line in the legend."""
 
     label: str
     color: str
     dash: Literal["-", "--", ":", "o"] = "-"
-    """'-', '--' or ':'; 'o' is a hollow mark."""
+    """Style of the line; 'o' is a hollow mark."""
 
 
 @dataclass(frozen=True)
 class Panel:
+    """One plot."""
+
     title: str
     draw: Callable[[Axes], None]
+    """Function that draws it."""
     height: float = PANEL[1]
-    """Inches."""
+    """Height [inches]."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +75,11 @@ class Chart:
     """Panels with one legend."""
 
     name: str
-    """For file names."""
+    """Name of its files."""
     caption: str
     panels: Sequence[Panel]
     data: pd.DataFrame
-    """What is drawn, tidy."""
+    """Numbers that are drawn, as a tidy frame."""
     legend: Sequence[Series] = ()
     columns: int = 2
 
@@ -100,12 +103,15 @@ def panel_svg(chart: Chart, panel: Panel) -> str:
 
 
 def themed_color(color: str) -> str:
-    """The page's variable that stands for a color."""
+    """The variable of the page's style that stands for a color."""
     return f"var(--{THEME[color]})"
 
 
 def chart_files(chart: Chart) -> dict[str, bytes]:
-    """<name>.png, <name>.pdf and <name>.csv."""
+    """Files <name>.png, <name>.pdf and <name>.csv of a chart; the last one only where it has no panel."""
+    numbers = {f"{chart.name}.csv": chart.data.to_csv(index=False).encode()}
+    if not chart.panels:
+        return numbers
     columns = min(chart.columns, len(chart.panels))
     rows = -(-len(chart.panels) // columns)
     size = PANEL[0] * columns, max(panel.height for panel in chart.panels) * rows + 0.5
@@ -121,11 +127,7 @@ def chart_files(chart: Chart) -> dict[str, bytes]:
         png, pdf = io.BytesIO(), io.BytesIO()
         figure.savefig(png, format="png", dpi=160)
         figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
-    return {
-        f"{chart.name}.png": png.getvalue(),
-        f"{chart.name}.pdf": pdf.getvalue(),
-        f"{chart.name}.csv": chart.data.to_csv(index=False).encode(),
-    }
+    return {f"{chart.name}.png": png.getvalue(), f"{chart.name}.pdf": pdf.getvalue(), **numbers}
 
 
 def _handle(series: Series) -> Line2D:
@@ -135,12 +137,14 @@ def _handle(series: Series) -> Line2D:
 
 
 def bars(axes: Axes, labels: Sequence[str], groups: Sequence[tuple[str, np.ndarray, np.ndarray]], unit: str) -> None:
-    """Horizontal bars: for each label one bar of each group, whiskers, and the paper's value as a ring.
+    """Draw horizontal bars: for each label one bar of each group, whiskers, and the paper's value as a ring.
 
     Args:
-        labels: from top to bottom.
-        groups: color, [n 3] value and its interval's ends, [n] the paper's values; NaN where there is none.
-        unit: of the values.
+        axes: to draw on.
+        labels: n labels from top to bottom.
+        groups: of each its color, values with the ends of their intervals [n 3] and the paper's values [n], in `unit`; NaN
+            where there is none.
+        unit: text at the axis of values.
     """
     height = 0.8 / len(groups)
     for g, (color, values, paper) in enumerate(groups):
@@ -160,7 +164,7 @@ def bars(axes: Axes, labels: Sequence[str], groups: Sequence[tuple[str, np.ndarr
 
 
 def scatter(axes: Axes, distance: np.ndarray, score: np.ndarray, robots: Sequence[str], xlabel: str, ylabel: str) -> None:
-    """Score by distance: five points, the line through all, and thin ones without one of them."""
+    """Draw scores [n] by distances [n] of n robots: points, the line through all, and thin lines without one of them."""
     ends = np.array([distance.min(), distance.max()])
     for left_out in range(len(robots)):
         rest = np.delete(np.arange(len(robots)), left_out)
@@ -180,7 +184,7 @@ def scatter(axes: Axes, distance: np.ndarray, score: np.ndarray, robots: Sequenc
 def lines(
     axes: Axes, series: Sequence[tuple[Series, np.ndarray, np.ndarray, np.ndarray | None]], xlabel: str, ylabel: str
 ) -> None:
-    """Lines with bands: each with x [n], y [n] and the band's ends [n 2] or None."""
+    """Draw lines with bands: for each its style, x [n], y [n] and the band's ends [n 2] or None."""
     for style, x, y, band in series:
         if band is not None:
             axes.fill_between(x, band[:, 0], band[:, 1], color=style.color, alpha=0.15, linewidth=0)

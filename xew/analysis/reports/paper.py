@@ -1,8 +1,8 @@
-"""The paper's figures checked against each other. `report --paper` writes what is made here.
+"""The report on the paper's own figures, which are checked against each other; `report --paper` writes it.
 
-Its distance table is rebuilt from its scores and distances, the percentages of its text from its tables, and its claims are
-asked of its own figures. Ours is the question what comes out if workspaces are compared in the frame of the arm's base, as
-its text says that they were.
+The paper's distance table is rebuilt from its scores and distances, the percentages of its text from its tables, and its
+claims are asked of its own figures. One question is ours: what comes out if workspaces are compared in the frame of the arm's
+base, as the text says that they were.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -55,7 +55,7 @@ TITLE = "The paper's figures, rebuilt from one another"
 OWN_FRAMES: tuple[Frame, ...] = ("arm_base", "arm_alone")
 """Frames of workspaces whose distances the paper does not print."""
 PRIMARY = "lpips"
-"""The paper's primary outcome; it calls all others exploratory."""
+"""Primary outcome of the paper, which calls all others exploratory."""
 CLAIMS_TEXT = (
     "Each claim of the paper as an inequality, asked of its own printed figures: it holds where all that prints the same lies "
     "on its side. The last ones, “ours”, ask more than the paper claims. The paper prints no intervals, so a claim that holds "
@@ -69,14 +69,14 @@ SCORES_TEXT = (
 
 @dataclass(frozen=True)
 class Content:
-    """What the formats show."""
+    """Everything that the page and the Markdown show."""
 
     sentences: Sequence[str]
     claims: Sequence[Finding]
     shown: Mapping[str, Sequence[Table]]
-    """By section."""
+    """Tables by section."""
     folded: Sequence[Table]
-    """The tables of scores."""
+    """Tables of scores, folded away."""
     chart: Chart
 
 
@@ -93,7 +93,7 @@ def build(paper: Paper, footer: str) -> Report:
     by_frame = {frame: frame_results(paper, frames[frame]) for frame in OWN_FRAMES}
     grades = PaperGrades(paper, paper.infos)
     claims = ask(grades)
-    chart = distance_chart(grades, _with_own_frames(printed_distances(paper), frames), PRIMARY)
+    chart = distance_chart(grades, _add_own_frames(printed_distances(paper), frames), PRIMARY)
     assert chart is not None  # all folds are printed
     content = Content(
         finding(cells, results, changes, by_frame, claims),
@@ -118,7 +118,7 @@ def finding(
     by_frame: Mapping[Frame, Mapping[str, Correlation]],
     claims: Sequence[Finding],
 ) -> list[str]:
-    """What came out, in sentences."""
+    """The results in sentences."""
     return [
         *_rebuilt_sentences(cells, changes),
         *(_correlation_sentence(axis, results[PRIMARY, axis]) for axis in AXES),
@@ -150,7 +150,7 @@ def _certainty_sentences(results: Mapping[tuple[str, str], Correlation]) -> Iter
 def _frame_sentences(
     results: Mapping[tuple[str, str], Correlation], by_frame: Mapping[Frame, Mapping[str, Correlation]]
 ) -> Iterator[str]:
-    """What the frame of workspaces does to the primary outcome, and to the others."""
+    """Sentences on how the frame of workspaces changes the primary outcome, and the others."""
     starts: dict[Frame, str] = {
         "arm_base": "By kinematic distance as the text defines it, in the arm's base frame (our clouds, its scores)",
         "arm_alone": "By workspaces of the arm alone, in that frame (ours)",
@@ -172,7 +172,7 @@ def _claims_sentence(claims: Sequence[Finding]) -> str:
 
 
 def _count_answers(claims: Sequence[Finding]) -> str:
-    """Such as '25 claims: 24 hold, 0 fail, 1 not told by the printed digits'."""
+    """Text such as '25 claims: hold 24, fail 0, not to be told by the printed digits 1'."""
     counts = [sum(one.answer == word for one in claims) for word in (HOLDS, FAILS, UNRESOLVED)]
     return f"{len(claims)} claims: hold {counts[0]}, fail {counts[1]}, not to be told by the printed digits {counts[2]}"
 
@@ -193,7 +193,7 @@ def _name_correlation(metric: str, axis: str) -> str:
     return f"{PAPER_TITLES[metric]} by {axis}"
 
 
-def _with_own_frames(distances: Distances, frames: Mapping[Frame, np.ndarray]) -> Distances:
+def _add_own_frames(distances: Distances, frames: Mapping[Frame, np.ndarray]) -> Distances:
     """The printed distances, and our own [s 5] in other frames."""
     own = [pd.DataFrame({"robot": ROBOT_NAMES, "feature": frame, "value": frames[frame].mean(axis=0)}) for frame in OWN_FRAMES]
     return replace(distances, robots=pd.concat([distances.robots, *own], ignore_index=True))

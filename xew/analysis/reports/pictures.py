@@ -1,4 +1,4 @@
-"""Pictures of the report: strips and sheets, uint8 RGB arrays."""
+"""Pictures of a report: strips and sheets of frames, as uint8 RGB arrays."""
 
 import base64
 from collections.abc import Sequence
@@ -10,14 +10,18 @@ import numpy as np
 from xew.rollout import resized
 
 GAP = 4
-"""White pixels between the pictures of a sheet."""
+"""Width of the gap between the pictures of a sheet [px]."""
 DIFFERENCE_FULL = 96
-"""Levels of 255 at which the difference picture is darkest."""
+"""Difference, in levels of 255, from which on the difference picture is darkest."""
 FRAME = (208, 215, 222)
+"""Color of the edge of a difference picture, RGB."""
 
 
 def difference_picture(predicted: np.ndarray, observed: np.ndarray) -> np.ndarray:
-    """Largest channel difference of two uint8 frames [h w 3] as color: white is none, black DIFFERENCE_FULL or more."""
+    """Largest channel difference of two frames [h w 3] uint8 as a picture [h w 3] uint8.
+
+    White is no difference, black is DIFFERENCE_FULL or more.
+    """
     difference = cv2.absdiff(predicted, observed).max(axis=-1) / DIFFERENCE_FULL
     picture = (matplotlib.colormaps["gist_heat_r"](np.minimum(difference, 1))[..., :3] * 255).astype(np.uint8)
     height, width = picture.shape[:2]
@@ -25,12 +29,15 @@ def difference_picture(predicted: np.ndarray, observed: np.ndarray) -> np.ndarra
 
 
 def fit_to_episode(video: np.ndarray, truth: np.ndarray, frame_zero: str) -> np.ndarray:
-    """A rollout's video [t h w 3] beside its episode's as it was graded: frame by frame, at the episode's size.
+    """Bring a rollout's video to its episode's frames and size, as it was graded.
 
     Args:
-        video: the rollout's, as it is stored.
-        truth: the episode's.
+        video: [t h w 3] uint8, the rollout's as it is stored.
+        truth: [t h w 3] uint8, the episode's.
         frame_zero: what the score table says; where it is 'absent' the video begins with frame 1.
+
+    Returns:
+        [t h w 3] uint8 with the height and width of `truth`, at most as long.
     """
     video = resized(video, truth.shape[1:3])
     if frame_zero == "absent":
@@ -39,12 +46,15 @@ def fit_to_episode(video: np.ndarray, truth: np.ndarray, frame_zero: str) -> np.
 
 
 def strip_times(frame_count: int, count: int = 5) -> list[int]:
-    """Frames shown of a video: the given one, the last, and some between."""
+    """Numbers of the frames to show of a video: the first, the last, and some between."""
     return np.unique(np.linspace(0, frame_count - 1, count).round().astype(int)).tolist()
 
 
 def strip(observed: np.ndarray, predicted: np.ndarray, times: Sequence[int]) -> np.ndarray:
-    """Three rows observed, predicted, difference; one column for each time. Videos [t h w 3] uint8 of the same length."""
+    """A picture [h w 3] uint8 with the rows observed, predicted and difference, and a column for each time.
+
+    Both videos are [t h w 3] uint8 of the same length.
+    """
     rows = [
         [observed[t] for t in times],
         [predicted[t] for t in times],
@@ -54,7 +64,7 @@ def strip(observed: np.ndarray, predicted: np.ndarray, times: Sequence[int]) -> 
 
 
 def sheet(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
-    """Pictures [h w 3] of one size as a grid on white."""
+    """Rows of pictures [h w 3] uint8 of one size, side by side on a white picture [H W 3] uint8."""
     height, width = rows[0][0].shape[:2]
     columns = max(len(row) for row in rows)
     page = np.full((len(rows) * (height + GAP) - GAP, columns * (width + GAP) - GAP, 3), 255, np.uint8)
@@ -66,7 +76,7 @@ def sheet(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """An RGB image [h w 3] uint8 as PNG."""
+    """The PNG file of an RGB image [h w 3] uint8."""
     done, encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 9])
     if not done:
         raise OSError("OpenCV cannot encode a PNG")
@@ -74,5 +84,5 @@ def encode_png(image: np.ndarray) -> bytes:
 
 
 def data_uri(image: bytes) -> str:
-    """PNG bytes for the src of an <img> that must open without a network."""
+    """A PNG file as a data URI, which needs no network."""
     return "data:image/png;base64," + base64.b64encode(image).decode()

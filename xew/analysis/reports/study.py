@@ -1,6 +1,6 @@
 """The report of a study, from a score table with the column `variant`; `report` reads and writes files.
 
-What came out stands first, then the claims with their verdicts, then a section for each question of the paper: chart, the
+What came out stands first, then the claims with their answers, then a section for each question of the paper: chart, the
 main table, what it looks like, and all metrics folded away.
 """
 
@@ -35,6 +35,7 @@ from xew.analysis.tables.distances import (
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask, findings_frame
 from xew.analysis.tables.labels import ACTIONS, LADDER, SHORT_ROBOTS
 from xew.analysis.tables.layouts import build_tables, count_table
+from xew.analysis.tables.outside import outside_tables
 from xew.analysis.tables.table import MARKS, Table
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
 from xew.statistics import interval
@@ -47,6 +48,7 @@ PART_TITLES = {
     "few_shot": "Adaptation, and what it costs",
     "loeo": "Does distance predict difficulty?",
     "baselines": "Other world models",
+    "outside": "Outside the protocol",
 }
 SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]] = {
     "fixed": ((), ("gap",), ()),
@@ -59,40 +61,42 @@ SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]]
         ("certainty", "distances", "features", "matrices"),
     ),
     "baselines": ((), ("baselines",), ()),
+    "outside": ((), ("outside",), ()),
 }
-"""By part: charts, tables that stand open, and tables that are folded away."""
+"""Content of each part's section: charts, tables that stand open, and tables that are folded away."""
 FRAME_CHARTS = {"actions": "frames_actions", "ladder": "frames_ladder"}
 
 
 @dataclass(frozen=True)
 class Report:
-    """All that is written, by path relative to the report's folder."""
+    """Everything that is written into a report's folder."""
 
     html: str
     markdown: str
     summary: pd.DataFrame
     files: Mapping[str, bytes]
+    """Further files by path relative to the folder."""
 
 
 @dataclass(frozen=True)
 class Content:
-    """What the formats show."""
+    """Everything that the page and the Markdown show."""
 
     sentences: Sequence[str]
     findings: Sequence[Finding]
     printed: Sequence[Finding]
-    """The same claims asked of the paper's own figures."""
+    """Answers to the same claims on the paper's own figures."""
     tables: Mapping[str, Table]
     charts: Mapping[str, Chart]
     strips: Mapping[str, Strip]
     lacks: Sequence[str]
     """Notes on what is not there."""
     missing: pd.DataFrame
-    """Every cell that other models have."""
+    """Scores that other models have."""
 
 
 def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances: Path | None, footer: str) -> Report:
-    """Everything that a report holds.
+    """Make the report of a study.
 
     Args:
         scores: with the column `variant`.
@@ -111,7 +115,7 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
     printed = PaperGrades(paper, scores.metrics)
     planned = scores.attributes.get("study", {}).get("variants", {})
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
-    tables = [*build_tables(builder), count_table(builder), *distance_tables(known)]
+    tables = [*build_tables(builder), *outside_tables(builder, scores.rows), count_table(builder), *distance_tables(known)]
     if builder.has_results("loeo"):
         tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
         tables.append(certainty_table(grades, known, paper))
@@ -132,7 +136,7 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
 
 
 def _sentences(grades: Grades, distances: Distances, findings: Sequence[Finding]) -> list[str]:
-    """What came out, in as many sentences as there are questions that were asked."""
+    """The results in sentences, one for each question that was asked."""
     asked = [
         *_gap_sentence(grades),
         *_best_sentences(grades),
@@ -171,7 +175,7 @@ def _gap_sentence(grades: Grades) -> Iterator[str]:
 
 
 def _best_sentences(grades: Grades) -> Iterator[str]:
-    """What helps most, of ways to be told actions and of ways to be told looks."""
+    """Sentences on which action representation and which condition on looks help most."""
     for part, base, labels in (("actions", "joints", ACTIONS), ("ladder", "none", LADDER)):
         found = []
         for robot in HELD_OUT_ROBOTS:
@@ -229,7 +233,7 @@ def _missing_notes(builder: Builder, scores: Scores) -> Iterator[str]:
 
 
 def missing_note(missing: pd.DataFrame) -> list[str]:
-    """What to say of scores that other models have; none where there is nothing to say."""
+    """A note on scores that other models have and one lacks; none where nothing is missing."""
     if missing.empty:
         return []
     return [

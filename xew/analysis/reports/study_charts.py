@@ -29,14 +29,14 @@ ROBOT_COLORS = dict(zip(HELD_OUT_ROBOTS, SERIES, strict=False))
 
 @dataclass(frozen=True)
 class GainRows:
-    """Rows of a part against the row that they start from."""
+    """Rows of a part, whose gain over the row that they start from is drawn."""
 
     part: str
     title: str
     base: Callable[[str], str]
-    """Of a robot."""
+    """Function from a robot to the row that its gains are measured from."""
     rows: Callable[[str], Mapping[str, str]]
-    """Row and label, of a robot."""
+    """Function from a robot to its rows with their labels."""
 
 
 def _leave_out(base: str, labels: Mapping[str, str]) -> dict[str, str]:
@@ -51,7 +51,7 @@ GAIN_ROWS = (
 
 
 def study_charts(builder: Builder, distances: Distances, curves: pd.DataFrame) -> dict[str, Chart]:
-    """All charts for which something was measured, by name."""
+    """All charts that have something to draw, by name."""
     made = {f"gains_{gain.part}": gain_chart(builder, gain) for gain in GAIN_ROWS if builder.has_results(gain.part)}
     if builder.has_results("forgetting"):
         made["forgetting"] = forgetting_chart(builder)
@@ -61,7 +61,7 @@ def study_charts(builder: Builder, distances: Distances, curves: pd.DataFrame) -
     for part, labels in (("actions", ACTIONS), ("ladder", LADDER)):
         if builder.has_results(part) and len(curves):
             made[f"frames_{part}"] = frame_chart(curves, part, labels)
-    return made
+    return {name: chart for name, chart in made.items() if chart.panels}
 
 
 def gain_chart(builder: Builder, gain: GainRows) -> Chart:
@@ -114,7 +114,7 @@ def forgetting_chart(builder: Builder) -> Chart:
 
 
 def _adaptation_styles() -> dict[Series, tuple[str, str]]:
-    """How each line is drawn: what it shows, and of whom."""
+    """The line that each style draws: what it shows, and whether it is ours (here) or the paper's."""
     lost = SHORT_ROBOTS[FORGETTING_ROBOT]
     return {
         Series("target", SERIES[0]): ("target", "here"),
@@ -210,7 +210,7 @@ def frame_chart(curves: pd.DataFrame, part: str, labels: Mapping[str, str]) -> C
 
 
 def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Sequence[str]) -> Chart:
-    """Of one ordinary run: mean over episodes by frame, a panel for each metric and robot; bands hold the middle half."""
+    """Error of one run by frame, a panel for each metric and robot; lines are means, bands hold the middle half."""
     robots = [robot for robot in robots if (curves["robot"] == robot).any()]
     shown = curves[curves["robot"].isin(robots) & curves["metric"].isin([metric.name for metric in metrics])]
     # The truth's PSNR is a cap, not a measurement, and would squeeze everything else flat.
@@ -254,7 +254,7 @@ def _gain(builder: Builder, gain: GainRows, row: str, robot: str, metric: str) -
 
 
 def _relative_gain(grades: Grades | PaperGrades, part: str, row: str, base: str, robot: str, metric: str) -> np.ndarray:
-    """Gain over the base and its interval's ends [3] in percent; NaN where one of the two is missing."""
+    """Gain over the base and the ends of its interval [3] float64 [%]; NaN where one of the two is missing."""
     after, before = (grades.mean(part, key, robot, metric, shared=True) for key in (row, base))
     if after is None or before is None:
         return np.full(3, np.nan)

@@ -1,4 +1,4 @@
-"""What the variants of a study look like, one scene and moment, robots down and conditions across."""
+"""Strips of a study: the same scene and moment under several variants, robots down and conditions across."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,16 +17,17 @@ from xew.protocol import HELD_OUT_ROBOTS, SHOTS, VARIANTS
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
 
 RANKED_BY = "lpips"
+"""Metric by which the median scene is found."""
 Videos = dict[tuple[str, str, int, str], Rollout]
-"""By variant, task, seed and robot."""
+"""Rollouts by variant, task, seed and robot."""
 
 
 @dataclass(frozen=True)
 class Strip:
-    """A sheet of frames."""
+    """A sheet of frames with its labels."""
 
     image: bytes
-    """PNG."""
+    """PNG file."""
     caption: str
     columns: Sequence[str]
     rows: Sequence[str]

@@ -79,7 +79,7 @@ class Machine:
 
 @dataclass(frozen=True)
 class Study:
-    """What a study compares, and with what settings."""
+    """A study: the variants that it compares, and their settings."""
 
     out: Path
     """Folder for everything of the study."""

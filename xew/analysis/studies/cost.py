@@ -1,4 +1,4 @@
-"""What a study will take: time, GPU-hours and disk for every kind of step, from measured rates, before anything starts.
+"""The cost of a study: time, GPU-hours and disk for every kind of step, from measured rates, before anything starts.
 
 Where steps of a kind are done in this study already, the others of that kind are estimated by how long those took.
 """

@@ -1,4 +1,4 @@
-"""Where the steps of a study run: on the GPUs (or cores) of this machine, or on a Ray cluster.
+"""Machines that the steps of a study run on: the GPUs (or cores) of this one, or a Ray cluster.
 
 Both start the same commands as processes of their own, with their output in the same logs. A cluster's machines must see the
 study's folder at the same path.
@@ -27,7 +27,7 @@ PATIENCE_S = 120.0
 
 
 class Machines(Protocol):
-    """Where steps can run, as the study's loop uses it."""
+    """Machines that steps can run on, as the study's loop uses them."""
 
     slots: int
     """Number of steps of one GPU (or core) that can run at once; 0 where it is not known."""

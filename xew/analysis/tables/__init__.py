@@ -3,4 +3,17 @@
 A `Table` is plain data; `formats` writes Markdown, LaTeX and CSV, the page of a report writes HTML.
 """
 
-__all__ = ["distances", "findings", "formats", "layouts", "paper"]
+__all__ = [
+    "builder",
+    "claims",
+    "comparisons",
+    "distances",
+    "findings",
+    "formats",
+    "labels",
+    "layouts",
+    "outside",
+    "paper",
+    "recompute",
+    "table",
+]

@@ -21,12 +21,12 @@ from xew.statistics import Mean
 
 @dataclass(frozen=True)
 class Builder:
-    """Makes cells, rows and sections of means.
+    """Makes the cells, rows and notes of a study's tables.
 
     Attributes:
-        ours: what is reported on.
-        paper: the printed values beside; None leaves them out.
-        planned: episodes that the study meant to grade, by variant and robot; the paper's where it does not say.
+        ours: means of the study.
+        paper: means that the paper prints; None leaves them out.
+        planned: numbers of episodes that the study meant to grade, by variant and robot; the paper's where it does not say.
     """
 
     ours: Grades
@@ -44,7 +44,7 @@ class Builder:
         return tuple(name for name, info in self.ours.metrics.items() if name in PAPER_METRICS or info.reported)
 
     def has_results(self, part: str) -> bool:
-        """Was anything measured that only this part asks for? The models that comparisons start from do not count."""
+        """Whether anything was measured that only this part asks for; models that comparisons start from do not count."""
         if not isinstance(self.ours, StudyGrades):
             return part in PAPER_PARTS
         adapted = [variant for variant in PARTS[part] if variant.target is not None]
@@ -52,10 +52,10 @@ class Builder:
         return any(self.ours.has(variant.name) for variant in own)
 
     def cell(self, part: str, row: str, robots: str, metric: str, base: str = "") -> TableCell:
-        """The mean at an address, against that of the row `base`."""
+        """The mean at an address, with the paper's value and the verdict on its difference from the row `base`."""
         info = self.ours.metrics.get(metric)
         mean = self.ours.mean(part, row, robots, metric) if info else None
-        printed = self._printed(part, row, robots, metric)
+        printed = self._printed_cell(part, row, robots, metric)
         if info is None or mean is None:
             return printed
         ends = _interval_ends(mean, self.ours.level)
@@ -71,19 +71,25 @@ class Builder:
         )
 
     def row(self, part: str, row: str, robots: str, metrics: Sequence[str], labels: Sequence[str], base: str = "") -> TableRow:
+        """One cell for each metric."""
         return TableRow(tuple(labels), tuple(self.cell(part, row, robots, metric, base) for metric in metrics))
 
     def baselines(self, robots: Sequence[str], metrics: Sequence[str]) -> list[TableRow]:
-        """The frozen first frame and the true video, where they were graded."""
+        """Rows of the frozen first frame and of the true video, where they were graded."""
         still = [TableRow((STILL,), tuple(self.baseline(COPY, robots, metric) for metric in metrics), baseline=True)]
         return [*_keep_graded(still), *self.truth((TRUE,), [(robots, metric) for metric in metrics])]
 
     def truth(self, labels: tuple[str, ...], places: Sequence[tuple[Sequence[str], str]]) -> list[TableRow]:
-        """The true video, of robots and a metric for each column: what it lacks is the noise floor. Empty if not graded."""
+        """A row of the true video, which shows the noise floor; none if it was not graded.
+
+        Args:
+            labels: of the row.
+            places: robots, pooled, and metric of each column.
+        """
         return _keep_graded([TableRow(labels, tuple(self.baseline(TRUTH, *place) for place in places), baseline=True)])
 
     def note(self, part: str, rows: Iterable[tuple[str, str, str]]) -> str:
-        """What a section lacks. Rows are key, robots and label."""
+        """Note on what a section lacks, or ''; its rows are given as key, robots and label."""
         if not isinstance(self.ours, StudyGrades):
             return ""
         found: dict[str, list[str]] = {}
@@ -107,9 +113,13 @@ class Builder:
         return f"{word}. {' '.join(parts)}"
 
     def baseline(self, model: str, robots: Sequence[str], metric: str) -> TableCell:
-        """Mean of COPY or TRUTH on some robots."""
+        """The mean of COPY or TRUTH on some robots, pooled."""
+        return self.variant_cell(model, tuple(robots), metric)
+
+    def variant_cell(self, model: str, robots: tuple[str, ...], metric: str) -> TableCell:
+        """The mean of a variant, or of COPY or TRUTH, on some robots, pooled; without the paper's value."""
         info = self.ours.metrics.get(metric)
-        mean = self.ours.baseline(model, robots, metric) if isinstance(self.ours, StudyGrades) else None
+        mean = self.ours.variant_mean(model, robots, metric) if isinstance(self.ours, StudyGrades) else None
         if info is None or mean is None:
             return TableCell()
         if model == TRUTH and metric == "psnr":
@@ -124,17 +134,18 @@ class Builder:
             episodes=mean.count,
         )
 
-    def _printed(self, part: str, row: str, robots: str, metric: str) -> TableCell:
+    def _printed_cell(self, part: str, row: str, robots: str, metric: str) -> TableCell:
         text = self.paper.print(part, row, robots, metric) if self.paper else ""
         return TableCell(published=text, printed=float(text)) if text else TableCell()
 
 
 def _keep_graded(rows: Sequence[TableRow]) -> list[TableRow]:
+    """Rows with at least one graded cell."""
     return [row for row in rows if any(cell.episodes for cell in row.cells)]
 
 
 def paired_verdict(grades: Grades, part: str, row: str, base: str, robots: str, metric: str) -> str:
-    """Is a row better than another of its part, on the cells that all rows of the part have?"""
+    """Verdict on the paired difference of a row from another of its part, on the cells that all rows of the part have."""
     difference = grades.difference(part, row, base, robots, metric)
     if difference is None:
         return ""
@@ -143,5 +154,5 @@ def paired_verdict(grades: Grades, part: str, row: str, base: str, robots: str, 
 
 
 def _interval_ends(mean: Mean, level: float) -> tuple[float, float]:
-    """NaN where there are too few scenes for an interval, or where none is known (the paper)."""
+    """Ends of a mean's interval; NaN where there are too few scenes, or where none is known (the paper)."""
     return mean.interval(level) if mean.scenes is not None else (np.nan, np.nan)

@@ -1,4 +1,4 @@
-"""What the paper claims, as inequalities that can be asked of any study's numbers.
+"""The paper's claims, as inequalities that can be asked of any study's numbers.
 
 Where the paper's text has a number, the bound is that number. Where it has a word only ("substantial", "several times"), the
 bound is ours and the claim says so in its test.

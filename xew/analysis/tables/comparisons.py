@@ -1,4 +1,4 @@
-"""What claims are made of: numbers with bounds, and the reader that computes them from a study's means."""
+"""Parts of claims: numbers with bounds, and the reader that computes them from a study's means."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from xew.statistics import MIN_SCENES, Mean, interval
 
 
 class NotMeasuredError(Exception):
-    """A claim needs a mean that was not measured."""
+    """Raised where a claim needs a mean that was not measured."""
 
 
 @dataclass(frozen=True)
@@ -22,34 +22,39 @@ class Comparison:
 
     label: str
     values: np.ndarray
-    """[1 + n] the number, then what else it could have been."""
+    """[1 + n] float64: the number, then its values in n bootstrap draws."""
     above: float = -np.inf
+    """Bound that the number has to lie above."""
     below: float = np.inf
+    """Bound that the number has to lie below."""
     percent: bool = True
-    """Shown as a percentage, else with three decimals."""
+    """Whether it is printed as a percentage, else with three decimals."""
     doubt: str = ""
-    """Why it cannot be resolved whatever the interval says."""
+    """Reason why it cannot be resolved whatever the interval says, or ''."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """What is said, and what would have to be true."""
+    """A claim in words, and the comparisons that test it."""
 
     name: str
     where: str
-    """The paper's section, or 'ours' for a stricter question that it does not answer."""
+    """Section of the paper, or 'ours' for a stricter question that it does not answer."""
     says: str
+    """Claim in words."""
     test: str
+    """Test in words."""
     comparisons: Callable[["Reader"], Iterator[Comparison]]
 
 
 class Reader:
-    """What claims read of a study: means that must be there, and comparisons of them."""
+    """Computes comparisons from the means of a study; a mean that was not measured raises NotMeasuredError."""
 
     def __init__(self, grades: Grades) -> None:
         self.grades = grades
 
     def mean(self, part: str, row: str, robots: str, metric: str) -> Mean:
+        """The mean at an address, over the cells that all rows of the part have."""
         mean = self.grades.mean(part, row, robots, metric, shared=True) if metric in self.grades.metrics else None
         if mean is None:
             name = SHORT_ROBOTS.get(robots, "seen robots")
@@ -59,7 +64,7 @@ class Reader:
     def gain(
         self, part: str, after: str, before: str, robots: str, metric: str, above: float = -np.inf, below: float = np.inf
     ) -> Comparison:
-        """By which share of the value before one row is better than another."""
+        """The gain of one row over another, as a share of the value before; positive is better."""
         new, old = self.mean(part, after, robots, metric), self.mean(part, before, robots, metric)
         label = f"{SHORT_ROBOTS.get(robots, 'seen')} {PAPER_TITLES[metric]}"
         # Where a bound from above is asked for, smallness is the claim, and the floor does not speak against it.
@@ -69,37 +74,38 @@ class Reader:
     def worse_than_seen(
         self, part: str, row: str, robots: str, metric: str, above: float = 0, below: float = np.inf
     ) -> Comparison:
-        """By which share of its score on seen robots a row is worse on another robot."""
+        """The loss of a row on another robot, as a share of its score on seen robots; positive is worse."""
         new, old = self.mean(part, row, robots, metric), self.mean(part, row, SEEN, metric)
         label = f"{SHORT_ROBOTS[robots]} {PAPER_TITLES[metric]}"
         values = -relative_gain(new, old, self.grades.metrics[metric]).values
         return Comparison(label, values, above, below, doubt=self._doubt((new, old), robots, metric))
 
     def share(self, start: Mean, after: Mean, end: Mean, metric: str) -> tuple[np.ndarray, str]:
-        """Which share of the way from a start to a better end has been gone [1 + n], and why that is no answer, or ''.
+        """The share of the gap from a start to a better end that is closed [1 + n] float64, and a doubt about it, or ''.
 
-        Without such a way there is no share: were the end worse than the start, who does worse would seem to get there.
+        Without such a gap there is no share: if the end were worse than the start, a worse score would seem to close it.
         """
-        way = (end.values - start.values) * (1 if self.grades.metrics[metric].higher_is_better else -1)
+        gap = (end.values - start.values) * (1 if self.grades.metrics[metric].higher_is_better else -1)
         with np.errstate(divide="ignore", invalid="ignore"):
             share = (after.values - start.values) / (end.values - start.values)
-        no_way = "" if interval(way, self.grades.level)[0] > 0 else "no gap to close"
-        return share, self._doubt_of_few((start, after, end)) or no_way
+        no_gap = "" if interval(gap, self.grades.level)[0] > 0 else "no gap to close"
+        return share, self._doubt_of_few((start, after, end)) or no_gap
 
     def closed_share(
         self, part: str, after: str, before: str, robots: str, metric: str, goal: tuple[str, str]
     ) -> tuple[np.ndarray, str]:
-        """`share` of the way from a row to the goal (part, row of the seen robots) that another row has gone."""
+        """`share` [1 + n] of the gap from a row to the goal (part and row, on seen robots) that another row closes."""
         old, new = self.mean(part, before, robots, metric), self.mean(part, after, robots, metric)
         return self.share(old, new, self.mean(*goal, SEEN, metric), metric)
 
     def loeo(self, metric: str) -> np.ndarray:
-        """How bad each held-out robot is [1 + n 5]: higher is worse."""
+        """Scores of each robot when it was held out [1 + n 5] float64, with the sign turned so that higher is worse."""
         means = [self.mean("loeo", f"loeo_{robot}", robot, metric) for robot in ROBOT_NAMES]
         sign = -1 if self.grades.metrics[metric].higher_is_better else 1
         return sign * np.stack([mean.values for mean in means], axis=1)
 
     def doubt_of_few_scenes(self, part: str, row: str, robots: str, metric: str) -> str:
+        """Text that says that a mean rests on too few scenes, or ''."""
         return self._doubt_of_few((self.mean(part, row, robots, metric),))
 
     def _doubt_of_few(self, means: Sequence[Mean]) -> str:

@@ -1,4 +1,4 @@
-"""Tables of distance between robots, and of how it goes with scores, in the paper's layouts.
+"""Tables of distances between robots, and of their correlation with scores, in the paper's layouts.
 
 Distances are those that `python -m xew.analysis.distance` wrote; without them the paper's printed ones stand in, and say so.
 """
@@ -32,27 +32,28 @@ COMMAND = "python -m xew.analysis.distance --out {folder}"
 
 @dataclass(frozen=True)
 class Distances:
-    """What is known of the robots."""
+    """Distances between robots, and the features of each robot."""
 
     pairs: pd.DataFrame
-    """Columns axis robot other value spread published."""
+    """Table with the columns axis robot other value spread published."""
     robots: pd.DataFrame
-    """Columns robot feature value spread published; features are those above and the mean distances by axis."""
+    """Table with the columns robot feature value spread published; mean distances stand under their axis."""
     measured: bool
-    """By ourselves, or the paper's figures in their place."""
+    """Whether we measured them; else they are the paper's figures."""
 
     @property
     def axes(self) -> list[str]:
+        """Kinds of distance that are known."""
         return [axis for axis in AXIS_TITLES if axis in set(self.robots["feature"])]
 
     def of(self, feature: str) -> np.ndarray:
-        """A feature of all robots in the order of ROBOT_NAMES [5]."""
+        """A feature of all robots: [5] float64 in the order of ROBOT_NAMES."""
         column = self.robots[self.robots["feature"] == feature].set_index("robot")["value"]
         return column.reindex(list(ROBOT_NAMES)).to_numpy(np.float64)
 
 
 def read_distances(folder: Path) -> Distances:
-    """Read what the command of distances wrote.
+    """Read the files that python -m xew.analysis.distance wrote.
 
     Raises:
         ConfigError: a file is missing, or lacks a column, a robot or one of the paper's two axes.
@@ -79,7 +80,7 @@ def read_distances(folder: Path) -> Distances:
 
 
 def printed_distances(paper: Paper) -> Distances:
-    """The paper's figures as if they were measured."""
+    """The paper's figures in place of measured ones."""
     features = (*FEATURE_TITLES, *AXES)
     robots = [(robot, name, getattr(paper.robots[robot], name)) for name in features for robot in ROBOT_NAMES]
     names = list(paper.robots)
@@ -95,7 +96,7 @@ def printed_distances(paper: Paper) -> Distances:
 
 
 def correlate(grades: Grades, distances: Distances) -> dict[tuple[str, str], Correlation]:
-    """By metric and axis; metrics that some fold lacks are left out."""
+    """Correlations by metric and axis; metrics that some fold lacks are left out."""
     found = {}
     for name in PAPER_METRICS:
         scores = _loeo_scores(grades, name)
@@ -107,7 +108,7 @@ def correlate(grades: Grades, distances: Distances) -> dict[tuple[str, str], Cor
 
 
 def distance_tables(distances: Distances) -> list[Table]:
-    """Mean distances, features and both matrices."""
+    """Tables of mean distances, of features and of all matrices."""
     origin = "" if distances.measured else " These are the paper's figures: none of our own were given (--distances)."
     drawn = (distances.robots["spread"] > 0).any()
     spread = " ±: deviation of one draw of configurations; of looks, the jackknife over views." if drawn else ""
@@ -131,7 +132,7 @@ def distance_tables(distances: Distances) -> list[Table]:
 
 
 def correlation_table(grades: Grades, distances: Distances, paper: Paper) -> Table:
-    """The paper's layout: r and leave-one-out range for each of its axes, then r with the number of joints."""
+    """The paper's table: r and leave-one-out range for each of its axes, then r with the number of joints."""
     found = correlate(grades, distances)
 
     def row(metric: str) -> TableRow:
@@ -162,7 +163,7 @@ def correlation_table(grades: Grades, distances: Distances, paper: Paper) -> Tab
 
 
 def own_correlation_tables(grades: Grades, distances: Distances) -> list[Table]:
-    """The same of distances that the paper does not have; none where none were measured."""
+    """The same table for distances that the paper does not have; none where none were measured."""
     found = correlate(grades, distances)
     own = [axis for axis in distances.axes if axis not in AXES]
     shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
@@ -191,7 +192,7 @@ def own_correlation_tables(grades: Grades, distances: Distances) -> list[Table]:
 
 
 def certainty_table(grades: Grades, distances: Distances, paper: Paper) -> Table:
-    """What five points can say: exact p, Spearman, bootstrap over robots, stability of the sign."""
+    """Table of what five points can say: exact p, Spearman, bootstrap over robots, stability of the sign."""
     found = correlate(grades, distances)
 
     def row(metric: str) -> TableRow:
@@ -225,6 +226,7 @@ def certainty_table(grades: Grades, distances: Distances, paper: Paper) -> Table
 
 
 def format_signed(value: float) -> str:
+    """Text such as '+0.812'."""
     return f"{value:+z.3f}".replace("-", "−")
 
 
@@ -249,7 +251,7 @@ def _note_printed_distances(distances: Distances) -> str:
 
 
 def _signed_cell(ours: Sequence[float], printed: Sequence[float]) -> TableCell:
-    """One figure, or the two ends of a range."""
+    """A cell of one figure, or of the two ends of a range."""
     return TableCell(
         " to ".join(map(format_signed, ours)) or "–",
         published=" to ".join(map(format_signed, printed)),

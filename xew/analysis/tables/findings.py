@@ -18,6 +18,7 @@ from xew.analysis.tables.comparisons import Claim, Comparison, NotMeasuredError,
 from xew.statistics import interval
 
 HOLDS, FAILS, UNRESOLVED, UNMEASURED = "holds", "fails", "unresolved", "not measured"
+"""The answers to a claim."""
 
 
 @dataclass(frozen=True)
@@ -26,29 +27,33 @@ class AnsweredComparison:
 
     label: str
     numbers: str
-    """Value and interval, and what speaks against an answer."""
+    """Value and interval as text, with any doubt."""
     value: float
     low: float
     high: float
     answer: str
+    """One of HOLDS, FAILS and UNRESOLVED."""
 
     @property
     def text(self) -> str:
+        """Label and numbers."""
         return f"{self.label} {self.numbers}"
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One claim, asked of one study."""
+    """The answer to one claim on one study's scores."""
 
     claim: Claim
     answer: str
+    """One of HOLDS, FAILS, UNRESOLVED and UNMEASURED."""
     comparisons: tuple[AnsweredComparison, ...]
-    """Empty where something was not measured."""
+    """Comparisons of the claim; empty where something was not measured."""
     missing: str = ""
+    """Name of what was not measured, if anything."""
 
     def span(self) -> str:
-        """Smallest and largest number of those that are alike."""
+        """Text with the smallest and the largest number."""
         numbers = sorted(self.comparisons, key=lambda one: one.value)
         first, last = (one.numbers.partition(" [")[0] for one in (numbers[0], numbers[-1]))
         return f"{len(numbers)} comparisons, {first} to {last}"
@@ -93,7 +98,10 @@ def _format_plain(value: float) -> str:
 
 
 def findings_frame(findings: Sequence[Finding], of: str) -> pd.DataFrame:
-    """Columns: of claim where says test verdict comparison value low high answer; one row a comparison."""
+    """A tidy frame of claims, one row per comparison: of claim where says test verdict comparison value low high answer.
+
+    `verdict` is the answer to the claim, `answer` that of the comparison; `of` says whose numbers they are.
+    """
     columns = ["of", "claim", "where", "says", "test", "verdict", "comparison", "value", "low", "high", "answer"]
     rows = [
         (of, f.claim.name, f.claim.where, f.claim.says, f.claim.test, f.answer, a.label, a.value, a.low, a.high, a.answer)

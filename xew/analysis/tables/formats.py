@@ -18,16 +18,16 @@ LATEX = {
     "·": r"$\cdot$", "×": r"$\times$", "±": r"$\pm$", "✓": r"$\checkmark$", "✗": r"$\times$", "\u00a0": "~",
     "<": "$<$", ">": "$>$",
 }  # fmt: skip
-"""What stands for characters that LaTeX reads otherwise, or does not have."""
+"""Replacements for characters that LaTeX reads otherwise, or does not have."""
 
 
 def column_heads(table: Table) -> list[str]:
-    """Heads of all columns in one line each: 'Visual quality: PSNR [dB] ↑'."""
+    """Heads of all columns, each on one line, such as 'Visual quality: PSNR [dB] ↑'."""
     return [*table.stubs, *(": ".join(filter(None, (column.group, column.title))) for column in table.columns)]
 
 
 def markdown(table: Table) -> str:
-    """Ours [interval] mark (paper ...); what is missing stands in the table."""
+    """A table as Markdown, with cells such as '0.12 [0.10–0.14] ▲ (paper 0.11)'."""
     width = len(table.stubs) + len(table.columns)
     lines = [_markdown_line(column_heads(table)), f"|{'---|' * len(table.stubs)}{'---:|' * len(table.columns)}"]
     for section in table.sections:
@@ -49,9 +49,9 @@ def _markdown_cell(cell: TableCell) -> str:
 
 
 def latex(table: Table) -> str:
-    """A table for the packages booktabs, amssymb and adjustbox; small under each number stand its interval and the paper's.
+    """A table for the packages booktabs, amssymb and adjustbox, scaled down where it is wider than the page.
 
-    It is scaled down where it is wider than the page.
+    The interval and the paper's value stand small below each number.
     """
     stubs, width = len(table.stubs), len(table.stubs) + len(table.columns)
     lines = [
@@ -93,7 +93,7 @@ def _latex_groups(table: Table) -> Iterator[str]:
 
 
 def _latex_rows(row: TableRow, above: TableRow | None) -> Iterator[str]:
-    """A label that the row above has too stands there only, but for the last one."""
+    """Lines of a row; a label that the row above has, too, is left out, except for the last label."""
     same = [bool(above and above.labels[i] == label and label != row.labels[-1]) for i, label in enumerate(row.labels)]
     labels = ["" if repeated else _escape(label) for label, repeated in zip(row.labels, same, strict=True)]
     yield _latex_line([*labels, *map(_latex_cell, row.cells)])
@@ -114,14 +114,14 @@ def _latex_line(cells: Sequence[str]) -> str:
 
 
 def _escape(text: str) -> str:
-    """Also two hyphens, of a command's option, which LaTeX would draw as a dash."""
+    """Text with LaTeX's special characters replaced, also the two hyphens of an option, which it would draw as a dash."""
     return "-{}-".join("".join(LATEX.get(character, character) for character in part) for part in text.split("--"))
 
 
 def table_frame(table: Table) -> pd.DataFrame:
-    """A tidy table_frame, one row a cell: table section note row column text value low high verdict paper episodes.
+    """A tidy frame, one row per cell: table block note row column text value low high verdict paper episodes.
 
-    `note` says what the section lacks.
+    `block` is the title of the section, `note` says what it lacks.
     """
     columns = column_heads(table)[len(table.stubs) :]
     return pd.DataFrame(
@@ -146,12 +146,12 @@ def table_frame(table: Table) -> pd.DataFrame:
 
 
 def tables_frame(tables: Sequence[Table]) -> pd.DataFrame:
-    """All tables, one below the other."""
+    """The frames of all tables, one below the other."""
     return pd.concat([table_frame(table) for table in tables], ignore_index=True)
 
 
 def findings_markdown(findings: Sequence[Finding], papers: Sequence[Finding] = ()) -> str:
-    """Claim, test, verdict with numbers, and where given the verdict on the paper's own figures."""
+    """A Markdown table of claims: test, answer with numbers, and where given the answer on the paper's own figures."""
     beside = [["the paper's own figures"], *([paper.answer] for paper in papers)] if papers else [[]] * (len(findings) + 1)
     lines = [_markdown_line(["claim", "test", "verdict", "numbers", *beside[0]]), "|---" * (4 + bool(papers)) + "|"]
     for finding, last in zip(findings, beside[1:], strict=True):
@@ -162,7 +162,7 @@ def findings_markdown(findings: Sequence[Finding], papers: Sequence[Finding] = (
 
 
 def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = ()) -> str:
-    """The verdicts alone: claim, test, here, and where given the paper's own figures."""
+    """A LaTeX table of claims: test, answer, and where given the answer on the paper's own figures."""
     beside = [["paper"], *([paper.answer] for paper in papers)] if papers else [[]] * (len(findings) + 1)
     rows = [
         _latex_line([_escape(text) for text in (finding.claim.says, finding.claim.test, finding.answer, *last)])

@@ -46,7 +46,7 @@ SYSTEM_ACTIONS = tuple(
     REPRESENTATIONS[variant.action].label if variant.action in REPRESENTATIONS else spell_key(variant.action)
     for variant in PARTS["baselines"]
 )
-"""What each of SYSTEMS is told of actions."""
+"""Labels of the actions that each of SYSTEMS gets."""
 STILL, TRUE = "frozen first frame", "true video, graded"
 """Labels of the rows of both baselines."""
 REMEDIES = {"replay": "with replay", "lora": "with LoRA"}

@@ -46,7 +46,7 @@ def _keep_measured(builder: Builder, names: Sequence[str]) -> tuple[str, ...]:
 def gap_table(builder: Builder) -> Table:
     """Not in the paper as such: the reference model, flow only, on robots seen and unseen, beside both baselines."""
     keys = {"fixed": "flow only"}
-    return _full(builder, "gap", "The gap: robots seen and unseen", "fixed", "model", keys, "")
+    return _full_table(builder, "gap", "The gap: robots seen and unseen", "fixed", "model", keys, "")
 
 
 def action_table(builder: Builder) -> Table:
@@ -71,7 +71,9 @@ def action_table(builder: Builder) -> Table:
 
 def action_full(builder: Builder) -> Table:
     """The appendix's complete table of action representations."""
-    return _full(builder, "actions_full", "Action representation, all metrics", "actions", "representation", ACTIONS, "joints")
+    return _full_table(
+        builder, "actions_full", "Action representation, all metrics", "actions", "representation", ACTIONS, "joints"
+    )
 
 
 def ladder_table(builder: Builder) -> Table:
@@ -91,7 +93,7 @@ def ladder_table(builder: Builder) -> Table:
 
 def ladder_full(builder: Builder) -> Table:
     """The appendix's complete table of the conditioning ladder."""
-    return _full(builder, "ladder_full", "Conditioning, all metrics", "ladder", "conditioning", LADDER, "none")
+    return _full_table(builder, "ladder_full", "Conditioning, all metrics", "ladder", "conditioning", LADDER, "none")
 
 
 def few_shot_table(builder: Builder) -> Table:
@@ -247,7 +249,7 @@ def _count_cell(builder: Builder, part: str, place: int, printed: int) -> TableC
     )
 
 
-def _full(builder: Builder, name: str, title: str, part: str, stub: str, keys: dict[str, str], base: str) -> Table:
+def _full_table(builder: Builder, name: str, title: str, part: str, stub: str, keys: dict[str, str], base: str) -> Table:
     """Ten metrics; the seen pool and each held-out robot a section."""
     metrics = builder.reported
     groups = {SEEN: SEEN_TITLE, **{robot: f"Held-out {ROBOT_TITLES[robot]}" for robot in HELD_OUT_ROBOTS}}

@@ -1,4 +1,4 @@
-"""Tables of what follows from the paper's figures, for `paper_report`."""
+"""Tables of what follows from the paper's own figures, for the report on them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ from xew.sim_warp.robots import ROBOTS
 
 AXIS_TITLES = {"appearance": "Appearance distance", "kinematic": "Kinematic distance"}
 SEEDS = range(20)
-"""Draws of the clouds that kinematic distances of our own are means of."""
+"""Seeds of the draws that our own kinematic distances are means of."""
 SECTIONS = {
     "sec:exp-actrep": "Action representation",
     "sec:exp-cond": "Robot descriptions",
@@ -63,7 +63,7 @@ ROBOT_TEXT = "Means of the rows of the printed matrices, the printed means below
 
 
 class PrintedBuilder(Builder):
-    """Tables of the paper alone: its means with all the digits that it prints."""
+    """Makes tables of the paper alone, its means with all the digits that it prints."""
 
     def cell(self, part: str, row: str, robots: str, metric: str, base: str = "") -> TableCell:
         assert isinstance(self.ours, PaperGrades)
@@ -73,7 +73,7 @@ class PrintedBuilder(Builder):
 
 @cache
 def frame_distances() -> dict[Frame, np.ndarray]:
-    """Mean kinematic distances of our five robots to the other four by frame, a row for each seed [s 5], meters."""
+    """Mean kinematic distances of our five robots to the other four, by frame: [s 5] float64, a row for each seed [m]."""
     robots = {name: ROBOTS[name] for name in ROBOT_NAMES}
     return {frame: mean_distances(measure(robots, SEEDS, frame).kinematic) for frame in FRAME_TITLES}
 
@@ -84,7 +84,7 @@ def _mean_floor() -> np.ndarray:
 
 
 def frame_results(paper: Paper, distances: np.ndarray) -> dict[str, Correlation]:
-    """Correlation of the paper's scores with mean distances [s 5], by metric."""
+    """Correlation by metric of the paper's scores with mean distances [s 5]."""
     axis = distances.mean(axis=0).tolist()
     return {
         name: loeo_correlation(axis, paper.scores(name).tolist(), metric.higher_is_better)
@@ -105,7 +105,7 @@ def claims_table(claims: Sequence[Finding]) -> Table:
 
 
 def correlation_table(paper: Paper, cells: Sequence[RecomputedFigure]) -> Table:
-    """The paper's layout: r and leave-one-out range for each axis, then r with the number of joints."""
+    """The paper's correlation table: r and leave-one-out range for each axis, then r with the number of joints."""
     found = {(cell.metric, cell.axis, cell.quantity): cell for cell in cells}
     layout = [(axis, names) for axis in AXES for names in (("r",), ("low", "high"))] + [("dof", ("r",))]
     rows = [
@@ -121,7 +121,7 @@ def correlation_table(paper: Paper, cells: Sequence[RecomputedFigure]) -> Table:
 
 
 def _compared_cell(cells: Sequence[RecomputedFigure]) -> TableCell:
-    """One figure, or the two ends of a range."""
+    """A cell of one figure, or of the two ends of a range."""
     ours = " to ".join(format_signed(cell.ours) for cell in cells)
     published = " to ".join(format_signed(cell.published) for cell in cells)
     value, printed = (cells[0].ours, cells[0].published) if len(cells) == 1 else (np.nan, np.nan)
@@ -140,7 +140,7 @@ def certainty_table(paper: Paper, cells: Sequence[RecomputedFigure], results: Ma
             compared = TableCell(text, value=result.p_value)
             if p:
                 compared = replace(compared, published=f"{p.published:.3f}", agrees=p.agrees, printed=p.published)
-            columns += [compared, *_own_certainty(result)]
+            columns += [compared, *_certainty_cells(result)]
         return TableRow((PAPER_TITLES[metric],), tuple(columns))
 
     heads = ("p", "Spearman ρ", "bootstrap of r", "sign")
@@ -150,7 +150,7 @@ def certainty_table(paper: Paper, cells: Sequence[RecomputedFigure], results: Ma
     )
 
 
-def _own_certainty(result: Correlation) -> list[TableCell]:
+def _certainty_cells(result: Correlation) -> list[TableCell]:
     ends = (result.bootstrap_low, result.bootstrap_high)
     return [
         TableCell(format_signed(result.spearman), value=result.spearman),
@@ -164,7 +164,7 @@ def _stability_cell(result: Correlation) -> TableCell:
 
 
 def frame_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
-    """The paper's kinematic correlation beside what our own clouds give for it, in each frame."""
+    """Table of the paper's kinematic correlation beside those that our own clouds give; `frames` has mean distances [s 5]."""
     by_frame = {frame: frame_results(paper, distances) for frame, distances in frames.items()}
 
     def row(metric: str) -> TableRow:
@@ -187,7 +187,7 @@ def frame_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
 
 
 def base_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
-    """The distances that this rests on."""
+    """Table of the mean distances [s 5] that `frame_table` rests on."""
     rows, floor = [], _mean_floor()
     for i, name in enumerate(paper.robots):
         cells = [TableCell(f"{paper.robots[name].kinematic:.3f}", value=paper.robots[name].kinematic)]
@@ -231,7 +231,7 @@ def _change_cell(found: RecomputedChange) -> TableCell:
 
 
 def describe_change(change: PublishedChange) -> str:
-    """Such as 'LPIPS, Piper: joint pose to optical flow'."""
+    """Text such as 'LPIPS, Piper: joint pose to optical flow'."""
     (part, before, start), (_, after, end) = (place.split("/") for place in (change.before, change.after))
     if start == end:
         subject, first, second = ROBOT_TITLES[end], _row_title(part, before, end), _row_title(part, after, end)

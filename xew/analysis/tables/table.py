@@ -15,7 +15,7 @@ MARKS = (
     "▲ better, ▼ worse, ≈ not resolved: the interval of the paired difference holds 0, the difference is inside the noise "
     f"floor or the floor is not known, or there are fewer than {MIN_SCENES} scenes"
 )
-"""What stands behind values; captions name the row that they are compared with."""
+"""Explanation of the marks behind values; captions name the row that a value is compared with."""
 
 
 @dataclass(frozen=True)
@@ -23,16 +23,16 @@ class TableCell:
     """One value of a table, as text and as numbers."""
 
     text: str = "–"
-    """'–' where nothing was measured."""
+    """Value as text, '–' where nothing was measured."""
     interval: str = ""
     published: str = ""
-    """The paper's value as it is printed."""
+    """Paper's value as it is printed."""
     verdict: str = ""
-    """Against the row that the caption names: better, worse or unresolved; '' where there is none."""
+    """Verdict on the difference from the row that the caption names: better, worse or unresolved; '' where there is none."""
     agrees: bool | None = None
-    """Does a recomputed value print like the paper's; None where this is not asked."""
+    """Whether a recomputed value prints like the paper's; None where this is not asked."""
     best: bool = False
-    """Of the rows of a section that are models."""
+    """Whether it is the best of its section's models."""
     value: float = np.nan
     low: float = np.nan
     high: float = np.nan
@@ -42,6 +42,8 @@ class TableCell:
 
 @dataclass(frozen=True)
 class Column:
+    """The head of a column of values."""
+
     title: str
     group: str = ""
     """Title over several columns."""
@@ -49,10 +51,13 @@ class Column:
 
 @dataclass(frozen=True)
 class TableRow:
+    """A row of labels and values."""
+
     labels: tuple[str, ...]
-    """One for each stub of the table."""
+    """Labels, one for each stub of the table."""
     cells: tuple[TableCell, ...]
     baseline: bool = False
+    """Whether no model made it."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,7 @@ class TableSection:
     title: str
     rows: tuple[TableRow, ...]
     note: str = ""
-    """What is missing."""
+    """Note on what is missing, or ''."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ class Table:
     """A table as any of the output formats shows it."""
 
     name: str
-    """For file names and labels."""
+    """Name in files and LaTeX labels."""
     title: str
     caption: str
     stubs: tuple[str, ...]
@@ -80,28 +85,29 @@ class Table:
 
     @property
     def complete(self) -> bool:
+        """Whether no section lacks anything."""
         return not any(section.note for section in self.sections)
 
 
 def format_number(value: float, metric: MetricInfo) -> str:
-    """Digits that mean something: 0.01 dB, 0.1 px, else 0.001."""
+    """A value with the digits that mean something: 0.01 dB, 0.1 px, else 0.001."""
     return f"{value:.{ {'dB': 2, 'px': 1}.get(metric.unit, 3) }f}"
 
 
 def metric_title(metric: MetricInfo) -> str:
-    """Such as 'PSNR [dB] ↑': the arrow points to better."""
+    """Head such as 'PSNR [dB] ↑', whose arrow points to better."""
     unit = f" [{metric.unit}]" if metric.unit else ""
     return f"{metric.title}{unit} {'↑' if metric.higher_is_better else '↓'}"
 
 
 def metric_columns(metrics: Mapping[str, MetricInfo], names: Sequence[str]) -> tuple[Column, ...]:
-    """A column for each name, under its dimension."""
+    """A column for each metric, under the title of its dimension."""
     infos = [metrics[name] for name in names]
     return tuple(Column(metric_title(info), DIMENSION_TITLES.get(info.dimension, info.dimension)) for info in infos)
 
 
 def format_interval(ends: tuple[float, float], metric: MetricInfo) -> str:
-    """Such as '0.12–0.15'; '' where there is no interval, or none at these digits."""
+    """Text such as '0.12–0.15'; '' where there is no interval, or none at these digits."""
     low, high = ends
     if np.isnan(low):
         return ""

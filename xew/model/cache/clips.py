@@ -9,7 +9,7 @@ import numpy as np
 from xew.episode import Record
 from xew.model.conditions import Condition, clip_numbers, robot_render
 from xew.model.episodes.commands import episode_command
-from xew.model.experiment import Clip
+from xew.model.settings.settings import Clip
 from xew.model.video.frames import to_model_size
 from xew.model.video.pixels import Pixels, stored_pixels
 

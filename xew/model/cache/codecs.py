@@ -12,8 +12,8 @@ from xew.episode import complete_folder
 from xew.model.cache.clips import clip_starts, take_frames
 from xew.model.cache.keys import codec_path
 from xew.model.codecs.codec import Codec, codec_class
-from xew.model.experiment import Encoding
 from xew.model.runs.folder import load_run_codec
+from xew.model.settings.parts import Encoding
 from xew.model.video.frames import to_model_size
 from xew.model.video.pixels import PixelSource, stored_pixels
 
@@ -25,7 +25,7 @@ def load_codec(encoding: Encoding, episodes: Sequence[Episode]) -> Codec:
         ConfigError: `latents` has not been run for them, or the weights are missing or do not fit.
     """
     if encoding.start_from is not None:
-        return load_run_codec(encoding.start_from)
+        return load_run_codec(encoding.start_from, encoding.codec)
     kind = codec_class(encoding.codec)
     if not kind.fitted:
         return kind.prepare(encoding.codec, list)

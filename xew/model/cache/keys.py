@@ -12,7 +12,7 @@ from typing import Any
 from xew.config import digest
 from xew.dataset import Episode
 from xew.episode import Record, episode_folder
-from xew.model.experiment import Encoding
+from xew.model.settings.parts import Encoding
 
 CACHE_VERSION = 2
 

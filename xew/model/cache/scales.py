@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+from jax.experimental import multihost_utils
 
 from xew.config import ConfigError
 from xew.dataset import Episode
@@ -18,7 +20,7 @@ from xew.files import replacing
 from xew.model.cache.keys import scales_path
 from xew.model.conditions import Command, Condition
 from xew.model.episodes.commands import episode_command
-from xew.model.experiment import Encoding
+from xew.model.settings.parts import Encoding
 
 PERCENTILES = (1, 99)
 """Percentiles that become -1 and 1, with clipping beyond, as in Ctrl-World and Boundless-World-Model."""
@@ -127,3 +129,13 @@ def keep_scales(encoding: Encoding, episodes: Sequence[Episode]) -> None:
     path, conditions = scales_path(encoding, episodes), encoding.inputs.conditions.values()
     if any(condition.scale != "none" for condition in conditions) and encoding.start_from is None and not path.exists():
         save_scales(path, fit_scales(conditions, (episode_command(folder, record) for folder, record in episodes)))
+
+
+def share_scales(out: Path, conditions: Mapping[str, Condition], found: Mapping[str, Scale]) -> dict[str, Scale]:
+    """The scales that a run was begun with; those found in the data, which all processes wait for, if it is new."""
+    path = out / SCALES
+    if found and not path.exists() and jax.process_index() == 0:
+        save_scales(path, found)
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices("scales")
+    return load_run_scales(conditions, out)

@@ -17,7 +17,7 @@ from xew.model.cache.codecs import load_codec
 from xew.model.cache.keys import stream_path
 from xew.model.codecs.codec import Codec
 from xew.model.conditions import Condition
-from xew.model.experiment import Encoding
+from xew.model.settings.parts import Encoding
 
 CLIPS = "clips"
 """Name of the one array of a cached stream. Safetensors and not .npy, whose headers no two threads may read at once."""

@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import UInt8
 
 from xew.model.codecs.codec import Codec
 from xew.model.video.frames import to_camera_size, to_model_size
@@ -17,7 +18,7 @@ from xew.model.video.frames import to_camera_size, to_model_size
 T = TypeVar("T")
 
 LPIPS_EVERY = 3
-"""Frames between those on which LPIPS is taken: not 4, so that each place in a group of four gets its turn."""
+"""Number of frames between those on which LPIPS is taken: not 4, so that each place in a group of four gets its turn."""
 
 
 @dataclass(frozen=True)
@@ -25,19 +26,23 @@ class Ceiling:
     """Reconstruction of true video at the camera's size, mean over clips."""
 
     psnr: float
-    """Decibels, as `xew.metrics.psnr`."""
+    """Mean PSNR [dB], as `xew.metrics.psnr`."""
     lpips: float
-    """As `xew.metrics.lpips`, on every third frame."""
+    """Mean LPIPS, as `xew.metrics.lpips`, on every third frame."""
     clips: int
+    """Number of clips."""
 
     def __str__(self) -> str:
         return f"PSNR {self.psnr:.2f} dB, LPIPS {self.lpips:.4f} at camera size over {self.clips} clips"
 
 
-def measure_ceiling(codec: Codec, videos: Iterable[np.ndarray], frames: int, height: int, width: int) -> Ceiling:
-    """Encode and decode the first `frames` frames of each video.
+def measure_ceiling(
+    codec: Codec, videos: Iterable[UInt8[np.ndarray, "t h w 3"]], frames: int, height: int, width: int
+) -> Ceiling:
+    """Grade what is left of the first `frames` frames of each video after encoding and decoding.
 
     Args:
+        codec: the codec.
         videos: true video, uint8 [t 240 320 3] each; a shorter one is continued by its last frame, which is not graded.
         frames, height, width: of the model's clip.
     """
@@ -55,5 +60,5 @@ def measure_ceiling(codec: Codec, videos: Iterable[np.ndarray], frames: int, hei
 
 
 def choose_evenly(items: Sequence[T], count: int) -> list[T]:
-    """At most `count` of them, evenly chosen."""
+    """At most `count` of the items, at even distances."""
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(len(items), count)).astype(int))]

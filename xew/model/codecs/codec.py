@@ -13,18 +13,25 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol, Self
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax import Array, lax
+from jaxtyping import Float, Shaped, UInt8
 
 from xew.config import ConfigError, parse, pick
 from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae
+from xew.model.codecs.vae_layers import as_row
 from xew.model.codecs.vae_layouts import load_vae, save_vae
 from xew.model.video.frames import TEMPORAL_FACTOR
+
+Pictures = UInt8[np.ndarray, "t h w 3"]
+Latents = Float[np.ndarray, "k y x c"]
+FrameBatch = Float[Array, "b t h w 3"]
+LatentBatch = Float[Array, "b k y x c"]
 
 
 @dataclass(frozen=True)
@@ -34,51 +41,54 @@ class CodecSettings:
     name: str = "patch_pca"
     """One of CODECS."""
     spatial_factor: int = 8
+    """Number of pixels a side of a latent."""
     channels: int = 48
+    """Number of channels of the latents."""
     fit_clips: int = 64
-    """patch_pca: clips of training episodes from which the components are computed."""
+    """Number of clips of training episodes from which patch_pca computes its components."""
     vae: str = "wan22"
-    """wan_vae: one of VAES."""
+    """Size of wan_vae, one of VAES."""
     weights: Path | None = None
-    """wan_vae: Wan2.2_VAE.pth, the vae folder of the diffusers layout, or what `train_vae` wrote."""
+    """Weights of wan_vae: Wan2.2_VAE.pth, the vae folder of the diffusers layout, or what `train_vae` wrote."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """wan_vae: of the activations."""
+    """Type of wan_vae's activations."""
     chunk: int = 8
-    """wan_vae: latent frames that go through the network at once; more is faster and takes more memory, 0 takes all."""
+    """Number of latent frames that go through wan_vae at once; more is faster and takes more memory, 0 takes all."""
 
 
+@runtime_checkable
 class Codec(Protocol):
     """What the rest of the room asks of a codec."""
 
     fitted: ClassVar[bool]
-    """Whether it comes from the training episodes themselves, and not from weights."""
+    """Whether it is fitted to the training episodes, and not read from weights."""
 
     @property
     def spatial_factor(self) -> int:
-        """Pixels a side of what one latent covers."""
+        """Number of pixels a side of a latent."""
 
     @property
     def channels(self) -> int:
-        """Of the latents."""
+        """Number of channels of the latents."""
 
     @property
     def hash(self) -> str:
-        """Changes whenever latents would."""
+        """Text that changes whenever latents would."""
 
-    def encode(self, video: np.ndarray) -> np.ndarray:
-        """uint8 [t h w 3] -> float32 [t' h' w' c]. Later frames never change earlier latents."""
+    def encode(self, video: Pictures) -> Latents:
+        """Video uint8 [t h w 3] -> latents float32 [t' h' w' c]. Later frames never change earlier latents."""
 
-    def decode(self, latents: np.ndarray) -> np.ndarray:
-        """float32 [t' h' w' c] -> uint8 [t h w 3]."""
+    def decode(self, latents: Latents) -> Pictures:
+        """Latents float32 [t' h' w' c] -> video uint8 [t h w 3]."""
 
-    def encode_batch(self, frames: Array) -> Array:
-        """Float [b t h w 3] in [-1, 1] -> float32 [b t' h' w' c]; may be traced."""
+    def encode_batch(self, frames: FrameBatch) -> LatentBatch:
+        """Frames [b t h w 3] in [-1, 1] -> latents [b t' h' w' c] float32; may be traced."""
 
-    def decode_batch(self, latents: Array) -> Array:
-        """Float [b t' h' w' c] -> float32 [b t h w 3], about in [-1, 1]; may be traced."""
+    def decode_batch(self, latents: LatentBatch) -> FrameBatch:
+        """Latents [b t' h' w' c] -> frames [b t h w 3] float32, about in [-1, 1]; may be traced."""
 
-    def next_reference(self, latents: Array) -> Array:
-        """[b t' h' w' c] -> [b 1 h' w' c]: the last frame of a decoded clip, encoded alone; may be traced.
+    def next_reference(self, latents: LatentBatch) -> Float[Array, "b 1 y x c"]:
+        """The last frame of a decoded clip, encoded alone: [b t' h' w' c] -> [b 1 h' w' c]; may be traced.
 
         It is rounded as if it had been a picture in between, so it is what a rollout begins its next chunk with.
         """
@@ -87,14 +97,15 @@ class Codec(Protocol):
         """Write all that `load` needs into a folder, under names of its own."""
 
     @classmethod
-    def load(cls, folder: Path) -> Self: ...
+    def load(cls, folder: Path) -> "Codec":
+        """The codec that was saved in a folder."""
 
     @classmethod
     def check(cls, settings: CodecSettings) -> None:
         """Raise ConfigError where settings contradict one another; reads no weights."""
 
     @classmethod
-    def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> Self:
+    def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> "Codec":
         """The codec of a config; `clips` gives uint8 [t h w 3] of training episodes to one that is fitted to them."""
 
 
@@ -106,38 +117,38 @@ class BatchCodec:
     decode_batch: Callable[[Array], Array]
 
     def encode(self, video: np.ndarray) -> np.ndarray:
-        """uint8 [t h w 3] -> float32 [t' h' w' c]; t must be 4 k + 1 and the sides multiples of the factor."""
+        """Video uint8 [t h w 3] -> latents float32 [t' h' w' c]; t must be 4 k + 1 and the sides multiples of the factor."""
         check_clip_shape(video.shape, self.spatial_factor)
         return np.asarray(encode_pictures(self, video[None]))[0]
 
-    def decode(self, latents: np.ndarray) -> np.ndarray:
-        """float32 [t' h' w' c] -> uint8 [t h w 3]."""
+    def decode(self, latents: Latents) -> Pictures:
+        """Latents float32 [t' h' w' c] -> video uint8 [t h w 3]."""
         return np.asarray(decode_to_pictures(self, latents[None]))[0]
 
-    def next_reference(self, latents: Array) -> Array:
-        """[b t' h' w' c] -> [b 1 h' w' c]: the last decoded frame as a picture, encoded alone."""
+    def next_reference(self, latents: LatentBatch) -> Float[Array, "b 1 y x c"]:
+        """The last decoded frame as a picture, encoded alone: [b t' h' w' c] -> [b 1 h' w' c]."""
         return self.encode_batch(to_signed(to_pictures(self.decode_batch(latents)[:, -1:])))
 
 
 @jax.jit
-def encode_pictures(codec: Any, videos: Array) -> Array:
-    """uint8 [b t h w 3] -> float32 latents [b t' h' w' c]."""
+def encode_pictures(codec: Any, videos: UInt8[Array, "b t h w 3"]) -> LatentBatch:
+    """Videos uint8 [b t h w 3] -> latents float32 [b t' h' w' c]."""
     return codec.encode_batch(to_signed(videos))
 
 
 @jax.jit
-def decode_to_pictures(codec: Any, latents: Array) -> Array:
-    """Latents [b t' h' w' c] -> uint8 [b t h w 3]."""
+def decode_to_pictures(codec: Any, latents: LatentBatch) -> UInt8[Array, "b t h w 3"]:
+    """Latents [b t' h' w' c] -> videos uint8 [b t h w 3]."""
     return to_pictures(codec.decode_batch(latents))
 
 
-def to_signed(pictures: Array) -> Array:
-    """uint8 -> float32 in [-1, 1]."""
+def to_signed(pictures: UInt8[Array, "*n"]) -> Float[Array, "*n"]:
+    """Pictures uint8 [...] -> float32 [...] in [-1, 1]."""
     return pictures.astype(jnp.float32) / 127.5 - 1
 
 
-def to_pictures(frames: Array) -> Array:
-    """Float, about in [-1, 1] -> uint8."""
+def to_pictures(frames: Float[Array, "*n"]) -> UInt8[Array, "*n"]:
+    """Frames [...], about in [-1, 1] -> uint8 [...]."""
     return jnp.clip(jnp.rint((frames + 1) * 127.5), 0, 255).astype(jnp.uint8)
 
 
@@ -147,24 +158,22 @@ class Basis:
     """An affine map between patches [p] and latent channels [c]."""
 
     mean: Any
-    """[p] float32."""
+    """Mean patch [p] float32."""
     directions: Any
-    """[p c] float32, orthonormal columns."""
+    """Orthonormal columns [p c] float32."""
     scale: Any
-    """[c] float32, divides the coordinates along the directions."""
+    """Divisors [c] float32 of the coordinates along the directions."""
 
-    def encode(self, patches: Array) -> Array:
-        """[... p] -> [... c]. At the highest precision: TF32, the default of some GPUs, costs the codec decibels."""
-        centered = patches - broadcast_over_last(self.mean, patches.ndim)
-        return jnp.matmul(centered, self.directions, precision=lax.Precision.HIGHEST) / broadcast_over_last(
-            self.scale, patches.ndim
-        )
+    def encode(self, patches: Float[Array, "*n p"]) -> Float[Array, "*n c"]:
+        """Patches [... p] -> latents [... c], at the highest precision: TF32, the default of some GPUs, costs decibels."""
+        centered = patches - as_row(self.mean, patches.ndim)
+        return jnp.matmul(centered, self.directions, precision=lax.Precision.HIGHEST) / as_row(self.scale, patches.ndim)
 
-    def decode(self, latents: Array) -> Array:
-        """[... c] -> [... p]."""
-        scaled = latents * broadcast_over_last(self.scale, latents.ndim)
+    def decode(self, latents: Float[Array, "*n c"]) -> Float[Array, "*n p"]:
+        """Latents [... c] -> patches [... p]."""
+        scaled = latents * as_row(self.scale, latents.ndim)
         patches = jnp.matmul(scaled, self.directions.T, precision=lax.Precision.HIGHEST)
-        return patches + broadcast_over_last(self.mean, latents.ndim)
+        return patches + as_row(self.mean, latents.ndim)
 
 
 @functools.partial(jax.tree_util.register_dataclass, data_fields=("first", "later"), meta_fields=("spatial_factor",))
@@ -180,9 +189,9 @@ class PatchCodec(BatchCodec):
 
     spatial_factor: int
     first: Basis
-    """Of patches [factor factor 3] of the first frame."""
+    """Map of patches [factor factor 3] of the first frame."""
     later: Basis
-    """Of patches [4 factor factor 3] of differences from the first frame; its mean is zero."""
+    """Map of patches [4 factor factor 3] of differences from the first frame; its mean is zero."""
 
     @property
     def channels(self) -> int:
@@ -196,13 +205,13 @@ class PatchCodec(BatchCodec):
                 digest.update(np.ascontiguousarray(getattr(basis, field.name)).tobytes())
         return digest.hexdigest()
 
-    def encode_batch(self, frames: Array) -> Array:
-        """Float [b t h w 3] in [-1, 1] -> float32 [b t' h' w' c]."""
+    def encode_batch(self, frames: FrameBatch) -> LatentBatch:
+        """Frames [b t h w 3] in [-1, 1] -> latents [b t' h' w' c] float32."""
         first, later = cut_patches(frames, self.spatial_factor)
         return jnp.concatenate([self.first.encode(first), self.later.encode(later)], axis=1)
 
-    def decode_batch(self, latents: Array) -> Array:
-        """Float32 [b t' h' w' c] -> float32 [b t h w 3], about in [-1, 1]."""
+    def decode_batch(self, latents: LatentBatch) -> FrameBatch:
+        """Latents [b t' h' w' c] -> frames [b t h w 3] float32, about in [-1, 1]."""
         return join_patches(self.first.decode(latents[:, :1]), self.later.decode(latents[:, 1:]), self.spatial_factor)
 
     def save(self, folder: Path) -> None:
@@ -214,6 +223,7 @@ class PatchCodec(BatchCodec):
 
     @classmethod
     def load(cls, folder: Path) -> "PatchCodec":
+        """Read codec.npz."""
         with np.load(folder / "codec.npz") as stored:
             first, later = (Basis(*(stored[f"{name}_{f.name}"] for f in fields(Basis))) for name in ("first", "later"))
             return cls(int(stored["spatial_factor"]), first, later)
@@ -231,13 +241,19 @@ class PatchCodec(BatchCodec):
 
     @classmethod
     def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> "PatchCodec":
+        """Fit the codec of a config on the clips."""
         return cls.fit(clips(), settings.spatial_factor, settings.channels)
 
     @classmethod
-    def fit(cls, clips: list[np.ndarray], spatial_factor: int, channels: int, whitening: float = 0.5) -> "PatchCodec":
-        """Fit on uint8 clips [t h w 3]; deterministic.
+    def fit(
+        cls, clips: list[UInt8[np.ndarray, "t h w 3"]], spatial_factor: int, channels: int, whitening: float = 0.5
+    ) -> "PatchCodec":
+        """Fit on clips; deterministic.
 
         Args:
+            clips: [t h w 3] uint8 each.
+            spatial_factor: pixels a side of a patch.
+            channels: number of components.
             whitening: 1 gives every channel unit variance, 0 keeps the patches' own proportions; the scale is such that
                 the mean variance over channels is 1 either way.
         """
@@ -257,7 +273,7 @@ class WanVaeCodec(BatchCodec):
     fitted: ClassVar[bool] = False
 
     params: Any
-    """State of a `VideoVae`, with the statistics of its latents."""
+    """State of a `VideoVae` with the statistics of its latents."""
     graph: nnx.GraphDef
     size: VaeSize
     dtype: str
@@ -274,18 +290,22 @@ class WanVaeCodec(BatchCodec):
 
     @property
     def vae(self) -> VideoVae:
+        """The autoencoder itself."""
         return nnx.merge(self.graph, self.params)
 
-    def encode_batch(self, frames: Array) -> Array:
-        """Float [b t h w 3] in [-1, 1] -> float32 [b t' h' w' c]: normalized means, as Wan's diffusion takes them."""
+    def encode_batch(self, frames: FrameBatch) -> LatentBatch:
+        """Frames [b t h w 3] in [-1, 1] -> latents [b t' h' w' c] float32: normalized means, as Wan's diffusion takes them."""
         return self.vae.encode(frames, self.chunk)
 
-    def decode_batch(self, latents: Array) -> Array:
-        """Float [b t' h' w' c] -> float32 [b t h w 3] in [-1, 1]."""
+    def decode_batch(self, latents: LatentBatch) -> FrameBatch:
+        """Latents [b t' h' w' c] -> frames [b t h w 3] float32 in [-1, 1]."""
         return self.vae.decode(latents, self.chunk)
 
-    def next_reference(self, latents: Array) -> Array:
-        """[b t' h' w' c] -> [b 1 h' w' c]; decodes two latents at a time, so that it fits beside a network in training."""
+    def next_reference(self, latents: LatentBatch) -> Float[Array, "b 1 y x c"]:
+        """The last decoded frame as a picture, encoded alone: [b t' h' w' c] -> [b 1 h' w' c].
+
+        It decodes two latents at a time, so that it fits beside a network in training.
+        """
         last = self.vae.decode(latents, chunk=2, last_only=True)
         return self.vae.encode(to_signed(to_pictures(last)))
 
@@ -299,6 +319,7 @@ class WanVaeCodec(BatchCodec):
 
     @classmethod
     def load(cls, folder: Path) -> "WanVaeCodec":
+        """Read vae.safetensors and vae.json."""
         stored = json.loads((folder / "vae.json").read_text())
         size = parse(VaeSize, stored["size"], str(folder / "vae.json"))
         return cls.from_weights(folder / "vae.safetensors", size, stored["dtype"], stored["chunk"])
@@ -350,14 +371,9 @@ class WanVaeCodec(BatchCodec):
 CODECS: dict[str, type[Codec]] = {"patch_pca": PatchCodec, "wan_vae": WanVaeCodec}
 
 
-def codec_class(settings: CodecSettings) -> type[Codec]:
-    """The kind of codec that a config names. Raises ConfigError if there is none of that name."""
+def codec_class(settings: CodecSettings) -> type[Any]:
+    """The class of codec that a config names, with what `Codec` asks. Raises ConfigError if there is none of that name."""
     return pick(CODECS, settings.name, "codec")
-
-
-def broadcast_over_last(vector: Array, ndim: int) -> Array:
-    """[c] -> [1 ... 1 c]: to be broadcast over the last of `ndim` axes."""
-    return jnp.reshape(vector, (1,) * (ndim - 1) + (-1,))
 
 
 def check_clip_shape(shape: tuple[int, ...], spatial_factor: int) -> None:
@@ -368,12 +384,20 @@ def check_clip_shape(shape: tuple[int, ...], spatial_factor: int) -> None:
 
 
 def latent_frames(frames: int) -> int:
-    """How many latent frames `frames` = 4 k + 1 pixels frames become."""
+    """Number of latent frames that 4 k + 1 frames of video become."""
     return (frames - 1) // TEMPORAL_FACTOR + 1
 
 
-def cut_patches(frames: Any, factor: int) -> tuple[Any, Any]:
-    """Frames [b t h w 3] -> first frame's patches [b 1 h' w' p] and later groups' difference patches [b k h' w' 4p]."""
+def cut_patches(frames: Shaped[Array | np.ndarray, "b t h w 3"], factor: int) -> tuple[Any, Any]:
+    """Cut frames into square patches.
+
+    Args:
+        frames: [b t h w 3] float32.
+        factor: pixels a side.
+
+    Returns:
+        Patches of the first frame [b 1 h' w' p], and of the later groups' differences from it [b k h' w' 4p].
+    """
     b, t, h, w, _ = frames.shape
     rows, columns, patch = h // factor, w // factor, factor * factor * 3
     cut = frames.reshape(b, t, rows, factor, columns, factor, 3).transpose(0, 1, 2, 4, 3, 5, 6)
@@ -382,8 +406,8 @@ def cut_patches(frames: Any, factor: int) -> tuple[Any, Any]:
     return cut[:, :1].reshape(b, 1, rows, columns, patch), later.reshape(*later.shape[:4], TEMPORAL_FACTOR * patch)
 
 
-def join_patches(first: Array, later: Array, factor: int) -> Array:
-    """The inverse of `cut_patches`."""
+def join_patches(first: Float[Array, "b 1 y x p"], later: Float[Array, "b k y x q"], factor: int) -> FrameBatch:
+    """Frames [b t h w 3] of patches [b 1 h' w' p] and [b k h' w' 4p], the inverse of `cut_patches`."""
     b, k, h, w, _ = later.shape
     groups = later.reshape(b, k, h, w, TEMPORAL_FACTOR, factor, factor, 3).transpose(0, 1, 4, 2, 3, 5, 6, 7)
     cut = first.reshape(b, 1, h, w, factor, factor, 3)

@@ -1,4 +1,4 @@
-"""What the leaves of `VideoVae` are called in the files of others: Wan2.2's own, diffusers', and ours.
+"""Names of the leaves of `VideoVae` in files: Wan2.2's own, diffusers', and ours.
 
 Ours is diffusers' and the two statistics of the latents, which theirs keeps in its config and Wan2.2's in its code.
 """
@@ -11,9 +11,12 @@ from flax import nnx
 
 from xew.config import ConfigError
 from xew.model.codecs.vae import VideoVae
-from xew.model.weights.tensors import Layout, Source, Tensors, fill, read_tensors, save_weights
+from xew.model.weights.layout import Layout, Source
+from xew.model.weights.reading import Tensors, fill, read_tensors
+from xew.model.weights.writing import save_weights
 
 STATISTICS = ("latents_mean", "latents_std")
+"""Leaves that only our own files hold."""
 
 DIFFUSERS = {
     r"^(post_)?quant\.": r"\g<1>quant_conv.",
@@ -55,7 +58,7 @@ OFFICIAL = {
 
 def diffusers_layout(vae: VideoVae) -> Layout:
     """Names of diffusers' AutoencoderKLWan; the module may be abstract."""
-    return _layout(vae, lambda path: _renamed(path, DIFFUSERS))
+    return _layout(vae, lambda path: _rename(path, DIFFUSERS))
 
 
 def official_layout(vae: VideoVae) -> Layout:
@@ -63,7 +66,7 @@ def official_layout(vae: VideoVae) -> Layout:
 
     def name(path: str) -> str:
         blocks = vae.size.blocks + (1 if path.startswith("decoder") else 0)
-        return _renamed(path.replace(".resample.", f".{blocks}."), OFFICIAL)
+        return _rename(path.replace(".resample.", f".{blocks}."), OFFICIAL)
 
     return _layout(vae, name)
 
@@ -115,7 +118,7 @@ def _source(path: str, name: str) -> Source:
     return Source((name,))
 
 
-def _renamed(path: str, patterns: Mapping[str, str]) -> str:
+def _rename(path: str, patterns: Mapping[str, str]) -> str:
     for pattern, replacement in patterns.items():
         path = re.sub(pattern, replacement, path)
     return path

@@ -97,7 +97,7 @@ def check_batch(batch: int, accumulate: int, devices: int) -> None:
 
 
 def parameter_spec(path: Sequence[Any], shape: Sequence[int], fsdp: int) -> PartitionSpec:
-    """The axis of an array that is sharded: the largest that `fsdp` divides, the last of equals, never the layers; or none."""
+    """Axis of an array that is sharded: the largest that `fsdp` divides (the last of equals), but no axis of layers."""
     first = 1 if LAYERS in path and len(shape) > 1 else 0
     candidates = [axis for axis in range(first, len(shape)) if shape[axis] % fsdp == 0]
     if fsdp == 1 or not candidates or math.prod(shape[first:]) < SMALL:
@@ -113,6 +113,23 @@ def state_shardings(state: Any, mesh: Mesh) -> Any:
         return NamedSharding(mesh, parameter_spec(path_names(path), leaf.shape, mesh.shape["fsdp"]))
 
     return jax.tree_util.tree_map_with_path(place, state)
+
+
+def place_shapes(shapes: Any, mesh: Mesh) -> Any:
+    """Give a tree of shapes and types their places on the mesh."""
+    return _with_places(shapes, state_shardings(shapes, mesh))
+
+
+def place_beside(shapes: Any, like: Any) -> Any:
+    """Give a tree of shapes and types their places on the mesh of another tree, or on its device."""
+    sharding = jax.tree.leaves(like)[0].sharding
+    if isinstance(sharding, NamedSharding) and isinstance(sharding.mesh, Mesh):
+        return place_shapes(shapes, sharding.mesh)
+    return _with_places(shapes, jax.tree.map(lambda leaf: sharding, shapes))
+
+
+def _with_places(shapes: Any, places: Any) -> Any:
+    return jax.tree.map(lambda leaf, place: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), shapes, places)
 
 
 def path_names(path: Sequence[Any]) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from xew.config import ConfigError, suggestion
 from xew.dataset import Dataset, Episode, read_dataset
 from xew.episode import EpisodeError
-from xew.model.experiment import EpisodeChoice
+from xew.model.settings.parts import EpisodeChoice
 
 
 @dataclass(frozen=True)
@@ -22,30 +22,37 @@ class TrainingEpisodes:
     """Those that sample videos are drawn of, by role and robot."""
 
 
-def choose_episodes(choice: EpisodeChoice) -> TrainingEpisodes:
-    """Choose all episodes that a training reads, from one index of its data set.
+def choose_episodes(dataset: Dataset, choice: EpisodeChoice) -> TrainingEpisodes:
+    """Choose all episodes that a training reads.
 
     Raises:
-        ConfigError, EpisodeError: there are none to learn from, or too few to adapt to.
+        ConfigError, EpisodeError: there are none to learn from, too few to adapt to, or no videos to draw samples of.
     """
-    return TrainingEpisodes(training_episodes(choice), replay_episodes(choice), sample_episodes(choice))
+    samples = sample_episodes(dataset, choice) if choice.samples else {}
+    bare = [folder for folder, record in samples.values() if not record.videos]
+    if bare:
+        raise ConfigError(
+            f"{bare[0]} was made with --states-only and has no video to begin a sample with; draw none with "
+            f"--train.sample-every 0, or make videos: python -m xew.sim_warp.inspect {dataset.root} --render"
+        )
+    return TrainingEpisodes(training_episodes(dataset, choice), replay_episodes(dataset, choice), samples)
 
 
-def training_episodes(choice: EpisodeChoice) -> list[Episode]:
+def training_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
     """Episodes to learn from, of training seeds: all of the split's training robots, or a few of the robots to adapt to.
 
     Raises:
         ConfigError, EpisodeError: there are none, or too few to adapt to.
     """
-    dataset, adapt = read_dataset(choice.data), choice.adapt
+    adapt = choice.adapt
     if adapt.start_from is None:
         return _select_training(dataset, choice.split.train_robots, need_all=False)
     return first_of_each(_select_training(dataset, adapt.robots, need_all=True), adapt.episodes)
 
 
-def replay_episodes(choice: EpisodeChoice) -> list[Episode]:
+def replay_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
     """In an adaptation with replay, what the run that it starts from was trained on; else none."""
-    return _select_training(read_dataset(choice.data), choice.replay, need_all=True) if choice.replay else []
+    return _select_training(dataset, choice.replay, need_all=True) if choice.replay else []
 
 
 def _select_training(dataset: Dataset, robots: Sequence[str], *, need_all: bool) -> list[Episode]:
@@ -73,12 +80,7 @@ def first_of_each(episodes: Sequence[Episode], count: int) -> list[Episode]:
     return [episode for _, group in sorted(groups.items()) for episode in group[:count]]
 
 
-def test_episodes(data: Path, robots: Sequence[str]) -> list[Episode]:
-    """Accepted episodes of test seeds of the given robots, possibly none."""
-    return read_dataset(data).select(robots=robots, split="test")
-
-
-def sample_episodes(choice: EpisodeChoice) -> dict[str, Episode]:
+def sample_episodes(dataset: Dataset, choice: EpisodeChoice) -> dict[str, Episode]:
     """An episode of each robot of the split by role and robot, of test seeds where there are any.
 
     In an adapted run the robots adapted to are the target, and seen are those of the run that it started from.
@@ -86,7 +88,7 @@ def sample_episodes(choice: EpisodeChoice) -> dict[str, Episode]:
     split, targets = choice.split, choice.adapt.robots
     roles = dict.fromkeys(split.train_robots, "seen") | dict.fromkeys(split.held_out_robots, "unseen")
     roles |= dict.fromkeys(targets, "target")
-    found = test_episodes(choice.data, tuple(roles)) or training_episodes(choice)
+    found = dataset.select(robots=tuple(roles), split="test") or training_episodes(dataset, choice)
     first = {record.robot: (folder, record) for folder, record in reversed(found)}
     return {f"{roles[robot]}/{robot}": first[robot] for robot in roles if robot in first}
 

@@ -1,6 +1,6 @@
 """Published weights of the network: where each leaf lies in the files of Wan2.2 (official and diffusers), FlowWAM and BWM.
 
-Reads and writes checkpoints through weights.py.
+Reads and writes checkpoints through xew/model/weights.
 Names: Wan2.2's own `wan/modules/model.py`, diffusers' `WanTransformer3DModel`, FlowWAM's `flow_stream`.
 """
 
@@ -16,10 +16,13 @@ from flax import nnx
 from xew.model.network.blocks import EPSILON
 from xew.model.network.dit import STREAMS, WorldModel
 from xew.model.network.tokens import PATCH, TIME_FREQUENCIES
-from xew.model.weights.tensors import Layout, Source, Tensors, check_fit, fill, read_tensors, save_weights
+from xew.model.weights.layout import Layout, Source
+from xew.model.weights.reading import Tensors, check_fit, fill, read_tensors
+from xew.model.weights.writing import save_weights
 
 Naming = Literal["official", "diffusers"]
 COLUMN = {"official": 0, "diffusers": 1}
+"""Place of a project's name in the pairs below."""
 
 LINEARS = {
     "text_embedding.first": ("text_embedding.0", "condition_embedder.text_embedder.linear_1"),
@@ -29,7 +32,7 @@ LINEARS = {
     "time_projection": ("time_projection.1", "condition_embedder.time_proj"),
     "head.head": ("head.head", "proj_out"),
 }
-"""Our module -> its name in each project; all have a weight and a bias."""
+"""Names of each of our modules in both projects; all have a weight and a bias."""
 BLOCK_LINEARS = {
     **{
         f"{ours}.{part}": (f"{ours}.{part}", f"{theirs}.{their_part}")
@@ -52,17 +55,17 @@ BLOCK_VECTORS = {
 """Norms and modulation. What Wan calls norm3 is diffusers' norm2; the norms without parameters have the other two names."""
 
 FLOW_STREAM = "action"
-"""Our stream that FlowWAM's optical-flow stream becomes."""
+"""Stream of ours that FlowWAM's optical-flow stream becomes."""
 BWM_LINEARS = {
     "mechanisms.pose_context.first": "action_encoder.action_mlp1.0",
     "mechanisms.pose_context.second": "action_encoder.action_mlp1.2",
     "mechanisms.pose_time.first": "action_encoder.action_mlp2.0",
     "mechanisms.pose_time.second": "action_encoder.action_mlp2.2",
 }
-"""What Boundless-World-Model has beside Wan's keys: the two paths of its tool poses (action bwm)."""
+"""Names in Boundless-World-Model of the two paths of its tool poses (action bwm), which it has beside Wan's keys."""
 NOT_OURS = ("flow_stream.flow_head.*", "action_encoder.action_embedding.*")
-"""FlowWAM has a head for its flow too, which a world model does not use; its published file may lack it. BWM's class has an
-embedding that its network does not use."""
+"""Patterns of keys that we do not use. FlowWAM has a head for its flow too, which its published file may lack; BWM's class has
+an embedding that its network does not use."""
 
 
 def wan_layout(model: WorldModel, naming: Naming) -> Layout:
@@ -114,14 +117,14 @@ def load_dit(model: WorldModel, path: Path) -> None:
 
     Args:
         model: of any size; of `nnx.eval_shape` only if the file has all of its leaves.
-        path: as for `weights.read_tensors`.
+        path: as for `reading.read_tensors`.
 
     Raises:
         ConfigError: tensors are missing, left over or of another shape.
     """
     tensors = read_tensors(path)
     layout = dit_layout(model, find_naming(tensors))
-    fill(model, tensors, layout, optional=_may_differ(model, tensors))
+    fill(model, tensors, layout, optional=_optional_names(model, tensors))
     for name in model.condition_streams:
         if STREAMS[name].source == "latents" and layout[f"stream_inputs.{name}.kernel"].keys[0] not in tensors:
             model.stream_inputs[name] = jax.tree.map(jnp.copy, model.patch_embedding)
@@ -131,12 +134,12 @@ def load_dit(model: WorldModel, path: Path) -> None:
 
 
 def check_dit(model: WorldModel, path: Path) -> None:
-    """Raises what `load_dit` would, without reading a tensor; `model` may be of `nnx.eval_shape`."""
+    """Raise what `load_dit` would, without reading a tensor; `model` may be of `nnx.eval_shape`."""
     tensors = read_tensors(path)
-    check_fit(model, tensors, dit_layout(model, find_naming(tensors)), optional=_may_differ(model, tensors))
+    check_fit(model, tensors, dit_layout(model, find_naming(tensors)), optional=_optional_names(model, tensors))
 
 
-def _may_differ(model: WorldModel, tensors: Tensors) -> tuple[str, ...]:
+def _optional_names(model: WorldModel, tensors: Tensors) -> tuple[str, ...]:
     """Leaves that a checkpoint may lack (all that Wan does not have) and keys that it may have beside."""
     naming = find_naming(tensors)
     return (*(dit_layout(model, naming).keys() - wan_layout(model, naming).keys()), *NOT_OURS)
@@ -185,7 +188,7 @@ def diffusers_config(model: WorldModel) -> dict[str, Any]:
 
 
 def find_naming(tensors: Tensors) -> Naming:
-    """Whose names a checkpoint uses."""
+    """The project whose names a checkpoint uses."""
     return "diffusers" if any(key.startswith("condition_embedder.") for key in tensors) else "official"
 
 

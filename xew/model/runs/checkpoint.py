@@ -1,5 +1,6 @@
 """Checkpoints of a run (Orbax): written in the background, read on whatever devices there are."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,10 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from xew.config import ConfigError
+from xew.files import checkpoint_time
+from xew.model.devices.sharding import place_beside
+from xew.model.network.lora import apply_lora, init_lora
+from xew.model.runs.folder import START, load_run_config
 
 
 @jax.tree_util.register_dataclass
@@ -60,7 +65,55 @@ def restore_state(checkpoints: ocp.CheckpointManager, like: TrainState) -> tuple
     return state, restored["data"]
 
 
-def restore_kept(out: Path, like: Any, step: int | None) -> tuple[Any, int]:
+def restore_params(out: Path, like: Any, step: int | None = None) -> tuple[Any, int]:
+    """Restore the network's parameters for inference (the average where one was kept), and their step.
+
+    Of a run with LoRA they are those of the run that it started from, with its corrections added.
+
+    Args:
+        like: the network's parameters, or their shapes, types and shardings.
+        step: of the checkpoint; the latest where left out.
+
+    Raises:
+        ConfigError: the run has no such checkpoint, or what it started from has gone.
+    """
+    adapt = load_run_config(out).adapt
+    if not adapt.lora_rank:
+        return _restore_kept(out, like, step)
+    assert adapt.start_from is not None
+    shapes = place_beside(jax.eval_shape(lambda: init_lora(like, adapt.lora_rank, jax.random.key(0))), like)
+    base = restore_start(out, adapt.start_from, like)
+    corrections, step = _restore_kept(out, shapes, step)
+    return jax.jit(apply_lora)(base, corrections), step
+
+
+def restore_start(out: Path, run: Path, like: Any) -> Any:
+    """Restore the parameters of another run that an adapted run started from, as noted when it began.
+
+    Args:
+        out: the adapted run.
+        run: the run that it started from.
+        like: the network's parameters, or their shapes, types and shardings.
+
+    Raises:
+        ConfigError: they have gone or were trained anew since, or the note is lost.
+    """
+    try:
+        note = json.loads((out / START).read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"{out} does not tell from which checkpoint of {run} it was adapted ({error}); copy the whole run, or "
+            "adapt again with --overwrite."
+        ) from error
+    if not (run / "config.yaml").exists() or checkpoint_time(run, note["step"]) != note["saved"]:
+        raise ConfigError(
+            f"{out} was adapted from step {note['step']} of {run}, which is not there any more or was trained anew; "
+            "put that run back (a longer train.keep_checkpoints keeps it), or adapt again with --overwrite."
+        )
+    return restore_params(run, like, note["step"])[0]
+
+
+def _restore_kept(out: Path, like: Any, step: int | None) -> tuple[Any, int]:
     """Restore what a run's checkpoint holds for inference, `ema` or else `params`, and its step.
 
     Args:

@@ -9,17 +9,26 @@
 """
 
 import dataclasses
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
+import jax
+from jax.experimental import multihost_utils
+
 from xew import config
 from xew.config import ConfigError
-from xew.model.codecs.codec import Codec, codec_class
+from xew.files import checkpoint_time
+from xew.model.codecs.codec import Codec, CodecSettings, codec_class
 from xew.model.experiment import Experiment, load_experiment
 
 T = TypeVar("T")
+
+START = "start.json"
+"""Name of the file that says, in an adapted run, which checkpoint of which run it started from."""
+
 
 FREE_TO_CHANGE = (
     "data",
@@ -43,6 +52,26 @@ FREE_TO_CHANGE = (
 """Settings that a resumed run may change; any other would make it another experiment."""
 
 
+def begin_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite: bool) -> None:
+    """Make the run folder ready, by the first process; the others wait for it."""
+    out, start = experiment.out, experiment.adapt.start_from
+    if jax.process_index() == 0:
+        prepare_run(experiment, codec, resume=resume, overwrite=overwrite)
+        if start is not None and not (resume and (out / START).exists()):
+            note_start(out, start)
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices("run folder")
+
+
+def note_start(out: Path, run: Path) -> None:
+    """Write into a new run which checkpoint of another run it starts from."""
+    step = max((int(path.name) for path in (run / "checkpoints").glob("*") if path.name.isdecimal()), default=None)
+    if step is None:
+        raise ConfigError(f"{run} has no checkpoint to start from; train it: python -m xew.model.train CONFIG --out {run}")
+    note = {"run": str(run), "step": step, "saved": checkpoint_time(run, step)}
+    (out / START).write_text(json.dumps(note, indent=1) + "\n")
+
+
 def prepare_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite: bool) -> None:
     """Make a run folder ready, new, continued or replaced, and keep config and codec in it.
 
@@ -51,19 +80,25 @@ def prepare_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite
     """
     out = experiment.out
     claim_run(out, experiment, load_experiment, resume=resume, overwrite=overwrite)
+    _check_same_codec(experiment.codec, codec, out)
     try:
-        _check_same_codec(codec, out)
         (out / "codec").mkdir(exist_ok=True)
         codec.save(out / "codec")
     except OSError as error:
         raise ConfigError(f"cannot write the run {out}: {error}; choose another --out.") from error
 
 
-def claim_run(out: Path, settings: T, load: Callable[[Path], T], *, resume: bool, overwrite: bool) -> None:
+def check_one_of(resume: bool, overwrite: bool) -> None:
+    """Raise ConfigError where a run would be both continued and replaced."""
+    if resume and overwrite:
+        raise ConfigError("--resume continues the run in --out, --overwrite replaces it; give one of them.")
+
+
+def claim_run(out: Path, settings: T, read: Callable[[Path], T], *, resume: bool, overwrite: bool) -> None:
     """Make a folder ready for a run with these settings, new, continued or replaced, and write them there as config.yaml.
 
     Args:
-        load: reads settings of this kind.
+        read: reads settings of this kind.
 
     Raises:
         ConfigError: it holds a run and neither was asked, or it would be continued with another config.
@@ -72,7 +107,7 @@ def claim_run(out: Path, settings: T, load: Callable[[Path], T], *, resume: bool
     if saved.exists() and overwrite:
         shutil.rmtree(out)
     elif saved.exists() and resume:
-        _check_same(load(saved), settings, out)
+        _check_same(read(saved), settings, out)
     elif saved.exists():
         raise ConfigError(
             f"{out} holds a run already; continue it with --resume, replace it with --overwrite, or choose --out."
@@ -86,34 +121,26 @@ def claim_run(out: Path, settings: T, load: Callable[[Path], T], *, resume: bool
         raise ConfigError(f"cannot write the run {out}: {error}; choose another --out.") from error
 
 
-def _check_same(saved: Any, asked: Any, out: Path) -> None:
-    """Raise ConfigError where settings that may not change differ."""
-    before, after = dict(flatten(saved)), dict(flatten(asked))
-    changed = [key for key in after if before[key] != after[key] and not key.startswith(FREE_TO_CHANGE)]
-    if changed:
-        found = "; ".join(f"{key} was {before[key]!r}, is {after[key]!r}" for key in changed)
-        raise ConfigError(f"{out} was begun with another config ({found}); set it back, use --overwrite, or choose --out.")
-
-
-def _check_same_codec(codec: Codec, out: Path) -> None:
+def _check_same_codec(settings: CodecSettings, codec: Codec, out: Path) -> None:
     """Raise ConfigError where the codec is another. A file of weights may have moved, but must hold the same."""
-    if (out / "codec").exists() and type(codec).load(out / "codec").hash != codec.hash:
+    if (out / "codec").exists() and load_run_codec(out, settings).hash != codec.hash:
         raise ConfigError(f"{out} was begun with another codec than the config's now; set it back, or choose --out.")
 
 
-def flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Name every field of nested settings, as ('train.steps', value)."""
-    for field in dataclasses.fields(settings):
-        value = getattr(settings, field.name)
-        if dataclasses.is_dataclass(value):
-            yield from flatten(value, f"{prefix}{field.name}.")
-        else:
-            yield prefix + field.name, value
+def check_start(experiment: Experiment) -> None:
+    """Raise ConfigError unless the run to adapt, if any, is another one, of the same network on the same clips and codec."""
+    run = experiment.adapt.start_from
+    if run is None:
+        return
+    if run.resolve() == experiment.out.resolve():
+        raise ConfigError(f"out is {experiment.out}, the run that adapt.start_from names; choose another --out.")
+    _check_same_network(load_run_config(run), experiment, run)
 
 
 def load_run(out: Path) -> tuple[Experiment, Codec]:
     """Config and codec of a run. Raises ConfigError if the folder lacks them."""
-    return load_run_config(out), load_run_codec(out)
+    experiment = load_run_config(out)
+    return experiment, load_run_codec(out, experiment.codec)
 
 
 def load_run_config(out: Path) -> Experiment:
@@ -123,9 +150,38 @@ def load_run_config(out: Path) -> Experiment:
     return load_experiment(out / "config.yaml")
 
 
-def load_run_codec(out: Path) -> Codec:
-    """The codec that a run was trained with. Raises ConfigError if the folder lacks it."""
+def load_run_codec(out: Path, settings: CodecSettings) -> Codec:
+    """The codec, of these settings, that a run was trained with. Raises ConfigError if the folder lacks it."""
     try:
-        return codec_class(load_run_config(out).codec).load(out / "codec")
+        return codec_class(settings).load(out / "codec")
     except FileNotFoundError as error:
         raise ConfigError(f"{out} lacks its codec ({error.filename}); copy the whole run, or train again.") from error
+
+
+def _check_same(saved: Any, asked: Any, out: Path) -> None:
+    """Raise ConfigError where settings that may not change differ."""
+    before, after = dict(_flatten(saved)), dict(_flatten(asked))
+    changed = [key for key in after if before[key] != after[key] and not key.startswith(FREE_TO_CHANGE)]
+    if changed:
+        found = "; ".join(f"{key} was {before[key]!r}, is {after[key]!r}" for key in changed)
+        raise ConfigError(f"{out} was begun with another config ({found}); set it back, use --overwrite, or choose --out.")
+
+
+def _check_same_network(source: Any, asked: Any, run: Path) -> None:
+    """Raise ConfigError unless the network of a run can be adapted as the one asked for: on the same clips and codec."""
+    before, after = dict(_flatten(source)), dict(_flatten(asked))
+    compared = [key for key in after if key.startswith(("clip.", "codec.", "model.")) and not key.startswith(FREE_TO_CHANGE)]
+    changed = [key for key in compared if before[key] != after[key] and key not in ("model.dtype", "model.weights")]
+    if changed:
+        found = "; ".join(f"{key} is {before[key]!r} there, {after[key]!r} here" for key in changed)
+        raise ConfigError(f"the network of {run} cannot be adapted as another one ({found}); make them agree.")
+
+
+def _flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Name every field of nested settings, as ('train.steps', value)."""
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _flatten(value, f"{prefix}{field.name}.")
+        else:
+            yield prefix + field.name, value

@@ -30,8 +30,9 @@ from xew.model.codecs.codec import Codec, encode_pictures, to_pictures, to_signe
 from xew.model.conditions import Condition, clip_numbers
 from xew.model.devices.sharding import batch_sharding, replicated_sharding
 from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES, NoiseSchedule
-from xew.model.experiment import ClipInputs, Instructions, RolloutSettings
 from xew.model.network.dit import WorldModel, cast_params
+from xew.model.settings.parts import ClipInputs, Instructions
+from xew.model.settings.settings import RolloutSettings
 
 Streams = dict[str, np.ndarray]
 """Of one whole episode, by stream: uint8 [t h w 3] or float32 [t n]."""

@@ -1,4 +1,4 @@
-"""What the network is told in words: instructions to word numbers, or to embeddings of a frozen text encoder.
+"""The instruction as the network gets it: ids of words, or embeddings of a frozen text encoder.
 
 Reads  instructions; for UMT5 the encoder's weights and tokenizer.json
 Writes int32 [tokens] for the network's own table of words, or float32 [tokens width], zero past the end
@@ -21,17 +21,19 @@ import jax
 import numpy as np
 import tokenizers
 from flax import nnx
+from jaxtyping import Int
 
 from xew.config import ConfigError
 from xew.files import replacing
 from xew.model.text.umt5 import UMT5S, load_umt5
 
 VOCABULARY = 8192
-"""Rows of the learned table; row 0 is that of no word and stays zero."""
+"""Number of rows of the learned table; row 0 is that of no word and stays zero."""
 END, PAD = "</s>", "<pad>"
 ENCODE_BATCH = 16
+"""Number of instructions that are embedded at once."""
 LENGTH_STEP = 32
-"""Token sequences are padded to a multiple of this, so that few shapes are compiled."""
+"""Number of tokens of which sequences are padded to a multiple, so that few shapes are compiled."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class TextSource:
     """What an experiment gives its encoder to work with."""
 
     tokens: int
-    """Most that the network takes."""
+    """Largest number of tokens that the network takes."""
     weights: Path | None
     tokenizer: Path | None
     cache: Path
@@ -51,11 +53,11 @@ class TextEncoder:
     """One way to turn instructions into what the network takes."""
 
     encode: Callable[[TextSource, Sequence[str]], list[np.ndarray]]
-    """Instructions to int32 [n] (learned) or float32 [n width]; what is longer than the network takes is cut."""
+    """Function from instructions to int32 [n] (learned) or float32 [n width]; what is longer than the network takes is cut."""
     width: int | None = None
-    """Of the embeddings; None where it is as the model's size says."""
+    """Width of the embeddings; None where the model's size says it."""
     learned: bool = False
-    """The network itself has the table that these numbers are rows of."""
+    """Whether the network itself has the table that the ids are rows of."""
 
 
 def encode_instructions(
@@ -71,18 +73,18 @@ def encode_instructions(
     """
     distinct = list(dict.fromkeys(instructions))
     encoded = encoder.encode(source, [prefix + instruction for instruction in distinct])
-    return {instruction: _padded(array, source.tokens) for instruction, array in zip(distinct, encoded, strict=True)}
+    return {instruction: _pad(array, source.tokens) for instruction, array in zip(distinct, encoded, strict=True)}
 
 
-def _padded(array: np.ndarray, tokens: int) -> np.ndarray:
+def _pad(array: np.ndarray, tokens: int) -> np.ndarray:
     return np.pad(array[:tokens], ((0, tokens - len(array[:tokens])), *((0, 0),) * (array.ndim - 1)))
 
 
 # A table that the network learns: needs no files.
 
 
-def learned(source: TextSource, instructions: Sequence[str]) -> list[np.ndarray]:
-    """Each word is a row of the network's table, found by its hash: an unknown word has one too, which means nothing yet."""
+def encode_words(source: TextSource, instructions: Sequence[str]) -> list[np.ndarray]:
+    """Rows [n] int32 of the network's table by the hash of each word; an unknown word has one too, which means nothing yet."""
     return [np.array([_row(word) for word in _words(instruction)], np.int32) for instruction in instructions]
 
 
@@ -125,14 +127,14 @@ def load_tokenizer(path: Path) -> tokenizers.Tokenizer:
     return tokenizer
 
 
-def token_ids(tokenizer: tokenizers.Tokenizer, text: str, tokens: int) -> np.ndarray:
+def token_ids(tokenizer: tokenizers.Tokenizer, text: str, tokens: int) -> Int[np.ndarray, " n"]:
     """Ids int32 [n] of a cleaned text, cut so that with the end token they are at most `tokens`."""
     ids = tokenizer.encode(clean(text), add_special_tokens=False).ids
     return np.array([*ids[: tokens - 1], tokenizer.token_to_id(END)], np.int32)
 
 
-def umt5(name: str) -> Callable[[TextSource, Sequence[str]], list[np.ndarray]]:
-    """`TextEncoder.encode` of an encoder in `UMT5S`: what has been embedded before is read, the rest computed and kept."""
+def encode_with_umt5(name: str) -> Callable[[TextSource, Sequence[str]], list[np.ndarray]]:
+    """The `TextEncoder.encode` of an encoder in `UMT5S`: it reads what was embedded before, and computes and keeps the rest."""
 
     def encode(source: TextSource, instructions: Sequence[str]) -> list[np.ndarray]:
         cache = _EmbeddingCache(source, name)
@@ -159,8 +161,8 @@ def _embed(source: TextSource, name: str, instructions: Sequence[str]) -> Iterat
     for start in range(0, len(ids), ENCODE_BATCH):
         group = ids[start : start + ENCODE_BATCH]
         lengths = np.array([len(row) for row in group], np.int32)
-        longest = -(-lengths.max() // LENGTH_STEP) * LENGTH_STEP
-        embedded = np.asarray(forward(params, np.stack([_padded(row, longest) for row in group]), lengths))
+        longest = -(-int(lengths.max()) // LENGTH_STEP) * LENGTH_STEP
+        embedded = np.asarray(forward(params, np.stack([_pad(row, longest) for row in group]), lengths))
         yield from (embedding[:n] for embedding, n in zip(embedded, lengths, strict=True))
 
 
@@ -224,7 +226,7 @@ def _ends(file: Path, size: int = 1 << 20) -> bytes:
 
 
 TEXT_ENCODERS = {
-    "learned": TextEncoder(learned, learned=True),
-    "umt5": TextEncoder(umt5("xxl"), width=UMT5S["xxl"].dim),
-    "umt5_tiny": TextEncoder(umt5("tiny"), width=UMT5S["tiny"].dim),
+    "learned": TextEncoder(encode_words, learned=True),
+    "umt5": TextEncoder(encode_with_umt5("xxl"), width=UMT5S["xxl"].dim),
+    "umt5_tiny": TextEncoder(encode_with_umt5("tiny"), width=UMT5S["tiny"].dim),
 }

@@ -1,4 +1,4 @@
-"""UMT5's encoder, which tells Wan2.2 what the instruction says (Flax NNX).
+"""UMT5's encoder, whose embeddings of the instruction Wan2.2 reads (Flax NNX).
 
 Reads  token ids [b l], lengths [b]
 Writes embeddings [b l d] float32, zero past each length, as the network takes them
@@ -17,8 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import Bool, Float, Int
 
-from xew.model.weights.tensors import Layout, Source, fill, read_tensors
+from xew.model.weights.layout import Layout, Source
+from xew.model.weights.reading import fill, read_tensors
 
 EPSILON = 1e-6
 
@@ -34,9 +37,9 @@ class Umt5Size:
     head_dim: int
     ffn_dim: int
     buckets: int = 32
-    """Rows of a table of relative positions."""
+    """Number of rows of a table of relative positions."""
     max_distance: int = 128
-    """Tokens; everything further away shares a row."""
+    """Distance in tokens from which on all share a row."""
 
 
 UMT5S = {
@@ -55,71 +58,86 @@ class Umt5Encoder(nnx.Module):
     """
 
     def __init__(
-        self, size: Umt5Size, *, dtype: jnp.dtype = jnp.float32, param_dtype: jnp.dtype = jnp.float32, rngs: nnx.Rngs
+        self, size: Umt5Size, *, dtype: DTypeLike = jnp.float32, param_dtype: DTypeLike = jnp.float32, rngs: nnx.Rngs
     ) -> None:
         self.size = size
         self.token_embedding = nnx.Embed(size.vocabulary, size.dim, dtype=dtype, param_dtype=param_dtype, rngs=rngs)
         self.blocks = _stacked_blocks(size, dtype, param_dtype, rngs)
         self.norm = _norm(size.dim, param_dtype, rngs)
 
-    def __call__(self, ids: Array, lengths: Array) -> Array:
+    def __call__(self, ids: Int[Array, "b l"], lengths: Int[Array, " b"]) -> Float[Array, "b l d"]:
         """Embeddings of ids [b l] int32 of which the first `lengths` [b] count: [b l d] float32, zero from there on."""
         graph, layers = nnx.split(self.blocks)
-        present = jnp.arange(ids.shape[1])[None] < lengths[:, None]
+        valid = jnp.arange(ids.shape[1])[None] < lengths[:, None]
         buckets = relative_buckets(ids.shape[1], self.size.buckets, self.size.max_distance)
 
         def block(tokens: Array, layer: nnx.State) -> tuple[Array, None]:
-            return nnx.merge(graph, layer)(tokens, present, buckets), None
+            return nnx.merge(graph, layer)(tokens, valid, buckets), None
 
         tokens = jax.lax.scan(block, self.token_embedding(ids).astype(jnp.float32), layers)[0]
-        return jnp.where(present[..., None], self.norm(tokens), 0)
+        return jnp.where(valid[..., None], self.norm(tokens), 0)
 
 
-class Block(nnx.Module):
+class EncoderBlock(nnx.Module):
     """Self-attention, then a gated feed-forward, each on the norm of what it is added to."""
 
-    def __init__(self, size: Umt5Size, dtype: jnp.dtype, param_dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
+    def __init__(self, size: Umt5Size, dtype: DTypeLike, param_dtype: DTypeLike, rngs: nnx.Rngs) -> None:
         self.norm1, self.norm2 = (_norm(size.dim, param_dtype, rngs) for _ in range(2))
         self.attn = Attention(size, dtype, param_dtype, rngs)
         self.ffn = GatedFeedForward(size, dtype, param_dtype, rngs)
 
-    def __call__(self, tokens: Array, present: Array, buckets: np.ndarray) -> Array:
-        """tokens [b l d] float32, present [b l] bool, buckets [l l]."""
-        tokens = tokens + self.attn(self.norm1(tokens), present, buckets).astype(jnp.float32)
+    def __call__(
+        self, tokens: Float[Array, "b l d"], valid: Bool[Array, "b l"], buckets: Int[np.ndarray, "l l"]
+    ) -> Float[Array, "b l d"]:
+        """One block's change of the tokens.
+
+        Args:
+            tokens: [b l d] float32.
+            valid: [b l] bool, tokens of the text.
+            buckets: [l l], row of the table of positions for each pair.
+
+        Returns:
+            Tokens [b l d] float32.
+        """
+        tokens = tokens + self.attn(self.norm1(tokens), valid, buckets).astype(jnp.float32)
         return tokens + self.ffn(self.norm2(tokens)).astype(jnp.float32)
 
 
 class Attention(nnx.Module):
-    """Multi-head self-attention to the tokens that are present, biased by the layer's own table of relative positions."""
+    """Multi-head self-attention to the valid tokens, biased by the layer's own table of relative positions."""
 
-    def __init__(self, size: Umt5Size, dtype: jnp.dtype, param_dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
+    def __init__(self, size: Umt5Size, dtype: DTypeLike, param_dtype: DTypeLike, rngs: nnx.Rngs) -> None:
         inner = size.heads * size.head_dim
         self.heads, self.dtype = size.heads, dtype
         self.q, self.k, self.v = (_linear(size.dim, inner, dtype, param_dtype, rngs) for _ in range(3))
         self.o = _linear(inner, size.dim, dtype, param_dtype, rngs)
         self.position = nnx.Embed(size.buckets, size.heads, dtype=jnp.float32, param_dtype=param_dtype, rngs=rngs)
 
-    def __call__(self, tokens: Array, present: Array, buckets: np.ndarray) -> Array:
+    def __call__(
+        self, tokens: Float[Array, "b l d"], valid: Bool[Array, "b l"], buckets: Int[np.ndarray, "l l"]
+    ) -> Float[Array, "b l d"]:
+        """Attention of tokens [b l d] to those that are `valid` [b l]; `buckets` [l l] as of `EncoderBlock`: [b l d]."""
         q, k, v = (layer(tokens).reshape(*tokens.shape[:2], self.heads, -1) for layer in (self.q, self.k, self.v))
         bias = self.position(jnp.asarray(buckets)).transpose(2, 0, 1)[None]
-        mask = present[:, None, None, :]
+        mask = valid[:, None, None, :]
         attended = jax.nn.dot_product_attention(q, k, v, bias=bias, mask=mask, scale=1.0)
         return self.o(attended.reshape(*tokens.shape[:2], -1))
 
 
 class GatedFeedForward(nnx.Module):
-    """gelu(gate) times a linear layer, then another (Shazeer, arXiv 2002.05202)."""
+    """Product of gelu(gate) and a linear layer, then another linear layer (Shazeer, arXiv 2002.05202)."""
 
-    def __init__(self, size: Umt5Size, dtype: jnp.dtype, param_dtype: jnp.dtype, rngs: nnx.Rngs) -> None:
+    def __init__(self, size: Umt5Size, dtype: DTypeLike, param_dtype: DTypeLike, rngs: nnx.Rngs) -> None:
         self.gate, self.first = (_linear(size.dim, size.ffn_dim, dtype, param_dtype, rngs) for _ in range(2))
         self.second = _linear(size.ffn_dim, size.dim, dtype, param_dtype, rngs)
 
-    def __call__(self, tokens: Array) -> Array:
+    def __call__(self, tokens: Float[Array, "b l d"]) -> Float[Array, "b l d"]:
+        """Tokens [b l d] -> [b l d]."""
         return self.second(nnx.gelu(self.gate(tokens), approximate=True) * self.first(tokens))
 
 
-def relative_buckets(length: int, buckets: int, max_distance: int) -> np.ndarray:
-    """Row of the position table [l l] for each query (rows) and key (columns).
+def relative_buckets(length: int, buckets: int, max_distance: int) -> Int[np.ndarray, "l l"]:
+    """Row of the table of positions for each pair of a query and a key: [l l] int.
 
     Half of the rows are for keys after the query. Of each half, half are for one distance each and the others widen with the
     logarithm of the distance up to `max_distance`.
@@ -142,7 +160,7 @@ def official_layout(size: Umt5Size) -> Layout:
         "ffn.first.kernel": "blocks.{}.ffn.fc1.weight",
         "ffn.second.kernel": "blocks.{}.ffn.fc2.weight",
     }
-    names |= {f"attn.{part}.kernel": f"blocks.{{}}.attn.{part}.weight" for part in "qkvo"}
+    names |= {f"attn.{name}.kernel": f"blocks.{{}}.attn.{name}.weight" for name in "qkvo"}
     return _layout(size, "token_embedding.weight", names, "norm.weight")
 
 
@@ -164,7 +182,7 @@ HF_DUPLICATE = "encoder.embed_tokens.weight"
 """The token embedding a second time, or the only one where `shared.weight` is left out."""
 
 
-def load_umt5(path: Path, size: Umt5Size, dtype: jnp.dtype = jnp.bfloat16) -> Umt5Encoder:
+def load_umt5(path: Path, size: Umt5Size, dtype: DTypeLike = jnp.bfloat16) -> Umt5Encoder:
     """The encoder with a checkpoint's weights, kept and multiplied in `dtype`; the names tell which layout it is in.
 
     Raises:
@@ -190,20 +208,20 @@ def _layout(size: Umt5Size, embedding: str, blocks: dict[str, str], norm: str) -
     return layout
 
 
-def _norm(features: int, param_dtype: jnp.dtype, rngs: nnx.Rngs) -> nnx.RMSNorm:
+def _norm(features: int, param_dtype: DTypeLike, rngs: nnx.Rngs) -> nnx.RMSNorm:
     return nnx.RMSNorm(features, epsilon=EPSILON, dtype=jnp.float32, param_dtype=param_dtype, rngs=rngs)
 
 
-def _linear(features: int, out: int, dtype: jnp.dtype, param_dtype: jnp.dtype, rngs: nnx.Rngs) -> nnx.Linear:
+def _linear(features: int, out: int, dtype: DTypeLike, param_dtype: DTypeLike, rngs: nnx.Rngs) -> nnx.Linear:
     return nnx.Linear(features, out, use_bias=False, dtype=dtype, param_dtype=param_dtype, rngs=rngs)
 
 
-def _stacked_blocks(size: Umt5Size, dtype: jnp.dtype, param_dtype: jnp.dtype, rngs: nnx.Rngs) -> Block:
+def _stacked_blocks(size: Umt5Size, dtype: DTypeLike, param_dtype: DTypeLike, rngs: nnx.Rngs) -> EncoderBlock:
     """`depth` blocks as one whose parameters have a leading layer axis."""
 
     @nnx.split_rngs(splits=size.depth)
     @nnx.vmap(in_axes=0, out_axes=0)
-    def create(layer_rngs: nnx.Rngs) -> Block:
-        return Block(size, dtype, param_dtype, layer_rngs)
+    def create(layer_rngs: nnx.Rngs) -> EncoderBlock:
+        return EncoderBlock(size, dtype, param_dtype, layer_rngs)
 
     return create(rngs)

@@ -6,7 +6,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -15,43 +14,12 @@ import optax
 from jax.experimental import multihost_utils
 from tqdm import tqdm
 
-from xew.model.runs.checkpoint import TrainState, open_checkpoints, save_state
-from xew.model.training.memory import peak_flops
-from xew.model.training.tensorboard import RunLog
+from xew.model.runs.checkpoint import TrainState, save_state
+from xew.model.runs.session import Session
+from xew.model.training.flops import peak_flops
 
 STOPPED = 128 + signal.SIGTERM
 """Exit status of a run that was asked to stop before its last step: it is saved, but nobody may take it for done."""
-
-
-@dataclass(frozen=True)
-class Session:
-    """The open files of a run."""
-
-    checkpoints: Any
-    log: RunLog | None
-    """None on all processes but the first."""
-
-    @property
-    def step(self) -> int:
-        """Step of the latest checkpoint; 0 of a new run."""
-        return self.checkpoints.latest_step() or 0
-
-
-@contextlib.contextmanager
-def open_session(out: Path, keep: int) -> Iterator[Session]:
-    """Open the checkpoints and the log of a run; what is being written is finished when the block ends.
-
-    Args:
-        out: folder of the run.
-        keep: number of checkpoints to keep.
-    """
-    with open_checkpoints(out, keep) as checkpoints:
-        log = RunLog(out, checkpoints.latest_step() or 0) if jax.process_index() == 0 else None
-        try:
-            yield Session(checkpoints, log)
-        finally:
-            if log is not None:
-                log.close()
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How much memory training needs, before anything is compiled, and how much arithmetic it does.
+"""How much memory training needs, before anything is compiled.
 
 The numbers are of one device: parameters, optimizer, moving average and gradients are cut along `fsdp`; activations are
 those of the device's samples of one part of the batch. The estimate is made from shapes alone; what XLA adds (buffers that
@@ -15,19 +15,18 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from xew.config import ConfigError, pick
-from xew.model.codecs.codec import CodecSettings, latent_frames
-from xew.model.codecs.vae import VAES, abstract_vae
+from xew.config import ConfigError
+from xew.model.codecs.codec import latent_frames
+from xew.model.codecs.vae import abstract_vae
 from xew.model.devices.sharding import parameter_spec, path_names
-from xew.model.experiment import Clip, ClipInputs, Learning, Network
-from xew.model.network.dit import STREAMS, ModelSize, RematName, flops, token_grid
+from xew.model.network.dit import ModelSize, RematName
 from xew.model.runs.checkpoint import TrainState
+from xew.model.settings.network import Network
+from xew.model.settings.parts import ClipInputs, Encoding, Learning
 from xew.model.video.frames import TEMPORAL_FACTOR
 
 MARGIN = 1.1
 """Factor that leaves room for what the estimate does not see."""
-PEAK_FLOPS = {"H100": 989e12, "H200": 989e12, "A100": 312e12}
-"""Dense bfloat16 FLOPs a second by the maker's data sheets, by part of the device's name."""
 
 
 @dataclass(frozen=True)
@@ -54,16 +53,13 @@ class Memory:
         return "\n".join([f"each device, {self.layout}:", *lines, total])
 
 
-def estimate_memory(
-    learning: Learning, state: TrainState, inputs: ClipInputs, codec: CodecSettings, devices: int, fsdp: int
-) -> Memory:
+def estimate_memory(learning: Learning, state: TrainState, encoding: Encoding, devices: int, fsdp: int) -> Memory:
     """Estimate what each of `devices` devices needs to train with its state cut in `fsdp` shards.
 
     Args:
         learning: the network and its optimizer.
         state: shapes and types of the state (`abstract_state`).
-        inputs: what the network is given of a clip.
-        codec: settings of the codec, which works between two chunks.
+        encoding: what the network is given of a clip, and the codec, which works between two chunks.
     """
     settings, network = learning.settings, learning.network
     compute = jnp.dtype(network.settings.dtype).itemsize
@@ -79,8 +75,8 @@ def estimate_memory(
         f"rounded to {network.settings.dtype}": weights * compute if compute < 4 else 0.0,
         "gradients": weights * compute + (weights * 4 if summed else 0.0),
         "layers gathered": 2 * compute * cut_bytes(params, 1, 1) / network.size.depth if fsdp > 1 else 0.0,
-        "activations": samples * activation_bytes(network, inputs),
-        "autoencoder": codec_bytes(codec, inputs.clip, samples) if settings.chunks == 2 else 0.0,
+        "activations": samples * activation_bytes(network, encoding.inputs),
+        "autoencoder": codec_bytes(encoding, samples) if settings.chunks == 2 else 0.0,
     }
     layout = f"{devices} devices, state in {fsdp} parts, {samples:g} samples at once on each, remat {network.settings.remat}"
     return Memory(parts, layout)
@@ -99,18 +95,18 @@ def cut_bytes(tree: Any, fsdp: int, itemsize: int = 0) -> float:
 def activation_bytes(network: Network, inputs: ClipInputs) -> float:
     """Bytes of activations of one sample: what is kept of every block, and the work of one block in the backward pass."""
     settings, size = network.settings, network.size
-    tokens = sum(math.prod(grid) for grid in stream_grids(inputs))
+    tokens = sum(math.prod(grid) for grid in inputs.grids)
     compute, residual = jnp.dtype(settings.dtype).itemsize, jnp.dtype(settings.residual).itemsize
     logits = logits_bytes(network, tokens)
     kept = tokens * kept_bytes(size, settings.remat, compute, residual) + (logits if settings.remat == "none" else 0.0)
     return size.depth * kept + 2 * (tokens * work_bytes(size, compute, residual) + logits)
 
 
-def codec_bytes(settings: CodecSettings, clip: Clip, samples: float) -> float:
+def codec_bytes(encoding: Encoding, samples: float) -> float:
     """Bytes of the codec that decodes and encodes between two chunks: weights, and four of its widest arrays a sample."""
-    if settings.name != "wan_vae":
+    settings, clip, size = encoding.codec, encoding.inputs.clip, encoding.autoencoder
+    if size is None:
         return 0.0
-    size = pick(VAES, settings.vae, "autoencoder")
     frames = TEMPORAL_FACTOR * min(settings.chunk or latent_frames(clip.frames), latent_frames(clip.frames))
     widest = size.decoder_widths[-1] * frames * (clip.height * clip.width // size.patch**2) * jnp.dtype(settings.dtype).itemsize
     return cut_bytes(nnx.state(abstract_vae(size), nnx.Param), 1) + 4 * samples * widest
@@ -138,26 +134,6 @@ def logits_bytes(network: Network, tokens: int) -> float:
     fused = settings.attention == "cudnn" or (settings.attention == "auto" and settings.dtype == "bfloat16")
     compute = jnp.dtype(settings.dtype).itemsize
     return 0.0 if fused else network.size.heads * tokens**2 * (4 + compute)
-
-
-def stream_grids(inputs: ClipInputs) -> list[tuple[int, int, int]]:
-    """Tokens (t', h', w') of each stream, RGB first."""
-    streams = ["rgb", *(name for name in inputs.conditions if name in STREAMS)]
-    return [token_grid((1, *inputs.shapes[name])) for name in streams]
-
-
-def flops_of_step(learning: Learning, inputs: ClipInputs) -> float:
-    """Model FLOPs of one training step over all devices: three times the forward pass, recomputation not counted."""
-    settings, network = learning.settings, learning.network
-    visibility = network.settings.visibility
-    grids = stream_grids(inputs)
-    forward = flops(network.size, grids, batch=settings.batch, channels=network.channels, visibility=visibility)
-    return 3 * settings.chunks * forward
-
-
-def peak_flops(device_kind: str) -> float | None:
-    """FLOPs a second of one device by its name; None where it is not known, and then no MFU is logged."""
-    return next((peak for name, peak in PEAK_FLOPS.items() if name in device_kind), None)
 
 
 def device_memory() -> float:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import optax
 
-from xew.model.experiment import TrainSettings, count_replayed
+from xew.model.settings.settings import TrainSettings, count_replayed
 
 
 def learning_rate(settings: TrainSettings) -> optax.Schedule:

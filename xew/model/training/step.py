@@ -20,12 +20,12 @@ from jax import Array
 from jax.sharding import Mesh
 
 from xew.model.codecs.codec import Codec
-from xew.model.devices.sharding import gather_parameters, replicated_sharding, state_shardings
+from xew.model.devices.sharding import gather_parameters, place_shapes
 from xew.model.diffusion.flow_matching import TrainingPair, sample_losses, training_pair
-from xew.model.experiment import Learning, Network
 from xew.model.network.dit import cast_params
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs.checkpoint import TrainState
+from xew.model.settings.parts import Learning
 from xew.model.training.data import Batch
 from xew.model.training.optimizer import make_optimizer
 
@@ -56,7 +56,7 @@ class Learner:
     mesh: Mesh
     graph: nnx.GraphDef
     shapes: TrainState
-    """Shapes, types and shardings of the state."""
+    """Shapes, types and shardings of the state; its step has a copy on every device."""
 
     @property
     def network_shapes(self) -> Any:
@@ -72,6 +72,17 @@ class Learner:
         init = jax.jit(lambda start: _init(self.learning, start), out_shardings=list_shardings(self.shapes), donate_argnums=0)
         with jax.set_mesh(self.mesh):
             return init(start)
+
+    def random_network(self) -> tuple[nnx.GraphDef, Any]:
+        """The network's structure and its parameters at their random start, made where they lie on the mesh."""
+        network = self.learning.network
+        init = jax.jit(lambda: nnx.state(network.create(), nnx.Param), out_shardings=list_shardings(self.network_shapes))
+        return self.graph, init()
+
+    def average_params(self, state: TrainState) -> Any:
+        """The network's parameters for inference: the moving average where one is kept."""
+        with jax.set_mesh(self.mesh):
+            return jax.jit(apply_lora)(state.base, state.params if state.ema is None else state.ema)
 
     def compile_step(self, codec: Codec | None = None) -> "TrainStep":
         """The compiled step; its noise depends on the seed, the step and the place in the batch only.
@@ -101,7 +112,7 @@ class Learner:
             result = StepResult(losses, sigma, samples.weights, norm, finite)
             return TrainState(state.step + 1, learned, moments, ema, state.base), result
 
-        everywhere = replicated_sharding(self.mesh)
+        everywhere = self.shapes.step.sharding
         jitted = jax.jit(step, donate_argnums=0, out_shardings=(list_shardings(self.shapes), everywhere))
         copies = jax.device_put(jax.tree.map(np.asarray, codec), everywhere) if settings.chunks == 2 else None
         return TrainStep(jitted, self.mesh, copies)
@@ -128,20 +139,6 @@ def _init(learning: Learning, start: Any) -> TrainState:
         learned = init_lora(params, learning.lora_rank, jax.random.key(settings.seed))
     ema = jax.tree.map(jnp.copy, learned) if settings.ema_decay else None
     return TrainState(jnp.int32(0), learned, make_optimizer(settings).init(learned), ema, base)
-
-
-def random_params(network: Network, mesh: Mesh) -> tuple[nnx.GraphDef, Any]:
-    """The network's structure and its parameters at their random start, made where they lie on the mesh."""
-    graph, shapes = nnx.split(nnx.eval_shape(network.create), nnx.Param)
-    init = jax.jit(lambda: nnx.state(network.create(), nnx.Param), out_shardings=state_shardings(shapes, mesh))
-    return graph, init()
-
-
-def place_shapes(shapes: Any, mesh: Mesh) -> Any:
-    """Give shapes and types their places on the mesh."""
-    return jax.tree.map(
-        lambda leaf, place: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), shapes, state_shardings(shapes, mesh)
-    )
 
 
 def list_shardings(shapes: Any) -> Any:

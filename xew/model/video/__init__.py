@@ -1,3 +1,3 @@
-"""Pixels of episodes: where they come from, and how the camera's frames become the model's and back."""
+"""Pixels of episodes: where they come from, how the camera's frames become the model's and back, and videos compared."""
 
-__all__ = ["frames", "pixels"]
+__all__ = ["comparison", "frames", "pixels"]

@@ -1,6 +1,6 @@
-"""Tensors of other projects' checkpoints into our modules, and back out under their names.
+"""Checkpoints of other projects: their tensors into our modules, and our modules out under their names.
 
-A tensor that is missing, left over or of another shape is an error that names it.
+A module's `Layout` says for each of its leaves which tensors it comes from and how their axes are ordered.
 """
 
-__all__ = ["tensors"]
+__all__ = ["layout", "reading", "writing"]

@@ -44,7 +44,7 @@ gain is not small beside the inertia, what a hand holds is thrown ahead of it (9
 CONTACT_TIME = 0.012
 """Time constant in which soft contacts push back [s], three time steps: held things sink 1 mm into a pad."""
 PIN_STIFFNESS, PIN_DAMPING, PIN_ARMATURE = 20000.0, 500.0, 1.0
-"""The same of the seventh joint of an arm that has six."""
+"""Gains and inertia of the pinned seventh joint of an arm that has six."""
 FINGER_STIFFNESS, FINGER_DAMPING, FINGER_ARMATURE = 10000.0, 200.0, 0.5
 """Gains [N/m, N s/m] and inertia [kg] of a finger: stiff enough that a wall of 5 mm is held with the full force."""
 FINGER_FORCE = 16.0

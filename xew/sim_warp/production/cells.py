@@ -47,10 +47,10 @@ class Cell:
     robot: RobotSpec
     commands: Commands
     motion: Motion | None = None
-    """What physics made of the commands; None before, and where the robot cannot follow the plan."""
+    """Motion that physics made of the commands; None before, and where the robot cannot follow the plan."""
 
     @property
-    def moved(self) -> Motion:
+    def known_motion(self) -> Motion:
         """The motion of a cell that is known to have one."""
         assert self.motion is not None, f"{self.robot.key} cannot follow the plan of {self.scene.task}/{self.scene.seed}"
         return self.motion
@@ -58,19 +58,19 @@ class Cell:
     @cached_property
     def tool_pose(self) -> np.ndarray:
         """[t 2 7] float32 measured tool poses, xyz [m] and quaternion xyzw, world."""
-        return measured_tools(self.robot, self.moved.joint_pos)
+        return measured_tools(self.robot, self.known_motion.joint_pos)
 
     @cached_property
     def failure(self) -> tuple[str, str] | None:
         """Why the cell does not count: one of `episode.FAILURES` and a sentence; None if it succeeded."""
         if self.commands.problem is not None:
             return "plan", self.commands.problem
-        return find_failure(self.task, self.scene, self.path, self.commands.action, self.moved, self.tool_pose)
+        return find_failure(self.task, self.scene, self.path, self.commands.action, self.known_motion, self.tool_pose)
 
     @property
     def recording(self) -> Recording:
         """What the camera looks at."""
-        motion = self.moved
+        motion = self.known_motion
         return scene_recording(self.robot, self.scene, motion.joint_pos, motion.object_pose, motion.object_joint)
 
 

@@ -24,7 +24,7 @@ from xew.sim_warp.scene import Scene, scene_hash
 from xew.sim_warp.tasks import Task
 
 Pixels = tuple[Observation, np.ndarray]
-"""What the camera sees, and the robot alone [t h w 3] uint8."""
+"""Images of a cell: what the camera sees, and the robot alone [t h w 3] uint8."""
 
 
 def render_cells(cells: Sequence[Cell], renderer: Renderer) -> list[Pixels]:
@@ -64,7 +64,7 @@ def header(cell: Cell, device: wp.Device) -> Record:
 
 
 def fill_instruction(task: Task, scene: Scene) -> str:
-    """What the robot is told to do in this scene. Raises ConfigError where the scene has no word for a slot."""
+    """The instruction of a task with the words of this scene. Raises ConfigError where the scene has no word for a slot."""
     try:
         return task.instruction.format(**scene.words)
     except (KeyError, IndexError, ValueError) as error:
@@ -82,13 +82,13 @@ def _versions() -> dict[str, str]:
 def _states(cell: Cell, view: Observation) -> States:
     return States(
         action=cell.commands.action,
-        joint_pos=cell.moved.joint_pos,
-        joint_vel=cell.moved.joint_vel,
+        joint_pos=cell.known_motion.joint_pos,
+        joint_vel=cell.known_motion.joint_vel,
         tool_pose=cell.tool_pose,
-        object_pose=cell.moved.object_pose,
-        object_joint=cell.moved.object_joint,
-        contact=cell.moved.contact,
-        penetration=cell.moved.penetration,
+        object_pose=cell.known_motion.object_pose,
+        object_joint=cell.known_motion.object_joint,
+        contact=cell.known_motion.contact,
+        penetration=cell.known_motion.penetration,
         keypoints=view.keypoints,
         keypoint_visible=view.keypoint_visible,
         robot_mask=view.robot_mask,

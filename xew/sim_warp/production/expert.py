@@ -21,12 +21,12 @@ ROTATION_TOLERANCE = 0.03
 
 @dataclass(frozen=True)
 class Commands:
-    """What a robot is told to do."""
+    """Joint commands of a robot, or why there are none."""
 
     action: np.ndarray
     """[t 16] float32 canonical joint targets [rad] and grippers [0 closed, 1 open] at every stored frame."""
     problem: str | None
-    """Why this robot cannot follow the plan, in words; None if it can."""
+    """Reason for which this robot cannot follow the plan, in words; None if it can."""
 
 
 def joint_commands(robot: RobotSpec, paths: list[ToolPath]) -> list[Commands]:

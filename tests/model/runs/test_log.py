@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from xew.model.training.tensorboard import RunLog
+from xew.model.runs.log import RunLog
 
 NAME = "train/loss"
 

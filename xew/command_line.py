@@ -1,0 +1,87 @@
+"""Commands on a config: `CONFIG [flags] [--section.field value …]`, where --help lists all that may be overridden.
+
+The flags are a dataclass of the command; every other option is a field of the config and has the config's value as default.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Generic, NamedTuple, TypeVar
+
+import tyro
+
+from xew.config import ConfigError
+
+F = TypeVar("F")
+C = TypeVar("C")
+
+
+class Command(NamedTuple, Generic[F, C]):
+    """What a command line asks for."""
+
+    path: Path
+    """The config, or what else the command works on."""
+    flags: F
+    config: C
+    """The content of the config with the overrides in it; only types have been checked."""
+
+
+def parse_command(
+    flags: type[F],
+    kind: type[C],
+    read: Callable[[Path], C],
+    arguments: Sequence[str] | None,
+    *,
+    prog: str,
+    description: str,
+    metavar: str = "CONFIG",
+) -> Command[F, C]:
+    """Parse a command line.
+
+    Args:
+        flags: the command's own flags, a dataclass whose fields all have defaults. They go before fields of the config that
+            have the same name.
+        kind: type of the config, a dataclass; its fields may be overridden.
+        read: reads the config at a path.
+        arguments: those of the process where left out.
+        prog: how the command is called, for messages.
+        description: one line on what it does.
+        metavar: name of the first argument, for messages.
+
+    Raises:
+        ConfigError: the config is not named, or cannot be read.
+        SystemExit: an option is unknown or malformed (tyro has told so; code 2), or asks for --help (code 0).
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    path = find_path(words, flags)
+    if path is None and not {"-h", "--help"} & set(words):
+        raise ConfigError(f"name the {metavar} first, as in `{prog} {metavar}`; --help tells the rest.")
+    first = ("path", Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name=metavar.lower(), help=f"The {metavar}.")])
+    whole: Any = dataclasses.make_dataclass("Options", [first], bases=(flags, kind), frozen=True, kw_only=True)
+    own = [field.name for field in dataclasses.fields(flags)]  # type: ignore[arg-type]
+    others = [field.name for field in dataclasses.fields(kind) if field.name not in own]  # type: ignore[arg-type]
+    config = None if path is None else read(path)
+    default = None
+    if config is not None:
+        values = {name: getattr(flags(), name) for name in own} | {name: getattr(config, name) for name in others}
+        default = whole(path=path, **values)
+    style = (tyro.conf.FlagCreatePairsOff,)
+    found = tyro.cli(whole, args=words, default=default, prog=prog, description=description, config=style)
+    assert config is not None  # without a path --help was asked for, which has ended the program
+    changed: Any = dataclasses.replace(config, **{name: getattr(found, name) for name in others})  # type: ignore[type-var]
+    return Command(found.path, flags(**{name: getattr(found, name) for name in own}), changed)
+
+
+def find_path(words: Sequence[str], flags: type) -> Path | None:
+    """The first of a command's arguments that is no option and no option's value."""
+    switches = {"--" + field.name.replace("_", "-") for field in dataclasses.fields(flags) if field.default is False}
+    is_value = False
+    for word in words:
+        if word.startswith("-"):
+            is_value = "=" not in word and word.replace("_", "-") not in switches | {"-h", "--help"}
+        elif not is_value:
+            return Path(word)
+        else:
+            is_value = False
+    return None

@@ -1,0 +1,45 @@
+"""The open files of a run that is being trained: its checkpoints and its log."""
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from xew.model.runs.checkpoint import open_checkpoints
+from xew.model.runs.log import RunLog
+
+
+@dataclass(frozen=True)
+class Session:
+    """The open files of a run."""
+
+    out: Path
+    """Folder of the run."""
+    checkpoints: Any
+    log: RunLog | None
+    """None on all processes but the first."""
+
+    @property
+    def step(self) -> int:
+        """Step of the latest checkpoint; 0 of a new run."""
+        return self.checkpoints.latest_step() or 0
+
+
+@contextlib.contextmanager
+def open_session(out: Path, keep: int) -> Iterator[Session]:
+    """Open the checkpoints and the log of a run; what is being written is finished when the block ends.
+
+    Args:
+        out: folder of the run.
+        keep: number of checkpoints to keep.
+    """
+    with open_checkpoints(out, keep) as checkpoints:
+        log = RunLog(out, checkpoints.latest_step() or 0) if jax.process_index() == 0 else None
+        try:
+            yield Session(out, checkpoints, log)
+        finally:
+            if log is not None:
+                log.close()

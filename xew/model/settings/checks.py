@@ -1,0 +1,135 @@
+"""Checks of an experiment: every number and choice that cannot be used is told before anything is done with it."""
+
+from collections.abc import Mapping
+from operator import attrgetter
+from typing import Any, Protocol
+
+from xew.config import ConfigError, pick
+from xew.model.codecs.codec import CodecSettings, codec_class
+from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES
+from xew.model.network.dit import (
+    PATCH,
+    STREAMS,
+)
+from xew.model.network.mechanisms import MECHANISMS
+from xew.model.settings.parts import pick_conditions
+from xew.model.settings.settings import AdaptSettings, Clip, ModelSettings, RolloutSettings, TrainSettings, count_replayed
+from xew.model.video.frames import TEMPORAL_FACTOR
+
+LEAST = {
+    "clip.height": 1,
+    "clip.width": 1,
+    "model.unroll": 1,
+    "train.batch": 1,
+    "train.accumulate": 1,
+    "train.learning_rate": 0,
+    "train.warmup_steps": 0,
+    "train.clip_norm": 0,
+    "train.ema_decay": 0,
+    "train.history_noise": 0,
+    "train.log_every": 1,
+    "train.save_every": 1,
+    "train.sample_every": 0,
+    "train.keep_checkpoints": 1,
+    "adapt.lora_rank": 0,
+    "rollout.steps": 1,
+    "rollout.batch": 1,
+    "rollout.max_frames": 0,
+}
+"""Numbers of an experiment that mean nothing below."""
+
+
+class Settings(Protocol):
+    """The sections of an experiment that are checked."""
+
+    @property
+    def clip(self) -> Clip: ...
+    @property
+    def model(self) -> ModelSettings: ...
+    @property
+    def train(self) -> TrainSettings: ...
+    @property
+    def codec(self) -> CodecSettings: ...
+    @property
+    def adapt(self) -> AdaptSettings: ...
+    @property
+    def rollout(self) -> RolloutSettings: ...
+
+
+def check_experiment(experiment: Settings, source: str) -> None:
+    """Raise ConfigError, naming the source, with a choice of an experiment that does not exist or does not fit."""
+    check_least(LEAST, experiment, source)
+    codec_class(experiment.codec).check(experiment.codec)
+    pick(SAMPLERS, experiment.rollout.sampler, "sampler")
+    pick(SCHEDULES, experiment.rollout.grid, "noise schedule")
+    _check_conditions(experiment, source)
+    _check_sizes(experiment, source)
+    _check_training(experiment, source)
+    _check_history(experiment, source)
+
+
+def check_least(least: Mapping[str, float], settings: Any, source: str) -> None:
+    """Raise ConfigError where a number of some settings, named as "train.batch", is under the least that it may be."""
+    for name, smallest in least.items():
+        value = attrgetter(name)(settings)
+        if not value >= smallest:
+            raise ConfigError(f"{source}: {name} is {value:g}; it must be at least {smallest:g}.")
+
+
+def _check_conditions(experiment: Settings, source: str) -> None:
+    feeders: dict[str, str] = {}
+    for condition in pick_conditions(experiment.model):
+        if condition.stream == "rgb" or condition.stream not in {**STREAMS, **MECHANISMS}:
+            known = ", ".join(name for name in (*STREAMS, *MECHANISMS) if name != "rgb")
+            raise ConfigError(f"{source}: the condition {condition.name} feeds {condition.stream!r}; conditions feed {known}.")
+        if condition.stream in feeders:
+            raise ConfigError(
+                f"{source}: {feeders[condition.stream]} and {condition.name} both feed {condition.stream}; choose one of them "
+                "(model.action, model.embodiment)."
+            )
+        feeders[condition.stream] = condition.name
+
+
+def _check_sizes(experiment: Settings, source: str) -> None:
+    clip, factor = experiment.clip, experiment.codec.spatial_factor * PATCH[1]
+    if clip.frames < 5 or clip.frames % TEMPORAL_FACTOR != 1:
+        near = max(5, clip.frames // TEMPORAL_FACTOR * TEMPORAL_FACTOR + 1)
+        raise ConfigError(f"{source}: clip.frames is {clip.frames}; it must be 4 k + 1 and at least 5, for example {near}.")
+    if clip.height % factor or clip.width % factor:
+        found = f"clip is {clip.width}x{clip.height}"
+        raise ConfigError(f"{source}: {found}; both sides must be multiples of {factor} (codec factor x patch).")
+
+
+def _check_training(experiment: Settings, source: str) -> None:
+    train, adapt = experiment.train, experiment.adapt
+    if (train.steps > 0) == (train.epochs > 0):
+        raise ConfigError(f"{source}: train.steps is {train.steps}, train.epochs {train.epochs:g}; give one of them, over 0.")
+    if train.ema_decay >= 1:
+        raise ConfigError(f"{source}: train.ema_decay is {train.ema_decay:g}; it must be under 1.")
+    for name, shift in {"train": train.shift, "rollout": experiment.rollout.shift}.items():
+        if shift is not None and not shift > 0:
+            raise ConfigError(f"{source}: {name}.shift is {shift:g}; it must be over 0 (1 leaves the levels as they are).")
+    if adapt.start_from is None:
+        if adapt != AdaptSettings():
+            raise ConfigError(f"{source}: adapt says how, but adapt.start_from not which run to adapt; give that, or no adapt.")
+        return
+    if not adapt.robots or adapt.episodes < 1:
+        raise ConfigError(f"{source}: adapt needs the robots to adapt to and at least one episode of each task and robot.")
+    if not 0 <= adapt.replay < 1 or (adapt.replay and count_replayed(train.batch, adapt.replay) >= train.batch):
+        raise ConfigError(
+            f"{source}: adapt.replay is {adapt.replay:g} of a batch of {train.batch}; it is a part that leaves room for others."
+        )
+
+
+def _check_history(experiment: Settings, source: str) -> None:
+    settings = experiment.model
+    if any(frame >= 0 for frame in settings.history) or list(settings.history) != sorted(settings.history):
+        found = f"{source}: model.history is {list(settings.history)}"
+        raise ConfigError(f"{found}; give frames before the clip, the earliest first, as [-40, -20].")
+    streams = [condition.stream for condition in pick_conditions(settings)]
+    framed = [name for name in streams if name in MECHANISMS and MECHANISMS[name].enters == "frame"]
+    if settings.visibility == "one_way" and framed and settings.history:
+        raise ConfigError(
+            f"{source}: model.visibility one_way computes earlier frames without the poses that action {settings.action} tells "
+            "them; use joint, or leave model.history out."
+        )

@@ -1,0 +1,103 @@
+"""The parts that an experiment is resolved into, each for one place that takes it."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from xew.config import pick
+from xew.model.codecs.codec import CodecSettings
+from xew.model.codecs.vae import VaeSize
+from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition, list_conditions
+from xew.model.network.dit import STREAMS, token_grid
+from xew.model.settings.network import Network
+from xew.model.settings.settings import AdaptSettings, Clip, ModelSettings, TrainSettings
+from xew.model.text.instructions import TextEncoder, TextSource, encode_instructions
+from xew.protocol import Split
+
+
+@dataclass(frozen=True)
+class ClipInputs:
+    """What the network is given of a clip: how it is cut, and which conditions go with it."""
+
+    clip: Clip
+    chunks: int
+    """Consecutive clips of a training sample."""
+    history: tuple[int, ...]
+    """Earlier frames, counted from the clip's first."""
+    conditions: dict[str, Condition]
+    """Conditions by the stream or mechanism that each feeds; `.name` is a condition's name in the cache."""
+    shapes: dict[str, tuple[int, ...]]
+    """Shapes of a clip's arrays by stream or mechanism, rgb and text included: latents [t h w c], numbers [t n], text [l e] or
+    [l]."""
+
+    @property
+    def latent_shape(self) -> tuple[int, ...]:
+        """Shape [t h w c] of one RGB clip."""
+        return self.shapes["rgb"]
+
+    @property
+    def grids(self) -> list[tuple[int, int, int]]:
+        """Tokens (t', h', w') of each stream, RGB first."""
+        streams = ["rgb", *(name for name in self.conditions if name in STREAMS)]
+        return [token_grid((1, *self.shapes[name])) for name in streams]
+
+
+@dataclass(frozen=True)
+class Instructions:
+    """How instructions become what the network takes."""
+
+    encoder: TextEncoder
+    source: TextSource
+    prefix: str
+
+    def encode(self, instructions: Iterable[str]) -> dict[str, np.ndarray]:
+        """Every distinct instruction as the network takes it: [l] int32 where the table is learned, else [l e] float32."""
+        return encode_instructions(self.encoder, self.source, instructions, self.prefix)
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How episodes become latents, and where these are kept: everything that the latent cache depends on."""
+
+    inputs: ClipInputs
+    codec: CodecSettings
+    folder: Path
+    data: Path
+    start_from: Path | None
+    """Run whose codec and scales are used, in an adaptation."""
+    autoencoder: VaeSize | None = None
+    """Size of the video autoencoder, where the codec is one."""
+
+    @property
+    def remedy(self) -> str:
+        """What to do where the cache lacks something."""
+        return f"run `python -m xew.model.latents CONFIG --data {self.data}`, with the other choices of this command too"
+
+
+@dataclass(frozen=True)
+class EpisodeChoice:
+    """Which episodes of a data set a training reads."""
+
+    split: Split
+    adapt: AdaptSettings = field(default_factory=AdaptSettings)
+    replay: tuple[str, ...] = ()
+    """Robots whose training episodes are replayed, in an adaptation with replay."""
+    samples: bool = False
+    """Whether sample videos are drawn."""
+
+
+@dataclass(frozen=True)
+class Learning:
+    """What is learned, and how: the network, the optimizer and the loss."""
+
+    network: Network
+    settings: TrainSettings
+    lora_rank: int = 0
+
+
+def pick_conditions(settings: ModelSettings) -> list[Condition]:
+    """Look up the conditions of action, embodiment and history. Raises ConfigError for a name that does not exist."""
+    action, embodiment = pick(ACTIONS, settings.action, "action"), pick(CONDITIONS, settings.embodiment, "embodiment")
+    return [*list_conditions(action), *list_conditions(embodiment), *([HISTORY] if settings.history else [])]

@@ -1,0 +1,134 @@
+"""What the sections of configs/*.yaml hold. Fields without a default must be given."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from xew.model.network.dit import (
+    AttentionName,
+    RematName,
+    TimeEmbedding,
+    Visibility,
+)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """What the model sees at once."""
+
+    frames: int
+    """4 k + 1; the first is given, the others are predicted."""
+    height: int
+    """Pixels; the camera's 320x240 is padded to this aspect ratio, then resized."""
+    width: int
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    size: str
+    """One of MODELS."""
+    action: str = "none"
+    """One of ACTIONS: how the commanded motion is shown."""
+    embodiment: str = "none"
+    """One of CONDITIONS: how the robot's looks are shown."""
+    history: tuple[int, ...] = ()
+    """Earlier frames that are shown too, counted from the clip's first, as [-40, -20]; before the episode its first counts."""
+    text: str = "learned"
+    """One of TEXT_ENCODERS: a table of words that the network learns, or Wan's frozen encoder."""
+    text_weights: Path | None = None
+    """umt5: models_t5_umt5-xxl-enc-bf16.pth, or the text_encoder folder of the diffusers layout."""
+    text_tokenizer: Path | None = None
+    """umt5: the folder google/umt5-xxl, or the tokenizer folder of the diffusers layout."""
+    text_prefix: str = ""
+    """Put before every instruction, as FlowWAM's published weights expect it."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Of the matrix products."""
+    residual: Literal["float32", "bfloat16"] = "float32"
+    """Of the tokens between blocks; their sums are float32 either way."""
+    remat: RematName = "none"
+    """What the backward pass computes again: nothing, all but attention or matrix products, or everything (blocks.REMAT)."""
+    unroll: int = 1
+    """Blocks compiled as one loop body."""
+    attention: AttentionName = "auto"
+    """cuDNN's where it can be used, else XLA's (blocks.choose_attention)."""
+    visibility: Visibility = "joint"
+    """one_way: condition tokens see condition tokens only, and are computed once a clip when sampling. A departure."""
+    time: TimeEmbedding = "exact"
+    """flowwam: with the rounding under which FlowWAM's published weights were trained."""
+    weights: Path | None = None
+    """Published weights to start from: official Wan, diffusers, FlowWAM (dit_layouts.load_dit); from nothing if left out."""
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    batch: int
+    """Samples of one step over all devices."""
+    steps: int = 0
+    epochs: float = 0.0
+    """Passes over the training samples; give this or `steps`."""
+    seed: int = 0
+    accumulate: int = 1
+    """Parts of the batch that are computed one after another: less memory, the same step."""
+    chunks: Literal[1, 2] = 1
+    """Consecutive clips of a sample; the second starts from the predicted, not the true, end of the first."""
+    learning_rate: float = 5e-5
+    warmup_steps: int = 0
+    decay_to: float = 1.0
+    """Cosine decay of the learning rate to this part of its peak at the last step; 1 keeps it constant."""
+    weight_decay: float = 0.01
+    clip_norm: float = 1.0
+    ema_decay: float = 0.0
+    """0 keeps no average."""
+    mu_dtype: Literal["float32", "bfloat16"] = "float32"
+    """Of AdamW's first moment; bfloat16 saves two bytes a parameter."""
+    shift: float = 5.0
+    """Of the noise levels, in training and in sampling."""
+    history_noise: float = 0.0
+    """Standard deviation of what is added to earlier frames' latents in training; Ctrl-World has 0.3."""
+    log_every: int = 20
+    save_every: int = 1000
+    sample_every: int = 1000
+    """0 draws no samples."""
+    keep_checkpoints: int = 2
+
+
+@dataclass(frozen=True)
+class AdaptSettings:
+    """Adaptation of a trained run to robots that it has not seen, from a few episodes. Off without `start_from`."""
+
+    start_from: Path | None = None
+    """The run whose weights, at its latest checkpoint, are the start."""
+    robots: tuple[str, ...] = ()
+    """Whose episodes are learned from."""
+    episodes: int = 1
+    """Of each task and robot: the first so many accepted training seeds (M in the paper)."""
+    replay: float = 0.0
+    """Part of every batch that comes from the run's own training robots; 0 as in the paper."""
+    lora_rank: int = 0
+    """Learn corrections of this rank to the blocks' matrices instead of all weights; 0 as in the paper."""
+
+
+@dataclass(frozen=True)
+class RolloutSettings:
+    sampler: str = "euler"
+    """One of SAMPLERS."""
+    grid: str = "flowwam"
+    """Noise schedule: one of SCHEDULES, each by the name of the project that has it."""
+    steps: int = 50
+    """Evaluations of the network a chunk."""
+    shift: float | None = None
+    """Of the noise levels; that of training where left out."""
+    guidance: float = 1.0
+    """Classifier-free guidance against `negative_prompt`; 1 is none and costs nothing. Wan's own sampling has 5; networks
+    trained here have never gone without their instruction."""
+    negative_prompt: str = ""
+    batch: int = 4
+    """Episodes at once over all devices."""
+    max_frames: int = 0
+    """Predict only the first so many frames of an episode; 0 predicts all."""
+    seed: int = 0
+
+
+def count_replayed(batch: int, replay: float) -> int:
+    """Number of samples of a batch that are replayed: the nearest whole one, at least one where any are asked for."""
+    return max(1, round(batch * replay)) if replay else 0

@@ -1,0 +1,306 @@
+"""Checkpoints of other projects into our modules.
+
+Reads  .safetensors, *.safetensors.index.json, a folder of either, .pth and .pt (PyTorch state dicts, `weights_only`)
+Writes the leaves of a module, by its `Layout`
+
+Tensors are read one at a time, so that a checkpoint of 20 GB is never held twice, and nothing is ever unpickled freely.
+"""
+
+import json
+import pickle
+import zipfile
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import ml_dtypes
+import numpy as np
+from flax import nnx
+from jaxtyping import Shaped
+from safetensors import SafetensorError, safe_open
+
+from xew.config import ConfigError
+from xew.model.weights.layout import AXES, Layout, Source, list_some, module_leaves, tensor_shape
+
+PREFIXES = ("pipe.dit.", "pipe.", "model.diffusion_model.", "model.", "module.")
+"""Names of wrappers in front of keys, taken off (the longest that fits)."""
+STATE_DICTS = ("state_dict", "model_state_dict", "model")
+"""Names under which a .pth may hold its tensors one level down."""
+
+
+@runtime_checkable
+class Entry(Protocol):
+    """One tensor of a checkpoint, not yet read."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the tensor."""
+
+    def read(self) -> Shaped[np.ndarray, "..."]:
+        """The tensor, of `shape`."""
+
+
+class Tensors(Mapping):
+    """Tensors of a checkpoint by key; each is read when it is asked for.
+
+    The mapping has no type parameters: to check them at run time would read a tensor.
+    """
+
+    def __init__(self, entries: Mapping[str, Entry], source: Path) -> None:
+        self.entries, self.source = dict(entries), source
+
+    def __getitem__(self, key: str) -> np.ndarray:
+        return self.entries[key].read()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.entries)
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __contains__(self, key: object) -> bool:
+        return key in self.entries
+
+    def shape(self, key: str) -> tuple[int, ...]:
+        """Shape of a tensor, without reading it."""
+        return self.entries[key].shape
+
+
+def read_tensors(path: Path) -> Tensors:
+    """Open a checkpoint: numpy arrays by key (bfloat16 as of ml_dtypes), read lazily; wrappers' prefixes are taken off.
+
+    Args:
+        path: a .safetensors file, a *.safetensors.index.json, a folder that holds either, or a .pth / .pt state dict
+            (needs PyTorch; loaded with `weights_only`, so that it can hold nothing but tensors).
+
+    Raises:
+        ConfigError: there is no such file, it is broken, or it is of another kind.
+    """
+    path = Path(path)
+    try:
+        return Tensors(_strip_prefixes(_open(path), path), path)
+    except SafetensorError as error:
+        raise ConfigError(f"{path} is no whole safetensors file ({error}); download it again.") from error
+    except OSError as error:
+        raise ConfigError(f"cannot read the weights {path}: {error.strerror or error}.") from error
+
+
+def fill(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Collection[str] = ()) -> None:
+    """Fill the leaves of a module in place from a checkpoint, in each leaf's own type and on its own devices.
+
+    Leaves that the layout does not name keep their values. An abstract module (of `nnx.eval_shape`) becomes a real one
+    but for such leaves.
+
+    Args:
+        module: whose leaves are filled.
+        tensors: of the checkpoint, from `read_tensors`.
+        layout: where each leaf comes from.
+        optional: patterns (as "flow_stream.*") of leaves that the checkpoint may lack, and of its keys that may be left.
+
+    Raises:
+        ConfigError: tensors are missing, left over or misshapen; the first few are named. Nothing has been filled then.
+    """
+    wanted = check_fit(module, tensors, layout, optional=optional)
+    leaves = module_leaves(module, layout)
+    for path, source in wanted.items():
+        variable = leaves[path]
+        value = _leaf_value(tensors, source, variable.shape, np.dtype(variable.dtype))
+        variable.set_value(_place(value, variable.get_value()))
+
+
+def check_fit(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Collection[str] = ()) -> Layout:
+    """The leaves that `fill` would fill; raises its errors without reading a tensor."""
+    wanted = {path: source for path, source in layout.items() if not _keeps_its_value(path, source, tensors, optional)}
+    _check(module_leaves(module, layout), tensors, wanted, _foreign_keys(tensors, layout, optional))
+    return wanted
+
+
+def _keeps_its_value(path: str, source: Source, tensors: Tensors, optional: Collection[str]) -> bool:
+    """Whether a leaf is to keep its value: optional, and the checkpoint has none of its tensors."""
+    return _matches(path, optional) and not any(key in tensors for key in source.keys)
+
+
+def _foreign_keys(tensors: Tensors, layout: Layout, optional: Collection[str]) -> list[str]:
+    taken = {key for source in layout.values() for key in source.keys}
+    return [key for key in tensors if key not in taken and not _matches(key, optional)]
+
+
+def _matches(name: str, patterns: Collection[str]) -> bool:
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def _check(leaves: Mapping[str, nnx.Variable], tensors: Tensors, layout: Layout, foreign: list[str]) -> None:
+    """Raises ConfigError with all that does not fit, the first few of each kind by name."""
+    missing = [f"{key} (for {path})" for path, source in layout.items() for key in source.keys if key not in tensors]
+    misshapen = [
+        f"{key} is {list(tensors.shape(key))}, the model's {path} needs {list(shape)}"
+        for path, source in layout.items()
+        for shape in (tensor_shape(leaves[path].shape, source),)
+        for key in source.keys
+        if key in tensors and tensors.shape(key) != shape
+    ]
+    faults = {"missing": missing, "of another shape": misshapen, "not of this model": foreign}
+    found = [f"{len(names)} {kind}: {list_some(names)}" for kind, names in faults.items() if names]
+    if found:
+        raise ConfigError(
+            f"{tensors.source} does not fit the model: " + "; ".join(found) + ". Choose the model size that it was trained"
+            " with, or another file."
+        )
+
+
+def _leaf_value(tensors: Tensors, source: Source, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """A leaf of `shape` from its tensors: each is read, converted into its place, and let go."""
+    value = np.empty(shape, dtype)
+    for place, key in zip(value if source.is_stacked else (value,), source.keys, strict=True):
+        np.copyto(place, AXES[source.layout].to_leaf(tensors[key], source.kernel), casting="unsafe")
+    return value
+
+
+def _place(value: np.ndarray, like: Any) -> jax.Array:
+    """Put a value where the leaf lay before; each process gives its own devices their shards."""
+    sharding = getattr(like, "sharding", None)
+    if sharding is None:
+        return jax.device_put(value)
+    return jax.make_array_from_callback(value.shape, sharding, lambda index: value[index])
+
+
+@dataclass(frozen=True)
+class _SafetensorsEntry:
+    file: Any
+    key: str
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(self.file.get_slice(self.key).get_shape())
+
+    def read(self) -> np.ndarray:
+        return self.file.get_tensor(self.key)
+
+
+@dataclass(frozen=True)
+class _TorchEntry:
+    tensor: Any
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(self.tensor.shape)
+
+    def read(self) -> np.ndarray:
+        tensor = self.tensor.detach()
+        if str(tensor.dtype) == "torch.bfloat16":  # NumPy has no such type of its own: the same bits by another name
+            import torch
+
+            return tensor.contiguous().view(torch.uint16).numpy().view(ml_dtypes.bfloat16)
+        return tensor.numpy()
+
+
+def _open(path: Path) -> dict[str, Entry]:
+    if path.is_dir():
+        return _open_folder(path)
+    if not path.is_file():
+        raise ConfigError(f"there are no weights at {path}; give a file or folder that exists.")
+    if path.name.endswith(".safetensors.index.json"):
+        return _open_index(path)
+    if path.suffix == ".safetensors":
+        return _open_safetensors(path)
+    if path.suffix in (".pth", ".pt"):
+        return _open_torch(path)
+    raise ConfigError(
+        f"{path} is no checkpoint that is known here; expected .safetensors, .safetensors.index.json, .pth or .pt."
+    )
+
+
+def _open_folder(folder: Path) -> dict[str, Entry]:
+    """Open a folder by its index if there is one; else all its .safetensors; else its only .pth."""
+    indexes, shards = sorted(folder.glob("*.safetensors.index.json")), sorted(folder.glob("*.safetensors"))
+    pickles = sorted(file for file in folder.iterdir() if file.suffix in (".pth", ".pt"))
+    if len(indexes) == 1:
+        return _open_index(indexes[0])
+    if not indexes and shards:
+        return _merge((shard, _open_safetensors(shard)) for shard in shards)
+    if not indexes and len(pickles) == 1:
+        return _open_torch(pickles[0])
+    choices = [file.name for file in (*indexes, *pickles)]
+    found = f"several checkpoints ({', '.join(choices)}); name one of them" if choices else "no .safetensors, .pth or .pt"
+    raise ConfigError(f"{folder} holds {found}.")
+
+
+def _open_index(index: Path) -> dict[str, Entry]:
+    """Open the shards that an index names; they lie beside it, and whatever points elsewhere is refused."""
+    try:
+        names = json.loads(index.read_text())["weight_map"]
+        shards = sorted(set(names.values()))
+        elsewhere = [name for name in shards if Path(name).name != name or "\\" in name or not name.endswith(".safetensors")]
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{index} is no index of safetensors (no weight_map of keys to files); download it again.") from error
+    if elsewhere:
+        raise ConfigError(
+            f"{index} names files that are no .safetensors beside it: {list_some(map(repr, elsewhere))}; do not use it."
+        )
+    absent = [name for name in shards if not (index.parent / name).is_file()]
+    if absent:
+        raise ConfigError(f"{index} names shards that are not there: {list_some(absent)}; download them into {index.parent}.")
+    entries = _merge((index.parent / name, _open_safetensors(index.parent / name)) for name in shards)
+    lost = [key for key in names if key not in entries]
+    if lost:
+        raise ConfigError(f"{index} names tensors that its shards lack: {list_some(lost)}; download the shards again.")
+    return entries
+
+
+def _open_safetensors(path: Path) -> dict[str, Entry]:
+    try:
+        file = safe_open(path, framework="numpy")
+    except SafetensorError as error:
+        raise ConfigError(f"{path} is no whole safetensors file ({error}); download it again.") from error
+    return {key: _SafetensorsEntry(file, key) for key in file.keys()}  # noqa: SIM118 (no mapping)
+
+
+def _open_torch(path: Path) -> dict[str, Entry]:
+    try:
+        import torch
+    except ImportError as error:
+        raise ConfigError(f"reading {path} needs PyTorch: pip install torch; or convert it to .safetensors first.") from error
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
+    except pickle.UnpicklingError as error:
+        raise ConfigError(
+            f"{path} holds more than tensors, or is broken, and is not opened; get it as .safetensors."
+        ) from error
+    except (RuntimeError, EOFError, ValueError) as error:
+        raise ConfigError(f"{path} is no whole PyTorch file ({str(error).splitlines()[0]}); download it again.") from error
+    state = _state_dict(content)
+    tensors = {str(key): _TorchEntry(value) for key, value in state.items() if isinstance(value, torch.Tensor)}
+    if not tensors:
+        raise ConfigError(f"{path} holds no tensors by name; expected a state dict.")
+    return dict(tensors)
+
+
+def _state_dict(content: Any) -> Mapping[str, Any]:
+    """The mapping of names to tensors in what a .pth holds."""
+    if not isinstance(content, Mapping):
+        return {}
+    inner = [content[name] for name in STATE_DICTS if isinstance(content.get(name), Mapping)]
+    return inner[0] if inner else content
+
+
+def _merge(files: Iterable[tuple[Path, Mapping[str, Entry]]]) -> dict[str, Entry]:
+    merged: dict[str, Entry] = {}
+    for path, entries in files:
+        twice = merged.keys() & entries.keys()
+        if twice:
+            raise ConfigError(f"{path} repeats tensors of another file beside it: {list_some(sorted(twice))}; name one file.")
+        merged |= entries
+    return merged
+
+
+def _strip_prefixes(entries: Mapping[str, Entry], path: Path) -> dict[str, Entry]:
+    bare: dict[str, Entry] = {}
+    for key, entry in entries.items():
+        name = key.removeprefix(next((prefix for prefix in PREFIXES if key.startswith(prefix)), ""))
+        if name in bare:
+            raise ConfigError(f"{path} holds {name} twice, under different prefixes; keep one of them.")
+        bare[name] = entry
+    return bare
