@@ -1,4 +1,4 @@
-"""Does distance predict difficulty? Correlation over the five leave-one-embodiment-out (LOEO) folds."""
+"""Correlation of distance with difficulty over the five leave-one-embodiment-out (LOEO) folds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

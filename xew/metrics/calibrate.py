@@ -1,4 +1,4 @@
-"""How far the metrics can be trusted: what they say of videos whose truth is known. Two tables, for docs/calibration.md.
+"""The command that measures the estimators' error: what metrics say of videos whose truth is known (docs/calibration.md).
 
 Reads  a data set; for the second table its episodes are rendered anew, with robot and objects moved wrongly
 Writes <out>/calibration.md (both tables), references.parquet and wrong.parquet (a row for each episode, case and metric),
@@ -34,16 +34,16 @@ from xew.metrics.grade import Comparison, Grades, grade, input_kind
 from xew.metrics.truth import NEEDS, Truth, read_truth
 
 LATE = 8
-"""Frames of the time-shifted truth, half a second."""
+"""Number of frames by which the true video is shifted, half a second."""
 KEY = ["task", "seed", "robot", "case"]
 ESTIMATED = tuple(name for name in METRICS if input_kind(name) in ("mask", "keypoints", "objects"))
-"""Metrics that see a prediction through an estimator."""
+"""Names of the metrics that see a prediction through an estimator."""
 BY_MOTION = ("mask_iou", "boundary_f1", "keypoint_error")
-"""Metrics of the table by motion, frame by frame."""
+"""Names of the metrics of the table by motion, frame by frame."""
 MOTION_STEPS = (0, 0.5, 2, 5, 10, 20, 40, 80, np.inf)
-"""Pixels by which the keypoints of a wrong video are off in the mean of a frame."""
+"""Edges of the classes of motion: mean distance [pixels] by which the keypoints of a perturbation are off in a frame."""
 TOLD_APART = {"px": 0.5, "": 0.005}
-"""By unit, how far two true scores must lie apart that their order counts: less is no order."""
+"""Least difference of two true scores, by unit, at which their order counts."""
 Row = dict[str, Any]
 Episode = tuple[Path, Record]
 

@@ -1,4 +1,4 @@
-"""Stage 10 of 11: evaluate. Rollouts and the episodes they predict to scores.
+"""The command that grades rollouts against the episodes that they predict.
 
 Reads  <rollouts>/<task>/<seed>/<robot>/ (xew.rollout) and the same folders of the data set
 Writes scores.parquet, one row per model, condition, task, seed, robot and metric; beside it
@@ -41,7 +41,7 @@ from xew.rollout import RolloutError
 from xew.threads import in_order
 
 PROTOCOL = 3
-"""Goes up when any number that evaluate writes would change; scores of another protocol are graded anew."""
+"""Version of the grading: it goes up when any score would change, and scores of another version are graded anew."""
 DIMENSIONS = tuple(dict.fromkeys(metric.dimension for metric in METRICS.values()))
 
 
@@ -99,7 +99,7 @@ WRITTEN = {
     "pairs.csv": "differences between models",
     "bundle.json": "for others to check",
 }
-"""What lies beside each other, by the ending of the name."""
+"""Files that are written beside each other, by the ending of the name, with what each holds."""
 
 
 @user_errors

@@ -1,4 +1,4 @@
-"""Metrics, one video: a prediction and the episode that it predicts to scores. Estimators first, then metrics.
+"""The scores of one video: a prediction is compared with the episode that it predicts, by estimators and then by metrics.
 
 Frames and points go through the compiler in blocks of one size, so that a few programs serve episodes of all lengths.
 """
@@ -18,12 +18,12 @@ from xew.metrics.perceptual import SMALLEST_SIDE, union_box
 from xew.metrics.truth import Truth, is_inside
 
 FRAME_BLOCK = 16
-"""On a CPU; on a GPU as many frames as it takes at once."""
+"""Number of frames graded at once on a CPU; on a GPU it is `ACCELERATOR_CHUNK`."""
 POINT_BLOCK = 8
 OF_WHOLE_FRAMES = {"region_lpips": "lpips"}
-"""Metrics of the robot's box, and what they are where that is the whole frame, which it often is over an episode."""
+"""Metrics of the robot's box by name, each with the metric that it equals where the box is the whole frame, as it often is."""
 DIAGNOSTICS = {"contact_f1": contact_f1}
-"""What is computed if asked and is no part of the reported suite."""
+"""Functions by name that are computed where asked for and are no part of the reported suite."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Grades:
 
 
 def input_kind(name: str) -> str:
-    """What a metric or a diagnostic compares, a key of `truth.NEEDS`."""
+    """The kind of arrays that a metric or a diagnostic compares, a key of `truth.NEEDS`."""
     if name in DIAGNOSTICS:
         return "contact"
     metric = METRICS[name]
@@ -143,7 +143,7 @@ INPUTS: dict[str, Callable[[Comparison], Arrays | None]] = {
     "objects": _objects,
     "contact": _contact,
 }
-"""What the functions of metrics take, by `compared`; None where the truth has nothing to compare."""
+"""Arrays that the functions of metrics take, by `input_kind`; None where the truth has nothing to compare."""
 
 
 def _tracks(c: Comparison, points: np.ndarray, visible: np.ndarray) -> Arrays | None:

@@ -1,4 +1,4 @@
-"""Metrics, the true side of a comparison: what an episode's files say of its pixels, its robot and its objects.
+"""Ground truth: what an episode's files say of its pixels, its robot and its objects.
 
 Reads  <data>/<task>/<seed>/<robot>/ (xew.episode)
 """
@@ -20,15 +20,15 @@ NEEDS = {
     "objects": ("object_pose", "extrinsics", "intrinsics"),
     "contact": ("object_pose", "tool_pose", "contact", "extrinsics", "intrinsics"),
 }
-"""What is compared, and the arrays of an episode that it rests on; imported episodes may not know some."""
-
+"""Arrays of an episode that each kind of comparison rests on; imported episodes may not know some."""
 
 REST = 1.0
-"""Pixels by which a resting object's point may move."""
+"""Largest distance [pixels] by which a resting object's point may move."""
 PATCH = 2
-"""Pixels to each side of a point whose mean is the color of its place."""
+"""Number of pixels to each side of a point whose mean is the color of its place."""
 OTHER_COLOR = 40
-"""Levels of a channel. A shadow on a bright object may be one too: then its frames are left out, which costs little."""
+"""Least difference [levels of a channel] that is another color. A shadow on a bright object may be one too: then its frames
+are left out, which costs little."""
 
 
 @dataclass(frozen=True)

@@ -93,8 +93,9 @@ def bootstrap_means(values: np.ndarray, numbers: np.ndarray, unit_count: int) ->
 
 
 def _draw_block(values: np.ndarray, numbers: np.ndarray, unit_count: int) -> Iterator[Mean | None]:
-    # `scipy.stats.bootstrap` gives the same up to chance, but draws column by column and gathers every drawn score: 20 scenes
-    # take it 50 times as long, 500 scenes 400 times. Here all columns share the draws, and a draw is a row of a matrix.
+    # `scipy.stats.bootstrap` gives the same up to chance, but gathers every drawn score: on two cores, a mean over 500 scenes
+    # took it 79 ms (among 128, in batches of 100 draws) to 1.1 s (alone), and this 4 ms. All columns share the draws, and a
+    # draw is a row of a matrix.
     held = np.isfinite(values)
     lowest = np.min(values, axis=0, where=held, initial=np.inf)
     lowest = np.where(np.isfinite(lowest), lowest, 0)

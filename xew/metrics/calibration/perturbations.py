@@ -1,4 +1,4 @@
-"""Metrics, calibration: renderings that are wrong in a known way, with their true masks, keypoints and object places.
+"""Renderings that are wrong in a known way, with their true masks, keypoints and object places.
 
 Reads  an episode's recorded states
 Writes `Perturbation`s: the same scene with robot and objects moved otherwise, as a model that errs would show it
@@ -34,18 +34,18 @@ class Perturbation:
 
 
 def delay(states: States, frames: int) -> States:
-    """Everything happens some frames too late."""
+    """States in which everything happens some frames too late."""
     shown = np.maximum(np.arange(states.frame_count) - frames, 0)
     return _replace_motion(states, states.joint_pos[shown], states.object_pose[shown], states.object_joint[shown])
 
 
 def freeze(states: States) -> States:
-    """Nothing ever moves."""
+    """States in which nothing ever moves."""
     return delay(states, states.frame_count)
 
 
 def bias_joints(states: States, angle: float) -> States:
-    """Every joint of both arms is off by an angle [rad] after frame 0; the objects are where they belong."""
+    """States in which every joint of both arms is off by an angle [rad] after frame 0; the objects are where they belong."""
     joints = states.joint_pos.copy()
     for arm, _ in ARMS:
         used = np.any(states.joint_pos[:, arm] != 0, axis=0)  # arms of six joints leave their seventh at zero
@@ -54,7 +54,7 @@ def bias_joints(states: States, angle: float) -> States:
 
 
 def halve_motion(states: States) -> States:
-    """Robot and objects move half as far from where they began."""
+    """States in which robot and objects move half as far from where they began."""
     joints, hinges = (0.5 * (values[:1] + values) for values in (states.joint_pos, states.object_joint))
     poses = states.object_pose.copy()
     poses[..., :3] = 0.5 * (poses[:1, :, :3] + poses[..., :3])
@@ -73,7 +73,7 @@ MOTIONS: dict[str, Callable[[States], States]] = {
     "half the motion": halve_motion,
     "frozen": freeze,
 }
-"""How each case moves what it shows."""
+"""Perturbations of recorded states, by the name of the case."""
 
 
 def render_perturbations(folder: Path) -> Iterator[tuple[str, Perturbation]]:

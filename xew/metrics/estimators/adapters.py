@@ -1,4 +1,4 @@
-"""Metrics, ground of the adapters: the packages, checkpoints and queries that other projects' networks share.
+"""What the adapters of other projects' networks share: packages, checkpoints and queries.
 
 PyTorch is imported where it is first needed, so that nobody needs it who uses no adapter. Nothing is downloaded, and no file
 is unpickled freely.

@@ -1,4 +1,4 @@
-"""Metrics, a diagnostic: when does a hand touch an object in a predicted video, as far as the image plane tells?
+"""A diagnostic: the frames in which a hand touches an object in a predicted video, as far as the image plane tells.
 
 A hand and an object are said to touch where their tracked points are nearer than the distance that best tells touching
 from not touching in the true episode itself. The paper computes such a score and leaves it out of its suite, because

@@ -1,7 +1,7 @@
 """Optical flow of video for which there are no exact motion vectors: DIS of OpenCV and RAFT of torchvision.
 
-Our own data need neither: the renderer knows every pixel's motion (`rendering.streams`). These are for anybody's video,
-and tests hold them against the exact vectors.
+Our own data need neither: the renderer knows every pixel's motion (`rendering.streams`). These are for anybody's video
+(`backends.open_flow`), and tests hold them against the exact vectors.
 """
 
 from pathlib import Path
@@ -14,13 +14,13 @@ from xew.config import ConfigError
 from xew.metrics.estimators.adapters import import_package, import_torch, load_state_dict, read_state_dict, torch_device
 
 RAFT_UPDATES = 12
-"""torchvision's own number of refinements."""
+"""Number of refinements, as torchvision has it."""
 RAFT_BATCH = 8
-"""Pairs at once: about 2 GB on a GPU at 320x240."""
+"""Number of pairs at once: about 2 GB on a GPU at 320x240."""
 RAFT_STRIDE, RAFT_SMALLEST = 8, 128
-"""Sides must be multiples of the one and at least the other; smaller frames are filled up with their rim."""
+"""Sides [pixels] must be multiples of the one and at least the other; smaller frames are filled up with their rim."""
 RAFT_WIDTHS = {64: "raft_large", 32: "raft_small"}
-"""Which of torchvision's two networks a checkpoint is, by the channels of its first layer."""
+"""Networks of torchvision by the channels of the first layer, which a checkpoint is known by."""
 
 
 def dis_flow(start: np.ndarray, end: np.ndarray) -> np.ndarray:

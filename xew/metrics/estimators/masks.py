@@ -1,4 +1,4 @@
-"""Metrics, default estimator: where is the robot in a predicted video, without any network's weights?
+"""The default masker: it finds the robot in a predicted video without any network's weights.
 
 Each predicted frame is read with the help of the true episode, whose masks are known. Three kinds of evidence add up, as
 log-likelihood ratios learnt from the true video itself:
@@ -22,23 +22,23 @@ import numpy as np
 from xew.metrics.estimators.similarity import find_most_similar
 
 COLOR_BINS = 24
-"""Per channel of Lab."""
+"""Number of bins for each channel of Lab."""
 LEARNING_FRAMES = 32
-"""The appearance is learnt from at most so many frames, spread evenly."""
+"""Largest number of frames, spread evenly, that the appearance is learnt from."""
 SOFTNESS = (1.0, 2.0)
 """Standard deviations of the blur [pixels] of the softened copies that are learnt from too."""
 RESIDUAL_SOFTNESS = 1.5
-"""Both frames are blurred so before they are compared, so that sharpness and grain do not count as motion."""
+"""Standard deviation [pixels] of the blur of both frames before they are compared: sharpness and grain are no motion."""
 EVIDENCE_LIMIT = 4.0
-"""No single kind of evidence may say more than exp(4) : 1; histograms of one episode know no better."""
+"""Largest log-likelihood ratio of a single kind of evidence, exp(4) : 1; histograms of one episode know no better."""
 SHAPE_WEIGHT = 9.0
-"""More than both other kinds together: where flow explains a pixel fully, an object in the robot's colors stays out."""
+"""Weight of shape, above both other kinds together: where flow explains a pixel fully, things of its colors stay out."""
 SHAPE_REACH = 1.0
 """Pixels from the carried contour at which shape evidence is three quarters of its full weight."""
 SHAPE_TRUST = 0.8
-"""How much of the other two kinds is dropped where flow explains a pixel fully: a carried contour is sharper than they are."""
+"""Share of the other two kinds that is dropped where flow explains a pixel fully: a carried contour is sharper than they."""
 SMALLEST_PIECE = 24
-"""Pixels; what is smaller is the rim of some object, not a robot."""
+"""Least size of a piece [pixels]; what is smaller is the rim of some object, not a robot."""
 RESIDUAL_SCALE = 25.0
 """Color difference (levels) between a pixel and the one that flow says it came from, at which the gate is 1/e."""
 CLOSURE_SCALE = 3.0

@@ -20,7 +20,7 @@ from xew.config import ConfigError
 from xew.metrics.estimators.adapters import import_package, import_torch, load_state_dict, read_state_dict, torch_device
 
 MEAN, DEVIATION = np.array([(0.485, 0.456, 0.406), (0.229, 0.224, 0.225)], np.float32)
-"""Of ImageNet's colors in [0, 1], by which SAM 2 normalizes."""
+"""Mean and standard deviation of ImageNet's colors in [0, 1], by which SAM 2 normalizes."""
 SIZES = {(96, 12): "t", (96, 16): "s", (112, 24): "b+", (144, 48): "l"}
 """Names of the authors' configs, by the width of the trunk's first layer and the number of its blocks."""
 ROBOT = 1

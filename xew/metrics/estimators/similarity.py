@@ -1,4 +1,4 @@
-"""Metrics, default estimators: which moment of the true video does a predicted frame show?
+"""Similarity of frames: the moment of the true video that a predicted frame shows.
 
 Both estimators read a predicted frame beside two true frames: that of the same time, and the one found here.
 """
@@ -9,9 +9,9 @@ import numpy as np
 THUMBNAIL = (40, 30)
 """Width and height to which frames are shrunk to be compared [pixels]."""
 CLEARLY = 0.9
-"""Another moment must differ by so much less, as a factor of the squared difference, to be preferred to the same one."""
+"""Factor of the squared difference that another moment must stay under to be preferred to the same one."""
 ROUNDING = 0.01
-"""Squared levels by which frames that are the same may seem to differ: they stay with their own time."""
+"""Difference [levels squared] that frames which are the same may seem to have: they stay with their own time."""
 
 
 def find_most_similar(prediction: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

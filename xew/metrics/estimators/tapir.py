@@ -19,22 +19,22 @@ from xew.metrics.estimators.adapters import check_tracks, import_package, lost_t
 from xew.metrics.networks.pickles import read_arrays
 
 SIDE = 256
-"""Of the square for which the networks were trained [pixels]."""
+"""Side [pixels] of the square for which the networks were trained."""
 CHUNK = 64
-"""Points at once."""
+"""Number of points at once."""
 INSTALL = "install it from the sources of github.com/google-deepmind/tapnet, with all that they ask for (it is not on PyPI)"
 TAPIR = {"bilinear_interp_with_depthwise_conv": False, "pyramid_level": 0}
 BOOTSTAPIR = {
     "bilinear_interp_with_depthwise_conv": False, "pyramid_level": 1, "extra_convs": True, "softmax_temperature": 10.0
 }  # fmt: skip
-"""How the authors build each network; a BootsTAPIR is told by its extra convolutions."""
+"""Options by which the authors build BootsTAPIR (TAPIR above); it is known by its extra convolutions."""
 ADMITTED = {
     *((f"numpy.{core}.multiarray", name) for core in ("core", "_core") for name in ("_reconstruct", "scalar")),
     ("numpy", "ndarray"),
     ("numpy", "dtype"),
     ("collections", "OrderedDict"),
 }
-"""The only names that a checkpoint may call: what arrays and dictionaries are made of."""
+"""Names that a checkpoint may call, and no others: what arrays and dictionaries are made of."""
 
 
 def open_tapir(checkpoint: Path) -> "Tapir":

@@ -1,10 +1,10 @@
-"""Metrics, default tracker: where are the true video's points in a predicted video, without any network's weights?
+"""The default tracker: it finds the true video's points in a predicted video without any network's weights.
 
 Each predicted frame is read with the help of true frames, in which every point is known, so that nothing drifts: the frame
 of the same time, and the one that looks most like it, which is another where a model lags, hurries or stands still.
     proposals   optical flow from both true frames, search for the patch of image round a point, and where the predicted
                 video's own flow carries the point from the frame before
-    likeness    how well the patch at a proposal agrees with the patch round the true point, as far as both are in the image;
+    similarity  how well the patch at a proposal agrees with the patch round the true point, as far as both are in the image;
                 what stands at a far proposal in the true frame too is something else
     motion      how far a proposal lies from where the predicted video's flow carries the one before
 The cheapest path through all frames wins (Viterbi). Where nothing looks like the point it is lost (NaN), not left where
@@ -22,35 +22,35 @@ from xew.metrics.estimators.similarity import find_most_similar
 PATCH = 12
 """Half the side of the patch round a point [pixels]."""
 PATCH_STEP = 2
-"""Likeness is taken over every second pixel of it."""
+"""Step [pixels] between the pixels of a patch that are compared."""
 SOFTNESS = 1.5
 """Standard deviation [pixels] of the blur of what is compared, so that sharpness and grain do not count as motion."""
 FLATNESS = 10.0
-"""Levels squared, added to the variances that differences are compared with, so that flat patches look alike."""
+"""Variance [levels squared] added to those that differences are compared with, so that flat patches are similar."""
 SURE = 0.9
-"""A point with a proposal of this likeness is not searched for."""
+"""Similarity of a proposal from which on the point is not searched for."""
 REACH = 64
-"""How far from the true point it is searched for [pixels]; the search goes over images of half the size."""
+"""Largest distance [pixels] from the true point at which it is searched for, in images of half the size."""
 PEAKS = 4
-"""Most proposals of a search."""
+"""Largest number of proposals of a search."""
 SPACING = 3
 """Least distance between two of them [pixels of half the size]."""
 REFINEMENT = 4.0
-"""Furthest that optical flow may shift a proposal towards its best fit [pixels]."""
+"""Largest distance by which optical flow may shift a proposal towards its best fit [pixels]."""
 STRAYING = 2.0
 """Distance [pixels] from where the flow carries a point, at which half of JUMP is paid."""
 JUMP = 0.5
 """Cost of a point's jump to anywhere, and of getting lost or found; a patch just like the true one costs 0, like nothing 1."""
 STANDING = 0.3
-"""A place far from the true point may be likened to itself in the true frame by so much less than to the point, and is none."""
+"""Margin of similarity: a far place is no proposal if it is as similar, less this, to its own place in the true frame."""
 LOST = 0.5
 """Cost of each frame in which a point is nowhere."""
 INNER_MOTION = 8.0
-"""A link's origin lies inside the link and moves by so much otherwise than the surface in front of it, at most [pixels]."""
+"""Largest difference [pixels] between the motion of a link's origin, inside the link, and that of the surface before it."""
 SAME_MOMENT = 4.0
 """Root mean square difference [levels] of thumbnails up to which two frames show the same moment, hidden points included."""
 HIDDEN = 0.3
-"""Cost of believing that: a point that the most alike frame hides is where that frame has it."""
+"""Cost of believing that a point which the most similar frame hides is where that frame has it."""
 GIVEN_UP = 9.0
 """Cost of a proposal that there is not."""
 

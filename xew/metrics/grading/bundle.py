@@ -25,9 +25,9 @@ FORMAT = 1
 DIGESTS = ("prediction", "rgb", "states")
 CHOICES = ("protocol", "estimators", "frame_zero", "allowed")
 SHOWN = 5
-"""So many differences are named."""
+"""Number of differences that a message names."""
 AGREEMENT = 1e-3
-"""Relative (of numbers below 1: absolute), by which scores graded anew on another machine may differ."""
+"""Largest relative difference (of numbers below 1: absolute) of scores that are graded anew on another machine."""
 
 Bundle = dict[str, Any]
 

@@ -1,4 +1,4 @@
-"""Metrics, what there is to grade: rollouts, the episodes that they predict, and the baselines on these episodes."""
+"""What there is to grade: rollouts, the episodes that they predict, and the baselines on these episodes."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ BASELINES: dict[str, Callable[[Truth], np.ndarray]] = {
     COPY_FIRST_FRAME: lambda truth: np.repeat(truth.rgb[:1], len(truth.rgb), axis=0),
     GROUND_TRUTH: lambda truth: truth.rgb,
 }
-"""What a score of nothing and a score of everything look like; the second is the noise floor of the estimators."""
+"""Videos that no model made, by name: the frozen first frame, and the ground truth, whose scores tell the noise floors."""
 SOFTNESS = 0.8
 """Standard deviation [pixels] of the blur through which estimators see the true video. Reference-aligned ones hardly err on the
 very video that they compare with; no prediction is ever that, and this is about as soft as a good codec leaves a video."""

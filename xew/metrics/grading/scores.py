@@ -4,7 +4,7 @@ scores.parquet         model condition task seed robot metric value | frames exa
 scores.curves.parquet  model condition task seed robot metric frame value
 scores.cells/          one small file for each graded video, from which the tables are put together
 A metric that a video has no value of has no row. The tables' attributes (pandas `attrs`) hold protocol, versions,
-estimators, what became of frame 0, and each metric's unit, direction, range and definition, so that the analysis needs no
+estimators, what became of frame 0, and each metric's title, unit, direction, range and source, so that the analysis needs no
 import of this room. The tables are a function of what was graded alone: the same bytes whatever was done first, in how
 many threads, and how often it was stopped on the way.
 """
@@ -31,7 +31,7 @@ from xew.metrics.grade import Grades
 
 KEY = ["model", "condition", "task", "seed", "robot"]
 ROW_GROUP = 64
-"""Cells in a row group, the most that is in memory at once."""
+"""Number of cells in a row group, the most that is in memory at once."""
 
 _KEY_FIELDS = [(name, pa.int64() if name == "seed" else pa.string()) for name in KEY] + [("metric", pa.string())]
 ROWS = pa.schema(

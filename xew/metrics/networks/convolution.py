@@ -1,4 +1,4 @@
-"""Metrics, ground: convolutions of images in float32, on NVIDIA's GPUs by matrix units that multiply shorter numbers.
+"""Convolutions of images in float32, on NVIDIA's GPUs by matrix units that multiply shorter numbers.
 
 A float32 has 24 significant bits, a TF32 11. With x = high + low, both of which TF32 holds, and the kernel likewise, three of
 the four products give 22 bits, and take less time than one in the units for float32. CUTLASS does the same for matrix
