@@ -27,7 +27,7 @@ LEAST_TEST_LINES = 0.4
 JAXTYPING = r"(?:Float|Int|UInt|UInt8|Bool|Num|Real|Key|Shaped)\w*\["
 ARRAY = re.compile(rf"\b(?:np\.ndarray|jax\.Array|NDArray|ArrayLike|wp\.array\w*|{JAXTYPING})|\bArray\b")
 """Annotations of arrays."""
-SHAPE = re.compile(r"\[((?:\.\.\.|[A-Za-z_]\w*|\d+|[-+*/() ])+(?:, [^\[\]]+)?)\]")
+SHAPE = re.compile(r"\[((?:\.\.\.|[A-Za-z_]\w*'*|\d+|[-+*/() ])+(?:, [^\[\]]+)?)\]")
 """Shape in brackets, perhaps with its unit behind a comma."""
 UNITS = {"m", "mm", "m/s", "m/s^2", "rad", "rad/s", "s", "px", "pixel", "pixels", "kg", "dB", "N", "Nm"}
 """What stands in brackets and is a unit, not a shape."""

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 from xew.analysis.correlation import leave_one_out, loeo_correlation, pearson
 from xew.analysis.paper import AXES, read_paper
-from xew.analysis.tables.recompute import rebuild, recompute_changes, recompute_mean_distances
+from xew.analysis.statistics.recompute import rebuild, recompute_changes, recompute_mean_distances
 from xew.protocol import ROBOT_NAMES
 
 PAPER = read_paper()

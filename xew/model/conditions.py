@@ -117,7 +117,7 @@ class Condition:
     title: str = ""
     """Name at the head of a table's row or a figure."""
     label: str = ""
-    """What the network is told, in a few words."""
+    """Description of what the network is told, in a few words."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class System:
     title: str
     """Name at the head of a table's row or a figure."""
     label: str
-    """What the network is told, in a few words."""
+    """Description of what the network is told, in a few words."""
 
     def __iter__(self) -> Iterator[Condition]:
         return iter(self.conditions)

@@ -146,7 +146,7 @@ def read_inputs(episode: Episode, max_frames: int = 0) -> EpisodeInputs:
 
 
 def predict(model: OutsideModel, name: str, inputs: EpisodeInputs) -> np.ndarray:
-    """The model's video of an episode. Raises ConfigError if it is none or of another length."""
+    """The model's video of an episode, [t h w 3] uint8. Raises ConfigError if it is none or of another length."""
     video = np.asarray(model(inputs))
     if video.dtype != np.uint8 or video.ndim != 4 or video.shape[-1] != 3 or len(video) != inputs.frame_count:
         raise ConfigError(
@@ -171,7 +171,7 @@ class Args:
     max_frames: int = 0
     """Predict only the first so many frames; 0 predicts all."""
     condition: str = ""
-    """What the model is told of the robot, for the tables."""
+    """Name of what the model is told of the robot, for the tables."""
     out: Path | None = None
     """Folder to write to; rollouts/NAME where left out."""
 

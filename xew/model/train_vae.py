@@ -95,9 +95,9 @@ class VaeExperiment:
     vae: str = "small"
     """One of VAES."""
     split: str = "fixed"
-    """One of protocol.SPLITS: which robots train."""
+    """Split, one of protocol.SPLITS: which robots train."""
     streams: tuple[str, ...] = ("rgb", "rgb", "robot_render", "optical_flow")
-    """What is learned from: the scene and conditions that are pictures; one named twice comes twice as often."""
+    """Streams that are learned from: the scene and conditions that are pictures; one named twice comes twice as often."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Of the activations."""
     cache: Path | None = None

@@ -23,6 +23,13 @@ from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study import Report
 from xew.analysis.reports.study_charts import distance_chart
 from xew.analysis.statistics.grades import PaperGrades
+from xew.analysis.statistics.recompute import (
+    RecomputedChange,
+    RecomputedFigure,
+    rebuild,
+    recompute_changes,
+    recompute_mean_distances,
+)
 from xew.analysis.tables import formats
 from xew.analysis.tables.distances import Distances, distance_tables, format_signed, printed_distances
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask, findings_frame
@@ -40,13 +47,6 @@ from xew.analysis.tables.paper import (
     frame_results,
     frame_table,
     robot_table,
-)
-from xew.analysis.tables.recompute import (
-    RecomputedChange,
-    RecomputedFigure,
-    rebuild,
-    recompute_changes,
-    recompute_mean_distances,
 )
 from xew.analysis.tables.table import Table
 from xew.protocol import ROBOT_NAMES

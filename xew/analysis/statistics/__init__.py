@@ -1,3 +1,6 @@
-"""Means, intervals and verdicts of score tables."""
+"""Score tables to means, intervals and verdicts, by robot and by a study's variants.
 
-__all__ = ["grades", "summary"]
+Draws, levels, floors and verdicts are those of `xew.statistics`, as everywhere.
+"""
+
+__all__ = ["grades", "recompute", "summary"]

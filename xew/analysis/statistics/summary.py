@@ -31,9 +31,9 @@ class Row:
     model: str
     condition: str
     scores: dict[str, Interval]
-    """By metric."""
+    """Mean and interval of each metric."""
     verdicts: dict[str, str]
-    """By metric, against the frozen first frame, paired by episode: better, worse or unresolved; empty for baselines."""
+    """Verdict on each metric against the frozen first frame, paired by episode: better, worse or unresolved; empty for baselines."""
 
     @property
     def title(self) -> str:

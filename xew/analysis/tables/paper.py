@@ -11,12 +11,12 @@ from xew.analysis.distances.matrices import mean_distances
 from xew.analysis.distances.workspaces import Frame, chamfer_floor, measure
 from xew.analysis.paper import AXES, PAPER_TITLES, Paper, PublishedChange
 from xew.analysis.statistics.grades import PaperGrades
+from xew.analysis.statistics.recompute import RecomputedChange, RecomputedFigure
 from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import format_signed
 from xew.analysis.tables.findings import Finding
 from xew.analysis.tables.labels import ACTIONS, LADDER, SYSTEMS
-from xew.analysis.tables.recompute import RecomputedChange, RecomputedFigure
 from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection
 from xew.protocol import ROBOT_NAMES
 from xew.sim_warp.robots import ROBOTS

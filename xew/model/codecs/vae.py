@@ -210,6 +210,7 @@ class Encoder(nnx.Module):
         self.conv_out = layers.causal(widths[-1], 2 * size.channels)
 
     def __call__(self, x: Float[Array, "b t h w i"], history: History) -> Float[Array, "b t2 h2 w2 o"]:
+        """Patches of frames [b t h w 4*3] -> mean and log variance of latents [b t' h' w' 2*c]."""
         x = self.conv_in(x, history)
         for stage in self.stages:
             x = stage(x, history)
@@ -230,6 +231,7 @@ class Decoder(nnx.Module):
         self.conv_out = layers.causal(widths[-1], 3 * size.patch**2)
 
     def __call__(self, x: Float[Array, "b t h w i"], history: History) -> Float[Array, "b t2 h2 w2 o"]:
+        """Latents [b t' h' w' c] -> patches of frames [b t h w 4*3]."""
         x = self.middle(self.conv_in(x, history), history)
         for stage in self.stages:
             x = stage(x, history)
@@ -251,6 +253,7 @@ class DownStage(nnx.Module):
         self.width, self.time, self.side = o, 2 if halve_time else 1, 1 if halve_time is None else 2
 
     def __call__(self, x: Float[Array, "b t h w i"], history: History) -> Float[Array, "b t2 h2 w2 o"]:
+        """Features [b t h w i] -> [b t' h' w' o], of half the sides and perhaps half the frames."""
         shortcut = average_groups(x, self.width, self.time, self.side)
         for block in self.blocks:
             x = block(x, history)
@@ -272,6 +275,7 @@ class UpStage(nnx.Module):
         self.width, self.time = o, 2 if double_time else 1
 
     def __call__(self, x: Float[Array, "b t h w i"], history: History) -> Float[Array, "b t2 h2 w2 o"]:
+        """Features [b t h w i] -> [b t' h' w' o], of double the sides and perhaps double the frames."""
         before = x
         for block in self.blocks:
             x = block(x, history)
@@ -290,4 +294,5 @@ class Middle(nnx.Module):
         self.last = ResidualBlock(width, width, layers)
 
     def __call__(self, x: Float[Array, "b t h w i"], history: History) -> Float[Array, "b t2 h2 w2 o"]:
+        """Features [b t h w c] -> [b t h w c]."""
         return self.last(self.attention(self.first(x, history)), history)

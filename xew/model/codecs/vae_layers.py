@@ -56,6 +56,7 @@ class ResidualBlock(nnx.Module):
         self.shortcut = nnx.data(None if i == o else layers.pointwise(i, o))
 
     def __call__(self, x: Float[Array, "b t h w i"], history: History) -> Float[Array, "b t h w o"]:
+        """Features [b t h w i] -> [b t h w o]."""
         y = self.conv1(nnx.silu(self.norm1(x)), history)
         y = self.conv2(nnx.silu(self.norm2(y)), history)
         return y + (x if self.shortcut is None else self.shortcut(x))
@@ -70,6 +71,7 @@ class FrameAttention(nnx.Module):
         self.proj = layers.pointwise(width, width, zero=True, axes=2)
 
     def __call__(self, x: Float[Array, "b t h w c"]) -> Float[Array, "b t h w c"]:
+        """Features [b t h w c] -> [b t h w c]."""
         b, t, h, w, c = x.shape
         q, k, v = jnp.split(self.to_qkv(self.norm(x)).reshape(b * t, h * w, 1, 3 * c), 3, axis=-1)
         attended = jax.nn.dot_product_attention(q, k, v)
@@ -87,6 +89,7 @@ class Downsample(nnx.Module):
         self.time = nnx.data(Conv((WINDOW, 1, 1, width, width), layers) if halve_time else None)
 
     def __call__(self, x: Float[Array, "b t h w c"], history: History) -> Float[Array, "b t2 h2 w2 c"]:
+        """Features [b t h w c] -> [b t' h/2 w/2 c]."""
         x = apply_to_frames(x, lambda frames: self.conv.apply(frames, stride=2, padding=((0, 1), (0, 1))))
         if self.time is None:
             return x
@@ -107,6 +110,7 @@ class Upsample(nnx.Module):
         self.time = nnx.data(Conv((WINDOW, 1, 1, width, 2 * width), layers) if double_time else None)
 
     def __call__(self, x: Float[Array, "b t h w c"], history: History) -> Float[Array, "b t2 h2 w2 c"]:
+        """Features [b t h w c] -> [b t' 2*h 2*w c]."""
         if self.time is not None:
             x = double_time(x, self.time, history)
         return apply_to_frames(x, lambda frames: double_sides(frames, self.conv))
@@ -133,6 +137,7 @@ class RmsNorm(nnx.Module):
         self.gamma = nnx.Param(jnp.ones(width))
 
     def __call__(self, x: Float[Array, "*n c"]) -> Float[Array, "*n c"]:
+        """Features [... c] -> [... c]."""
         values = x.astype(jnp.float32)
         squares = jnp.sum(jnp.square(values), axis=-1, keepdims=True)
         scale = lax.rsqrt(jnp.maximum(squares, SMALLEST_NORM**2)) * np.float32(x.shape[-1] ** 0.5)

@@ -385,7 +385,7 @@ def linear(features: int, out: int, dtype: DTypeLike, rngs: nnx.Rngs) -> nnx.Lin
 
 
 def scaled_normal(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "..."]:
-    """Random start of modulations as Wan's: normal numbers float32 of `shape`, over the root of the width."""
+    """Random start of modulations as Wan's: normal numbers float32 of `shape` [... d], over the root of the width d."""
     return jax.random.normal(key, shape, jnp.float32) / np.sqrt(shape[-1]).astype(np.float32)
 
 

@@ -40,7 +40,7 @@ class Entry(Protocol):
         """Shape of the tensor."""
 
     def read(self) -> Shaped[np.ndarray, "..."]:
-        """The tensor, of `shape`."""
+        """The tensor [...], of `shape`."""
 
 
 class Tensors(Mapping):
