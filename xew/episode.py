@@ -101,7 +101,7 @@ class Record:
     versions: dict[str, str] = field(default_factory=dict)
     device: str = ""
     source: str = ""
-    """Of an episode that was not simulated here: the format that it was imported from."""
+    """Format that an episode was imported from, if it was not simulated here."""
     unknown: tuple[str, ...] = ()
     """Arrays of `States` of which the source says nothing: their numbers are NaN, their truth values False."""
     schema_version: int = SCHEMA_VERSION

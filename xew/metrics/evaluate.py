@@ -58,7 +58,7 @@ class Args:
     metrics: tuple[str, ...] = tuple(METRICS)
     """Names of xew.metrics.METRICS."""
     dimensions: tuple[str, ...] = DIMENSIONS
-    """Of the metrics, those of these dimensions."""
+    """Dimensions whose metrics are graded."""
     masks: str = "default"
     """Who finds the robot in a prediction: a name of xew.metrics.backends.MASKERS, or module:NAME."""
     masks_checkpoint: Path | None = None

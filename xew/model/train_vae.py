@@ -48,7 +48,7 @@ from xew.protocol import SPLITS, Split
 
 CEILING_CLIPS = 16
 SMALLEST_DEVIATION = 1e-3
-"""Of a latent channel, so that one that the autoencoder leaves unused is not blown up."""
+"""Smallest deviation of a latent channel, so that one that the autoencoder leaves unused is not blown up."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class VaeTrainSettings:
     batch: int
     """Clips a step."""
     frames: int = 17
-    """Of a clip, 4 k + 1. Latents further on than any that were trained lose decibels: 5 with clips of 5 frames."""
+    """Number of frames of a clip, 4 k + 1. Latents further on than any that were trained lose decibels: 5 with clips of 5 frames."""
     crop: int = 128
     """Side of the square that is cut out of a frame, at most the frame's."""
     clips_of_a_video: int = 4
@@ -90,7 +90,7 @@ class VaeExperiment:
     """Episodes, made by `python -m xew.sim_warp.generate`."""
     out: Path
     clip: Clip
-    """Of the world model that is to use it: what the statistics and the report are computed on."""
+    """Clip of the world model that is to use it: what the statistics and the report are computed on."""
     train: VaeTrainSettings
     vae: str = "small"
     """One of VAES."""
@@ -99,7 +99,7 @@ class VaeExperiment:
     streams: tuple[str, ...] = ("rgb", "rgb", "robot_render", "optical_flow")
     """Streams that are learned from: the scene and conditions that are pictures; one named twice comes twice as often."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """Of the activations."""
+    """Type of the activations."""
     cache: Path | None = None
     """Pictures that no episode has as a file; beside the data where left out."""
 

@@ -33,7 +33,7 @@ class Row:
     scores: dict[str, Interval]
     """Mean and interval of each metric."""
     verdicts: dict[str, str]
-    """Verdict on each metric against the frozen first frame, paired by episode: better, worse or unresolved; empty for baselines."""
+    """Verdict on each metric against the frozen first frame, paired by episode; empty for baselines."""
 
     @property
     def title(self) -> str:

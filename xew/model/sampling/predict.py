@@ -35,7 +35,7 @@ from xew.model.settings.parts import ClipInputs, Instructions
 from xew.model.settings.settings import RolloutSettings
 
 Streams = dict[str, np.ndarray]
-"""Of one whole episode, by stream: uint8 [t h w 3] or float32 [t n]."""
+"""Inputs of one whole episode by stream: uint8 [t h w 3] or float32 [t n]."""
 
 
 class ChunkInputs(NamedTuple):
@@ -66,7 +66,7 @@ class Prediction(NamedTuple):
     """A prediction that the devices may still be working on."""
 
     chunks: list[Array]
-    """Of frames [b t h w 3] uint8; each begins with the last frame of the one before."""
+    """Chunks of frames [b t h w 3] uint8; each begins with the last frame of the one before."""
     episodes: int
     frame_count: int
 

@@ -46,7 +46,7 @@ class ModelSettings:
     residual: Literal["float32", "bfloat16"] = "float32"
     """Type of the tokens between blocks; their sums are float32 either way."""
     remat: RematName = "none"
-    """Part that the backward pass computes again: nothing, all but attention or matrix products, or everything (blocks.REMAT)."""
+    """Part that the backward pass computes again: none, all but attention or matrix products, or everything (blocks.REMAT)."""
     unroll: int = 1
     """Blocks compiled as one loop body."""
     attention: AttentionName = "auto"
@@ -80,9 +80,9 @@ class TrainSettings:
     ema_decay: float = 0.0
     """0 keeps no average."""
     mu_dtype: Literal["float32", "bfloat16"] = "float32"
-    """Of AdamW's first moment; bfloat16 saves two bytes a parameter."""
+    """Type of AdamW's first moment; bfloat16 saves two bytes a parameter."""
     shift: float = 5.0
-    """Of the noise levels, in training and in sampling."""
+    """Shift of the noise levels, in training and in sampling."""
     history_noise: float = 0.0
     """Standard deviation of what is added to earlier frames' latents in training; Ctrl-World has 0.3."""
     log_every: int = 20
@@ -101,7 +101,7 @@ class AdaptSettings:
     robots: tuple[str, ...] = ()
     """Whose episodes are learned from."""
     episodes: int = 1
-    """Of each task and robot: the first so many accepted training seeds (M in the paper)."""
+    """Number of episodes of each task and robot, those of the first accepted training seeds (M in the paper)."""
     replay: float = 0.0
     """Part of every batch that comes from the run's own training robots; 0 as in the paper."""
     lora_rank: int = 0
@@ -117,7 +117,7 @@ class RolloutSettings:
     steps: int = 50
     """Evaluations of the network a chunk."""
     shift: float | None = None
-    """Of the noise levels; that of training where left out."""
+    """Shift of the noise levels; that of training where left out."""
     guidance: float = 1.0
     """Classifier-free guidance against `negative_prompt`; 1 is none and costs nothing. Wan's own sampling has 5; networks
     trained here have never gone without their instruction."""
