@@ -57,7 +57,7 @@ def mean_over(values: Callable[..., tuple[jax.Array, jax.Array | None]]) -> Merg
         values: of what the metric takes, to the values of its parts [...] and which of them count [...] bool, or None for all.
     """
 
-    def update(state: Mean, *inputs: jax.Array, **options: Any) -> Mean:
+    def update(state: Mean, *inputs: jax.Array | np.ndarray, **options: Any) -> Mean:
         found, counts = values(*inputs, **options)
         return merge_means(state, mean_of(found.reshape(-1), True if counts is None else counts.reshape(-1)))
 
