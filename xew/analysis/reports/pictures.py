@@ -7,7 +7,7 @@ import cv2
 import matplotlib
 import numpy as np
 
-from xew.rollout import resized
+from xew.rollout import resize_video
 
 GAP = 4
 """White pixels between the pictures of a sheet."""
@@ -32,7 +32,7 @@ def as_graded(video: np.ndarray, truth: np.ndarray, frame_zero: str) -> np.ndarr
         truth: the episode's.
         frame_zero: what the score table says; where it is 'absent' the video begins with frame 1.
     """
-    video = resized(video, truth.shape[1:3])
+    video = resize_video(video, truth.shape[1:3])
     if frame_zero == "absent":
         video = np.concatenate([truth[:1], video])
     return video[: len(truth)]

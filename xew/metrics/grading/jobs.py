@@ -13,8 +13,8 @@ from xew.episode import EpisodeError, Record, episode_folder, read_record
 from xew.files import digest_files
 from xew.metrics.grading.scores import Cell
 from xew.metrics.truth import Truth
-from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video, resized
-from xew.threads import in_order
+from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video, resize_video
+from xew.threads import map_in_order
 
 BASELINES: dict[str, Callable[[Truth], np.ndarray]] = {
     "copy_first_frame": lambda truth: np.repeat(truth.rgb[:1], len(truth.rgb), axis=0),
@@ -74,7 +74,9 @@ def plan(
 
     found = _unique(rollouts, problems)
     jobs: dict[Cell, Job] = {}
-    results = tqdm(in_order(try_jobs, found, workers), total=len(found), desc="read", unit="video", disable=None, leave=False)
+    results = tqdm(
+        map_in_order(try_jobs, found, workers), total=len(found), desc="read", unit="video", disable=None, leave=False
+    )
     for result in results:
         if isinstance(result, EpisodeError):
             _tell(problems, str(result))
@@ -172,7 +174,7 @@ def prediction_of(job: Job, truth: Truth, allow: Collection[str] = (), frame_zer
         return BASELINES[job.cell.model](truth)
     video = read_rollout_video(job.rollout, None if "rate" in allow else job.frame_rate)
     if "resize" in allow:
-        video = resized(video, truth.rgb.shape[1:3])
+        video = resize_video(video, truth.rgb.shape[1:3])
     if frame_zero == "absent" and video.shape[1:] == truth.rgb.shape[1:]:
         video = np.concatenate([truth.rgb[:1], video])
     if "trim" in allow:
