@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from xew.threads import in_order
+from xew.threads import map_in_order
 
 
 def test_results_come_in_order_and_not_too_far_ahead() -> None:
@@ -17,7 +17,7 @@ def test_results_come_in_order_and_not_too_far_ahead() -> None:
         time.sleep(0.02 if number == 0 else 0)
         return 10 * number
 
-    results = in_order(slow_at_first, range(100))
+    results = map_in_order(slow_at_first, range(100))
     assert next(results) == 0
     assert len(begun) < 100
     assert list(results) == [10 * number for number in range(1, 100)]
@@ -29,7 +29,7 @@ def test_failure_ahead_is_raised_where_it_belongs() -> None:
             raise ValueError("three")
         return number
 
-    results = in_order(fail_at_three, range(9))
+    results = map_in_order(fail_at_three, range(9))
     assert [next(results) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(ValueError, match="three"):
         next(results)
@@ -48,7 +48,7 @@ def test_threads_are_a_few_items_ahead_and_no_more() -> None:
         begun.append(i)
         return i * i
 
-    for i, square in enumerate(in_order(note, items(), workers=3)):
+    for i, square in enumerate(map_in_order(note, items(), workers=3)):
         taken = i + 1
         assert square == i * i
     assert sorted(begun) == list(range(200))
@@ -66,5 +66,5 @@ def test_where_one_fails_nothing_more_is_begun() -> None:
         return i
 
     with pytest.raises(ValueError, match="three"):
-        list(in_order(fails, range(1000), 2, stop))
+        list(map_in_order(fails, range(1000), 2, stop))
     assert len(begun) < 20

@@ -61,7 +61,7 @@ def parse(cls: type[T], content: Any, source: str) -> T:
         return CONVERTER.structure(content, cls)
     except (cattrs.BaseValidationError, ValueError, TypeError) as error:
         reasons = cattrs.transform_error(error, path="", format_exception=_reason)
-        raise ConfigError("\n".join(f"{source}: {_tidy(reason)}" for reason in reasons)) from error
+        raise ConfigError("\n".join(f"{source}: {_put_path_first(reason)}" for reason in reasons)) from error
 
 
 def save(config: Any, path: Path) -> None:
@@ -150,7 +150,7 @@ def _structure_names(value: Any, kind: type) -> tuple[str, ...]:
 
 
 def _reason(error: BaseException, kind: type | None) -> str:
-    """What is wrong, for people: unknown keys with a suggestion, the rest as told."""
+    """Say in words what is wrong: unknown keys with a suggestion, the rest as cattrs says it."""
     if isinstance(error, cattrs.ForbiddenExtraKeysError):
         known = [field.name for field in dataclasses.fields(error.cl)]
         return " ".join(
@@ -163,8 +163,8 @@ def _reason(error: BaseException, kind: type | None) -> str:
     return str(error)
 
 
-def _tidy(reason: str) -> str:
-    """cattrs appends ' @ .path'; put the path first."""
+def _put_path_first(reason: str) -> str:
+    """Put the path, which cattrs appends as " @ .path", first."""
     message, _, path = reason.rpartition(" @ ")
     return f"{path.lstrip('.')}: {message}" if path.strip(".") else message or reason
 

@@ -156,7 +156,7 @@ def write_episode(
             hashes = {}
             if states is not None:
                 hashes["states"] = states_hash(states)
-                np.savez_compressed(temporary / "states.npz", **_packed(states))  # type: ignore[arg-type]
+                np.savez_compressed(temporary / "states.npz", **_pack(states))  # type: ignore[arg-type]
             for name, video in (("rgb", rgb), ("robot", robot)):
                 if video is not None:
                     hashes[name] = array_hash(video)
@@ -171,7 +171,7 @@ def write_episode(
 
 @contextmanager
 def complete_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder to fill, which takes the name `folder` when the block ends well and else is removed."""
+    """Give a temporary folder to fill, which takes the name `folder` when the block ends well and else is removed."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=folder.parent))
     replaced = temporary.with_name(f"{temporary.name}-replaced")
@@ -185,8 +185,8 @@ def complete_folder(folder: Path) -> Iterator[Path]:
             shutil.rmtree(left, ignore_errors=True)
 
 
-def _packed(states: States) -> dict[str, np.ndarray]:
-    """Arrays as stored: the mask with eight pixels a byte."""
+def _pack(states: States) -> dict[str, np.ndarray]:
+    """Bring arrays to the form in which they are stored: the mask with eight pixels a byte."""
     arrays = {f.name: getattr(states, f.name) for f in fields(States)}
     arrays["robot_mask"] = np.packbits(states.robot_mask, axis=-1)
     return arrays

@@ -145,11 +145,11 @@ def read_rollout_video(rollout: Rollout, frame_rate: float | None = None) -> np.
         video = _read_npz(first)
     else:
         video = _read_container(first, frame_rate)
-    return _checked(first, video)
+    return _check_video(first, video)
 
 
-def resized(video: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """Frames [t h w 3] at another height and width, as they are graded where that is allowed: by areas where it is smaller."""
+def resize_video(video: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """Resize frames [t h w 3] uint8 to a height and width, by areas where these are smaller, as rollouts are graded."""
     if video.shape[1:3] == size:
         return video
     method = cv2.INTER_AREA if video.shape[1] > size[0] else cv2.INTER_CUBIC
@@ -189,7 +189,7 @@ def _read_header(path: Path) -> dict[str, Any]:
 
 def _find_video(folder: Path) -> tuple[Path, ...]:
     files = sorted(file for file in folder.rglob("*") if file.suffix in VIDEO_SUFFIXES)
-    images = sorted(folder.rglob("*.png"), key=_by_number)
+    images = sorted(folder.rglob("*.png"), key=_number_key)
     if len(files) == 1 and not images:
         return (files[0],)
     if images and not files:
@@ -200,8 +200,8 @@ def _find_video(folder: Path) -> tuple[Path, ...]:
     )
 
 
-def _by_number(path: Path) -> list[tuple[int, str]]:
-    """So that 2.png comes before 10.png."""
+def _number_key(path: Path) -> list[tuple[int, str]]:
+    """A key for sorting by which 2.png comes before 10.png."""
     parts = re.split(r"([0-9]+)", str(path))
     return [(int(part), "") if part.isdecimal() else (0, part) for part in parts]
 
@@ -307,7 +307,7 @@ def _read_png(path: Path) -> np.ndarray:
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
     if image is None or not content.rstrip(b"\0").endswith(PNG_END):
         raise RolloutError(f"{path} is no readable PNG or is cut off; make this rollout again.")
-    _checked(path, image[None])
+    _check_video(path, image[None])
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
@@ -321,8 +321,8 @@ def _read_npz(path: Path) -> np.ndarray:
     return next(iter(arrays.values()))
 
 
-def _checked(path: Path, video: np.ndarray) -> np.ndarray:
-    """The video. Raises RolloutError with what it is instead where it is not uint8 [t h w 3] with a frame."""
+def _check_video(path: Path, video: np.ndarray) -> np.ndarray:
+    """The video itself. Raises RolloutError with what it is instead where it is not [t h w 3] uint8 with a frame."""
     if video.dtype == np.uint8 and video.ndim == 4 and video.shape[-1] == 3 and video.size:
         return video
     kind = ""

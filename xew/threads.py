@@ -1,4 +1,4 @@
-"""Threads, for all rooms: work done ahead in order, and what only one thread may do at a time."""
+"""Threads, for all rooms: work that is done ahead, in order, and what only one thread may do at a time."""
 
 import os
 import threading
@@ -11,11 +11,11 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 PARSING = threading.RLock()
-"""Held by whatever threads do that parses Python: reading .npy headers, building kernels. Python 3.11 counts the depth of all
+"""Lock for whatever threads do that parses Python: reading .npy headers, building kernels. Python 3.11 counts the depth of all
 parsers in one place (github.com/python/cpython/issues/106905), and two at a time end in a SystemError now and then."""
 
 
-def in_order(
+def map_in_order(
     function: Callable[[Item], Result],
     items: Iterable[Item],
     workers: int | None = None,

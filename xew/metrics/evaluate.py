@@ -38,7 +38,7 @@ from xew.metrics.grading.workers import Bench, make_opener, open_nothing, worker
 from xew.metrics.truth import Truth, read_truth
 from xew.protocol import HELD_OUT_ROBOTS
 from xew.rollout import RolloutError
-from xew.threads import in_order
+from xew.threads import map_in_order
 
 PROTOCOL = 3
 """Version of the grading: it goes up when any score would change, and scores of another version are graded anew."""
@@ -213,7 +213,7 @@ def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: Cell
     stop = threading.Event()
     with tqdm(total=len(jobs), initial=len(jobs) - len(todo), desc="evaluate", unit="video", disable=None) as bar:
         work = functools.partial(_grade_group, args=args, bench=bench, store=store, stop=stop)
-        results = in_order(work, groups, worker_count(args.workers), stop)
+        results = map_in_order(work, groups, worker_count(args.workers), stop)
         for group, problems in zip(groups, results, strict=True):
             errors += problems
             bar.update(len(group))

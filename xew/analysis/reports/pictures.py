@@ -7,7 +7,7 @@ import cv2
 import matplotlib
 import numpy as np
 
-from xew.rollout import resized
+from xew.rollout import resize_video
 
 GAP = 4
 """Width of the gap between the pictures of a sheet [px]."""
@@ -39,7 +39,7 @@ def fit_to_episode(video: np.ndarray, truth: np.ndarray, frame_zero: str) -> np.
     Returns:
         [t h w 3] uint8 with the height and width of `truth`, at most as long.
     """
-    video = resized(video, truth.shape[1:3])
+    video = resize_video(video, truth.shape[1:3])
     if frame_zero == "absent":
         video = np.concatenate([truth[:1], video])
     return video[: len(truth)]

@@ -14,8 +14,8 @@ from xew.files import digest_files
 from xew.metrics.grading.scores import Cell
 from xew.metrics.truth import Truth
 from xew.protocol import COPY_FIRST_FRAME, GROUND_TRUTH
-from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video, resized
-from xew.threads import in_order
+from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video, resize_video
+from xew.threads import map_in_order
 
 BASELINES: dict[str, Callable[[Truth], np.ndarray]] = {
     COPY_FIRST_FRAME: lambda truth: np.repeat(truth.rgb[:1], len(truth.rgb), axis=0),
@@ -75,7 +75,9 @@ def list_jobs(
 
     found = _unique(rollouts, problems)
     jobs: dict[Cell, Job] = {}
-    results = tqdm(in_order(try_jobs, found, workers), total=len(found), desc="read", unit="video", disable=None, leave=False)
+    results = tqdm(
+        map_in_order(try_jobs, found, workers), total=len(found), desc="read", unit="video", disable=None, leave=False
+    )
     for result in results:
         if isinstance(result, EpisodeError):
             _raise_or_note(problems, str(result))
@@ -173,7 +175,7 @@ def read_prediction(job: Job, truth: Truth, allow: Collection[str] = (), frame_z
         return BASELINES[job.cell.model](truth)
     video = read_rollout_video(job.rollout, None if "rate" in allow else job.frame_rate)
     if "resize" in allow:
-        video = resized(video, truth.rgb.shape[1:3])
+        video = resize_video(video, truth.rgb.shape[1:3])
     if frame_zero == "absent" and video.shape[1:] == truth.rgb.shape[1:]:
         video = np.concatenate([truth.rgb[:1], video])
     if "trim" in allow:

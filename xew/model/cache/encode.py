@@ -12,7 +12,7 @@ from xew.model.cache.clips import cut_clip, needed_pixels, read_streams
 from xew.model.cache.store import LatentCache
 from xew.model.codecs.codec import Codec, check_clip_shape, encode_pictures
 from xew.model.video.pixels import PixelSource, stored_pixels
-from xew.threads import in_order
+from xew.threads import map_in_order
 
 
 def encode_episodes(
@@ -35,7 +35,7 @@ def encode_episodes(
         pixels = source(*episode, needed_pixels(inputs.conditions, missing))
         return read_streams(inputs.conditions, inputs.clip, *episode, missing, pixels)
 
-    for (_, record), videos in zip(pending, in_order(load, pending), strict=True):
+    for (_, record), videos in zip(pending, map_in_order(load, pending), strict=True):
         written += _encode_streams(cache, record, videos, batch)
         progress.update()
     progress.close()

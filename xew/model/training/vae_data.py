@@ -25,7 +25,7 @@ from xew.files import replacing
 from xew.model.conditions import optical_flow, ray_map, robot_mask
 from xew.model.episodes.commands import episode_command
 from xew.model.video.frames import to_model_size
-from xew.threads import in_order
+from xew.threads import map_in_order
 
 PASSES = 1_000_000
 """Over the videos: without end, and yet a number that Grain can count with."""
@@ -62,7 +62,7 @@ def video_files(streams: Sequence[str], episodes: Sequence[Episode], cache: Path
         folder, record = episode
         return [(_file(name, folder, record, cache), record.frame_count) for name in streams]
 
-    drawn = tqdm(in_order(draw, episodes), desc="streams", total=len(episodes), unit="episode")
+    drawn = tqdm(map_in_order(draw, episodes), desc="streams", total=len(episodes), unit="episode")
     return [file for files in drawn for file in files]
 
 
