@@ -57,7 +57,7 @@ class VaeTrainSettings:
     batch: int
     """Clips a step."""
     frames: int = 17
-    """Number of frames of a clip, 4 k + 1. Latents further on than any that were trained lose decibels: 5 dB with clips of 5."""
+    """Number of frames of a clip, 4 k + 1. Latents further on than any that were trained lose 5 dB with clips of 5 frames."""
     crop: int = 128
     """Side of the square that is cut out of a frame, at most the frame's."""
     clips_of_a_video: int = 4
