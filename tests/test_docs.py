@@ -21,6 +21,8 @@ import tyro
 
 from tests.synthetic import write_synthetic_data
 from xew.episode import read_video
+from xew.model.experiment import load_experiment
+from xew.model.runs import folder as run_folder
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
@@ -135,6 +137,8 @@ def dry_run(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> str:
     said = io.StringIO()
     with monkeypatch.context() as patch, redirect_stdout(said), redirect_stderr(said), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # the module may have been imported before
+        # The runs that pages name do not exist, and the command reads a run's config before it parses its options.
+        patch.setattr(run_folder, "load_run_config", lambda run: load_experiment(ROOT / "configs" / "fixed.yaml"))
         patch.setattr(argparse.ArgumentParser, "parse_known_args", parse_and_stop)
         patch.setattr(tyro, "cli", cli_and_stop)
         patch.setattr(sys, "argv", list(arguments))

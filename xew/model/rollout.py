@@ -232,7 +232,7 @@ def predict_and_write(predictor: Predictor, pending: Sequence[Item], writer: Rol
         begun.hand_over(writer)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Flags:
     """Options of the command itself."""
 

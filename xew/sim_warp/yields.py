@@ -161,7 +161,7 @@ def page(records: Sequence[Record], args: Args) -> str:
 This page is written by `{COMMAND} --seeds {args.seeds}{first} --page docs/tasks.md`;
 the descriptions are the docstrings of `xew/sim_warp/tasks/`. Lengths are in meters,
 x to the right, y away from the robot, the origin under the table's center; the table's top is at z = 0.74.
-Words in braces stand for what the scene has: things, their kinds and colors.
+Words in braces are replaced by what the scene has: objects, their kinds and their colors.
 
 {tasks}
 
