@@ -236,6 +236,25 @@ def test_two_chunks_from_latents_to_a_run(world: Path, tmp_path: Path) -> None:
 # What is not finite, and memory.
 
 
+@pytest.mark.parametrize(("samples", "batch"), [(1, 1), (5, 1), (1, 2), (5, 2)])
+def test_batches_never_end_however_few_samples_there_are(samples: int, batch: int) -> None:
+    class Numbers:
+        """A source whose samples are their own numbers."""
+
+        fresh = samples
+
+        def __len__(self) -> int:
+            return samples
+
+        def __getitem__(self, index: int) -> Batch:
+            return Batch(np.float32(index), {}, np.int32(0))
+
+    batches = iter(make_dataset(Numbers(), batch, seed=0))  # type: ignore[arg-type]
+    drawn = np.concatenate([next(batches).latents for _ in range(2 * samples)])
+    assert len(drawn) == 2 * samples * batch
+    np.testing.assert_array_equal(np.bincount(drawn.astype(int)), np.full(samples, 2 * batch))
+
+
 def test_a_spoilt_state_is_never_saved(world: Path, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="not finite"):
         train.main([str(world / "config.yaml"), "--out", str(tmp_path / "run"), "--train.learning-rate", "inf"])

@@ -24,11 +24,10 @@ from xew.episode import EpisodeError, Record, episode_folder, write_video
 from xew.files import replacing
 from xew.model.conditions import optical_flow, ray_map, robot_mask
 from xew.model.episodes.commands import episode_command
+from xew.model.training.data import PASSES
 from xew.model.video.frames import to_model_size
 from xew.threads import map_in_order
 
-PASSES = 1_000_000
-"""Over the videos: without end, and yet a number that Grain can count with."""
 STORED = {"rgb": "rgb.mkv", "robot_render": "robot.mkv"}
 """Streams that every episode has as a file."""
 DRAWN = {"optical_flow": optical_flow, "mask": robot_mask, "ray_map": ray_map}
