@@ -12,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
+from jax.sharding import AbstractMesh
 
 from tests import synthetic
 from xew.config import ConfigError, save
 from xew.dataset import read_dataset
 from xew.model import latents, train
-from xew.model.devices.sharding import make_mesh, place_batch
+from xew.model.devices.sharding import AXES, make_mesh, place_batch, place_shapes
 from xew.model.diffusion.flow_matching import sample_losses
 from xew.model.episodes.choice import first_of_each, replay_episodes, sample_episodes, training_episodes
 from xew.model.experiment import Experiment, load_experiment
@@ -285,8 +286,8 @@ def test_log_lines_hold_what_a_run_is_watched_by(world: Path) -> None:
 
 def estimate(experiment: Experiment, devices: int) -> memory.Memory:
     """Memory of each device where the state is cut over all of them."""
-    learning = experiment.learning
-    return estimate_memory(learning, abstract_state(learning)[1], experiment.encoding, devices, devices)
+    learning, mesh = experiment.learning, AbstractMesh((1, devices), AXES)
+    return estimate_memory(learning, place_shapes(abstract_state(learning)[1], mesh), experiment.encoding, mesh)
 
 
 def test_projection_is_that_of_the_arithmetic() -> None:
