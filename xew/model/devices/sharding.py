@@ -120,7 +120,7 @@ def place_shapes(shapes: Any, mesh: Mesh | AbstractMesh) -> Any:
     return _with_places(shapes, state_shardings(shapes, mesh))
 
 
-def place_beside(shapes: Any, like: Any) -> Any:
+def place_like(shapes: Any, like: Any) -> Any:
     """Give a tree of shapes and types their places on the mesh of another tree, or on its device."""
     sharding = jax.tree.leaves(like)[0].sharding
     if isinstance(sharding, NamedSharding) and isinstance(sharding.mesh, Mesh):

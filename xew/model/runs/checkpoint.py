@@ -11,7 +11,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from xew.config import ConfigError
-from xew.model.devices.sharding import place_beside
+from xew.model.devices.sharding import place_like
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs.folder import KeptStep, trace_run
 
@@ -94,7 +94,7 @@ def restore_sum(kept: Sequence[KeptStep], like: Any) -> tuple[Any, int]:
     params, step = _restore_kept(first.run, like, first.step)
     for correction in adapted:
         shapes = jax.eval_shape(functools.partial(init_lora, like, correction.adapt.lora_rank, jax.random.key(0)))
-        learned, step = _restore_kept(correction.run, place_beside(shapes, like), correction.step)
+        learned, step = _restore_kept(correction.run, place_like(shapes, like), correction.step)
         params = jax.jit(apply_lora)(params, learned)
     return params, step
 
