@@ -58,8 +58,14 @@ def parse_command(
     if path is None and not {"-h", "--help"} & set(words):
         raise ConfigError(f"name the {metavar} first, as in `{prog} {metavar}`; --help tells the rest.")
     first = ("path", Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name=metavar.lower(), help=f"The {metavar}.")])
-    whole: Any = dataclasses.make_dataclass("Options", [first], bases=(flags, kind), frozen=True, kw_only=True)
     own = [field.name for field in dataclasses.fields(flags)]  # type: ignore[arg-type]
+    # A flag gives a default to a field of the config that has its name; fields without one may then follow as keywords only.
+    required = [
+        (field.name, field.type)
+        for field in dataclasses.fields(kind)  # type: ignore[arg-type]
+        if field.default is field.default_factory is dataclasses.MISSING and field.name not in own
+    ]
+    whole: Any = dataclasses.make_dataclass("Options", [first, *required], bases=(flags, kind), frozen=True, kw_only=True)
     others = [field.name for field in dataclasses.fields(kind) if field.name not in own]  # type: ignore[arg-type]
     config = None if path is None else read(path)
     default = None

@@ -207,7 +207,7 @@ class RolloutWriter:
 
 
 @dataclass(frozen=True)
-class _Begun:
+class _PendingBatch:
     """A batch on the devices."""
 
     items: list[Item]
@@ -221,15 +221,15 @@ class _Begun:
 def predict_and_write(predictor: Predictor, pending: Sequence[Item], writer: RolloutWriter) -> None:
     """Roll out episodes and write each as long as its header says; reads one batch ahead of the devices."""
     size = max(min(predictor.settings.batch, len(pending)), 1)
-    begun: _Begun | None = None
+    pending_batch: _PendingBatch | None = None
     for items in batches(pending, size):
         longest = max(header["frame_count"] for _, header in items)
-        following = _Begun(items, predictor.begin([episode for episode, _ in items], longest, size))
-        if begun is not None:
-            begun.hand_over(writer)
-        begun = following
-    if begun is not None:
-        begun.hand_over(writer)
+        following = _PendingBatch(items, predictor.begin([episode for episode, _ in items], longest, size))
+        if pending_batch is not None:
+            pending_batch.hand_over(writer)
+        pending_batch = following
+    if pending_batch is not None:
+        pending_batch.hand_over(writer)
 
 
 @dataclass(frozen=True, kw_only=True)

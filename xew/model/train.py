@@ -12,12 +12,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jax.sharding import AbstractMesh
 
 from xew.compilation import keep_compiled_programs
 from xew.config import ConfigError, user_errors
 from xew.dataset import read_dataset
 from xew.model.cache.scales import share_scales
-from xew.model.devices.sharding import check_batch, make_mesh, mesh_shape, place_batch, process_samples, start_processes
+from xew.model.devices.sharding import (
+    AXES,
+    check_batch,
+    make_mesh,
+    mesh_shape,
+    place_batch,
+    place_shapes,
+    process_samples,
+    start_processes,
+)
 from xew.model.episodes.choice import choose_episodes
 from xew.model.experiment import Experiment, parse_experiment
 from xew.model.runs.checkpoint import TrainState
@@ -75,10 +85,10 @@ def print_estimate(experiment: Experiment, devices: int, memory_gb: float | None
     """Print the memory of a run on devices that need not be there, with the arithmetic."""
     if devices < 1:
         raise ConfigError(f"--devices is {devices}; expected at least one.")
-    _, fsdp = mesh_shape(experiment.mesh, devices)
+    mesh = AbstractMesh(mesh_shape(experiment.mesh, devices), AXES)
     check_batch(experiment.train.batch, experiment.train.accumulate, devices)
-    learning = experiment.learning
-    memory = estimate_memory(learning, abstract_state(learning)[1], experiment.encoding, devices, fsdp)
+    shapes = place_shapes(abstract_state(experiment.learning)[1], mesh)
+    memory = estimate_memory(experiment.learning, shapes, experiment.encoding, mesh)
     print(memory.table())
     if memory_gb:
         print(f"{'fits' if memory.total < memory_gb * 1e9 else 'does not fit'} in {memory_gb:g} GB a device")
@@ -102,11 +112,10 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     dataset = make_dataset(source, settings.batch, settings.seed, adapt.replay, own)
     settings = set_steps(settings, source.fresh, adapt.replay)
     rates = learning_rate(settings)
-    learner = make_learner(replace(experiment.learning, settings=settings, optimizer=make_optimizer(settings)), mesh)
-    flops = flops_of_step(learner.learning, encoding.inputs)
-    check_memory(
-        estimate_memory(learner.learning, learner.shapes, encoding, mesh.size, mesh.shape["fsdp"]), ignore=ignore_memory
-    )
+    learning = replace(experiment.learning, settings=settings, optimizer=make_optimizer(settings))
+    learner = make_learner(learning, mesh)
+    flops = flops_of_step(learning, encoding.inputs)
+    check_memory(estimate_memory(learning, learner.shapes, encoding, mesh), ignore=ignore_memory)
 
     begin_run(experiment, source.cache.codec, resume=resume, overwrite=overwrite)
     source.scales = share_scales(out, encoding.inputs.conditions, source.scales)

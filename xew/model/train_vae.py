@@ -55,7 +55,7 @@ SMALLEST_DEVIATION = 1e-3
 class VaeTrainSettings:
     steps: int
     batch: int
-    """Clips a step."""
+    """Number of clips a step."""
     frames: int = 17
     """Number of frames of a clip, 4 k + 1. Latents further on than any that were trained lose 5 dB with clips of 5 frames."""
     crop: int = 128
@@ -74,11 +74,11 @@ class VaeTrainSettings:
     kl: float = 1e-4
     """Weight of the divergence from the unit normal distribution, mean over latent numbers."""
     statistics_clips: int = 128
-    """From which the mean and deviation of the latents are computed at the end."""
+    """Number of clips from which the mean and deviation of the latents are computed at the end."""
     log_every: int = 20
     save_every: int = 500
     sample_every: int = 500
-    """0 draws no samples."""
+    """Number of steps between sample pictures; 0 draws none."""
     keep_checkpoints: int = 1
 
 
@@ -346,7 +346,7 @@ def finish(
     vae.latents_std.set_value(std)
     save_vae(vae, experiment.out / "vae.safetensors")
     codec = WanVaeCodec.from_vae(vae)
-    ceilings = {name: ceiling_of(experiment, codec, chosen) for name, chosen in reported.items()}
+    ceilings = {name: measure_model_clips(experiment, codec, chosen) for name, chosen in reported.items()}
     for name, ceiling in ceilings.items():
         print(f"{name} robots, test seeds: {ceiling}")
         log.scalars(experiment.train.steps, {f"ceiling/{name}/psnr": ceiling.psnr, f"ceiling/{name}/lpips": ceiling.lpips})
@@ -372,7 +372,7 @@ def codec_options(experiment: VaeExperiment) -> str:
     return f"{chosen} --codec.spatial-factor {size.spatial_factor} --codec.channels {size.channels}"
 
 
-def ceiling_of(experiment: VaeExperiment, codec: WanVaeCodec, episodes: Sequence[Episode]) -> Ceiling:
+def measure_model_clips(experiment: VaeExperiment, codec: WanVaeCodec, episodes: Sequence[Episode]) -> Ceiling:
     videos = (read_video(folder / "rgb.mkv") for folder, _ in episodes)
     return measure_ceiling(codec, videos, **asdict(experiment.clip))
 

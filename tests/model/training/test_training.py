@@ -12,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
+from jax.sharding import AbstractMesh
 
 from tests import synthetic
 from xew.config import ConfigError, save
 from xew.dataset import read_dataset
 from xew.model import latents, train
-from xew.model.devices.sharding import make_mesh, place_batch
+from xew.model.devices.sharding import AXES, make_mesh, place_batch, place_shapes
 from xew.model.diffusion.flow_matching import sample_losses
 from xew.model.episodes.choice import first_of_each, replay_episodes, sample_episodes, training_episodes
 from xew.model.experiment import Experiment, load_experiment
@@ -236,6 +237,25 @@ def test_two_chunks_from_latents_to_a_run(world: Path, tmp_path: Path) -> None:
 # What is not finite, and memory.
 
 
+@pytest.mark.parametrize(("samples", "batch"), [(1, 1), (5, 1), (1, 2), (5, 2)])
+def test_batches_never_end_however_few_samples_there_are(samples: int, batch: int) -> None:
+    class Numbers:
+        """A source whose samples are their own numbers."""
+
+        fresh = samples
+
+        def __len__(self) -> int:
+            return samples
+
+        def __getitem__(self, index: int) -> Batch:
+            return Batch(np.float32(index), {}, np.int32(0))
+
+    batches = iter(make_dataset(Numbers(), batch, seed=0))  # type: ignore[arg-type]
+    drawn = np.concatenate([next(batches).latents for _ in range(2 * samples)])
+    assert len(drawn) == 2 * samples * batch
+    np.testing.assert_array_equal(np.bincount(drawn.astype(int)), np.full(samples, 2 * batch))
+
+
 def test_a_spoilt_state_is_never_saved(world: Path, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="not finite"):
         train.main([str(world / "config.yaml"), "--out", str(tmp_path / "run"), "--train.learning-rate", "inf"])
@@ -266,8 +286,8 @@ def test_log_lines_hold_what_a_run_is_watched_by(world: Path) -> None:
 
 def estimate(experiment: Experiment, devices: int) -> memory.Memory:
     """Memory of each device where the state is cut over all of them."""
-    learning = experiment.learning
-    return estimate_memory(learning, abstract_state(learning)[1], experiment.encoding, devices, devices)
+    learning, mesh = experiment.learning, AbstractMesh((1, devices), AXES)
+    return estimate_memory(learning, place_shapes(abstract_state(learning)[1], mesh), experiment.encoding, mesh)
 
 
 def test_projection_is_that_of_the_arithmetic() -> None:

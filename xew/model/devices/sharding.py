@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 from jax import Array
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Int, Shaped
 
 from xew.config import ConfigError
@@ -106,7 +106,7 @@ def parameter_spec(path: Sequence[Any], shape: Sequence[int], fsdp: int) -> Part
     return PartitionSpec(*("fsdp" if axis == chosen else None for axis in range(len(shape))))
 
 
-def state_shardings(state: Any, mesh: Mesh) -> Any:
+def state_shardings(state: Any, mesh: Mesh | AbstractMesh) -> Any:
     """Sharding of each array of a tree (parameters, optimizer), in the same tree; only shapes and names are looked at."""
 
     def place(path: tuple[Any, ...], leaf: Any) -> NamedSharding:
@@ -115,12 +115,12 @@ def state_shardings(state: Any, mesh: Mesh) -> Any:
     return jax.tree_util.tree_map_with_path(place, state)
 
 
-def place_shapes(shapes: Any, mesh: Mesh) -> Any:
+def place_shapes(shapes: Any, mesh: Mesh | AbstractMesh) -> Any:
     """Give a tree of shapes and types their places on the mesh."""
     return _with_places(shapes, state_shardings(shapes, mesh))
 
 
-def place_beside(shapes: Any, like: Any) -> Any:
+def place_like(shapes: Any, like: Any) -> Any:
     """Give a tree of shapes and types their places on the mesh of another tree, or on its device."""
     sharding = jax.tree.leaves(like)[0].sharding
     if isinstance(sharding, NamedSharding) and isinstance(sharding.mesh, Mesh):

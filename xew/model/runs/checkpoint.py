@@ -1,6 +1,7 @@
 """Checkpoints of a run (Orbax): written in the background, read on whatever devices there are."""
 
-import json
+import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,9 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from xew.config import ConfigError
-from xew.files import checkpoint_time
-from xew.model.devices.sharding import place_beside
+from xew.model.devices.sharding import place_like
 from xew.model.network.lora import apply_lora, init_lora
-from xew.model.runs.folder import START, load_run_config
+from xew.model.runs.folder import KeptStep, trace_run
 
 
 @jax.tree_util.register_dataclass
@@ -77,40 +77,26 @@ def restore_params(out: Path, like: Any, step: int | None = None) -> tuple[Any, 
     Raises:
         ConfigError: the run has no such checkpoint, or what it started from has gone.
     """
-    adapt = load_run_config(out).adapt
-    if not adapt.lora_rank:
-        return _restore_kept(out, like, step)
-    assert adapt.start_from is not None
-    shapes = place_beside(jax.eval_shape(lambda: init_lora(like, adapt.lora_rank, jax.random.key(0))), like)
-    base = restore_start(out, adapt.start_from, like)
-    corrections, step = _restore_kept(out, shapes, step)
-    return jax.jit(apply_lora)(base, corrections), step
+    return restore_sum(trace_run(out, step), like)
 
 
-def restore_start(out: Path, run: Path, like: Any) -> Any:
-    """Restore the parameters of another run that an adapted run started from, as noted when it began.
+def restore_sum(kept: Sequence[KeptStep], like: Any) -> tuple[Any, int]:
+    """Restore the parameters of a first checkpoint, add the corrections of those after it, and return the last one's step.
 
     Args:
-        out: the adapted run.
-        run: the run that it started from.
+        kept: the checkpoints, from `trace_run` or `trace_start`.
         like: the network's parameters, or their shapes, types and shardings.
 
     Raises:
-        ConfigError: they have gone or were trained anew since, or the note is lost.
+        ConfigError: a run has no such checkpoint.
     """
-    try:
-        note = json.loads((out / START).read_text())
-    except (OSError, ValueError) as error:
-        raise ConfigError(
-            f"{out} does not tell from which checkpoint of {run} it was adapted ({error}); copy the whole run, or "
-            "adapt again with --overwrite."
-        ) from error
-    if not (run / "config.yaml").exists() or checkpoint_time(run, note["step"]) != note["saved"]:
-        raise ConfigError(
-            f"{out} was adapted from step {note['step']} of {run}, which is not there any more or was trained anew; "
-            "put that run back (a longer train.keep_checkpoints keeps it), or adapt again with --overwrite."
-        )
-    return restore_params(run, like, note["step"])[0]
+    first, *adapted = kept
+    params, step = _restore_kept(first.run, like, first.step)
+    for correction in adapted:
+        shapes = jax.eval_shape(functools.partial(init_lora, like, correction.adapt.lora_rank, jax.random.key(0)))
+        learned, step = _restore_kept(correction.run, place_like(shapes, like), correction.step)
+        params = jax.jit(apply_lora)(params, learned)
+    return params, step
 
 
 def _restore_kept(out: Path, like: Any, step: int | None) -> tuple[Any, int]:

@@ -44,11 +44,11 @@ class RunLog:
 
     def image(self, step: int, name: str, picture: np.ndarray) -> None:
         """Log a picture uint8 [h w 3]."""
-        self._add(step, [Summary.Value(tag=name, image=_encoded([picture], "PNG"))])
+        self._add(step, [Summary.Value(tag=name, image=_encode_image([picture], "PNG"))])
 
     def video(self, step: int, name: str, video: np.ndarray) -> None:
         """Log uint8 [t h w 3] as an animated GIF, which TensorBoard plays among the images."""
-        self._add(step, [Summary.Value(tag=name, image=_encoded(list(video), "GIF"))])
+        self._add(step, [Summary.Value(tag=name, image=_encode_image(list(video), "GIF"))])
 
     def close(self) -> None:
         self.lines.close()
@@ -68,7 +68,7 @@ def _keep_until(path: Path, step: int) -> None:
             temporary.write_text("".join(kept))
 
 
-def _encoded(frames: list[np.ndarray], kind: str) -> Summary.Image:
+def _encode_image(frames: list[np.ndarray], kind: str) -> Summary.Image:
     buffer = io.BytesIO()
     pictures = [Image.fromarray(frame) for frame in frames]
     animation = (

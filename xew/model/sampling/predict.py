@@ -133,7 +133,7 @@ class Predictor:
         return read_streams(self.inputs.conditions, self.inputs.clip, *episode, ("rgb", *conditions))
 
     def _encode_text(self, episodes: Sequence[Episode]) -> tuple[Any, Any]:
-        """The instructions and, where there is guidance, as many negative prompts."""
+        """Encode the instructions and, where there is guidance, as many negative prompts."""
         settings = self.settings
         spoken = [record.instruction for _, record in episodes]
         encoded = self.instructions.encode(spoken)
@@ -144,7 +144,7 @@ class Predictor:
         return text, self._place(np.stack([negative] * len(episodes)))
 
     def _encode_unaligned(self, streams: Sequence[Streams]) -> dict[str, Array]:
-        """Pictures that say the same of every chunk."""
+        """Encode the pictures that say the same of every chunk."""
         return {
             name: encode_pictures(self.codec, self._place(np.stack([stream[name] for stream in streams])))
             for name, condition in self.inputs.conditions.items()
@@ -152,7 +152,7 @@ class Predictor:
         }
 
     def _encode_conditions(self, streams: Sequence[Streams], start: int) -> dict[str, Array]:
-        """What conditions say of the chunk that begins at frame `start`; past the end the last frame stays."""
+        """Encode what conditions say of the chunk that begins at frame `start`; past the end the last frame stays."""
         frames, history = self.inputs.clip.frames, self.inputs.history
         pictures, numbers = {}, {}
         for name, condition in self.inputs.conditions.items():
@@ -165,7 +165,7 @@ class Predictor:
         return pictures | {name: self._place(array) for name, array in scaled.items()}
 
     def _encode_history(self, given: Array, chunks: Sequence[Array], start: int) -> dict[str, Array]:
-        """Earlier frames, each encoded alone: what the model has made itself, for the recorded ones would show the future."""
+        """Encode earlier frames one by one: what the model has made itself, for the recorded ones would show the future."""
         names = [name for name, condition in self.inputs.conditions.items() if condition.make is None]
         if not names:
             return {}
@@ -188,11 +188,11 @@ class Predictor:
 
     @property
     def _devices(self) -> int:
-        """Over how many devices a batch is cut. Of several processes each has it whole, so that each gets all frames."""
+        """Number of devices over which a batch is cut. Of several processes each has it whole, so that each gets all frames."""
         return math.prod(self._mesh.devices.shape) if self._mesh is not None and jax.process_count() == 1 else 1
 
     def _place(self, array: Any) -> Any:
-        """An array [b ...] over the devices."""
+        """Put an array [b ...] on the devices."""
         if self._mesh is None:
             return jnp.asarray(array)
         return jax.device_put(array, batch_sharding(self._mesh) if self._devices > 1 else replicated_sharding(self._mesh))
@@ -200,7 +200,7 @@ class Predictor:
 
 @functools.partial(jax.jit, static_argnums=(0, 4))
 def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInputs, sampling: Sampling) -> Array:
-    """One chunk of every episode of a batch, from its reference on: uint8 [b t h w 3]."""
+    """Predict one chunk of every episode of a batch, from its reference on: uint8 [b t h w 3]."""
     model = nnx.merge(graph, cast_params(graph, params))
     reference = codec.encode_batch(to_signed(inputs.reference))
     keys = jax.random.wrap_key_data(inputs.keys)
@@ -211,7 +211,7 @@ def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInp
 
 
 def guided_velocity(model: WorldModel, inputs: ChunkInputs, guidance: float) -> Callable[[Array, Array], Array]:
-    """The network's velocity as a function of latents and level; with guidance away from the negative prompt's."""
+    """Make the network's velocity as a function of latents and noise level; with guidance away from the negative prompt's."""
     wanted = _make_velocity(model, inputs.conditions, inputs.text)
     if inputs.negative is None:
         return wanted

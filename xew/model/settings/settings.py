@@ -17,9 +17,9 @@ class Clip:
     """What the model sees at once."""
 
     frames: int
-    """4 k + 1; the first is given, the others are predicted."""
+    """Number of frames, 4 k + 1; the first is given, the others are predicted."""
     height: int
-    """Pixels; the camera's 320x240 is padded to this aspect ratio, then resized."""
+    """Height [pixels]; the camera's 320x240 is padded to this aspect ratio, then resized."""
     width: int
 
 
@@ -40,7 +40,7 @@ class ModelSettings:
     text_tokenizer: Path | None = None
     """umt5: the folder google/umt5-xxl, or the tokenizer folder of the diffusers layout."""
     text_prefix: str = ""
-    """Put before every instruction, as FlowWAM's published weights expect it."""
+    """Text put before every instruction, as FlowWAM's published weights expect it."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the matrix products."""
     residual: Literal["float32", "bfloat16"] = "float32"
@@ -48,9 +48,9 @@ class ModelSettings:
     remat: RematName = "none"
     """Part that the backward pass computes again: none, all but attention or matrix products, or everything (blocks.REMAT)."""
     unroll: int = 1
-    """Blocks compiled as one loop body."""
+    """Number of blocks compiled as one loop body."""
     attention: AttentionName = "auto"
-    """cuDNN's where it can be used, else XLA's (blocks.choose_attention)."""
+    """Attention: cuDNN's where it can be used, else XLA's (blocks.choose_attention)."""
     visibility: Visibility = "joint"
     """one_way: condition tokens see condition tokens only, and are computed once a clip when sampling. A departure."""
     time: TimeEmbedding = "exact"
@@ -78,7 +78,7 @@ class TrainSettings:
     weight_decay: float = 0.01
     clip_norm: float = 1.0
     ema_decay: float = 0.0
-    """0 keeps no average."""
+    """Decay of the moving average of the parameters; 0 keeps none."""
     mu_dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of AdamW's first moment; bfloat16 saves two bytes a parameter."""
     shift: float = 5.0
@@ -88,7 +88,7 @@ class TrainSettings:
     log_every: int = 20
     save_every: int = 1000
     sample_every: int = 1000
-    """0 draws no samples."""
+    """Number of steps between sample videos; 0 draws none."""
     keep_checkpoints: int = 2
 
 
@@ -99,13 +99,13 @@ class AdaptSettings:
     start_from: Path | None = None
     """The run whose weights, at its latest checkpoint, are the start."""
     robots: tuple[str, ...] = ()
-    """Whose episodes are learned from."""
+    """Robots whose episodes are learned from."""
     episodes: int = 1
     """Number of episodes of each task and robot, those of the first accepted training seeds (M in the paper)."""
     replay: float = 0.0
     """Part of every batch that comes from the run's own training robots; 0 as in the paper."""
     lora_rank: int = 0
-    """Learn corrections of this rank to the blocks' matrices instead of all weights; 0 as in the paper."""
+    """Rank of the LoRA corrections that are learned instead of all weights; 0, as in the paper, learns all weights."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class RolloutSettings:
     grid: str = "flowwam"
     """Noise schedule: one of SCHEDULES, each by the name of the project that has it."""
     steps: int = 50
-    """Evaluations of the network a chunk."""
+    """Number of evaluations of the network a chunk."""
     shift: float | None = None
     """Shift of the noise levels; that of training where left out."""
     guidance: float = 1.0
@@ -123,9 +123,9 @@ class RolloutSettings:
     trained here have never gone without their instruction."""
     negative_prompt: str = ""
     batch: int = 4
-    """Episodes at once over all devices."""
+    """Number of episodes at once over all devices."""
     max_frames: int = 0
-    """Predict only the first so many frames of an episode; 0 predicts all."""
+    """Number of frames of an episode that are predicted, from its first; 0 predicts all."""
     seed: int = 0
 
 

@@ -23,6 +23,10 @@ from xew.model.settings.settings import count_replayed
 from xew.model.text.instructions import VOCABULARY
 from xew.model.video.frames import TEMPORAL_FACTOR
 
+PASSES = 2**40
+"""Passes over the samples. Training ends before, and Grain, which rounds the length of an endless data set up to one more
+than Python can index, can count them."""
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -141,7 +145,7 @@ def make_dataset(
 
 def _shuffle(samples: range, seed: int, count: int) -> grain.MapDataset:
     """Make batches [count] of sample numbers without end; each pass over the samples has its own order."""
-    return grain.MapDataset.source(samples).seed(seed).shuffle().repeat().batch(count)
+    return grain.MapDataset.source(samples).seed(seed).shuffle().repeat(PASSES).batch(count)
 
 
 def stack(examples: Sequence[Batch]) -> Batch:

@@ -14,11 +14,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import nnx
+from jax.sharding import AbstractMesh, Mesh
 
 from xew.config import ConfigError
 from xew.model.codecs.codec import latent_frames
 from xew.model.codecs.vae import abstract_vae
-from xew.model.devices.sharding import parameter_spec, path_names
 from xew.model.network.dit import ModelSize, RematName
 from xew.model.runs.checkpoint import TrainState
 from xew.model.settings.network import Network
@@ -53,28 +53,31 @@ class Memory:
         return "\n".join([f"each device, {self.layout}:", *lines, total])
 
 
-def estimate_memory(learning: Learning, state: TrainState, encoding: Encoding, devices: int, fsdp: int) -> Memory:
-    """Estimate what each of `devices` devices needs to train with its state cut in `fsdp` shards.
+def estimate_memory(learning: Learning, state: TrainState, encoding: Encoding, mesh: Mesh | AbstractMesh) -> Memory:
+    """Estimate what each device of a mesh needs to train.
 
     Args:
         learning: the network and its optimizer.
-        state: shapes and types of the state (`abstract_state`).
+        state: shapes, types and shardings of the state.
         encoding: what the network is given of a clip, and the codec, which works between two chunks.
+        mesh: the devices, which need not be there.
     """
     settings, network = learning.settings, learning.network
+    devices, fsdp = mesh.size, mesh.shape["fsdp"]
     compute = jnp.dtype(network.settings.dtype).itemsize
     params = state.params if state.base is None else state.base
-    weights = cut_bytes(params, fsdp, 1)  # numbers a device
+    weights = sum(math.prod(leaf.sharding.shard_shape(leaf.shape)) for leaf in jax.tree.leaves(params))  # numbers a device
+    layer = sum(leaf.size for leaf in jax.tree.leaves(params)) / network.size.depth  # numbers of one layer, about
     summed = settings.accumulate > 1 or settings.chunks > 1
     samples = settings.batch / devices / settings.accumulate
     parts = {
-        "parameters": cut_bytes(state.params, fsdp),
-        "parameters kept as they are": cut_bytes(state.base, fsdp),
-        "optimizer": cut_bytes(state.optimizer, fsdp),
-        "moving average": cut_bytes(state.ema, fsdp),
+        "parameters": shard_bytes(state.params),
+        "parameters kept as they are": shard_bytes(state.base),
+        "optimizer": shard_bytes(state.optimizer),
+        "moving average": shard_bytes(state.ema),
         f"rounded to {network.settings.dtype}": weights * compute if compute < 4 else 0.0,
         "gradients": weights * compute + (weights * 4 if summed else 0.0),
-        "layers gathered": 2 * compute * cut_bytes(params, 1, 1) / network.size.depth if fsdp > 1 else 0.0,
+        "layers gathered": 2 * compute * layer if fsdp > 1 else 0.0,
         "activations": samples * activation_bytes(network, encoding.inputs),
         "autoencoder": codec_bytes(encoding, samples) if settings.chunks == 2 else 0.0,
     }
@@ -82,14 +85,10 @@ def estimate_memory(learning: Learning, state: TrainState, encoding: Encoding, d
     return Memory(parts, layout)
 
 
-def cut_bytes(tree: Any, fsdp: int, itemsize: int = 0) -> float:
-    """Bytes of a tree on each device (with `itemsize` a number, if given)."""
-
-    def size(path: tuple[Any, ...], leaf: Any) -> float:
-        cut = any(parameter_spec(path_names(path), leaf.shape, fsdp))
-        return math.prod(leaf.shape) * (itemsize or leaf.dtype.itemsize) / (fsdp if cut else 1)
-
-    return float(sum(size(path, leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)))
+def shard_bytes(tree: Any) -> float:
+    """Bytes that each device holds of a tree of shapes with their shardings."""
+    leaves = jax.tree.leaves(tree)
+    return float(sum(math.prod(leaf.sharding.shard_shape(leaf.shape)) * leaf.dtype.itemsize for leaf in leaves))
 
 
 def activation_bytes(network: Network, inputs: ClipInputs) -> float:
@@ -109,7 +108,8 @@ def codec_bytes(encoding: Encoding, samples: float) -> float:
         return 0.0
     frames = TEMPORAL_FACTOR * min(settings.chunk or latent_frames(clip.frames), latent_frames(clip.frames))
     widest = size.decoder_widths[-1] * frames * (clip.height * clip.width // size.patch**2) * jnp.dtype(settings.dtype).itemsize
-    return cut_bytes(nnx.state(abstract_vae(size), nnx.Param), 1) + 4 * samples * widest
+    weights = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(nnx.state(abstract_vae(size), nnx.Param)))
+    return weights + 4 * samples * widest
 
 
 def kept_bytes(size: ModelSize, remat: RematName, compute: int, residual: int) -> float:

@@ -9,7 +9,8 @@ from flax import nnx
 
 from xew.model.network.blocks import choose_attention
 from xew.model.network.dit_layouts import check_dit, load_dit_params
-from xew.model.runs.checkpoint import TrainState, restore_start, restore_state
+from xew.model.runs.checkpoint import TrainState, restore_state, restore_sum
+from xew.model.runs.folder import trace_start
 from xew.model.runs.session import Session
 from xew.model.settings.network import Network
 from xew.model.training.step import Learner
@@ -43,5 +44,5 @@ def start_params(learner: Learner, start_from: Path | None, out: Path) -> Any:
     """Parameters of step 0, placed on the mesh: those of the run to adapt, published weights, or None for random ones."""
     weights = learner.learning.network.settings.weights
     if start_from is not None:
-        return restore_start(out, start_from, learner.network_shapes)
+        return restore_sum(trace_start(out, start_from), learner.network_shapes)[0]
     return None if weights is None else load_dit_params(*learner.random_network(), weights)

@@ -24,15 +24,14 @@ from xew.episode import EpisodeError, Record, episode_folder, write_video
 from xew.files import replacing
 from xew.model.conditions import optical_flow, ray_map, robot_mask
 from xew.model.episodes.commands import episode_command
+from xew.model.training.data import PASSES
 from xew.model.video.frames import to_model_size
 from xew.threads import map_in_order
 
-PASSES = 1_000_000
-"""Over the videos: without end, and yet a number that Grain can count with."""
 STORED = {"rgb": "rgb.mkv", "robot_render": "robot.mkv"}
 """Streams that every episode has as a file."""
 DRAWN = {"optical_flow": optical_flow, "mask": robot_mask, "ray_map": ray_map}
-"""Streams that are drawn from an episode's commands."""
+"""Streams of pictures that are drawn from an episode's commands."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +59,14 @@ def video_files(streams: Sequence[str], episodes: Sequence[Episode], cache: Path
 
     def draw(episode: Episode) -> list[tuple[Path, int]]:
         folder, record = episode
-        return [(_file(name, folder, record, cache), record.frame_count) for name in streams]
+        return [(_find_or_draw(name, folder, record, cache), record.frame_count) for name in streams]
 
     drawn = tqdm(map_in_order(draw, episodes), desc="streams", total=len(episodes), unit="episode")
     return [file for files in drawn for file in files]
 
 
-def _file(name: str, folder: Path, record: Record, cache: Path) -> Path:
-    """Where the pictures of a stream are; they are drawn if there are none yet."""
+def _find_or_draw(name: str, folder: Path, record: Record, cache: Path) -> Path:
+    """The file of a stream's pictures, which are drawn if there are none yet."""
     if name in STORED:
         path = folder / STORED[name]
         if not path.exists():
@@ -85,7 +84,7 @@ def _file(name: str, folder: Path, record: Record, cache: Path) -> Path:
 
 
 def make_dataset(files: Sequence[tuple[Path, int]], cut: Cut, batch: int, seed: int) -> grain.IterDataset:
-    """Endless batches uint8 [b t h w 3], b = batch; the iterator's get_state and set_state carry its position.
+    """Make endless batches uint8 [b t h w 3], b = batch; the iterator's get_state and set_state carry its position.
 
     Raises:
         ConfigError: the clips of a video do not fill the batch evenly, or there is no video.
@@ -103,7 +102,7 @@ def make_dataset(files: Sequence[tuple[Path, int]], cut: Cut, batch: int, seed: 
 
 
 def random_clips(path: Path, frame_count: int, cut: Cut, rng: np.random.Generator) -> np.ndarray:
-    """Clips at random times and places of one video: uint8 [clips frames h w 3]."""
+    """Cut clips at random times and places out of one video: uint8 [clips frames h w 3]."""
     last = max(frame_count - cut.frames, 0)
     starts = rng.integers(0, last + 1, cut.clips)
     times = np.minimum(starts[:, None] + np.arange(cut.frames), frame_count - 1)
@@ -117,7 +116,7 @@ def _crop(video: np.ndarray, crop: tuple[int, int], rng: np.random.Generator) ->
 
 
 def read_frames(path: Path, wanted: set[int]) -> dict[int, np.ndarray]:
-    """Some frames uint8 [h w 3] of a video by number. Raises EpisodeError if it does not hold them."""
+    """Read frames of a video by number, each uint8 [h w 3]. Raises EpisodeError if it does not hold them."""
     frames = {}
     try:
         with av.open(str(path)) as container:
