@@ -195,12 +195,6 @@ def test_without_data_there_are_numbers_and_a_word_on_the_missing_pictures(study
     assert "No pictures" in text and "Franka Panda" in text and not Page(text).images and Page(text).charts
 
 
-def test_a_table_without_the_metric_that_chooses_episodes_says_so(study: Study, tmp_path: Path) -> None:
-    scores = edit(study, tmp_path, lambda rows: rows[rows["metric"] != "lpips"])
-    main(Args(scores, study.data, study.rollouts, out=tmp_path / "report"))
-    assert "has a score of lpips" in (tmp_path / "report" / "index.html").read_text()
-
-
 SPOILERS = {
     "more than once": lambda rows: pd.concat([rows, rows.iloc[:1]]),
     "NaN": lambda rows: rows.assign(value=rows["value"].where(rows.index > 0)),
