@@ -5,6 +5,7 @@ Every check is a function from sources to a list of failures; it is held against
 
 import ast
 import importlib
+import inspect
 import pkgutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -329,9 +330,37 @@ def test_the_registry_of_robots_is_complete() -> None:
 
 
 def test_the_registry_of_metrics_is_complete() -> None:
+    """Metrics of old score tables and of the paper are still there, and no exported one of a family's file was forgotten."""
     metrics = importlib.import_module("xew.metrics")
-    named = {"psnr", "ssim", "lpips", "mask_iou", "boundary_f1", "region_lpips", "pck", "keypoint_error", "ndtw"}
-    assert set(metrics.METRICS) >= named | {"trajectory_error"}, "names that outside code calls"
-    assert {metric.inputs for metric in metrics.METRICS.values()} <= set(importlib.import_module("xew.metrics.metric").INPUTS)
-    for metric in metrics.METRICS.values():
-        assert getattr(metrics, metric.function.__name__) is metric.function
+    kinds = importlib.import_module("xew.metrics.metric")
+    assert set(metrics.METRICS) >= set(importlib.import_module("xew.analysis.scores").EARLIER_TITLES), (
+        "names that score tables hold"
+    )
+    assert set(metrics.METRICS) >= set(importlib.import_module("xew.analysis.paper").read_paper().metrics)
+    registered = {metric.function for metric in metrics.METRICS.values()}
+    registered |= {metric.curve for metric in metrics.METRICS.values()}
+    registered |= set(importlib.import_module("xew.metrics.grade").DIAGNOSTICS.values())
+    for name in metrics.__all__:
+        function = getattr(metrics, name)
+        signature = inspect.signature(function) if callable(function) else None
+        if signature is None or signature.return_annotation not in (kinds.Scalar, kinds.ByFrame):
+            continue
+        compared = [parameter.annotation for parameter in signature.parameters.values()][:2]
+        if compared[0] == compared[1]:
+            assert function in registered, f"{name} compares a prediction with its target, and METRICS does not have it"
+
+
+def test_an_entry_of_the_registry_of_metrics_agrees_with_its_function() -> None:
+    metrics = importlib.import_module("xew.metrics")
+    others: dict[str, list[str]] = {"video": [], "mask": [], "region": ["target_mask"], "track": ["valid"]}
+    assert set(others) == set(importlib.import_module("xew.metrics.metric").INPUTS)
+    for name, metric in metrics.METRICS.items():
+        exported = metric.function.__name__
+        assert getattr(metrics, exported) is metric.function and exported in metrics.__all__, name
+        taken = ["prediction", "target", *others[metric.inputs]]
+        for function in filter(None, (metric.function, metric.curve, metric.parts)):
+            assert list(inspect.signature(function).parameters)[: len(taken)] == taken, name
+        assert (metric.curve is None) == (metric.inputs == "track"), name
+        assert metric.range[0] < metric.range[1] and metric.dimension and metric.reference, name
+    titles = [metric.title or name for name, metric in metrics.METRICS.items()]
+    assert len(set(titles)) == len(titles)

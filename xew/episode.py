@@ -119,7 +119,7 @@ def data_folder(episode: Path) -> Path:
 
 
 def array_hash(*arrays: np.ndarray) -> str:
-    """SHA-256 over dtype, shape and bytes of arrays, in order."""
+    """SHA-256, in hexadecimal, over dtype, shape and bytes of arrays [...] of any dtype, in order."""
     digest = hashlib.sha256()
     for array in arrays:
         digest.update(f"{array.dtype.str}{array.shape}".encode())

@@ -110,6 +110,14 @@ def test_robots_of_ones_own_are_told(tmp_path: Path) -> None:
     assert len(read_scores(written(path, rows, robots=["my_robot"])).rows) == len(rows)
 
 
+def test_robots_with_an_import_path_need_no_word(tmp_path: Path) -> None:
+    rows = graded(robots=("piper", "my_lab.robots:SPEC"))
+    assert set(read_scores(written(tmp_path / "s.parquet", rows)).rows["robot"]) == {"piper", "my_lab.robots:SPEC"}
+    for name in ("my_lab/robots:SPEC", "../robots:SPEC", ":SPEC", "my_lab:", "1a:B"):
+        with pytest.raises(ConfigError, match="the robot is unknown"):
+            read_scores(written(tmp_path / "s.parquet", graded(robots=("piper", name))))
+
+
 def test_a_table_that_does_not_describe_a_metric_is_none_of_ours(tmp_path: Path) -> None:
     without_unit = {name: value for name, value in METRICS["lpips"].items() if name != "unit"}
     with pytest.raises(ConfigError, match="does not say the unit of lpips"):

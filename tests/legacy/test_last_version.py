@@ -93,6 +93,7 @@ def test_scores_become_a_report(old: Path) -> None:
     run_command("xew.analysis.report", "scores.parquet", "--data", "data", "--rollouts", "rollouts", "--out", "report")
     page = (old / "report" / "index.html").read_text()
     assert "tiny · joints+robot_render" in page and "Mask IoU" in page
+    assert "No pictures: no held-out robot has a score of lpips" in page
 
 
 def test_steps_of_a_study_that_are_done_are_known(old: Path) -> None:

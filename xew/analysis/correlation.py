@@ -78,7 +78,10 @@ def dof_correlation(dof: Sequence[float], score: Sequence[float], higher_is_bett
 
 
 def pearson(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Pearson's r over the last axis; other axes broadcast. NaN where one of the two does not vary."""
+    """Pearson's r [...] float64 over the last axis of `x` and `y` [... n]; other axes broadcast.
+
+    NaN where one of the two does not vary.
+    """
     x, y = (values - values.mean(axis=-1, keepdims=True) for values in (x, y))
     with np.errstate(invalid="ignore"):
         return (x * y).sum(axis=-1) / np.sqrt((x**2).sum(axis=-1) * (y**2).sum(axis=-1))

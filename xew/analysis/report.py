@@ -92,11 +92,17 @@ def main(args: Args) -> None:
     if args.paper:
         _report_paper(args)
     elif args.scores:
-        scores = read_scores(args.scores)
+        scores = read_scores(args.scores, _own_robots(args.data))
         (_report_study if scores.of_study else _report_scores)(args, scores)
     else:
         raise ConfigError("no score table was named: give the one that xew.metrics.evaluate wrote, or --paper.")
     print(f"report: {args.out / 'index.html'}")
+
+
+def _own_robots(data: Path | None) -> list[str]:
+    """Keys of the robots of a data set; those that read as paths are left out, since tables and pictures are named by them."""
+    robots = {record.robot for _, record in find_records(data)} if data else set()
+    return sorted(robot for robot in robots if not set(robot) & {"/", "\\"} and robot not in ("", ".", ".."))
 
 
 def _report_paper(args: Args) -> None:
@@ -137,7 +143,7 @@ def _report_scores(args: Args, scores: Scores) -> None:
     sections = [
         *map(page.note, report_study.missing_note(missing)),
         _held_out_section(held_out, scores.metrics),
-        _strip_section(strips),
+        _strip_section(strips, args),
         page.section("How the error grows with time", page.chart(curves)) if curves.panels else None,
         _seen_section(seen, scores.metrics),
         _data_section(sheets, records),
@@ -240,11 +246,12 @@ def _run_cell(row: Row, metric: MetricInfo) -> TableCell:
     )
 
 
-def _strip_section(strips: Sequence[Picture]) -> Markup:
+def _strip_section(strips: Sequence[Picture], args: Args) -> Markup:
     if not strips:
-        return page.section(
-            "What it looks like", page.note("No pictures: name the data and the rollouts (--data, --rollouts).")
-        )
+        missing = "name the data and the rollouts (--data, --rollouts)"
+        if args.data and args.rollouts:
+            missing = f"no held-out robot has a score of {STRIP_METRIC}, by which episodes are chosen; grade it too (--metrics)"
+        return page.section("What it looks like", page.note(f"No pictures: {missing}."))
     text = (
         "Best, median and worst episode of each held-out robot by LPIPS. The difference is the largest of the three "
         f"channels, white for none, black for {pictures.DIFFERENCE_FULL} of 255 levels or more."

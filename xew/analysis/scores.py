@@ -5,6 +5,7 @@ each row (xew.protocol.Variant) and is empty for the two baselines, which belong
 """
 
 import operator
+import re
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -45,6 +46,8 @@ EARLIER_TITLES = {
     "object_coverage": "Objects found",
 }
 """Titles of metrics in score tables that were written before tables carried them."""
+IMPORT_PATH = re.compile(r"[^\W\d]\w*(?:\.[^\W\d]\w*)*:[^\W\d]\w*")
+"""Name of a robot from outside, `module:NAME`."""
 LISTED = 20
 """Largest number of rows of each kind that an error names; it counts the others."""
 
@@ -128,7 +131,8 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
 
     Args:
         path: what `xew.metrics.evaluate` or `write_scores` wrote.
-        own_robots: names of robots that are not the paper's; a table may also name them itself (attribute `robots`).
+        own_robots: names of robots that are not the paper's; a table may also name them itself (attribute `robots`), and
+            robots with an import path `module:NAME` need no further word.
 
     Raises:
         ConfigError: a file is missing or damaged; or cells are duplicate, not finite, of unknown robots, of other metrics
@@ -143,7 +147,8 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
     if rows.empty:
         raise ConfigError(f"{path} holds no row. Grade some rollouts: {command}")
     metrics = _read_metric_infos(path, rows.attrs["metrics"])
-    wrong = _find_wrong_rows(rows, metrics, {*ROBOT_NAMES, *rows.attrs.get("robots", ()), *own_robots})
+    added = {robot for robot in rows["robot"].unique() if IMPORT_PATH.fullmatch(str(robot))}
+    wrong = _find_wrong_rows(rows, metrics, {*ROBOT_NAMES, *added, *rows.attrs.get("robots", ()), *own_robots})
     if wrong:
         raise ConfigError(f"{path} cannot be averaged over:\n{_format_wrong_rows(wrong)}\nGrade anew: {command} --overwrite")
     return Scores(rows, curves, metrics, rows.attrs)

@@ -63,9 +63,9 @@ class Backend(Generic[T_co]):
     open: Callable[..., T_co]
     """Called with its checkpoint, or with nothing where it needs none. Raises ConfigError where something is missing."""
     needs: str | None
-    """What checkpoint to get, from whom, under which license; None: none."""
+    """Checkpoint to get, from whom, under which license; None where the estimator needs none."""
     summary: str
-    """What it is, for the notes under a table."""
+    """Description in a line, for the notes under a table."""
 
 
 def open_masker(name: str, checkpoint: Path | None = None, option: str = "--masks-checkpoint") -> Masker:
@@ -115,6 +115,7 @@ class ReferenceMasker:
         self._learnt: tuple[np.ndarray, np.ndarray, Appearance] | None = None
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:
+        """Masks bool [t h w] of a prediction [t h w 3] uint8, from the true video [t h w 3] uint8 and masks [t h w] bool."""
         if self._learnt is None or self._learnt[0] is not target or self._learnt[1] is not target_mask:
             self._learnt = target, target_mask, learn_appearance(target, target_mask)
         return estimate_masks(prediction, target, target_mask, self._learnt[2])

@@ -65,23 +65,24 @@ class Args:
     episodes: int = 0
     """At most so many, of as many robots and tasks as there are; 0: all."""
     masks: str = "default"
-    """Who finds the robot: a name of xew.metrics.backends.MASKERS, or module:NAME."""
+    """Estimator of robot masks: a name of xew.metrics.backends.MASKERS, or module:NAME."""
     masks_checkpoint: Path | None = None
     """Its weights, where it has some."""
     tracks: str = "default"
-    """Who finds keypoints and objects: a name of xew.metrics.backends.TRACKERS, or module:NAME."""
+    """Estimator of keypoints and objects: a name of xew.metrics.backends.TRACKERS, or module:NAME."""
     tracks_checkpoint: Path | None = None
     """Its weights, where it has some."""
 
 
 @dataclass(frozen=True)
 class Estimators:
-    """Who looks into the videos."""
+    """The estimators that look into the videos."""
 
     masker: Masker
     tracker: Tracker
 
     def grade(self, video: np.ndarray, truth: Truth, names: Sequence[str]) -> Grades:
+        """Scores of a video [t h w 3] uint8, of the shape of the true video, by the metrics of these names."""
         return grade(Comparison(video, truth, self.masker, self.tracker), names)
 
 

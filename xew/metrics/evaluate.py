@@ -60,25 +60,25 @@ class Args:
     dimensions: tuple[str, ...] = DIMENSIONS
     """Dimensions whose metrics are graded."""
     masks: str = "default"
-    """Who finds the robot in a prediction: a name of xew.metrics.backends.MASKERS, or module:NAME."""
+    """Estimator of robot masks in a prediction: a name of xew.metrics.backends.MASKERS, or module:NAME."""
     masks_checkpoint: Path | None = None
     """Its weights, where it has some."""
     tracks: str = "default"
-    """Who finds keypoints and objects in a prediction: a name of xew.metrics.backends.TRACKERS, or module:NAME."""
+    """Estimator of keypoints and objects in a prediction: a name of xew.metrics.backends.TRACKERS, or module:NAME."""
     tracks_checkpoint: Path | None = None
     """Its weights, where it has some."""
     frame_zero: Literal["given", "absent", "predicted"] = "given"
     """given: frame 0 of a video is the frame that the model was given, and is in no score. absent: videos begin with frame 1.
     predicted: frame 0 is scored like the others."""
     allow: tuple[Literal["resize", "trim", "rate"], ...] = ()
-    """What is an error else. resize: videos of another size are brought to the episode's. trim: longer videos are cut.
-    rate: containers may say any frame rate, their frames are the episode's one by one."""
+    """Changes to videos that are errors without it. resize: bring videos of another size to the episode's. trim: cut longer
+    videos. rate: take any frame rate of a container, its frames being the episode's one by one."""
     baselines: bool = True
     """Also grade, as models of their own, the frozen first frame, and the true video itself: the noise floor of the scores."""
     diagnostics: bool = False
     """Also write scores.diagnostics.parquet: contact F1, which is too unreliable in predicted video to be reported."""
     resample: Literal["scene", "task"] = "scene"
-    """What the summary's intervals resample: scenes (what would other scenes of these tasks give?), or whole tasks."""
+    """Unit that the summary's intervals resample: scenes (what would other scenes of these tasks give?), or whole tasks."""
     keep_going: bool = False
     """Grade the rest when a rollout cannot be graded; the exit status still says so."""
     overwrite: bool = False

@@ -31,11 +31,11 @@ class Grades:
     """The scores of one video."""
 
     values: dict[str, float]
-    """By metric; NaN where it is not defined, such as the error of keypoints of which none is ever seen."""
+    """Values by metric; NaN where one is not defined, such as the error of keypoints of which none is ever seen."""
     curves: dict[str, np.ndarray]
-    """By metric, [t] float32 by graded frame, NaN where a frame has no value; none for metrics of whole paths."""
+    """Values by metric and graded frame, [t] float32, NaN where a frame has no value; none for metrics of whole paths."""
     exact_frames: int
-    """How many graded frames equal the truth in every byte (their PSNR is the cap's)."""
+    """Number of graded frames that equal the truth in every byte (their PSNR is the cap's)."""
 
 
 def input_kind(name: str) -> str:
@@ -50,7 +50,7 @@ def input_kind(name: str) -> str:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A prediction, the truth, and who finds robot and points in the prediction (they see all frames)."""
+    """A prediction, the truth, and the estimators that find robot and points in the prediction (they see all frames)."""
 
     prediction: np.ndarray
     """[t h w 3] uint8, of the truth's shape."""
@@ -64,6 +64,7 @@ class Comparison:
 
     @property
     def seen(self) -> np.ndarray:
+        """Video [t h w 3] uint8 that the estimators see."""
         return self.prediction if self.shown is None else self.shown
 
 

@@ -159,7 +159,7 @@ class CappedMean:
 
     @property
     def value(self) -> jax.Array:
-        """float32 [dB], as the mean of `psnr` over all frames of the video."""
+        """Mean of `psnr` over the frames [t] of the video, a float32 scalar [dB]."""
         cap = jnp.where(self.finite.count > 0, self.largest, self.attainable)
         finite = jnp.where(self.finite.count > 0, to_float(self.finite.total), 0)
         return (finite + jnp.where(self.exact > 0, self.exact * cap, 0)) / (self.finite.count + self.exact)

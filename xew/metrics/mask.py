@@ -107,7 +107,7 @@ def _count(packed: jax.Array) -> jax.Array:
 @functools.partial(jax.jit, static_argnames="height")
 def _inner_edges(*masks: jax.Array, height: int) -> list[jax.Array]:
     """Pixels of packed masks with an 8-neighbor outside. Beyond the image there is no outside."""
-    image = np.packbits(np.arange(masks[0].shape[1] * BYTE) < height, bitorder="little")[:, None]
+    image = np.packbits(np.arange(masks[0].shape[1] * BYTE) < height, bitorder="little")[None, :, None]
     return [mask & _grow(~mask & image, SQUARE) for mask in masks]
 
 

@@ -21,9 +21,9 @@ Masks: TypeAlias = Bool[AnyArray, "t h w"]
 Tracks: TypeAlias = Float[AnyArray, "t k 2"]
 """Points in pixels, x right, y down; NaN where a prediction lost one."""
 Valid: TypeAlias = Bool[AnyArray, "t k"]
-"""Which points can be seen in the target."""
+"""Flags of the points that can be seen in the target."""
 Contacts: TypeAlias = Bool[AnyArray, "t c"]
-"""Which pairs of bodies touch."""
+"""Flags of the pairs of bodies that touch."""
 ByFrame: TypeAlias = Float32[jax.Array, " t"]
 """One value for each frame."""
 Scalar: TypeAlias = Float32[jax.Array, ""]

@@ -181,6 +181,7 @@ class StudyGrades:
         return next(bootstrap_means(values.reshape(-1, 1), np.repeat(np.arange(scenes), robots), scenes))
 
     def axis(self, name: str) -> np.ndarray:
+        """Mean distances [5] float64 to the other four robots: the paper's, or the study's own (`own_distances`)."""
         return self._axes[name]
 
     def _scores(self, variant: str, robots: tuple[str, ...], metric: str) -> np.ndarray:
@@ -248,6 +249,7 @@ class PaperGrades:
         return 0.0  # the paper prints none
 
     def axis(self, name: str) -> np.ndarray:
+        """Mean distances [1 + DRAWS 5] float64 to the other four robots: as printed, then at ends of what prints the same."""
         printed = np.array([getattr(self._paper.robots[robot], name) for robot in ROBOT_NAMES])
         # Each axis its own draws: two that moved together would leave out most of what prints the same.
         rng = np.random.default_rng(list(name.encode()))

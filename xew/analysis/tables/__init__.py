@@ -14,6 +14,5 @@ __all__ = [
     "layouts",
     "outside",
     "paper",
-    "recompute",
     "table",
 ]

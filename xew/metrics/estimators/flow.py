@@ -67,6 +67,11 @@ class Raft:
         self._torch = import_torch("RAFT")
 
     def __call__(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Flow [n h w 2] float32 from each pixel of `start` to its place in `end` [pixels, x right, y down].
+
+        Args:
+            start, end: [n h w 3] uint8 RGB.
+        """
         _check_pairs(start, end)
         blocks = [slice(first, first + RAFT_BATCH) for first in range(0, len(start), RAFT_BATCH)]
         flow = [self._block(start[block], end[block]) for block in blocks]

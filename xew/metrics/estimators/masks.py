@@ -128,7 +128,7 @@ def _looks(appearance: Appearance, frame: np.ndarray) -> np.ndarray:
 
 
 Shape = tuple[np.ndarray, np.ndarray]
-"""How well flow explains each pixel, [h w] 0 to 1, and how surely the mask it carries is there, [h w] -1 to 1."""
+"""Weights [h w] from 0 to 1 of how well flow explains each pixel, and a mask carried by it [h w] from -1 (surely not) to 1."""
 
 
 def _choose_better(a: Shape, b: Shape) -> Shape:

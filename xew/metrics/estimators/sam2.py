@@ -56,6 +56,13 @@ class Sam2:
         self._propagate, self._side = propagate, side
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:
+        """Masks [t h w] bool of the robot in a prediction.
+
+        Args:
+            prediction: [t h w 3] uint8, the predicted video.
+            target: [t h w 3] uint8, the true video; not looked at.
+            target_mask: [t h w] bool, the true masks; the largest is the prompt, and the answer of its own frame.
+        """
         if prediction.ndim != 4 or prediction.shape[-1] != 3 or prediction.dtype != np.uint8:
             raise ValueError(f"the video is {prediction.dtype} {prediction.shape}, expected uint8 [t h w 3].")
         if target_mask.shape != prediction.shape[:3] or target_mask.dtype != bool:

@@ -58,6 +58,14 @@ class Tapir:
         self._run = jax.jit(functools.partial(_run, network, dict(options)))
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        """Pixels float32 [t k 2] in the prediction, NaN where a point is lost.
+
+        Args:
+            prediction: [t h w 3] uint8, the predicted video.
+            target: [t h w 3] uint8, the true video; not looked at.
+            points: [t k 2] float32, true projections [pixels, x right, y down, center of the first pixel at 0].
+            visible: [t k] bool, where a true point is seen; a point that is never seen is lost in all frames.
+        """
         check_tracks(prediction, points, visible)
         tracks = lost_tracks(visible.shape)
         frames = query_frames(visible)

@@ -160,7 +160,7 @@ def _raise_or_note(problems: list[str] | None, message: str) -> None:
 
 
 def read_prediction(job: Job, truth: Truth, allow: Collection[str] = (), frame_zero: str = "given") -> np.ndarray:
-    """The video to grade, of the truth's shape.
+    """The video to grade [t h w 3] uint8, of the truth's shape.
 
     Args:
         job: of a rollout or a baseline.
@@ -190,7 +190,10 @@ def read_prediction(job: Job, truth: Truth, allow: Collection[str] = (), frame_z
 
 
 def estimator_view(job: Job, truth: Truth) -> np.ndarray | None:
-    """What estimators see in place of a job's video: the true video softened, whose masks and points are still known."""
+    """The video [t h w 3] uint8 that estimators see in place of a job's own; None where they see the job's.
+
+    For the ground truth it is the true video softened, whose masks and points are still known.
+    """
     if job.rollout is not None or job.cell.model != "ground_truth":
         return None
     return np.stack([cv2.GaussianBlur(frame, (0, 0), SOFTNESS) for frame in truth.rgb])

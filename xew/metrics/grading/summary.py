@@ -34,7 +34,7 @@ class Summary:
     pairs: pd.DataFrame
     """robot metric model condition other other_condition difference low high episodes noise verdict: model minus other."""
     unit: str
-    """What was resampled, a key of UNITS."""
+    """Unit that was resampled, a key of UNITS."""
 
 
 def summarize(rows: pd.DataFrame, unit: str = "scene", robots_first: Sequence[str] = ()) -> Summary:

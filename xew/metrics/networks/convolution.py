@@ -44,12 +44,15 @@ def _(
 
 
 def in_float32(x: jax.Array, kernel: jax.Array, stride: int, padding: int) -> jax.Array:
-    """`convolve` by the device's units for float32."""
+    """`convolve` of x [n h w i] and kernel [k k i o], both float32, by the device's units for float32: [n h' w' o] float32."""
     return _product(x, kernel, stride, padding, lax.Precision.HIGHEST)
 
 
 def in_three_parts(x: jax.Array, kernel: jax.Array, stride: int, padding: int) -> jax.Array:
-    """`convolve` by three products of numbers that TF32 holds."""
+    """`convolve` of x [n h w i] and kernel [k k i o], both float32: [n h' w' o] float32.
+
+    It takes three products of numbers that TF32 holds.
+    """
     if stride > 1:
         x, kernel = _in_blocks(x, kernel, stride, padding)
         stride, padding = 1, 0
