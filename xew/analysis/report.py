@@ -25,6 +25,7 @@ import tyro
 from markupsafe import Markup
 from tqdm import tqdm
 
+import xew
 from xew.analysis.paper import read_paper
 from xew.analysis.reports import page, pictures
 from xew.analysis.reports import paper as paper_report
@@ -351,8 +352,8 @@ def _task_row(data: Path, records: Sequence[Record], robots: Sequence[str]) -> l
 
 
 def _format_footer(graded_with: Mapping[str, str]) -> str:
-    packages = ("xew", "numpy", "scipy", "pandas", "opencv-python-headless")
-    versions = {name: metadata.version(name) for name in packages} | dict(graded_with)
+    packages = ("numpy", "scipy", "pandas", "opencv-python-headless")
+    versions = {"xew": xew.__version__} | {name: metadata.version(name) for name in packages} | dict(graded_with)
     text = " · ".join(f"{name} {version}" for name, version in versions.items())
     return f"{text} · Python {platform.python_version()}"
 

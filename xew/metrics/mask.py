@@ -95,7 +95,8 @@ def _f1_of_pixels(
     precision, recall = _count(matched_p) / jnp.maximum(count_p, 1), _count(matched_t) / jnp.maximum(count_t, 1)
     total = precision + recall
     score = jnp.where(total > 0, 2 * precision * recall / jnp.where(total > 0, total, 1), 0.0)
-    return jnp.where(count_p + count_t > 0, score, _count(different) == 0).astype(jnp.float32)
+    without_edges = (_count(different) == 0).astype(score.dtype)
+    return jnp.where(count_p + count_t > 0, score, without_edges).astype(jnp.float32)
 
 
 def _count(packed: jax.Array) -> jax.Array:
