@@ -82,7 +82,6 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "loose_ranks(reason): arrays of different rank may meet; says whose code needs that")
     folder = Path(os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(config.rootpath / ".pytest_cache" / "jax")))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
-    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # most of the time is compiling, and little is computed
     if not hasattr(config, "workerinput"):
         remove_old_files(folder)
 

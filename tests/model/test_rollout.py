@@ -27,6 +27,8 @@ from xew.model.sampling.predict import ChunkInputs, Predictor, guided_velocity
 from xew.protocol import ROBOT_NAMES
 from xew.rollout import find_rollouts, read_rollout_video
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
 FRAMES = 12
 CONFIG = """
 data: {root}/data

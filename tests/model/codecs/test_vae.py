@@ -10,6 +10,8 @@ from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae
 from xew.model.codecs.vae_chunks import even_chunk
 from xew.model.codecs.vae_layers import double_sides, patchify, unpatchify
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
 CHANNELS = VAES["tiny"].channels
 FOUR_STAGES = VaeSize(4, encoder_dim=8, decoder_dim=8, multipliers=(1, 2, 4, 4), halve_time=(False, True, True), blocks=1)
 
