@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
+import tests.checking
+
 XEW = Path(__file__).parents[1] / "xew"
 CHECKED_ROOMS = ("metrics", "model")
 """Rooms whose annotated modules are checked at run time."""
@@ -73,7 +75,7 @@ def annotated_modules() -> list[str]:
 for pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(pool, "1")  # before NumPy loads: two workers with a pool of threads each only wait for one another
 if CHECK_SHAPES:
-    install_import_hook(annotated_modules(), "beartype.beartype")
+    install_import_hook(annotated_modules(), f"{tests.checking.__name__}.check_annotations")
 
 
 def pytest_configure(config: pytest.Config) -> None:

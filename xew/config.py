@@ -74,8 +74,11 @@ def digest(config: Any) -> str:
     return json.dumps(CONVERTER.unstructure(config), sort_keys=True)
 
 
-def pick(registry: Mapping[str, T], name: str, kind: str) -> T:
+def pick(registry: Mapping[str, T], name: str, kind: str, also: tuple[type, ...] = ()) -> T:
     """The entry of a registry, or for `module:NAME` an object imported from outside.
+
+    Args:
+        also: types that an object from outside may have, beside those of the registry's entries.
 
     Raises:
         ConfigError: neither exists (the nearest name is suggested), or what was imported is of another type.
@@ -89,7 +92,7 @@ def pick(registry: Mapping[str, T], name: str, kind: str) -> T:
         except (ImportError, AttributeError, ValueError) as error:
             raise ConfigError(f"cannot import the {kind} {name!r}: {error}; expected module:NAME.") from error
         expected = tuple({type(entry) for entry in registry.values() if entry is not None})
-        if not isinstance(found, expected):
+        if not isinstance(found, (*expected, *also)):
             names = " or ".join(kind.__name__ for kind in expected)
             raise ConfigError(f"the {kind} {name!r} is a {type(found).__name__}; expected a {names}.")
         return found

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from xew.config import ConfigError
+from xew.files import digest_tree
 from xew.metrics import backends
 from xew.metrics.backends import FLOWS, MASKERS, TRACKERS, Backend, identity, open_flow, open_masker, open_tracker
 from xew.metrics.estimators.masks import estimate_masks
@@ -67,10 +68,10 @@ def test_a_score_table_tells_checkpoints_apart_by_content_and_not_by_place(tmp_p
     assert identity("default") == "default"
     assert identity("sam2", here) == identity("sam2", there)
     assert identity("sam2", here).startswith("sam2 net.pt sha256:")
-    assert backends.checkpoint_digest(tmp_path / "a") == backends.checkpoint_digest(tmp_path / "b")
+    assert digest_tree(tmp_path / "a") == digest_tree(tmp_path / "b")
     there.write_bytes(b"other weights")
     assert identity("sam2", here) != identity("sam2", there)
-    assert backends.checkpoint_digest(tmp_path / "a") != backends.checkpoint_digest(tmp_path / "b")
+    assert digest_tree(tmp_path / "a") != digest_tree(tmp_path / "b")
 
 
 def test_the_default_masker_learns_an_episode_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,7 +93,8 @@ def test_the_default_masker_learns_an_episode_once(monkeypatch: pytest.MonkeyPat
 def test_nobody_needs_pytorch_for_the_defaults() -> None:
     """In a process of its own; the adapters are imported too, which ask for their packages only when they are opened."""
     program = (
-        "import sys; from xew.metrics import backends, cotracker, flow, sam2, tapir; backends.open_masker('default'); "
+        "import sys; from xew.metrics import backends; from xew.metrics.estimators import cotracker, flow, sam2, tapir; "
+        "backends.open_masker('default'); "
         "backends.open_tracker('default'); backends.open_flow('dis'); "
         "print([name for name in ('torch', 'torchvision', 'transformers', 'haiku', 'tapnet') if name in sys.modules])"
     )

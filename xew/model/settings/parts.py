@@ -102,5 +102,5 @@ class Learning:
 
 def pick_conditions(settings: ModelSettings) -> list[Condition]:
     """Look up the conditions of action, embodiment and history. Raises ConfigError for a name that does not exist."""
-    action, embodiment = pick(ACTIONS, settings.action, "action"), pick(CONDITIONS, settings.embodiment, "embodiment")
+    action, embodiment = pick(ACTIONS, settings.action, "action", (tuple,)), pick(CONDITIONS, settings.embodiment, "embodiment")
     return [*list_conditions(action), *list_conditions(embodiment), *([HISTORY] if settings.history else [])]
