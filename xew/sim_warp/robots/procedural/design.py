@@ -1,0 +1,248 @@
+"""What a procedural body is: its arm's joints, its looks and its hand, drawn from the number of the body alone.
+
+A body is one arm that is put up twice. At zero joint positions all link frames are parallel to the base: x ahead, z up, so an
+axis and an offset read the same in every link. Lengths lie within those of real arms (the five robots of this project,
+reaches of .6 to .95 m); colors are those of real arms and beyond.
+"""
+
+import colorsys
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+Vector = tuple[float, float, float]
+X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+
+STYLES = ("tube", "shell", "box", "frame")
+"""Ways to shape a link: a tube with caps, a hull over its housings, a beam, two plates with a gap."""
+FINGERS = ("paddle", "bar", "jaw", "wedge")
+"""Shapes of fingers behind their pads."""
+MOUNTS = ("upright", "tilted", "frame")
+"""Kinds of base: a foot, a foot that leans back, a column that is part of the base."""
+COLORS = {
+    "white": (228, 229, 231),
+    "light": (186, 189, 194),
+    "silver": (146, 150, 157),
+    "slate": (92, 97, 106),
+    "dark": (58, 60, 66),
+    "black": (30, 31, 34),
+}
+"""Colors that most real arms have, sRGB."""
+SPEED = (3.0, 3.0, 3.0, 3.5, 3.5, 3.5, 3.5)
+"""Joint speed limits from the base outwards [rad/s]."""
+
+
+@dataclass(frozen=True)
+class JointDesign:
+    """One revolute joint."""
+
+    origin: Vector
+    """Position in the frame of the link before it [m]."""
+    axis: Vector
+    lower: float
+    """Position limit [rad]."""
+    upper: float
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the links look like."""
+
+    styles: tuple[str, ...]
+    """Style of each link that a joint moves, of STYLES."""
+    body: tuple[int, int, int]
+    """sRGB of the links; every other link has `second`."""
+    second: tuple[int, int, int]
+    housing: tuple[int, int, int]
+    accent: tuple[int, int, int]
+    radii: tuple[float, ...]
+    """Radius of the housing of each joint [m]."""
+    slenderness: float
+    """Half width of a link between its joints, as a share of the housings' radius."""
+    rings: int
+    """Number of accent rings round each long link."""
+    cable: bool
+    """Whether a cable runs along the outside of the long links."""
+
+
+@dataclass(frozen=True)
+class HandDesign:
+    """A parallel gripper whose two fingers slide along y."""
+
+    palm: Vector
+    """Size of the palm along x, y, z [m]."""
+    finger_length: float
+    """From the palm to the fingertip [m]."""
+    stroke: float
+    """Way of each finger from closed to open [m]."""
+    finger: str
+    """Shape, of FINGERS."""
+
+
+@dataclass(frozen=True)
+class BodyDesign:
+    """A procedural robot without a place to stand."""
+
+    number: int
+    family: str
+    """Kind of its arm, of FAMILIES."""
+    joints: tuple[JointDesign, ...]
+    flange: Vector
+    """Position of the hand in the frame of the last link [m]; the hand points along x."""
+    mount: str
+    """Kind of its base, of MOUNTS."""
+    column: float
+    """Height of the base's column [m]; 0 but for the mount `frame`."""
+    look: Look
+    hand: HandDesign
+
+
+def design_body(number: int) -> BodyDesign:
+    """The design of a body; equal numbers give equal designs.
+
+    Args:
+        number: from 0.
+    """
+    rng = np.random.Generator(np.random.Philox(key=[number, 0x626F6479]))
+    family = _choose(rng, tuple(FAMILIES))
+    joints, flange = FAMILIES[family](rng)
+    mount = _choose(rng, MOUNTS)
+    column = _length(rng, 0.18, 0.35) if mount == "frame" else 0.0
+    return BodyDesign(number, family, joints, flange, mount, column, _look(rng, len(joints)), _hand(rng))
+
+
+# --- Arms. Zero positions: upper arm up, forearm and hand ahead.
+
+
+def _roll_wrist(rng: np.random.Generator) -> tuple[tuple[JointDesign, ...], Vector]:
+    """Six joints; the wrist turns about the forearm, bends, and turns again (as PiPER's)."""
+    upper, fore = _length(rng, 0.24, 0.4), _length(rng, 0.22, 0.36)
+    roll = _share(rng, fore, 0.45, 0.75)
+    drop = _length(rng, 0.0, 0.06)
+    joints = (
+        *_shoulder(rng, 0.0, _length(rng, 0.0, 0.04)),
+        JointDesign((0.0, 0.0, upper), Y, -2.9, 2.9),
+        JointDesign((roll, 0.0, drop), X, -2.9, 2.9),
+        JointDesign((_rounded(fore - roll), 0.0, 0.0), Y, -1.9, 1.9),
+        JointDesign((_length(rng, 0.05, 0.1), 0.0, 0.0), X, -2.9, 2.9),
+    )
+    return joints, (_length(rng, 0.02, 0.05), 0.0, 0.0)
+
+
+def _yaw_wrist(rng: np.random.Generator) -> tuple[tuple[JointDesign, ...], Vector]:
+    """Six joints; the wrist bends, swings aside and turns (as ARX X5's)."""
+    upper, fore = _length(rng, 0.24, 0.38), _length(rng, 0.22, 0.34)
+    joints = (
+        *_shoulder(rng, 0.0, _length(rng, 0.0, 0.04)),
+        JointDesign((0.0, 0.0, upper), Y, -2.9, 2.9),
+        JointDesign((fore, 0.0, _length(rng, 0.0, 0.06)), Y, -2.0, 2.0),
+        JointDesign((_length(rng, 0.06, 0.09), 0.0, 0.0), Z, -1.7, 1.7),
+        JointDesign((_length(rng, 0.03, 0.06), 0.0, 0.0), X, -2.9, 2.9),
+    )
+    return joints, (_length(rng, 0.02, 0.05), 0.0, 0.0)
+
+
+def _offset_wrist(rng: np.random.Generator) -> tuple[tuple[JointDesign, ...], Vector]:
+    """Six joints beside one another, as UR5's: three bend in parallel planes, then across, then along the hand."""
+    upper, fore = _length(rng, 0.28, 0.42), _length(rng, 0.26, 0.39)
+    side, back = _length(rng, 0.08, 0.13), _length(rng, 0.06, 0.11)
+    joints = (
+        *_shoulder(rng, side, 0.0),
+        JointDesign((0.0, -back, upper), Y, -2.9, 2.9),
+        JointDesign((fore, 0.0, 0.0), Y, -2.9, 2.9),
+        JointDesign((0.0, _length(rng, 0.07, 0.1), 0.0), Z, -2.9, 2.9),
+        JointDesign((0.0, 0.0, -_length(rng, 0.07, 0.1)), X, -2.9, 2.9),
+    )
+    return joints, (_length(rng, 0.05, 0.08), 0.0, 0.0)
+
+
+def _seven_joints(rng: np.random.Generator) -> tuple[tuple[JointDesign, ...], Vector]:
+    """Seven joints as Franka's: upper arm and forearm turn about themselves, the elbow stands out ahead."""
+    upper, fore = _length(rng, 0.26, 0.34), _length(rng, 0.28, 0.4)
+    elbow, wrist = _length(rng, 0.0, 0.09), _length(rng, 0.0, 0.09)
+    turn, roll = _share(rng, upper, 0.4, 0.7), _share(rng, fore, 0.4, 0.7)
+    joints = (
+        *_shoulder(rng, 0.0, 0.0),
+        JointDesign((0.0, 0.0, turn), Z, -2.8, 2.8),
+        JointDesign((elbow, 0.0, _rounded(upper - turn)), Y, -2.8, 2.8),
+        JointDesign((roll, 0.0, elbow), X, -2.8, 2.8),
+        JointDesign((_rounded(fore - roll), 0.0, 0.0), Y, -2.2, 2.2),
+        JointDesign((_length(rng, 0.05, 0.1), 0.0, -wrist), X, -2.8, 2.8),
+    )
+    return joints, (_length(rng, 0.03, 0.06), 0.0, 0.0)
+
+
+FAMILIES: dict[str, Callable[[np.random.Generator], tuple[tuple[JointDesign, ...], Vector]]] = {
+    "roll_wrist": _roll_wrist,
+    "yaw_wrist": _yaw_wrist,
+    "offset_wrist": _offset_wrist,
+    "seven_joints": _seven_joints,
+}
+
+
+def _shoulder(rng: np.random.Generator, side: float, ahead: float) -> tuple[JointDesign, JointDesign]:
+    """The base's turn and the shoulder, which bends the upper arm forwards."""
+    return (
+        JointDesign((0.0, 0.0, _length(rng, 0.06, 0.16)), Z, -2.9, 2.9),
+        JointDesign((ahead, side, _length(rng, 0.03, 0.08)), Y, -1.9, 2.4),
+    )
+
+
+# --- Looks and hands.
+
+
+def _look(rng: np.random.Generator, joints: int) -> Look:
+    thick = rng.uniform(0.03, 0.056)
+    taper = rng.uniform(0.55, 0.9)
+    radii = tuple(_rounded(thick * (1 - (1 - taper) * index / (joints - 1))) for index in range(joints))
+    style = _choose(rng, STYLES)
+    mixed = rng.random() < 0.4
+    styles = tuple(_choose(rng, STYLES) if mixed else style for _ in range(joints))
+    body = _color(rng)
+    second = body if rng.random() < 0.55 else _color(rng)
+    return Look(
+        styles=styles,
+        body=body,
+        second=second,
+        housing=_color(rng, plain=0.8),
+        accent=_color(rng, plain=0.1),
+        radii=radii,
+        slenderness=_rounded(rng.uniform(0.55, 0.95)),
+        rings=int(rng.integers(0, 4)),
+        cable=bool(rng.random() < 0.3),
+    )
+
+
+def _color(rng: np.random.Generator, plain: float = 0.6) -> tuple[int, int, int]:
+    """A color of real arms with the probability `plain`, else any hue; sRGB."""
+    if rng.random() < plain:
+        return COLORS[_choose(rng, tuple(COLORS))]
+    hue, saturation, value = rng.uniform([0, 0.35, 0.3], [1, 0.95, 0.95])
+    red, green, blue = (round(255 * channel) for channel in colorsys.hsv_to_rgb(hue, saturation, value))
+    return red, green, blue
+
+
+def _hand(rng: np.random.Generator) -> HandDesign:
+    stroke = _length(rng, 0.038, 0.05)
+    width = _rounded(2 * stroke + rng.uniform(0.02, 0.05))
+    palm = (_length(rng, 0.05, 0.09), width, _length(rng, 0.03, 0.06))
+    return HandDesign(palm, _length(rng, 0.06, 0.09), stroke, _choose(rng, FINGERS))
+
+
+def _choose(rng: np.random.Generator, names: tuple[str, ...]) -> str:
+    return names[int(rng.integers(len(names)))]
+
+
+def _length(rng: np.random.Generator, low: float, high: float) -> float:
+    """Length between two bounds, in whole tenths of a millimeter [m]."""
+    return round(float(rng.uniform(low, high)), 4)
+
+
+def _share(rng: np.random.Generator, length: float, low: float, high: float) -> float:
+    """Share of a length, in whole tenths of a millimeter [m]."""
+    return round(length * float(rng.uniform(low, high)), 4)
+
+
+def _rounded(value: float) -> float:
+    return round(float(value), 4)
