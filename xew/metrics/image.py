@@ -162,7 +162,8 @@ class CappedMean:
         """Mean of `psnr` over the frames [t] of the video, a float32 scalar [dB]."""
         cap = jnp.where(self.finite.count > 0, self.largest, self.attainable)
         finite = jnp.where(self.finite.count > 0, to_float(self.finite.total), 0)
-        return (finite + jnp.where(self.exact > 0, self.exact * cap, 0)) / (self.finite.count + self.exact)
+        exact = self.exact.astype(jnp.float32)
+        return (finite + jnp.where(self.exact > 0, exact * cap, 0)) / (self.finite.count.astype(jnp.float32) + exact)
 
 
 def _empty_capped() -> CappedMean:

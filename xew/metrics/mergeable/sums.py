@@ -117,5 +117,6 @@ def to_float(limbs: jax.Array) -> jax.Array:
     magnitude = _carry(jnp.where(negative[..., None], -limbs, limbs))
     with np.errstate(over="ignore"):
         units = np.ldexp(np.float32(1), LOWEST + BITS * np.arange(LIMBS)).astype(np.float32)
-    total = jnp.sum(jnp.where(magnitude > 0, magnitude * units, 0), axis=-1)
+    terms = magnitude.astype(jnp.float32) * jnp.expand_dims(units, range(magnitude.ndim - 1))
+    total = jnp.sum(jnp.where(magnitude > 0, terms, 0), axis=-1)
     return jnp.where(negative, -total, total)
