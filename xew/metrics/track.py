@@ -245,7 +245,7 @@ def _update_objects(state: Mean, prediction: Tracks, target: Tracks, valid: Vali
 
 def _mean_over_objects(state: Mean) -> jax.Array:
     seen = state.count > 0
-    return jnp.sum(jnp.where(seen, state.value, 0)) / jnp.sum(seen)
+    return jnp.sum(jnp.where(seen, state.value, 0)) / jnp.sum(seen, dtype=jnp.float32)
 
 
 TRAJECTORY_STATE = Mergeable(lambda objects: empty_mean((objects,)), _update_objects, merge_means, _mean_over_objects)
