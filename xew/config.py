@@ -12,7 +12,7 @@ import json
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import cattrs
 import tyro
@@ -95,7 +95,7 @@ def pick(registry: Mapping[str, T], name: str, kind: str, also: tuple[type, ...]
         if not isinstance(found, (*expected, *also)):
             names = " or ".join(kind.__name__ for kind in expected)
             raise ConfigError(f"the {kind} {name!r} is a {type(found).__name__}; expected a {names}.")
-        return found
+        return cast(T, found)
     raise ConfigError(f"unknown {kind} {name!r};{suggestion(name, registry)} known: {', '.join(registry)}, or module:NAME.")
 
 
