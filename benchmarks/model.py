@@ -5,7 +5,7 @@
 Random weights of Wan2.2-TI2V-5B's shape, clips of 121 frames at 320x256 (31x8x10 tokens a stream), text of 512 tokens.
 The peer is diffusers in PyTorch: WanTransformer3DModel in bfloat16 with gradient checkpointing, its blocks under torch.compile
 and the faster of PyTorch's attentions (measured first), fused AdamW; it gets as many latent frames as our streams have
-together, so that both work on the same number of tokens with full attention among them. Ours: `make_train_step` as
+together, so that both work on the same number of tokens with full attention among them. Ours: `make_learner` as
 `xew.model.train` uses it, float32 parameters and moments, products in bfloat16. The autoencoder's peer is
 AutoencoderKLWan, as its users run it.
 Every side runs in a process of its own, one after another, on the same machine.
