@@ -32,8 +32,8 @@ from xew.sim_warp.tasks.task import Task
 
 @jax.jit
 def brightness_error(prediction, target):
-    means = [video.astype(jnp.float32).mean(axis=(1, 2, 3)) for video in (prediction, target)]
-    return jnp.abs(means[0] - means[1])
+    difference = prediction.astype(jnp.float32) - target.astype(jnp.float32)
+    return jnp.abs(difference.mean(axis=(1, 2, 3)))
 
 
 def half_way(command: Command) -> np.ndarray:

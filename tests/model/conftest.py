@@ -1,4 +1,4 @@
-"""What the tests of the model room share: the one exception from strict types, and quick compiling."""
+"""What the tests of the model room share: exceptions from strict types for two libraries, and quick compiling."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -9,8 +9,12 @@ import pytest
 
 
 @pytest.fixture(scope="session", autouse=True)
-def optax_may_promote() -> Iterator[None]:
-    """Optax raises float decays to the power of its int32 count of steps (bias correction), which strict types forbid."""
+def libraries_may_promote() -> Iterator[None]:
+    """What strict types forbid but libraries do.
+
+    Optax raises float decays to the power of its int32 count of steps (bias correction); JAX's attention adds up bfloat16
+    products in float32.
+    """
     chain = optax.chain
 
     def loose_chain(*transformations: optax.GradientTransformation) -> optax.GradientTransformation:
@@ -19,6 +23,7 @@ def optax_may_promote() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(optax, "chain", loose_chain)
+        patch.setattr(jax.nn, "dot_product_attention", loosely(jax.nn.dot_product_attention))
         yield
 
 

@@ -17,7 +17,7 @@ from xew.model import latents, rollout, train
 from xew.model.cache.codecs import load_codec
 from xew.model.cache.keys import scales_path
 from xew.model.cache.scales import load_scales
-from xew.model.conditions import ACTIONS
+from xew.model.conditions import ACTIONS, System
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import create_model, load_experiment
 from xew.model.sampling.predict import Predictor
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("quick_compile")
 
 FRAMES = 9
 ROBOTS = ("aloha_agilex", "arx_x5", "piper")
-SYSTEMS = [name for name, entry in ACTIONS.items() if isinstance(entry, tuple)]
+SYSTEMS = [name for name, entry in ACTIONS.items() if isinstance(entry, System) and entry.conditions]
 BASELINES = Path(__file__).parents[2] / "configs" / "baselines"
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}

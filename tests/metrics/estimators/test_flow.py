@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.metrics.estimators.torch_ops import make_torchvision_importable
+from tests.torch_ops import make_torchvision_importable
 from xew.config import ConfigError
 from xew.metrics.backends import open_flow
 from xew.metrics.estimators.flow import dis_flow, open_raft

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.metrics.estimators.torch_ops import make_torchvision_importable
+from tests.torch_ops import make_torchvision_importable
 from tests.synthetic import write_synthetic_data
 from xew.config import ConfigError
 from xew.episode import episode_folder, read_states, read_video

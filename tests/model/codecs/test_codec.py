@@ -70,7 +70,7 @@ def test_a_batch_is_its_clips(codec: PatchCodec) -> None:
     latents = encode_pictures(codec, videos)
     np.testing.assert_allclose(latents, np.stack([codec.encode(video) for video in videos]), atol=1e-5)
     decoded = np.stack([codec.decode(clip) for clip in np.asarray(latents)])
-    assert np.abs(decoded.astype(int) - decode_to_pictures(codec, latents)).max() <= 1
+    assert np.abs(decoded.astype(int) - np.asarray(decode_to_pictures(codec, latents))).max() <= 1
 
 
 def test_the_next_reference_is_what_a_rollout_would_encode(codec: PatchCodec) -> None:

@@ -138,7 +138,7 @@ def test_words_are_rows_of_a_table_that_is_learned(tmp_path: Path) -> None:
 
     model = create_model(asked)
     model.head.head.kernel[...] = jnp.ones_like(model.head.head.kernel[...])
-    latents = jax.random.normal(jax.random.key(0), (1, *asked.latent_shape), jnp.float32)
+    latents = jax.random.normal(jax.random.key(0), (1, *asked.inputs.latent_shape), jnp.float32)
 
     def loss(model: nnx.Module) -> jax.Array:
         return jnp.square(model(latents, {}, jnp.array([0.5], jnp.float32), jnp.asarray(stack)[None])).mean()

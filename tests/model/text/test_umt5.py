@@ -10,6 +10,7 @@ import pytest
 from flax import nnx
 from safetensors.numpy import save_file
 
+from tests.torch_ops import make_torchvision_importable
 from xew.config import ConfigError
 from xew.model.network.dit import parameter_count
 from xew.model.text.umt5 import HF_DUPLICATE, UMT5S, Umt5Encoder, hf_layout, load_umt5, official_layout, relative_buckets
@@ -25,7 +26,8 @@ def random_encoder(seed: int = 0) -> Umt5Encoder:
     encoder = Umt5Encoder(TINY, rngs=nnx.Rngs(seed))
     state = nnx.state(encoder)
     keys = iter(jax.random.split(jax.random.key(seed), 100))
-    nnx.update(encoder, jax.tree.map(lambda leaf: 0.2 * jax.random.normal(next(keys), leaf.shape) + (leaf == 1), state))
+    drawn = jax.tree.map(lambda leaf: 0.2 * jax.random.normal(next(keys), leaf.shape) + jnp.float32(leaf == 1), state)
+    nnx.update(encoder, drawn)
     return encoder
 
 
@@ -45,6 +47,7 @@ def test_names_and_shapes_at_full_size() -> None:
 
 def transformers_output(tensors: Path, ids: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """What transformers' encoder makes of a checkpoint in its names."""
+    make_torchvision_importable()
     torch, transformers = pytest.importorskip("torch"), pytest.importorskip("transformers")
     from safetensors.torch import load_file
 
@@ -78,6 +81,7 @@ def test_parity_with_transformers(length: int, tmp_path: Path) -> None:
 
 
 def test_buckets_of_all_distances_are_those_of_transformers() -> None:
+    make_torchvision_importable()
     torch, umt5 = pytest.importorskip("torch"), pytest.importorskip("transformers.models.umt5.modeling_umt5")
     config = pytest.importorskip("transformers").UMT5Config(d_model=8, d_kv=4, num_heads=2)
     attention = umt5.UMT5Attention(config, has_relative_attention_bias=True)
