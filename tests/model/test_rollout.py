@@ -248,9 +248,9 @@ def test_rollouts_never_take_the_place_of_episodes(world: Path, published: Path,
 
 
 def test_rollouts_are_called_as_their_run() -> None:
-    assert rollout.name_of(Path("runs/rate_0.1")) == "rate_0.1"
-    assert rollout.name_of(Path("configs/fixed.yaml")) == "fixed"
-    assert rollout.name_of(Path(".")) == Path.cwd().name
+    assert rollout.default_name(Path("runs/rate_0.1")) == "rate_0.1"
+    assert rollout.default_name(Path("configs/fixed.yaml")) == "fixed"
+    assert rollout.default_name(Path(".")) == Path.cwd().name
 
 
 def test_a_run_allows_rollout_overrides_only(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

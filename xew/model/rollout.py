@@ -88,8 +88,8 @@ def is_config(run: Path) -> bool:
     return run.suffix in (".yaml", ".yml")
 
 
-def name_of(run: Path) -> str:
-    """What its rollouts are called by default."""
+def default_name(run: Path) -> str:
+    """Name of a run's rollouts where the command line gives none."""
     run = run.resolve()
     return run.stem if is_config(run) else run.name
 
@@ -135,11 +135,11 @@ def rollout_header(experiment: Experiment, step: int | None, saved: int | None, 
         record,
         experiment.rollout.max_frames,
     )
-    made_by = {"checkpoint_step": step, "checkpoint_saved": saved, "config": CONVERTER.unstructure(_without_batch(experiment))}
+    made_by = {"checkpoint_step": step, "checkpoint_saved": saved, "config": CONVERTER.unstructure(_drop_batch(experiment))}
     return header | made_by
 
 
-def _without_batch(experiment: Experiment) -> Experiment:
+def _drop_batch(experiment: Experiment) -> Experiment:
     return replace(experiment, rollout=replace(experiment.rollout, batch=0))
 
 
@@ -159,7 +159,7 @@ def is_done(out: Path, episode: Episode, header: dict[str, Any]) -> bool:
         return False
 
 
-def batches(pending: Sequence[Item], size: int) -> Iterator[list[Item]]:
+def group_by_length(pending: Sequence[Item], size: int) -> Iterator[list[Item]]:
     """Groups of episodes of similar length, so that few chunks are computed for nothing."""
     ordered = sorted(pending, key=lambda item: item[1]["frame_count"])
     for start in range(0, len(ordered), size):
@@ -222,7 +222,7 @@ def predict_and_write(predictor: Predictor, pending: Sequence[Item], writer: Rol
     """Roll out episodes and write each as long as its header says; reads one batch ahead of the devices."""
     size = max(min(predictor.settings.batch, len(pending)), 1)
     pending_batch: _PendingBatch | None = None
-    for items in batches(pending, size):
+    for items in group_by_length(pending, size):
         longest = max(header["frame_count"] for _, header in items)
         following = _PendingBatch(items, predictor.begin([episode for episode, _ in items], longest, size))
         if pending_batch is not None:
@@ -232,7 +232,7 @@ def predict_and_write(predictor: Predictor, pending: Sequence[Item], writer: Rol
         pending_batch.hand_over(writer)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Flags:
     """Options of the command itself."""
 
@@ -261,7 +261,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     run, flags, experiment = parse_rollout(arguments)
     keep_compiled_programs()
     predictor, step = load_predictor(run, experiment, flags.checkpoint)
-    data, out = flags.data or experiment.data, flags.out or Path("rollouts") / name_of(run)
+    data, out = flags.data or experiment.data, flags.out or Path("rollouts") / default_name(run)
     check_out(out, data)
     episodes = select_episodes(data, flags.split, flags.robots or None)
     saved = None if step is None else checkpoint_time(run, step)

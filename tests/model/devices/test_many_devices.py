@@ -22,7 +22,7 @@ from xew.config import ConfigError
 from xew.model import latents
 from xew.model.cache.clips import clip_starts, sample_starts
 from xew.model.devices.sharding import MeshSettings, check_batch, mesh_shape, parameter_spec
-from xew.model.training.data import shown_frames
+from xew.model.training.data import valid_frames
 
 HERE = Path(__file__).parent
 CONFIG = """
@@ -159,7 +159,7 @@ def test_two_chunks_share_a_frame(frame_count: int, samples: tuple[tuple[int, ..
 
 
 @pytest.mark.parametrize(
-    ("left", "shown"), [(1, [1, 0, 0]), (2, [1, 1, 0]), (5, [1, 1, 0]), (6, [1, 1, 1]), (9, [1, 1, 1]), (99, [1, 1, 1])]
+    ("left", "valid"), [(1, [1, 0, 0]), (2, [1, 1, 0]), (5, [1, 1, 0]), (6, [1, 1, 1]), (9, [1, 1, 1]), (99, [1, 1, 1])]
 )
-def test_frames_past_the_end_are_not_shown(left: int, shown: list[int]) -> None:
-    assert shown_frames(left, 9).tolist() == shown
+def test_frames_past_the_end_are_not_valid(left: int, valid: list[int]) -> None:
+    assert valid_frames(left, 9).tolist() == valid

@@ -204,7 +204,7 @@ def test_codec_is_given_the_estimate_of_the_first_chunk(two: Experiment, two_chu
 
 def test_a_missing_second_chunk_counts_for_nothing(two: Experiment, two_chunks: Step, experiment: Experiment) -> None:
     batch = fake_batch(two.inputs, 2)
-    ended = replace(batch, following=replace(batch.following, shown=np.zeros_like(batch.following.shown)))
+    ended = replace(batch, following=replace(batch.following, valid=np.zeros_like(batch.following.valid)))
     state, result = two_chunks(ended)
     np.testing.assert_array_equal(result.weights, [[1, 0], [1, 0]])
     alone, of_alone = first_step(experiment)(replace(batch, following=None))

@@ -39,11 +39,11 @@ class Batch:
     """Arrays by stream or mechanism: [b t' h' w' c] latents or [b t' n] numbers, scaled, float32."""
     text: Any
     """[b l e] float32, or [b l] int32 rows of the network's table of words; zero-padded."""
-    shown: Any = None
+    valid: Any = None
     """[b t] float32 valid mask, 1 where a latent frame shows the episode and 0 past its end; None where all do."""
     following: "Batch | None" = None
     """Next chunk, whose first frame is the last of this one; None where one chunk is trained. A sample whose episode ends
-    before it has a following chunk of which nothing is shown."""
+    before it has a following chunk of which no frame is valid."""
 
 
 class ClipSource:
@@ -98,20 +98,20 @@ class ClipSource:
             return first
         if len(starts) == 2:
             return replace(first, following=self._read_chunk(record, starts[1]))
-        return replace(first, following=replace(first, shown=np.zeros_like(first.shown)))
+        return replace(first, following=replace(first, valid=np.zeros_like(first.valid)))
 
     def _read_chunk(self, record: Record, start: int) -> Batch:
         inputs = self.cache.encoding.inputs
         clip = self.cache.starts(record).index(start)
         arrays = {name: self.cache.read(record, name, clip).astype(np.float32) for name in self.cache.streams}
-        shown = shown_frames(record.frame_count - start, inputs.clip.frames)
+        valid = valid_frames(record.frame_count - start, inputs.clip.frames)
         latents = arrays.pop("rgb")
         conditions = apply_scales(self.scales, inputs.conditions, arrays)
-        return Batch(latents, conditions, self.text[record.instruction], shown)
+        return Batch(latents, conditions, self.text[record.instruction], valid)
 
 
-def shown_frames(left: int, frames: int) -> np.ndarray:
-    """Mask [t] float32 of the latent frames of a clip that show anything of an episode with `left` frames from there on."""
+def valid_frames(left: int, frames: int) -> np.ndarray:
+    """Valid mask [t] float32 of the latent frames of a clip that show anything of an episode with `left` frames from there on."""
     firsts = np.maximum(np.arange(latent_frames(frames)) * TEMPORAL_FACTOR - (TEMPORAL_FACTOR - 1), 0)
     return (firsts < left).astype(np.float32)
 

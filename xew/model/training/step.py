@@ -231,7 +231,7 @@ class Objective:
 
         def loss(params: Any) -> tuple[Array, tuple[Array, Array]]:
             predicted = nnx.merge(self.graph, gather_parameters(params))(pair.noisy, chunk.conditions, pair.sigma, chunk.text)
-            losses = sample_losses(predicted, pair, chunk.shown)
+            losses = sample_losses(predicted, pair, chunk.valid)
             return (shares * losses).sum(), (losses, predicted)
 
         gradients, (losses, predicted) = jax.grad(loss, has_aux=True)(params)
@@ -269,7 +269,7 @@ def chunk_weights(batch: Batch) -> Array:
     """Each chunk's share [b k] in its sample's loss: equal over those that show the episode beyond their first frame."""
     if batch.following is None:
         return jnp.ones((len(batch.latents), 1), jnp.float32)
-    later = batch.following.shown[:, 1:].any(axis=1).astype(jnp.float32)
+    later = batch.following.valid[:, 1:].any(axis=1).astype(jnp.float32)
     valid = jnp.stack([jnp.ones(len(later)), later], axis=1)
     return valid / valid.sum(axis=1, keepdims=True)
 
