@@ -32,14 +32,14 @@ from xew.analysis.reports import paper as paper_report
 from xew.analysis.reports import study as report_study
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study_charts import run_chart
-from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, find_missing_scores, read_scores
+from xew.analysis.scores import TRUTH, MetricInfo, Scores, find_missing_scores, read_scores
 from xew.analysis.statistics.summary import RobotTable, Row, finding, flat_summary, robot_table, robot_title
 from xew.analysis.tables import formats
 from xew.analysis.tables.table import Table, TableCell, TableRow, TableSection, format_interval, format_number, metric_columns
 from xew.config import ConfigError, user_errors
 from xew.dataset import find_records
 from xew.episode import Record, episode_folder, read_video
-from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
+from xew.protocol import BASELINES, HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
 from xew.statistics import MIN_SCENES
 
@@ -217,8 +217,7 @@ def run_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> Table:
     found = " to ".join(map(str, sorted({min(table.counts, default=0), max(table.counts, default=0)})))
     of = f"{found} episodes" if table.expected is None else f"{found} of {table.expected} test episodes"
     rows = [
-        TableRow((row.title,), tuple(_run_cell(row, metric) for metric in shown), row.model in (COPY, TRUTH))
-        for row in table.rows
+        TableRow((row.title,), tuple(_run_cell(row, metric) for metric in shown), row.model in BASELINES) for row in table.rows
     ]
     return Table(
         "_".join(table.robots),
@@ -285,7 +284,7 @@ def _make_strips(scores: Scores, args: Args) -> list[Picture]:
     assert args.data is not None
     rollouts = {(r.model, r.condition, r.task, r.seed, r.robot): r for root in args.rollouts for r in find_rollouts(root)}
     rows = scores.rows[(scores.rows["metric"] == STRIP_METRIC) & scores.rows["robot"].isin(args.held_out)]
-    rows = rows[~rows["model"].isin([COPY, TRUTH])]
+    rows = rows[~rows["model"].isin(BASELINES)]
     chosen = [pair for _, group in rows.groupby(["robot", "model", "condition"]) for pair in _rank_episodes(group)]
     shown = tqdm(chosen, desc="strips", unit="strip", disable=None)
     return [_make_strip(row, word, rollouts, args.data, scores.frame_zero) for word, row in shown]

@@ -16,7 +16,7 @@ import pandas as pd
 
 from xew.config import ConfigError
 from xew.files import replacing
-from xew.protocol import BASELINES, ROBOT_NAMES
+from xew.protocol import BASELINES, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES
 
 VARIANT = "variant"
 EPISODE = ["task", "seed", "robot"]
@@ -24,8 +24,8 @@ KEY = ["model", "condition", *EPISODE]
 NAMES = [VARIANT, "model", "condition", "task", "robot", "metric"]
 """Names of the columns of text."""
 COLUMNS = [*KEY, "metric", "value", "frames", "exact_frames"]
-COPY, TRUTH = BASELINES
-"""Names of both baselines: the frozen first frame, and the true video, which is the ceiling."""
+COPY, TRUTH = COPY_FIRST_FRAME, GROUND_TRUTH
+"""Baselines that others are measured by: the frozen first frame, and the true video, which is the ceiling."""
 COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero")
 """Attributes that say how a table was graded; tables that differ in one cannot be compared."""
 DEFINITION = ("dimension", "unit", "higher_is_better", "low", "high", "reference")
@@ -123,7 +123,7 @@ class Scores:
     def models(self) -> list[tuple[str, str]]:
         """Model and condition of all rows that are no baseline, each pair once, in order."""
         pairs = self.rows[["model", "condition"]].drop_duplicates().itertuples(index=False, name=None)
-        return [pair for pair in pairs if pair[0] not in (COPY, TRUTH)]
+        return [pair for pair in pairs if pair[0] not in BASELINES]
 
 
 def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
@@ -317,7 +317,7 @@ def _drop_known_baselines(rows: pd.DataFrame, graded: set[tuple[object, ...]]) -
     """Rows but those of baselines that are in `graded`, to which the others' are added."""
     columns = [*KEY, "metric", "content" if "content" in rows else "value"]
     identities = list(rows[columns].itertuples(index=False, name=None))
-    is_baseline = rows["model"].isin((COPY, TRUTH))
+    is_baseline = rows["model"].isin(BASELINES)
     new = [not (baseline and identity in graded) for baseline, identity in zip(is_baseline, identities, strict=True)]
     graded |= {identity for baseline, identity in zip(is_baseline, identities, strict=True) if baseline}
     return rows[new]
@@ -325,15 +325,15 @@ def _drop_known_baselines(rows: pd.DataFrame, graded: set[tuple[object, ...]]) -
 
 def _select_curves(curves: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame:
     """The curves of baselines that are in a table's rows, and all others."""
-    is_baseline = curves["model"].isin((COPY, TRUTH))
-    kept = rows.loc[rows["model"].isin((COPY, TRUTH)), [*KEY, "metric"]]
+    is_baseline = curves["model"].isin(BASELINES)
+    kept = rows.loc[rows["model"].isin(BASELINES), [*KEY, "metric"]]
     own = curves[~is_baseline]
     return own if kept.empty else pd.concat([own, curves[is_baseline].merge(kept, on=[*KEY, "metric"])])
 
 
 def _add_variant_column(variant: str, table: pd.DataFrame) -> pd.DataFrame:
     """A table with its variant in front; baselines have none."""
-    own = np.where(table["model"].isin((COPY, TRUTH)), "", variant)
+    own = np.where(table["model"].isin(BASELINES), "", variant)
     named = table.assign(**{VARIANT: own})[[VARIANT, *table.columns]]
     named.attrs = {}  # concat compares them
     return named

@@ -30,8 +30,9 @@ from xew.episode import EpisodeError, verify_episode
 from xew.metrics import METRICS
 from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, identity, open_masker, open_tracker
 from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, grade, input_kind
+from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.bundle import differences, disagreements, raise_if_any, read_bundle, write_bundle
-from xew.metrics.grading.jobs import BASELINES, Job, estimator_view, list_jobs, read_prediction
+from xew.metrics.grading.jobs import Job, estimator_view, list_jobs, read_prediction
 from xew.metrics.grading.scores import CellStore, check_out, describe, path_beside, write_diagnostics, write_tables, write_whole
 from xew.metrics.grading.summary import summarize, to_markdown
 from xew.metrics.grading.workers import Bench, make_opener, open_nothing, worker_count
@@ -74,7 +75,8 @@ class Args:
     """Changes to videos that are errors without it. resize: bring videos of another size to the episode's. trim: cut longer
     videos. rate: take any frame rate of a container, its frames being the episode's one by one."""
     baselines: bool = True
-    """Also grade, as models of their own, the frozen first frame, and the true video itself: the noise floor of the scores."""
+    """Also grade, as models of their own, the frozen first frame, the robot's render pasted into it, another robot's episode,
+    and the true video itself: the noise floor of the scores."""
     diagnostics: bool = False
     """Also write scores.diagnostics.parquet: contact F1, which is too unreliable in predicted video to be reported."""
     resample: Literal["scene", "task"] = "scene"

@@ -55,7 +55,7 @@ class Series:
 
     label: str
     color: str
-    dash: Literal["-", "--", ":", "o"] = "-"
+    dash: Literal["-", "--", "-.", ":", "o"] = "-"
     """Style of the line; 'o' is a hollow mark."""
 
 

@@ -18,12 +18,13 @@ from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import AXIS_TITLES, Distances
 from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, SHORT_ROBOTS
 from xew.analysis.tables.table import metric_title
-from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS
+from xew.protocol import BASELINES, FORGETTING_ROBOT, HELD_OUT_ROBOTS, PASTED_RENDER, ROBOT_NAMES, SHOTS
 from xew.statistics import Mean
 
 BAR_METRICS = ("lpips", "region_lpips", "mask_iou", "pck")
 CURVE_METRIC = "lpips"
-BASELINE_STYLES = {COPY: "frozen first frame", TRUTH: "ground truth"}
+DASHES: Mapping[str, Literal["--", "-.", ":"]] = {COPY: "--", PASTED_RENDER: "-.", TRUTH: ":"}
+"""Line styles of the baselines that charts show."""
 ROBOT_COLORS = dict(zip(HELD_OUT_ROBOTS, SERIES, strict=False))
 
 
@@ -187,12 +188,12 @@ def frame_chart(curves: pd.DataFrame, part: str, labels: Mapping[str, str]) -> C
     names = {find_variant(part, row).name: label for row, label in labels.items()}
     chosen = curves[(curves["metric"] == CURVE_METRIC) & curves["robot"].isin(HELD_OUT_ROBOTS)]
     own = chosen[chosen[VARIANT].isin(names)].assign(row=lambda rows: rows[VARIANT].map(names))
-    still = chosen[chosen["model"] == COPY].assign(row="frozen first frame")
-    grouped = pd.concat([own, still]).groupby(["robot", "row", "frame"], sort=False)["value"]
+    baselines = chosen[chosen["model"].isin([COPY, PASTED_RENDER])].assign(row=lambda rows: rows["model"].map(BASELINES))
+    grouped = pd.concat([own, baselines]).groupby(["robot", "row", "frame"], sort=False)["value"]
     data = pd.DataFrame({"mean": grouped.mean(), "low": grouped.quantile(0.25), "high": grouped.quantile(0.75)}).reset_index()
     colors = charts.color_of(list(names.values()))
     styles = [Series(label, colors[label]) for label in names.values() if label in set(own["row"])]
-    styles += [Series("frozen first frame", SOFT, "--")] if len(still) else []
+    styles += _baseline_styles(data["row"])
 
     def draw(axes: Axes, robot: str) -> None:
         lines = []
@@ -215,13 +216,13 @@ def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Seque
     shown = curves[curves["robot"].isin(robots) & curves["metric"].isin([metric.name for metric in metrics])]
     # The truth's PSNR is a cap, not a measurement, and would squeeze everything else flat.
     shown = shown[~((shown["model"] == TRUTH) & (shown["metric"] == "psnr"))]
+    shown = shown[~shown["model"].isin(set(BASELINES) - set(DASHES))]
     shown = shown.assign(row=[_run_title(*key) for key in zip(shown["model"], shown["condition"], strict=True)])
     grouped = shown.groupby(["metric", "robot", "row", "frame"], sort=False)["value"]
     data = pd.DataFrame({"mean": grouped.mean(), "low": grouped.quantile(0.25), "high": grouped.quantile(0.75)}).reset_index()
-    own = [row for row in dict.fromkeys(shown["row"]) if row not in BASELINE_STYLES.values()]
+    own = [row for row in dict.fromkeys(shown["row"]) if row not in BASELINES.values()]
     styles = [Series(label, color) for label, color in charts.color_of(own).items()]
-    dashes: Mapping[str, Literal["--", ":"]] = {COPY: "--", TRUTH: ":"}
-    styles += [Series(BASELINE_STYLES[m], SOFT, dash) for m, dash in dashes.items() if BASELINE_STYLES[m] in set(data["row"])]
+    styles += _baseline_styles(data["row"])
 
     def draw(axes: Axes, metric: MetricInfo, robot: str) -> None:
         lines = []
@@ -242,8 +243,13 @@ def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Seque
     return Chart("curves", caption, panels, data, styles, columns=len(robots))
 
 
+def _baseline_styles(rows: pd.Series) -> list[Series]:
+    """Styles of the baselines that are among the rows' titles."""
+    return [Series(BASELINES[name], SOFT, dash) for name, dash in DASHES.items() if BASELINES[name] in set(rows)]
+
+
 def _run_title(model: str, condition: str) -> str:
-    return BASELINE_STYLES.get(model) or " · ".join(filter(None, (model, condition)))
+    return BASELINES.get(model) or " · ".join(filter(None, (model, condition)))
 
 
 def _gain(builder: Builder, gain: GainRows, row: str, robot: str, metric: str) -> dict[str, float]:

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores
+from xew.protocol import BASELINES
 from xew.sim_warp.robots import ROBOTS
 from xew.statistics import MIN_SCENES, UNRESOLVED, Mean, Units, bootstrap_means, noise_floor, verdict
 
@@ -37,8 +38,7 @@ class Row:
 
     @property
     def title(self) -> str:
-        baseline = {COPY: "frozen first frame", TRUTH: "ground truth (ceiling)"}.get(self.model)
-        return baseline or (f"{self.model} · {self.condition}" if self.condition else self.model)
+        return BASELINES.get(self.model) or (f"{self.model} · {self.condition}" if self.condition else self.model)
 
 
 @dataclass(frozen=True)
@@ -109,12 +109,12 @@ def _bootstrap(scores: pd.Series, units: Units | None) -> Mean:
 
 
 def robot_table(scores: Scores, title: str, robots: Sequence[str], expected: int | None) -> RobotTable:
-    """Rows for all models, then the frozen first frame, then the truth."""
+    """Rows for all models, then for the baselines."""
     rows = scores.rows[scores.rows["robot"].isin(robots)]
     groups = rows.groupby(["model", "condition"], sort=False)
     by_model = {(str(model), str(condition)): group for (model, condition), group in groups}
-    ends = [key for name in (COPY, TRUTH) for key in by_model if key[0] == name]
-    order = [key for key in by_model if key[0] not in (COPY, TRUTH)] + ends
+    ends = [key for name in BASELINES for key in by_model if key[0] == name]
+    order = [key for key in by_model if key[0] not in BASELINES] + ends
     copy, truth = (next((by_model[key] for key in ends if key[0] == name), None) for name in (COPY, TRUTH))
     units = Units(scores.rows)
     built = tuple(_row(key, by_model[key], copy, truth, scores.metrics, units) for key in order)
@@ -131,7 +131,7 @@ def _row(
 ) -> Row:
     values = {metric.name: _by_episode(group, metric.name) for metric in metrics}
     verdicts = {}
-    if copy is not None and key[0] not in (COPY, TRUTH):
+    if copy is not None and key[0] not in BASELINES:
         for metric in metrics:
             floor = _noise_floor(truth, metric, units)
             still = _by_episode(copy, metric.name)

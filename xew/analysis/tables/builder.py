@@ -6,11 +6,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from xew import statistics
-from xew.analysis.scores import COPY, TRUTH
+from xew.analysis.scores import TRUTH
 from xew.analysis.statistics.grades import Grades, PaperGrades, StudyGrades, find_variant, pooled
-from xew.analysis.tables.labels import PAPER_METRICS, STILL, TRUE
+from xew.analysis.tables.labels import PAPER_METRICS, TRUE
 from xew.analysis.tables.table import TableCell, TableRow, format_interval, format_number
 from xew.protocol import (
+    BASELINES,
     PAPER_PARTS,
     PARTS,
     expected_counts,
@@ -75,9 +76,13 @@ class Builder:
         return TableRow(tuple(labels), tuple(self.cell(part, row, robots, metric, base) for metric in metrics))
 
     def baselines(self, robots: Sequence[str], metrics: Sequence[str]) -> list[TableRow]:
-        """Rows of the frozen first frame and of the true video, where they were graded."""
-        still = [TableRow((STILL,), tuple(self.baseline(COPY, robots, metric) for metric in metrics), baseline=True)]
-        return [*_keep_graded(still), *self.truth((TRUE,), [(robots, metric) for metric in metrics])]
+        """Rows of the baselines, the true video last, where they were graded."""
+        rows = [
+            TableRow((title,), tuple(self.baseline(name, robots, m) for m in metrics), baseline=True)
+            for name, title in BASELINES.items()
+            if name != TRUTH
+        ]
+        return [*_keep_graded(rows), *self.truth((TRUE,), [(robots, metric) for metric in metrics])]
 
     def truth(self, labels: tuple[str, ...], places: Sequence[tuple[Sequence[str], str]]) -> list[TableRow]:
         """A row of the true video, which shows the noise floor; none if it was not graded.
@@ -113,11 +118,11 @@ class Builder:
         return f"{word}. {' '.join(parts)}"
 
     def baseline(self, model: str, robots: Sequence[str], metric: str) -> TableCell:
-        """The mean of COPY or TRUTH on some robots, pooled."""
+        """The mean of a baseline on some robots, pooled."""
         return self.variant_cell(model, tuple(robots), metric)
 
     def variant_cell(self, model: str, robots: tuple[str, ...], metric: str) -> TableCell:
-        """The mean of a variant, or of COPY or TRUTH, on some robots, pooled; without the paper's value."""
+        """The mean of a variant, or of a baseline, on some robots, pooled; without the paper's value."""
         info = self.ours.metrics.get(metric)
         mean = self.ours.variant_mean(model, robots, metric) if isinstance(self.ours, StudyGrades) else None
         if info is None or mean is None:

@@ -47,7 +47,7 @@ SYSTEM_ACTIONS = tuple(
     for variant in PARTS["baselines"]
 )
 """Labels of the actions that each of SYSTEMS gets."""
-STILL, TRUE = "frozen first frame", "true video, graded"
+TRUE = "true video, graded"
 """Labels of the rows of both baselines."""
 REMEDIES = {"replay": "with replay", "lora": "with LoRA"}
 """Label of each remedy against forgetting, by its key."""

@@ -1,3 +1,3 @@
-"""From folders of videos to score tables: jobs, worker threads, tables on disk, summaries, bundles."""
+"""From folders of videos to score tables: jobs, baselines, worker threads, tables on disk, summaries, bundles."""
 
-__all__ = ["bundle", "jobs", "scores", "summary", "workers"]
+__all__ = ["baselines", "bundle", "jobs", "scores", "summary", "workers"]

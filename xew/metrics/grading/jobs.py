@@ -1,6 +1,6 @@
 """What there is to grade: rollouts, the episodes that they predict, and the baselines on these episodes."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,17 +11,13 @@ from tqdm import tqdm
 from xew.config import ConfigError
 from xew.episode import EpisodeError, Record, episode_folder, read_record
 from xew.files import digest_files
+from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.scores import Cell
 from xew.metrics.truth import Truth
-from xew.protocol import COPY_FIRST_FRAME, GROUND_TRUTH
+from xew.protocol import GROUND_TRUTH
 from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video, resize_video
 from xew.threads import map_in_order
 
-BASELINES: dict[str, Callable[[Truth], np.ndarray]] = {
-    COPY_FIRST_FRAME: lambda truth: np.repeat(truth.rgb[:1], len(truth.rgb), axis=0),
-    GROUND_TRUTH: lambda truth: truth.rgb,
-}
-"""Videos that no model made, by name: the frozen first frame, and the ground truth, whose scores tell the noise floors."""
 SOFTNESS = 0.8
 """Standard deviation [pixels] of the blur through which estimators see the true video. Reference-aligned ones hardly err on the
 very video that they compare with; no prediction is ever that, and this is about as soft as a good codec leaves a video."""
@@ -106,7 +102,9 @@ def _jobs(rollout: Rollout, data: Path, settings: str, baselines: Collection[str
     cell = Cell(*key, frames, digest, rgb, states, settings)
     yield Job(cell, rollout, episode, record.frame_rate)
     for name in baselines:
-        yield Job(replace(cell, model=name, condition="", prediction=""), None, episode, record.frame_rate)
+        source = BASELINES[name].source(episode, record)
+        if source is not None:
+            yield Job(replace(cell, model=name, condition="", prediction=source), None, episode, record.frame_rate)
 
 
 def _check_horizons(jobs: Iterable[Job]) -> None:
@@ -172,7 +170,7 @@ def read_prediction(job: Job, truth: Truth, allow: Collection[str] = (), frame_z
         RolloutError: the video cannot be read, or is not of the truth's shape, and that is not allowed.
     """
     if job.rollout is None:
-        return BASELINES[job.cell.model](truth)
+        return BASELINES[job.cell.model].make(job.episode, truth)
     video = read_rollout_video(job.rollout, None if "rate" in allow else job.frame_rate)
     if "resize" in allow:
         video = resize_video(video, truth.rgb.shape[1:3])
@@ -194,7 +192,7 @@ def estimator_view(job: Job, truth: Truth) -> np.ndarray | None:
 
     For the ground truth it is the true video softened, whose masks and points are still known.
     """
-    if job.rollout is not None or job.cell.model != "ground_truth":
+    if job.rollout is not None or job.cell.model != GROUND_TRUTH:
         return None
     return np.stack([cv2.GaussianBlur(frame, (0, 0), SOFTNESS) for frame in truth.rgb])
 

@@ -64,7 +64,8 @@ PAIRS += ["noise", "verdict"]
 def _table(rows: pd.DataFrame) -> pd.DataFrame:
     """One robot's values: a row per (task, seed), a column per (metric, model, condition); NaN where there is none."""
     table = rows.pivot(index=["task", "seed"], columns=["metric", "model", "condition"], values="value")
-    order = sorted(_columns(table), key=lambda c: (list(METRICS).index(c[0]), c[1] in BASELINES, c[1:]))
+    ranks = {name: rank for rank, name in enumerate(BASELINES)}
+    order = sorted(_columns(table), key=lambda c: (list(METRICS).index(c[0]), ranks.get(c[1], -1), c[1:]))
     return table.reindex(columns=pd.MultiIndex.from_tuples(order, names=table.columns.names))
 
 

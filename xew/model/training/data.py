@@ -111,7 +111,7 @@ class ClipSource:
 
 
 def valid_frames(left: int, frames: int) -> np.ndarray:
-    """Valid mask [t] float32 of the latent frames of a clip that show anything of an episode with `left` frames from there on."""
+    """Valid mask [t] float32 of a clip's latent frames that show any of the `left` frames of its episode from there on."""
     firsts = np.maximum(np.arange(latent_frames(frames)) * TEMPORAL_FACTOR - (TEMPORAL_FACTOR - 1), 0)
     return (firsts < left).astype(np.float32)
 

@@ -1,0 +1,95 @@
+"""Baselines: videos of an episode that no model made, graded like a model's.
+
+Reads  the episode (xew.metrics.truth), its robot.mkv, and the same scene's episodes of other robots
+
+A model is worth its training where it beats `pasted_render`, which knows what every model knows, the first frame and the
+robot's commands, and learned nothing. To add a baseline, write a function of an episode and one line in BASELINES.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from xew.episode import Record, read_record, read_video
+from xew.metrics.truth import Truth
+from xew.protocol import COPY_FIRST_FRAME, GROUND_TRUTH, OTHER_ROBOT, PASTED_RENDER
+
+WHITE = 250
+"""Least level of all channels of the white ground that the robot is rendered on."""
+GROWN = 1
+"""Number of pixels by which the robot of the first frame is grown before it is filled in, for its soft outline."""
+FILL_RADIUS = 5
+"""Radius [pixels] of the neighborhood that a filled pixel is computed from."""
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """One baseline: how its video is made, and what it is made from."""
+
+    make: Callable[[Path, Truth], np.ndarray]
+    """Function of an episode's folder and truth to the video, uint8 [t h w 3] of the truth's shape."""
+    source: Callable[[Path, Record], str | None] = lambda folder, record: ""
+    """Function of an episode's folder and header to the digest of what the video is made from beside the truth; None where
+    the data set does not hold that, and the baseline is left out."""
+
+
+def copy_first_frame(folder: Path, truth: Truth) -> np.ndarray:
+    """The first frame, frozen: uint8 [t h w 3]."""
+    return np.repeat(truth.rgb[:1], len(truth.rgb), axis=0)
+
+
+def pasted_render(folder: Path, truth: Truth) -> np.ndarray:
+    """The first frame with its robot filled in and the render of the robot's commands pasted on: uint8 [t h w 3].
+
+    The render and the first frame are what every model may be told; no other frame of the truth is looked at. What the arm
+    hid in the first frame is filled in from around by Telea's inpainting (2004).
+    """
+    render = read_video(folder / "robot.mkv")[: len(truth.rgb)]
+    robot = np.asarray((render < WHITE).any(axis=-1))
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * GROWN + 1, 2 * GROWN + 1))
+    hole = cv2.dilate(robot[0].astype(np.uint8), disk)
+    scene = cv2.inpaint(truth.rgb[0], hole, FILL_RADIUS, cv2.INPAINT_TELEA)
+    pasted = np.where(robot[..., None], render, scene)
+    pasted[0] = truth.rgb[0]
+    return pasted
+
+
+def other_robot(folder: Path, truth: Truth) -> np.ndarray:
+    """The true episode of the next robot by name in the same scene: uint8 [t h w 3]."""
+    other = find_other_robot(folder, len(truth.rgb))
+    assert other is not None, "BASELINES asks before"
+    return read_video(other / "rgb.mkv")[: len(truth.rgb)]
+
+
+def find_other_robot(folder: Path, frames: int) -> Path | None:
+    """The folder of the next robot by name, in a circle, whose episode of the same scene has its video and enough frames."""
+    record = read_record(folder)
+    names = sorted(path.name for path in folder.parent.iterdir() if (path / "episode.json").exists())
+    place = names.index(folder.name)
+    for name in names[place + 1 :] + names[:place]:
+        other = folder.parent / name
+        found = read_record(other)
+        if found.success and found.videos and found.frame_count >= frames and found.scene_hash == record.scene_hash:
+            return other
+    return None
+
+
+def _render_digest(folder: Path, record: Record) -> str | None:
+    return record.hashes.get("robot") if (folder / "robot.mkv").exists() else None
+
+
+def _other_digest(folder: Path, record: Record) -> str | None:
+    other = find_other_robot(folder, record.frame_count)
+    return None if other is None else read_record(other).hashes["rgb"]
+
+
+BASELINES: dict[str, Baseline] = {
+    COPY_FIRST_FRAME: Baseline(copy_first_frame),
+    PASTED_RENDER: Baseline(pasted_render, _render_digest),
+    OTHER_ROBOT: Baseline(other_robot, _other_digest),
+    GROUND_TRUTH: Baseline(lambda folder, truth: truth.rgb),
+}
+"""Baselines by name. The ground truth's scores tell the noise floors."""
