@@ -124,6 +124,8 @@ def chart_files(chart: Chart) -> dict[str, bytes]:
         handles = [_handle(series) for series in chart.legend]
         if handles:
             figure.legend(handles=handles, loc="outside upper center", ncols=min(4, len(handles)), frameon=False)
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # every file would lay it out anew
         png, pdf = io.BytesIO(), io.BytesIO()
         figure.savefig(png, format="png", dpi=160)
         figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
