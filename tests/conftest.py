@@ -83,7 +83,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "loose_types(reason): arrays of different types may meet; says whose code needs that")
     config.addinivalue_line("markers", "loose_ranks(reason): arrays of different rank may meet; says whose code needs that")
     folder = Path(os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(config.rootpath / ".pytest_cache" / "jax")))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # hundreds of small programs a test are much, too
     if not hasattr(config, "workerinput"):
         remove_old_files(folder)
 

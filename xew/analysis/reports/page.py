@@ -101,7 +101,7 @@ def _labels(rows: Sequence[TableRow], index: int) -> Iterator[_Label]:
 def chart(chart: Chart) -> Markup:
     """A chart with its legend; panels stand beside or below one another, as there is room."""
     panels = [Markup(panel_svg(chart, panel)) for panel in chart.panels]
-    kinds = {"-": "line", "--": "dashed", ":": "dotted", "o": "ring"}
+    kinds = {"-": "line", "--": "dashed", "-.": "dashdot", ":": "dotted", "o": "ring"}
     legend = [{"label": one.label, "kind": kinds[one.dash], "color": themed_color(one.color)} for one in chart.legend]
     return _render("figures.html", "chart", chart, panels, legend)
 
