@@ -3,7 +3,8 @@
 Reads  <rollouts>/<task>/<seed>/<robot>/ (xew.rollout) and the same folders of the data set
 Writes scores.parquet, one row per model, condition, task, seed, robot and metric; beside it
        scores.curves.parquet (the same by frame), scores.summary.md and .csv (means, intervals, noise), scores.pairs.csv
-       (differences between models), scores.bundle.json (what others need to check all this), scores.cells/ (to go on from)
+       (differences between models), scores.bundle.json (what others need to check all this), scores.cells/ (to go on from);
+       <data>-baselines/, the baselines' scores, for every table on the same data
 
     python -m xew.metrics.evaluate demo/rollouts --data demo/data --out demo/scores.parquet
     python -m xew.metrics.evaluate demo/rollouts --data demo/data --check demo/scores.bundle.json --regrade 5
@@ -33,7 +34,16 @@ from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, grade, input_kind
 from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.bundle import differences, disagreements, raise_if_any, read_bundle, write_bundle
 from xew.metrics.grading.jobs import Job, estimator_view, list_jobs, read_prediction
-from xew.metrics.grading.scores import CellStore, check_out, describe, path_beside, write_diagnostics, write_tables, write_whole
+from xew.metrics.grading.scores import (
+    CellStore,
+    baselines_folder,
+    check_out,
+    describe,
+    path_beside,
+    write_diagnostics,
+    write_tables,
+    write_whole,
+)
 from xew.metrics.grading.summary import summarize, to_markdown
 from xew.metrics.grading.workers import Bench, make_opener, open_nothing, worker_count
 from xew.metrics.truth import Truth, read_truth
@@ -115,7 +125,7 @@ def main(args: Args) -> None:
     check_out(args.out)
     metrics = choose_metrics(args)
     attributes = describe(settings(args), metrics)
-    store = CellStore(path_beside(args.out, "cells"))
+    store = CellStore(path_beside(args.out, "cells"), baselines_folder(args.data, args.out))
     errors: list[str] = []
     jobs = find_jobs(args, errors if args.keep_going else None)
     total = len(jobs) + len(errors)

@@ -2,6 +2,7 @@
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,13 +23,15 @@ from xew.episode import read_video
 from xew.metrics import evaluate
 from xew.metrics.evaluate import Args, main
 from xew.metrics.grading.workers import Bench
+from xew.protocol import BASELINES
 from xew.rollout import write_rollout
 
 ROBOTS = ("franka_panda", "piper")
 SEEDS = tuple(range(1_000_000, 1_000_003))
 METRICS = ("psnr", "mask_iou")
 WRITTEN = ("parquet", "curves.parquet", "summary.md", "summary.csv", "pairs.csv", "bundle.json")
-CELLS = len(SEEDS) * len(ROBOTS) * 3
+EPISODES = len(SEEDS) * len(ROBOTS)
+CELLS = EPISODES * (1 + len(BASELINES))
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +45,13 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
         video[1:] //= rng.integers(1, 4, (len(video) - 1, 1, 1, 1), dtype=np.uint8)
         write_rollout(root / "rollouts", record.task, record.seed, record.robot, video, {"model": "dim"})
     return root
+
+
+@pytest.fixture(autouse=True)
+def no_baselines_are_kept(world: Path, whole: dict[str, bytes]) -> None:
+    """Every test grades the baselines itself."""
+    shutil.rmtree(world / "data-baselines")
+    (world / "data-baselines").mkdir()
 
 
 def arguments(world: Path, out: Path) -> Args:
@@ -106,17 +116,19 @@ def test_killed_at_random_on_two_devices_it_ends_in_the_same_bytes(
     run = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wanted = random.randrange(1, CELLS - 2)
     deadline = time.monotonic() + 120
-    while run.poll() is None and len(graded(out)) < wanted and time.monotonic() < deadline:
+    while run.poll() is None and len(graded(out, world / "data")) < wanted and time.monotonic() < deadline:
         time.sleep(0.01)
     run.send_signal(signal.SIGKILL)
     run.wait()
-    assert wanted <= len(graded(out)) and not out.exists()
+    assert wanted <= len(graded(out, world / "data")) and not out.exists()
     main(arguments(world, out))
     assert read_all(out) == whole
 
 
-def graded(out: Path) -> list[Path]:
-    return list(out.with_suffix(".cells").glob("*/*/*/[!.]*.json"))
+def graded(out: Path, data: Path) -> list[Path]:
+    """Files of graded videos: of models beside the table, of baselines beside the data."""
+    folders = out.with_suffix(".cells"), data.with_name("data-baselines")
+    return [path for folder in folders for path in folder.glob("*/*/*/[!.]*.json")]
 
 
 def test_workers_are_shared_out_to_the_devices() -> None:
@@ -192,6 +204,18 @@ def test_a_second_run_grades_nothing_anew_and_metrics_come_beside_those_that_are
     assert len(asked) == 3 * CELLS and read_all(out) == whole
 
 
+def test_baselines_are_graded_once_a_data_set(
+    world: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    main(arguments(world, tmp_path / "first.parquet"))
+    asked: list[object] = []
+    real = evaluate.grade
+    monkeypatch.setattr(evaluate, "grade", lambda comparison, metrics: asked.append(metrics) or real(comparison, metrics))
+    main(arguments(world, tmp_path / "scores.parquet"))
+    assert len(asked) == EPISODES
+    assert read_all(tmp_path / "scores.parquet") == whole
+
+
 def test_other_settings_are_graded_anew(world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "scores.parquet"
     main(Args((world / "rollouts",), world / "data", out, ("psnr",), baselines=False))
@@ -207,7 +231,7 @@ def test_other_settings_are_graded_anew(world: Path, tmp_path: Path, monkeypatch
 def test_a_damaged_cell_is_graded_anew(world: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
     args = arguments(world, tmp_path / "scores.parquet")
     main(args)
-    first, second, *_ = graded(args.out)
+    first, *_, second = graded(args.out, args.data)
     first.write_text(first.read_text()[:100])
     second.write_text("[1, 2]")
     main(args)
@@ -227,7 +251,7 @@ def test_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path, monkey
     monkeypatch.setattr(evaluate, "_grade_group", notes)
     args = Args((tmp_path / "rollouts",), tmp_path / "data", tmp_path / "scores.parquet", ("psnr", "mask_iou"), workers=2)
     main(args)
-    assert len(held) == 300 and len(graded(args.out)) == 900
+    assert len(held) == 300 and len(graded(args.out, args.data)) == 900, "with two baselines: there is no render, no other robot"
     assert np.median(held[-50:]) - np.median(held[100:150]) < 8, "megabytes"
     assert resident() - held[-1] < 100, "megabytes, for the tables"
 

@@ -3,6 +3,7 @@
 scores.parquet         model condition task seed robot metric value | frames exact_frames content
 scores.curves.parquet  model condition task seed robot metric frame value
 scores.cells/          one small file for each graded video, from which the tables are put together
+<data>-baselines/      the same for the baselines, beside the data set and for all tables
 A metric that a video has no value of has no row. The tables' attributes (pandas `attrs`) hold protocol, versions,
 estimators, what became of frame 0, and each metric's title, unit, direction, range and source, so that the analysis needs no
 import of this room. The tables are a function of what was graded alone: the same bytes whatever was done first, in how
@@ -12,6 +13,7 @@ many threads, and how often it was stopped on the way.
 import hashlib
 import json
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,6 +30,7 @@ from xew.config import ConfigError
 from xew.files import replacing
 from xew.metrics import METRICS
 from xew.metrics.grade import Grades
+from xew.protocol import BASELINES
 
 KEY = ["model", "condition", "task", "seed", "robot"]
 ROW_GROUP = 64
@@ -72,10 +75,15 @@ class Cell:
 
 
 class CellStore:
-    """Graded videos, a file each, complete or not there: whoever is stopped goes on from what stands."""
+    """Graded videos, a file each, complete or not there: whoever is stopped goes on from what stands.
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    Args:
+        folder: of the videos of models.
+        baselines: folder of the baselines, which are the same for all models and are graded once a data set.
+    """
+
+    def __init__(self, folder: Path, baselines: Path) -> None:
+        self.folder, self.baselines = folder, baselines
 
     def read(self, cell: Cell) -> Grades | None:
         """What a cell was graded with; None where it was not, or where anything that it depends on has changed."""
@@ -108,14 +116,24 @@ class CellStore:
         write_whole(self._path(cell), json.dumps(content).encode())
 
     def _path(self, cell: Cell) -> Path:
+        episode = Path(cell.task, f"{cell.seed:07d}", cell.robot)
+        if cell.model in BASELINES:
+            return self.baselines / episode / f"{cell.model}-{cell.content}.json"
         name = hashlib.sha256(f"{cell.model}\n{cell.condition}".encode()).hexdigest()[:16]
-        return self.folder / cell.task / f"{cell.seed:07d}" / cell.robot / f"{name}.json"
+        return self.folder / episode / f"{name}.json"
 
 
 def check_out(path: Path) -> None:
     """Raise ConfigError if a path cannot be that of a score table."""
     if path.suffix != ".parquet":
         raise ConfigError(f"--out is {path}, expected a name that ends in .parquet.")
+
+
+def baselines_folder(data: Path, out: Path) -> Path:
+    """Where baselines on a data set are kept: beside it, for all tables; beside the table where that cannot be written to."""
+    beside = data.absolute().with_name(f"{data.absolute().name}-baselines")
+    writable = os.access(beside if beside.exists() else beside.parent, os.W_OK)
+    return beside if writable else path_beside(out, "baselines")
 
 
 def path_beside(path: Path, ending: str) -> Path:
