@@ -251,7 +251,7 @@ def test_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path, monkey
     monkeypatch.setattr(evaluate, "_grade_group", notes)
     args = Args((tmp_path / "rollouts",), tmp_path / "data", tmp_path / "scores.parquet", ("psnr", "mask_iou"), workers=2)
     main(args)
-    assert len(held) == 300 and len(graded(args.out, args.data)) == 900, "with two baselines: there is no render, no other robot"
+    assert len(held) == 300 and len(graded(args.out, args.data)) == 1200, "with three baselines: there is no other robot"
     assert np.median(held[-50:]) - np.median(held[100:150]) < 8, "megabytes"
     assert resident() - held[-1] < 100, "megabytes, for the tables"
 
