@@ -22,6 +22,8 @@ from xew.model.training.vae_data import Cut, make_dataset, random_clips, read_fr
 from xew.model.video.frames import to_model_size
 from xew.protocol import seed_split
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}
 vae: tiny

@@ -34,7 +34,7 @@ MADE = (
 ADAPTED = "few_shot-piper-1"
 PART = (ADAPTED, "--parts", "few_shot", "forgetting")
 """What is killed: a training, an adaptation from it, and all that they need and lead to."""
-KILLS = 4
+KILLS = 3
 
 
 @dataclass(frozen=True)

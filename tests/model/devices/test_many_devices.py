@@ -28,7 +28,7 @@ HERE = Path(__file__).parent
 CONFIG = """
 clip: {frames: 5, height: 32, width: 32}
 codec: {spatial_factor: 8, channels: 4}
-model: {size: debug, action: joints, embodiment: robot_render}
+model: {size: tiny, action: joints, embodiment: robot_render}
 train: {steps: 4, batch: 4, learning_rate: 1e-3, log_every: 1, save_every: 2, sample_every: 0, ema_decay: 0.5}
 rollout: {steps: 1, batch: 4}
 """

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from tests.networks import draw_network, normal
 from xew.config import ConfigError
 from xew.model.network import blocks, dit
 from xew.model.network.dit import MODELS, STREAMS, WorldModel
@@ -20,16 +21,7 @@ TOLERANCE = 2e-5
 
 def tiny(streams: tuple[str, ...] = (), **options: object) -> WorldModel:
     """A model whose every parameter is drawn anew, so that nothing hides behind a zero start."""
-    model = WorldModel(MODELS["tiny"], CHANNELS, streams, rngs=nnx.Rngs(0), **options)
-    graph, params = nnx.split(model)
-    leaves, tree = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.key(1), len(leaves))
-    drawn = [0.2 * jax.random.normal(key, leaf.shape, jnp.float32) for key, leaf in zip(keys, leaves, strict=True)]
-    return nnx.merge(graph, jax.tree.unflatten(tree, drawn))
-
-
-def normal(seed: int, *shape: int) -> jax.Array:
-    return jax.random.normal(jax.random.key(seed), shape, jnp.float32)
+    return draw_network(lambda: WorldModel(MODELS["tiny"], CHANNELS, streams, rngs=nnx.Rngs(0), **options))
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from safetensors.numpy import save_file
 from test_dit import tiny
 
 from tests import synthetic
+from tests.networks import normal
 from xew.config import ConfigError
 from xew.episode import HEIGHT, WIDTH, read_record, read_states
 from xew.model.codecs.codec import CODECS
@@ -32,10 +33,6 @@ CHANNELS = 3
 SHAPE = (2, 3, 4, 6, CHANNELS)
 EARLIER = (-2.5, -1.0)
 SIGMA = jnp.array([0.3, 0.9], jnp.float32)
-
-
-def normal(seed: int, *shape: int) -> jax.Array:
-    return jax.random.normal(jax.random.key(seed), shape, jnp.float32)
 
 
 LATENTS, TEXT = normal(2, *SHAPE), normal(3, 2, 8, 16)
@@ -71,16 +68,16 @@ def test_every_condition_fits_is_used_and_can_be_learned(action: str, embodiment
     model, conditions = model_of(streams), told(streams)
     graph, params = nnx.split(model, nnx.Param)
 
-    @jax.jit
-    def velocity(params: nnx.State, conditions: dict[str, jax.Array]) -> jax.Array:
-        return nnx.merge(graph, params)(LATENTS, conditions, SIGMA, TEXT)
+    def loss(params: nnx.State, conditions: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        velocity = nnx.merge(graph, params)(LATENTS, conditions, SIGMA, TEXT)
+        return jnp.square(velocity[:, 1:]).mean(), velocity
 
-    before = velocity(params, conditions)
+    gradients_and_velocity = jax.jit(jax.grad(loss, has_aux=True))
+    gradients, before = gradients_and_velocity(params, conditions)
     assert before.shape == SHAPE and before.dtype == jnp.float32
-    gradients = jax.jit(jax.grad(lambda params: jnp.square(velocity(params, conditions)[:, 1:]).mean()))(params)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
     for name in streams:
-        moved = velocity(params, conditions | {name: conditions[name] + 1.0})
+        moved = gradients_and_velocity(params, conditions | {name: conditions[name] + 1.0})[1]
         assert np.abs(moved - before)[:, 1:].max() > 1e-3, name
     learned = nnx.to_flat_state(gradients)
     own = [leaf for path, leaf in learned if path[0] in ("mechanisms", "stream_inputs", "stream_embeddings")]
