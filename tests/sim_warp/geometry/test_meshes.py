@@ -105,3 +105,11 @@ def test_a_hull_drops_the_points_inside() -> None:
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     inside = np.random.default_rng(0).uniform(0.1, 0.9, (20, 3))
     assert len(meshes.hull(np.concatenate([inside, corners]), RED).vertices) == 8
+
+
+def test_a_box_is_to_the_bit_the_one_that_trimesh_makes() -> None:
+    rng = np.random.default_rng(0)
+    for size in (10 ** rng.uniform(-4, 0.5, (50, 3))).tolist():
+        ours, theirs = meshes.box(size, RED), meshes.from_trimesh(trimesh.creation.box(size), RED)
+        for name in ("vertices", "triangles", "colors", "normals"):
+            assert getattr(ours, name).tobytes() == getattr(theirs, name).tobytes(), name

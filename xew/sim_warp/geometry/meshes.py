@@ -4,6 +4,7 @@ Units are meters, frames are those of the body that carries the mesh, triangles 
 outside. Shapes come from trimesh; a `Mesh` adds a color per triangle and a normal per corner.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -59,7 +60,17 @@ def _corner_normals(shape: trimesh.Trimesh, face_normals: np.ndarray, crease_ang
 
 def box(size: Sequence[float], color: Color) -> Mesh:
     """A box of full edge lengths `size` [m], centered."""
-    return from_trimesh(trimesh.creation.box(size), color)
+    corners, triangles, normals = _unit_box()  # a scene can have hundreds, whose normals are all the same
+    colors = np.tile(np.asarray(color, np.uint8), (len(triangles), 1))
+    return Mesh((corners * np.asarray(size, float)).astype(np.float32), triangles.copy(), colors, normals.copy())
+
+
+@functools.cache
+def _unit_box() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners [8 3] float64 of the cube of edge 1 about the origin, its triangles [12 3] and their normals [12 3 3]."""
+    shape = trimesh.creation.box((1, 1, 1))
+    mesh = from_trimesh(shape, (0, 0, 0))
+    return np.asarray(shape.vertices), mesh.triangles, mesh.normals
 
 
 def cylinder(radius: float, length: float, color: Color, sections: int = 24) -> Mesh:
