@@ -127,7 +127,7 @@ def main(args: Args) -> None:
     attributes = describe(settings(args), metrics)
     store = CellStore(path_beside(args.out, "cells"), baselines_folder(args.data, args.out))
     errors: list[str] = []
-    jobs = find_jobs(args, errors if args.keep_going else None)
+    jobs = find_jobs(args, tuple(BASELINES) if args.baselines else (), errors if args.keep_going else None)
     total = len(jobs) + len(errors)
     diagnostics = tuple(DIAGNOSTICS) if args.diagnostics else ()
     errors += grade_all(jobs, (*metrics, *diagnostics), args, store)
@@ -187,11 +187,10 @@ def _identity(name: str, checkpoint: Path | None, option: str) -> str:
     return identity(name, checkpoint)
 
 
-def find_jobs(args: Args, problems: list[str] | None = None) -> list[Job]:
-    """All that is to be graded. Raises, or tells the problems, as `plan`."""
-    if args.frame_zero == "predicted" and args.baselines:
+def find_jobs(args: Args, baselines: Sequence[str], problems: list[str] | None = None) -> list[Job]:
+    """All that is to be graded, with the baselines of these names. Raises, or tells the problems, as `list_jobs`."""
+    if args.frame_zero == "predicted" and baselines:
         raise ConfigError("frame 0 of the frozen first frame is the truth: with --frame-zero predicted say --no-baselines.")
-    baselines = tuple(BASELINES) if args.baselines else ()
     return list_jobs(args.rollouts, args.data, str(settings(args)), baselines, worker_count(args.workers), problems)
 
 
@@ -270,7 +269,8 @@ def check(args: Args, path: Path) -> None:
     print(f"{path}: {len(bundle['samples'])} videos, whole, and its means are those of its values")
     if not args.rollouts:
         return
-    jobs = find_jobs(args)
+    held = {sample["model"] for sample in bundle["samples"]}  # a bundle of an earlier version has fewer baselines
+    jobs = find_jobs(args, [name for name in BASELINES if name in held])
     raise_if_any(path, differences(bundle, settings(args), [job.cell for job in jobs]))
     print("made from these rollouts and this data, by their digests")
     picked = [jobs[i] for i in np.unique(np.linspace(0, len(jobs) - 1, args.regrade).astype(int))]

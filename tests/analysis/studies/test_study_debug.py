@@ -19,7 +19,7 @@ import pandas as pd
 import pytest
 
 from tests.sim_warp.small import TASK
-from xew.protocol import PAPER_PARTS, PARTS, VARIANTS
+from xew.protocol import BASELINES, PAPER_PARTS, PARTS, VARIANTS
 
 ROOT = Path(__file__).parents[3]
 CONFIG = ROOT / "configs" / "study_debug.yaml"
@@ -88,7 +88,7 @@ def test_from_nothing_to_a_report(place: Place, told: str) -> None:
         assert {variant.name for variant in PARTS[part]} & set(planned["variants"]), f"nothing of {part}"
     for name, counts in planned["variants"].items():
         assert counts["found"] == dict.fromkeys(VARIANTS[name].graded_robots, 1)
-    assert set(table.loc[table["variant"] == "", "model"]) == {"copy_first_frame", "ground_truth"}
+    assert set(table.loc[table["variant"] == "", "model"]) == set(BASELINES)
     assert table["value"].notna().all()
     assert (place.study / "report" / "index.html").stat().st_size > 10_000
     assert f"report: {Path('study', 'report', 'index.html')}" in told
