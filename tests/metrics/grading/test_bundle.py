@@ -33,7 +33,7 @@ def test_a_bundle_says_all_that_others_need(world: Path) -> None:
     bundle = read_bundle(world / "scores.bundle.json")
     rows = pd.read_parquet(world / "scores.parquet")
     assert bundle["protocol"] == rows.attrs["protocol"] and bundle["estimators"] == {"masks": "default", "tracks": "default"}
-    assert len(bundle["samples"]) == 9 and {sample["model"] for sample in bundle["samples"]} == set(rows["model"])
+    assert len(bundle["samples"]) == 12 and {sample["model"] for sample in bundle["samples"]} == set(rows["model"])
     for mean in bundle["means"]:
         own = rows[(rows["model"] == mean["model"]) & (rows["metric"] == mean["metric"])]["value"]
         assert mean["mean"] == pytest.approx(own.mean(), rel=1e-12) and mean["episodes"] == 3
@@ -42,7 +42,7 @@ def test_a_bundle_says_all_that_others_need(world: Path) -> None:
 
 def test_it_is_checked_against_itself_the_videos_and_scores_graded_anew(world: Path, capsys: pytest.CaptureFixture) -> None:
     check(world, rollouts=())
-    assert "9 videos" in capsys.readouterr().out
+    assert "12 videos" in capsys.readouterr().out
     check(world, regrade=4)
     assert "4 videos graded anew: the same scores" in capsys.readouterr().out
 
