@@ -2,13 +2,13 @@
 
     python -m xew.analysis.null [--studies 200 --scenes 24 --trainings 3 --spread 0.02]
 
-Every study has the scores of one model under all names. A claim that variants differ is then false whichever way it is answered; one
-that a difference is large is false only where it "holds", one that it is small only where it "fails". The rates are to be at
-most 5 % each, and the command prints them for four kinds of null.
+Every study has the scores of one model under all names. A claim that variants differ is then false whichever way it is
+answered; one that a difference is large is false only where it "holds", one that it is small only where it "fails". The rates
+are to be at most 5 % each, and the command prints them for four kinds of studies.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -104,25 +104,22 @@ class NullStudy(StudyGrades):
         infos = [info for info in paper.infos if info.name in METRICS]
         axes = {axis: np.array([getattr(paper.robots[robot], axis) for robot in ROBOT_NAMES]) for axis in AXES}
         super().__init__(_empty_table(null, scenes), infos, axes, draws=draws)
-        self._higher = np.array([self.metrics[str(metric)].higher_is_better for _, _, metric, _ in self._cells.columns])
+        columns = self._cells.columns
+        variants, robots, metrics, trainings = (columns.get_level_values(level) for level in range(4))
+        self._robot, self._metric = pd.Index(ROBOT_NAMES).get_indexer(robots), pd.Index(METRICS).get_indexer(metrics)
+        self._training = pd.factorize(pd.MultiIndex.from_arrays([variants, trainings, metrics]))[0]
+        self._sign = np.where([self.metrics[metric].higher_is_better for metric in metrics], -1.0, 1.0)
         self._drawn: list[Mean | None] = []
         self._pooled: dict[tuple[str, tuple[str, ...], str], Mean | None] = {}
 
     def draw(self, rng: np.random.Generator) -> None:
         """Draw the scores of another study."""
-        columns = self._cells.columns
-        variants, robots, _, trainings = (columns.get_level_values(level) for level in columns.names)
-        hard = rng.normal(0, HARDNESS, len(self._cells))
-        robot_hard = rng.normal(0, ROBOTS_DIFFER * self._null.unequal_robots, (len(ROBOT_NAMES), len(METRICS)))
-        of_robot, of_metric = (
-            pd.Index(ROBOT_NAMES).get_indexer(robots),
-            pd.Index(METRICS).get_indexer(columns.get_level_values(2)),
-        )
-        runs = pd.MultiIndex.from_arrays([variants, trainings, columns.get_level_values(2)])
-        of_run, names = pd.factorize(runs)
-        lucky = rng.normal(0, self._null.spread, len(names))[of_run]  # a training is good or bad on all robots
-        loss = hard[:, None] + rng.normal(0, NOISE, self._cells.shape) + robot_hard[of_robot, of_metric] + lucky
-        scores = self._scales[of_metric] * np.exp(np.where(self._higher, -loss, loss))
+        scenes, columns = self._cells.shape
+        hard = rng.normal(0, HARDNESS, (scenes, 1))
+        robots = rng.normal(0, ROBOTS_DIFFER * self._null.unequal_robots, (len(ROBOT_NAMES), len(METRICS)))
+        trainings = rng.normal(0, self._null.spread, columns)  # a training is good or bad on all robots
+        loss = hard + rng.normal(0, NOISE, (scenes, columns)) + robots[self._robot, self._metric] + trainings[self._training]
+        scores = self._scales[self._metric] * np.exp(self._sign * loss)
         self._drawn = list(bootstrap_means(scores, np.arange(len(scores)), self._strata, self._draws))
         self._pooled.clear()
 
@@ -132,13 +129,17 @@ class NullStudy(StudyGrades):
         if key not in self._pooled:
             means = [self._robot_mean(variant, robot, metric) for robot in robots]
             known = [mean for mean in means if mean]
-            self._pooled[key] = combine(lambda *v: np.mean(v, axis=0), *known) if len(known) == len(means) else None
+            self._pooled[key] = _pool(known) if len(known) == len(means) else None
         return self._pooled[key]
 
     def _robot_mean(self, variant: str, robot: str, metric: str) -> Mean | None:
         places = [self._columns.get((variant, robot, metric, training)) for training in self._trainings.get(variant, ())]
         own = [mean for i in places if i is not None and (mean := self._drawn[i])]
         return pool_trainings(own, variant, self._several) if own else None
+
+
+def _pool(means: Sequence[Mean]) -> Mean:
+    return means[0] if len(means) == 1 else combine(lambda *values: np.stack(values).sum(axis=0) / len(values), *means)
 
 
 def _metric_scales(paper: Paper) -> np.ndarray:

@@ -174,10 +174,11 @@ def _draw_block(values: np.ndarray, numbers: np.ndarray, strata: tuple[int, ...]
         else sum(scale * (weights @ counts[members]) for members, scale, weights in groups)
     )
     means = lowest + total / np.where(drawn > 0, drawn, np.nan)
-    freedom = _freedom(counts > 0, strata)
-    for i in range(values.shape[1]):
-        scenes = int((counts[:, i] > 0).sum())
-        yield Mean(means[:, i], int(counts[:, i].sum()), scenes, float(freedom[i])) if scenes else None
+    scored = counts > 0
+    sizes = (counts.sum(axis=0).astype(int), scored.sum(axis=0), _freedom(scored, strata))
+    columns = np.ascontiguousarray(means.T)
+    for values_drawn, count, scenes, freedom in zip(columns, *(size.tolist() for size in sizes), strict=True):
+        yield Mean(values_drawn, count, scenes, freedom) if scenes else None
 
 
 def _freedom(scored: np.ndarray, strata: tuple[int, ...]) -> np.ndarray:
@@ -255,15 +256,17 @@ def pool_trainings(means: Sequence[Mean], variant: str, left_out: Sequence[tuple
         left_out: names of all variants of the table that have several trainings, and how many.
     """
     values, count = np.stack([mean.values for mean in means], axis=1), len(means)
-    drawn = values if count == 1 else values * draw_trainings(variant, count, len(values) - 1)
-    pooled = drawn.mean(axis=1)
-    without = [np.full(number, pooled[0]) for _, number in left_out]
-    for i, (name, number) in enumerate(left_out):
-        if name == variant and number == count > 1:
-            without[i] = (values[0].sum() - values[0]) / (count - 1)
-    first = means[0]
-    numbers = tuple(number for _, number in left_out)
-    return Mean(np.concatenate([pooled, *without]), first.count, first.scenes, first.freedom, count, numbers)
+    weights = draw_trainings(variant, count, len(values) - 1) if count > 1 else np.ones((1, 1))
+    pooled = (values * weights).sum(axis=1) / count
+    first, numbers = means[0], tuple(number for _, number in left_out)
+    if not numbers:
+        return Mean(pooled, first.count, first.scenes, first.freedom, count)
+    padded = np.full(len(pooled) + sum(numbers), pooled[0])
+    padded[: len(pooled)] = pooled
+    if (variant, count) in left_out:
+        start = len(pooled) + sum(numbers[: left_out.index((variant, count))])
+        padded[start : start + count] = (values[0].sum() - values[0]) / (count - 1)
+    return Mean(padded, first.count, first.scenes, first.freedom, count, numbers)
 
 
 def every_draw(count: int, least: int) -> np.ndarray:

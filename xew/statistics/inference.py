@@ -41,17 +41,16 @@ class Drawn:
 
     def _pool_freedom(self, freedom: float, without: np.ndarray, left_out: Sequence[int]) -> float:
         """Degrees of freedom of trainings and scenes together."""
-        parts, start = [], 0
-        for count in left_out:
-            own = without[start : start + count]
-            start += count
-            parts.append(((count - 1) / count * float(np.square(own - own.mean()).sum()), count - 1))
-        if not any(variance > 0 for variance, _ in parts) or not len(self._drawn):
+        if not left_out or not len(self._drawn):
             return freedom
+        counts = np.asarray(left_out)
+        starts = np.cumsum(counts) - counts
+        deviations = without - np.repeat(np.add.reduceat(without, starts) / counts, counts)
+        between = (counts - 1) / counts * np.add.reduceat(np.square(deviations), starts)  # of each variant, the jackknife's
         total = float(self._drawn.var())
-        rest = max(total - sum(variance for variance, _ in parts), 0.0)
-        squares = rest**2 / freedom + sum(variance**2 / degrees for variance, degrees in parts)
-        return total**2 / squares if total > 0 else freedom
+        rest = max(total - float(between.sum()), 0.0)
+        squares = rest**2 / freedom + float((np.square(between) / (counts - 1)).sum())
+        return total**2 / squares if squares > 0 else freedom
 
     def interval(self, level: float = LEVEL) -> tuple[float, float]:
         """Ends of the interval that holds the true value in the share `level` of cases; with 1, of all that was drawn."""

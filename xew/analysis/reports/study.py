@@ -279,7 +279,8 @@ def _claims_section(content: Content) -> Markup:
         "every number lies on its side of the bound, and fails where one lies on the other side, each at 5 % after Holm's "
         "correction for the comparisons of the claim (for the paper: with all that prints the same); anything else is "
         "unresolved. “Among all claims” corrects once more, for all of them. That something saturates or is alike is an "
-        "equivalence: two one-sided tests with the margins that the claim names. The last ones, “ours”, ask more than the paper claims."
+        "equivalence: two one-sided tests with the margins that the claim names. The last ones, “ours”, ask more than the "
+        "paper claims."
     )
     return page.section(
         "Claims", page.paragraph(text), page.paragraph(content.trainings), page.claims(content.findings, content.printed)

@@ -76,6 +76,7 @@ class Reader:
 
     def __init__(self, grades: Grades) -> None:
         self.grades = grades
+        self._seen: dict[tuple[str, str], Mean | None] = {}
 
     def mean(self, part: str, row: str, robots: str, metric: str) -> Mean:
         """The mean at an address, over the cells that all rows of the part have."""
@@ -97,10 +98,12 @@ class Reader:
 
     def mean_of_seen(self, robot: str, metric: str) -> Mean | None:
         """Mean on a robot over the leave-one-embodiment-out folds that saw it; None where none was graded."""
-        rows = [f"loeo_{other}" for other in ROBOT_NAMES if other != robot] if metric in self.grades.metrics else []
-        means = [self.grades.mean("loeo", row, robot, metric, shared=True) for row in rows]
-        known = [mean for mean in means if mean is not None]
-        return combine(lambda *values: np.mean(values, axis=0), *known) if known else None
+        if (robot, metric) not in self._seen:
+            rows = [f"loeo_{other}" for other in ROBOT_NAMES if other != robot] if metric in self.grades.metrics else []
+            means = [self.grades.mean("loeo", row, robot, metric, shared=True) for row in rows]
+            known = [mean for mean in means if mean is not None]
+            self._seen[robot, metric] = combine(_average, *known) if known else None
+        return self._seen[robot, metric]
 
     def unseen_gap(self, robot: str, metric: str) -> Comparison:
         """The loss of the fold that did not see a robot from those that did, on this robot's same episodes; positive is worse.
@@ -129,7 +132,7 @@ class Reader:
         if len(known) < len(saw):
             doubt = self._doubt((new, old), robot, metric) or OTHER_ROBOTS
             return Comparison(label, _loss(new, old, self.grades, metric), above, doubt=doubt)
-        expected = combine(lambda score, own, *others: score * own / np.mean(others, axis=0), old, *known)
+        expected = combine(lambda score, own, *others: score * own / _average(*others), old, *known)
         doubt = self._doubt((new, expected), robot, metric)
         return Comparison(label, _loss(new, expected, self.grades, metric), above, doubt=doubt)
 
@@ -188,6 +191,10 @@ class Reader:
         inside = floor > 0 and abs(means[0].value - means[1].value) <= floor
         unknown = "no noise floor: the true video was not graded" if np.isnan(floor) else ""
         return self._doubt_of_few(means) or unknown or (f"inside the noise floor of {floor:.3g}" if inside else "")
+
+
+def _average(*values: np.ndarray) -> np.ndarray:
+    return np.stack(values).sum(axis=0) / len(values)
 
 
 def _loss(new: Mean, old: Mean, grades: Grades, metric: str) -> Mean:

@@ -1,7 +1,7 @@
 """The answers to claims: each claim's inequalities, asked of the numbers of a study or of the paper.
 
-Every comparison has two p-values, of what is claimed and of its opposite, each corrected by Holm's method for the comparisons of
-its claim. A claim holds where all of its comparisons do, it fails where the opposite of one is significant, and it is
+Every comparison has two p-values, of what is claimed and of its opposite, each corrected by Holm's method for the comparisons
+of its claim. A claim holds where all of its comparisons do, it fails where the opposite of one is significant, and it is
 unresolved in between: also where a difference is inside the noise floor, where a share is asked of a gap that may not be there,
 where five robots are too few, or where there are fewer than MIN_SCENES scenes. A second answer counts all claims as one family,
 by Holm's method once more. Asked of the paper's own figures, p is 0 or 1: whether all that prints the same lies on one side.
