@@ -11,7 +11,7 @@ DRAWN = np.concatenate([[2.0], stats.norm.ppf((np.arange(9999) + 0.5) / 9999) * 
 
 
 @pytest.mark.parametrize("freedom", [2.0, 5.0, 30.0, np.inf])
-@pytest.mark.parametrize("bound", [0.1, 0.9, 1.5, 2.0, 2.7, 4.0])
+@pytest.mark.parametrize("bound", [0.4, 0.9, 1.5, 2.0, 2.7, 4.0])
 def test_a_p_value_is_that_of_a_student(bound: float, freedom: float) -> None:
     expected = stats.t.sf((2.0 - bound) / 0.5, freedom) if np.isfinite(freedom) else stats.norm.sf((2.0 - bound) / 0.5)
     drawn = Drawn(DRAWN, freedom)
