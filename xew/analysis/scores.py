@@ -177,7 +177,7 @@ def merge_scores(tables: Sequence[tuple[str, Path]], own_robots: Sequence[str] =
     attributes, rows, curves = [], [], []
     metrics: tuple[MetricInfo, ...] = ()
     graded: set[tuple[object, ...]] = set()
-    seeds = trainings or [None] * len(tables)
+    seeds: Sequence[int | None] = trainings or [None] * len(tables)
     for (variant, path), seed in zip(tables, seeds, strict=True):
         scores = read_scores(path, own_robots)
         if not variant or scores.of_study:

@@ -67,11 +67,11 @@ class Drawn:
 
         The lower end of the interval of level 1 - 2 p lies on the bound.
         """
-        return self._p(bound, np.searchsorted(self._drawn, bound, "right"), 1)
+        return self._p(bound, int(np.searchsorted(self._drawn, bound, "right")), 1)
 
     def p_below(self, bound: float) -> float:
         """One-sided p of the number being below a bound."""
-        return self._p(bound, len(self._drawn) - np.searchsorted(self._drawn, bound, "left"), -1)
+        return self._p(bound, len(self._drawn) - int(np.searchsorted(self._drawn, bound, "left")), -1)
 
     def _p(self, bound: float, beyond: int, sign: int) -> float:
         """p of the number lying on the side `sign` of a bound, beyond which (or on which) so many draws lie."""
@@ -106,8 +106,8 @@ class Drawn:
         return low + (high - low) * (place - below)
 
 
-def holm(p_values: Sequence[float]) -> np.ndarray:
-    """p-values [n] float64 adjusted for being n (Holm 1979, "A simple sequentially rejective multiple test procedure").
+def holm(p_values: Sequence[float] | np.ndarray) -> np.ndarray:
+    """p-values [n] float64, adjusted for being n (Holm 1979, "A simple sequentially rejective multiple test procedure").
 
     Those at most SIGNIFICANCE are significant with a chance of at most SIGNIFICANCE that any of them is by mistake, however
     the tests depend on one another.
