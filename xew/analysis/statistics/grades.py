@@ -138,8 +138,8 @@ class StudyGrades:
         self._strata = find_strata(self._cells.index.get_level_values("task").to_list())
         self._columns: dict[tuple[str, str, str, int], int] = {}
         trainings: dict[str, set[int]] = {}
-        for i, column in enumerate(self._cells.columns.to_list()):
-            variant, robot, metric, training = column
+        names = self._cells.columns.to_frame(index=False).itertuples(index=False, name=None)
+        for i, (variant, robot, metric, training) in enumerate(names):
             self._columns[str(variant), str(robot), str(metric), int(training)] = i
             trainings.setdefault(str(variant), set()).add(int(training))
         self._trainings = {variant: tuple(sorted(found)) for variant, found in trainings.items()}
