@@ -76,13 +76,14 @@ def attributes() -> dict[str, object]:
 
 def _means(paper: Paper, variant: Variant, robot: str) -> dict[str, float]:
     """The paper's means of a variant and robot where it prints them, else of one like it."""
-    for group in (robot, *([] if robot in HELD_OUT_ROBOTS else [SEEN])):
+    for group in (robot, *([] if robot in HELD_OUT_ROBOTS else [SEEN])):  # where the paper prints it
         for part, variants in PARTS.items():
             for row in row_keys(part, variant) if variant in variants else []:
                 found = {metric: paper.score(part, row, group, metric) for metric in PAPER_METRICS}
                 if None not in found.values():
                     return {metric: float(value) for metric, value in found.items() if value is not None}
-    group = robot if robot in HELD_OUT_ROBOTS else SEEN
+    # A fold that saw a robot draws it as well as any other that it saw.
+    group = robot if robot in variant.held_out_robots and robot in HELD_OUT_ROBOTS else SEEN
     like = {metric: paper.score("actions", "optical_flow", group, metric) for metric in PAPER_METRICS}
     if variant.remedy != "full":
         like = {metric: paper.score("forgetting", "none", "ur5_wsg", metric) for metric in PAPER_METRICS}

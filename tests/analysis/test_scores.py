@@ -39,6 +39,24 @@ def test_tables_without_titles_keep_those_that_they_were_shown_with(tmp_path: Pa
     }
 
 
+def test_several_trainings_of_a_variant_are_told_by_their_seed(tmp_path: Path) -> None:
+    a, b = written(tmp_path / "a.parquet", graded()), written(tmp_path / "b.parquet", graded(baselines=False))
+    merged = merge_scores([("flow", a), ("flow", b)], trainings=(3, 7))
+    own = merged.rows[merged.rows["variant"] == "flow"]
+    assert own.groupby("training").size().to_dict() == {3: 8, 7: 8}
+    assert set(merged.rows.loc[merged.rows["variant"] == "", "training"]) == {0}
+    write_scores(merged, tmp_path / "merged.parquet")
+    assert read_scores(tmp_path / "merged.parquet").rows.equals(merged.rows) and merged.curves["training"].nunique() == 3
+    lacking = merged.rows.drop(own[(own["training"] == 7) & (own["robot"] == "piper") & (own["metric"] == "pck")].index[:1])
+    assert find_missing_scores(lacking)[["variant", "training", "robot", "metric"]].to_numpy().tolist() == [
+        ["flow", 7, "piper", "pck"]
+    ]
+    assert describe_scores(find_missing_scores(lacking)) == "flow 7 flow open_laptop 1000000 piper pck"
+    with pytest.raises(ConfigError, match="a cell occurs more than once"):
+        merge_scores([("flow", a), ("flow", b)], trainings=(3, 3))
+    assert "training" not in merge_scores([("flow", a)]).rows, "a table of one training each stays as it was"
+
+
 def graded(model: str = "flow", robots: tuple[str, ...] = ("ur5_wsg", "piper"), baselines: bool = True) -> pd.DataFrame:
     """Two tasks with one seed each; every value differs."""
     models = [model, *((COPY, TRUTH) if baselines else ())]

@@ -1,13 +1,13 @@
 """Correlation of distance with difficulty over the five leave-one-embodiment-out (LOEO) folds."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
 from scipy.stats import rankdata
 
-from xew.statistics import every_draw, interval
+from xew.statistics import Drawn, every_draw
 
 FOLDS = 5
 ORDERS = np.array(list(permutations(range(FOLDS))))
@@ -103,9 +103,23 @@ def permutation_p(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return (others >= np.abs(pearson(x, y))[..., None] - 1e-12).mean(axis=-1)
 
 
+def exact_p(statistic: Callable[[np.ndarray], np.ndarray], scores: np.ndarray) -> float:
+    """Exact two-sided p of a statistic of scores that are paired with robots.
+
+    Args:
+        statistic: of scores [... 5] float64 in the order of the robots, to [...]; 0 says nothing.
+        scores: those observed [5].
+
+    Returns:
+        The share of all 120 orders of the scores whose statistic is as far from 0; ties up to rounding count as as far.
+    """
+    others = np.abs(statistic(scores[ORDERS]))
+    return float((others >= np.abs(statistic(scores)) - 1e-12).mean())
+
+
 def _bootstrap(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     """Interval of r over all draws of the robots; those in which something does not vary have no r."""
-    return interval(np.concatenate([pearson(x, y)[None], pearson(x[ROBOT_DRAWS], y[ROBOT_DRAWS])]))
+    return Drawn(np.concatenate([pearson(x, y)[None], pearson(x[ROBOT_DRAWS], y[ROBOT_DRAWS])])).interval()
 
 
 def _folds(distance: Sequence[float], score: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,9 @@
 """Score tables: reading, checking and merging them. Rows that are wrong are named, never averaged over.
 
 A study's table is several runs' tables as one: `merge_scores` adds the column `variant`, which names the trained model of
-each row (xew.protocol.Variant) and is empty for the two baselines, which belong to no model.
+each row (xew.protocol.Variant) and is empty for the two baselines, which belong to no model. Where variants were trained
+several times, the column `training` has the seed of the training; it is 0 for baselines. In tables without that column every
+variant has one training.
 """
 
 import operator
@@ -19,6 +21,8 @@ from xew.files import replacing
 from xew.protocol import BASELINES, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES
 
 VARIANT = "variant"
+TRAINING = "training"
+"""Column of the seed of the training that a row's model is of; tables in which each variant has one training may lack it."""
 EPISODE = ["task", "seed", "robot"]
 KEY = ["model", "condition", *EPISODE]
 NAMES = [VARIANT, "model", "condition", "task", "robot", "metric"]
@@ -154,7 +158,7 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
     return Scores(rows, curves, metrics, rows.attrs)
 
 
-def merge_scores(tables: Sequence[tuple[str, Path]], own_robots: Sequence[str] = ()) -> Scores:
+def merge_scores(tables: Sequence[tuple[str, Path]], own_robots: Sequence[str] = (), trainings: Sequence[int] = ()) -> Scores:
     """The score tables of a study's variants as one, with the column `variant` in front.
 
     Baselines that several tables hold are kept once; they have no variant.
@@ -162,6 +166,7 @@ def merge_scores(tables: Sequence[tuple[str, Path]], own_robots: Sequence[str] =
     Args:
         tables: variant and path of its score table; a variant may have several.
         own_robots: as in `read_scores`.
+        trainings: seed of the training that each table is of, for the column `training`; without them there is none.
 
     Raises:
         ConfigError: a table cannot be read; tables were graded by different protocols, metrics or estimators; or cells
@@ -172,14 +177,15 @@ def merge_scores(tables: Sequence[tuple[str, Path]], own_robots: Sequence[str] =
     attributes, rows, curves = [], [], []
     metrics: tuple[MetricInfo, ...] = ()
     graded: set[tuple[object, ...]] = set()
-    for variant, path in tables:
+    seeds: Sequence[int | None] = trainings or [None] * len(tables)
+    for (variant, path), seed in zip(tables, seeds, strict=True):
         scores = read_scores(path, own_robots)
         if not variant or scores.of_study:
             found = f"is a merged table of {scores.rows[VARIANT].nunique()} variants" if variant else "has no variant's name"
             raise ConfigError(f"{path} {found}; expected the score table of one variant, and its name.")
         new = _drop_known_baselines(scores.rows, graded)
-        rows.append(_add_variant_column(variant, new))
-        curves.append(_compact_names(_add_variant_column(variant, _select_curves(scores.curves, new))))
+        rows.append(_add_variant_column(variant, seed, new))
+        curves.append(_compact_names(_add_variant_column(variant, seed, _select_curves(scores.curves, new))))
         attributes.append((path, scores.attributes))
         metrics = metrics or scores.metrics
     common = _merge_attributes(attributes)
@@ -216,9 +222,9 @@ def find_missing_scores(rows: pd.DataFrame) -> pd.DataFrame:
     this robot. Whole robots that it was never asked for are the protocol's to count (xew.protocol).
 
     Returns:
-        Columns [variant] model condition task seed robot metric, one row for each missing score, in order.
+        Columns [variant] [training] model condition task seed robot metric, one row for each missing score, in order.
     """
-    who = [column for column in (VARIANT, "model", "condition") if column in rows]
+    who = [column for column in (VARIANT, TRAINING, "model", "condition") if column in rows]
     asked = rows[[*who, "robot"]].drop_duplicates()
     expected = asked.merge(rows[[*EPISODE, "metric"]].drop_duplicates(), on="robot")[[*who, *EPISODE, "metric"]]
     found = expected.merge(rows[[*who, *EPISODE, "metric"]].drop_duplicates(), how="left", indicator=True)
@@ -228,7 +234,7 @@ def find_missing_scores(rows: pd.DataFrame) -> pd.DataFrame:
 
 def describe_scores(cells: pd.DataFrame, most: int = LISTED) -> str:
     """Text such as 'reference flow open_laptop 1000003 piper lpips; …', with the number of those left out."""
-    columns = [column for column in (VARIANT, *KEY, "metric") if column in cells]
+    columns = [column for column in (VARIANT, TRAINING, *KEY, "metric") if column in cells]
     shown = "; ".join(" ".join(str(part) for part in cell if part != "") for cell in cells[columns].head(most).to_numpy())
     return shown + (f"; and {len(cells) - most} more" if len(cells) > most else "")
 
@@ -274,7 +280,7 @@ def _find_wrong_rows(rows: pd.DataFrame, metrics: Sequence[MetricInfo], robots: 
     """Rows that cannot be averaged over, by what is wrong with them."""
     # Of a variant, model and condition are no more than names; two of them would be two scores of one cell.
     named = rows.assign(**{VARIANT: rows[VARIANT].where(rows[VARIANT] != "", rows["model"])}) if VARIANT in rows else rows
-    key = [*([VARIANT, *EPISODE] if VARIANT in rows else KEY), "metric"]
+    key = [*([VARIANT, *EPISODE] if VARIANT in rows else KEY), "metric", *([TRAINING] if TRAINING in rows else [])]
     value = pd.to_numeric(rows["value"], errors="coerce")
     low = rows["metric"].map({metric.name: -np.inf if metric.low is None else metric.low for metric in metrics})
     high = rows["metric"].map({metric.name: np.inf if metric.high is None else metric.high for metric in metrics})
@@ -331,10 +337,12 @@ def _select_curves(curves: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame:
     return own if kept.empty else pd.concat([own, curves[is_baseline].merge(kept, on=[*KEY, "metric"])])
 
 
-def _add_variant_column(variant: str, table: pd.DataFrame) -> pd.DataFrame:
-    """A table with its variant in front; baselines have none."""
-    own = np.where(table["model"].isin(BASELINES), "", variant)
-    named = table.assign(**{VARIANT: own})[[VARIANT, *table.columns]]
+def _add_variant_column(variant: str, seed: int | None, table: pd.DataFrame) -> pd.DataFrame:
+    """A table with its variant in front, and the seed of its training if there is one; baselines have none."""
+    baseline = table["model"].isin(BASELINES)
+    named = table.assign(**{VARIANT: np.where(baseline, "", variant)})[[VARIANT, *table.columns]]
+    if seed is not None:
+        named.insert(1, TRAINING, np.where(baseline, 0, seed))
     named.attrs = {}  # concat compares them
     return named
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import tyro
 
 from xew.analysis import report
-from xew.analysis.scores import VARIANT, Scores, merge_scores, write_scores
+from xew.analysis.scores import TRAINING, VARIANT, Scores, merge_scores, write_scores
 from xew.analysis.studies.config import Study, load_study
 from xew.config import ConfigError, user_errors
 from xew.protocol import TASK_COUNT, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expected_counts
@@ -29,7 +29,7 @@ class Args:
     study: Annotated[Path, tyro.conf.Positional]
     """Folder of the study."""
     variants: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Variants that are graded; all that have scores where left out."""
+    """Trainings of variants that are graded; all that have scores where left out."""
     distances: Path | None = None
     """Folder of python -m xew.analysis.distance; without it the report has the paper's distances."""
 
@@ -39,16 +39,19 @@ def main(args: Args) -> None:
     """Merge the tables, write the merged one and its report."""
     study = load_study(args.study / "study.yaml")
     study = replace(study, out=args.study)
-    graded = args.variants or tuple(
-        v.name for v in study.planned_variants if (args.study / "scores" / f"{v.name}.parquet").exists()
-    )
+    planned = {run.name: run for run in study.planned_runs}
+    graded = args.variants or tuple(name for name in planned if (args.study / "scores" / f"{name}.parquet").exists())
     if not graded:
         raise ConfigError(f"{args.study} has no graded variant yet; run python -m xew.analysis.study {args.study}/study.yaml")
-    merged = merge_scores([(name, args.study / "scores" / f"{name}.parquet") for name in graded])
+    tables = [(planned[name].of if name in planned else name, args.study / "scores" / f"{name}.parquet") for name in graded]
+    seeds = [(planned[name].seed or 0) if name in planned else 0 for name in graded]
+    merged = merge_scores(tables, trainings=seeds if study.training_seeds else ())
     scores = replace(merged, attributes={**merged.attributes, "study": describe(study, merged)})
     write_scores(scores, args.study / "scores.parquet")
     print(format_coverage(scores.attributes["study"]))
-    rollouts = tuple(args.study / "rollouts" / name for name in graded)
+    # Strips show the first training of each variant.
+    shown = [name for name in graded if name not in planned or planned[name].of == name]
+    rollouts = tuple(args.study / "rollouts" / name for name in shown)
     table, data, out = args.study / "scores.parquet", study.data_folder, args.study / "report"
     shutil.rmtree(out, ignore_errors=True)  # a larger study's figures would stay
     report.main(report.Args(scores=table, data=data, rollouts=rollouts, distances=args.distances, out=out))
@@ -58,11 +61,14 @@ def describe(study: Study, scores: Scores) -> dict[str, Any]:
     """What the merged table says about its study, as plain JSON.
 
     Returns:
-        `parts`, `tasks` (number), `robots`, `train_seeds`, `test_seeds`, `shots`: the extent; `of_paper`: whether it is the
-        paper's; `variants`: for each planned one, `expected` and `found` scored episodes of each robot; `incomplete`: names
-        of those that lack any, against the study's own extent.
+        `parts`, `tasks` (number), `robots`, `train_seeds`, `test_seeds`, `shots`, `training_seeds`: the extent; `of_paper`:
+        whether it is the paper's; `variants`: for each planned one, `expected` and `found` scored episodes of each robot;
+        `incomplete`: names of those that lack any, against the study's own extent.
     """
-    episodes = scores.rows[[VARIANT, "task", "seed", "robot"]].drop_duplicates()
+    cell = [VARIANT, "task", "seed", "robot"]
+    graded = scores.rows[[*cell, *([TRAINING] if TRAINING in scores.rows else [])]].drop_duplicates().groupby(cell).size()
+    # An episode counts where all trainings of the variant were graded on it.
+    episodes = graded[graded >= max(len(study.training_seeds), 1)].reset_index()
     found = episodes.groupby([VARIANT, "robot"]).size().to_dict()
     variants = {
         variant.name: {
@@ -78,6 +84,7 @@ def describe(study: Study, scores: Scores) -> dict[str, Any]:
         "train_seeds": study.train_seeds,
         "test_seeds": study.test_seeds,
         "shots": list(study.shots),
+        "training_seeds": list(study.training_seeds),
         "of_paper": is_of_paper(study),
         "variants": variants,
         "incomplete": [name for name, counts in variants.items() if counts["expected"] != counts["found"]],

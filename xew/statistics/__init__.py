@@ -1,24 +1,28 @@
-"""The statistics of scores: bootstrap draws, intervals, noise floors and verdicts.
+"""The statistics of scores: bootstrap draws, intervals, tests, noise floors and verdicts.
 
 `evaluate`, `report`, `study` and `distance` all ask here, so that the same scores have the same intervals and verdicts in each.
 The package stands on the ground: it imports NumPy, SciPy and pandas, and nothing of ours but `xew.protocol`.
 
-    bootstrap.py   what is drawn, how often, and the mean in every draw
+    bootstrap.py   what is drawn (trainings, then scenes within tasks), how often, and the mean in every draw
+    inference.py   intervals and p-values of what was drawn, Holm's correction for several tests
     verdicts.py    noise floors, and better, worse or unresolved
 """
 
 from xew.statistics.bootstrap import (
     DRAWS,
-    LEVEL,
     MIN_SCENES,
     UNITS,
     Mean,
     Units,
     bootstrap_means,
+    combine,
+    draw_trainings,
     draw_units,
     every_draw,
-    interval,
+    find_strata,
+    pool_trainings,
 )
+from xew.statistics.inference import LEVEL, SIGNIFICANCE, Drawn, holm
 from xew.statistics.verdicts import BETTER, UNRESOLVED, WORSE, noise_floor, verdict
 
 __all__ = [
@@ -26,15 +30,21 @@ __all__ = [
     "DRAWS",
     "LEVEL",
     "MIN_SCENES",
+    "SIGNIFICANCE",
     "UNITS",
     "UNRESOLVED",
     "WORSE",
+    "Drawn",
     "Mean",
     "Units",
     "bootstrap_means",
+    "combine",
+    "draw_trainings",
     "draw_units",
     "every_draw",
-    "interval",
+    "find_strata",
+    "holm",
     "noise_floor",
+    "pool_trainings",
     "verdict",
 ]

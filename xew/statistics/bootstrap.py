@@ -1,34 +1,33 @@
-"""Bootstrap draws of scenes or tasks, the mean of scores in every draw, and the interval of such means.
+"""Bootstrap draws of scenes or tasks, and the mean of scores in every draw.
 
-The unit that is drawn is by default the scene, a (task, seed). It is drawn with all its models, robots and metrics together,
-because they share its layout: every mean of one score table sees the same draws, so that whatever is computed of several means
-is paired by scene. An interval then says what other scenes of these tasks would give. Where tasks are drawn instead, with
-all their scenes, it says what other tasks would give.
+The unit that is drawn is by default the scene, a (task, seed), within its task. It is drawn with all its models, robots and
+metrics together, because they share its layout: every mean of one score table sees the same draws, so that whatever is computed
+of several means is paired by scene. An interval then says what other scenes of these tasks would give. Where tasks are drawn
+instead, with all their scenes, it says what other tasks would give.
 
-A second level (training seeds, then scenes) is a product of two matrices of `draw_units`, and belongs here.
+Of n units of a stratum (a task), n - 1 are drawn and count n / (n - 1) each, so that the variance of a mean over the draws has
+no bias however few they are (Rao and Wu 1988, "Resampling inference with complex survey data").
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import product
 
 import numpy as np
 import pandas as pd
 
+from xew.statistics.inference import LEVEL, Drawn
+
 DRAWS = 9999
 """Number of bootstrap draws. SciPy's default: by chance, an end of an interval is off by 3 % of the mean's standard error."""
-LEVEL = 0.95
-"""Share of the draws that an interval holds."""
 MIN_SCENES = 6
 """Least number of scenes (or of tasks, where tasks are drawn) that have an interval and a verdict.
 
-With six, all differences have one sign by chance in 3 % of cases, with five in 6 %. Percentile intervals of few scenes are too
-narrow all the same: where there is no difference, 15 % of six scenes leave out 0, 11 % of ten, 8 % of twenty, 5 % of a hundred
-(of two it would be 50 %).
+With six, all differences have one sign by chance in 3 % of cases, with five in 6 %.
 """
 SEED = 0
-"""Seed of all draws: two tables of as many scenes see the same draws."""
+"""Seed of all draws: two tables with as many scenes of each task see the same draws."""
 UNITS = {"scene": ("task", "seed"), "task": ("task",)}
 """Columns that name a unit, by what is drawn."""
 COLUMNS_AT_ONCE = 128
@@ -37,14 +36,21 @@ COLUMNS_AT_ONCE = 128
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean over episodes, and what it could as well have been."""
+    """A mean over episodes, or a number computed of several, and what it could as well have been."""
 
     values: np.ndarray
-    """[1 + n] float64, the mean itself, then the mean in each of n draws; NaN in a draw without any episode."""
+    """[1 + n + k] float64: the number itself, its value in each of n draws (NaN in a draw without any episode), and its value
+    without each of the k trainings that `left_out` counts."""
     count: int
     """Number of episodes; 0 where it is not known (printed means)."""
     scenes: int | None
     """Number of scenes or tasks that these episodes are of; None where the values are not drawn over any (printed means)."""
+    freedom: float = np.inf
+    """Degrees of freedom of the scenes: scenes less tasks."""
+    trainings: int = 0
+    """Least number of trainings that the number rests on: 1 where the interval is of this training; 0 where none is known."""
+    left_out: tuple[int, ...] = ()
+    """Numbers of trainings of the variants that have several, in the order of the last values."""
 
     @property
     def value(self) -> float:
@@ -54,7 +60,45 @@ class Mean:
         """Ends of the interval; NaN where there are fewer than MIN_SCENES scenes."""
         if self.scenes is not None and self.scenes < MIN_SCENES:
             return np.nan, np.nan
-        return interval(self.values, level)
+        return self._drawn.interval(level)
+
+    def p_above(self, bound: float, level: float = LEVEL) -> float:
+        """One-sided p of the number being above a bound, see `Drawn.p_above`; 1 where there are fewer than MIN_SCENES scenes.
+
+        With the level 1 it is 0 where all that was drawn lies above the bound, else 1.
+        """
+        if self.scenes is not None and self.scenes < MIN_SCENES:
+            return 1.0
+        return float(not self.interval(level)[0] > bound) if level >= 1 else self._drawn.p_above(bound)
+
+    def p_below(self, bound: float, level: float = LEVEL) -> float:
+        """One-sided p of the number being below a bound."""
+        if self.scenes is not None and self.scenes < MIN_SCENES:
+            return 1.0
+        return float(not self.interval(level)[1] < bound) if level >= 1 else self._drawn.p_below(bound)
+
+    @cached_property
+    def _drawn(self) -> Drawn:
+        return Drawn(self.values, self.freedom, self.left_out)
+
+
+def combine(function: Callable[..., np.ndarray], *means: Mean) -> Mean:
+    """A number computed of several means of one table, draw by draw; it rests on the fewest scenes and trainings of any.
+
+    Args:
+        function: of arrays [1 + n + k] float64, one for each mean, to one such array.
+        means: of one score table, so that all see the same draws.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = function(*(mean.values for mean in means))
+    return Mean(
+        values,
+        min(mean.count for mean in means),
+        min((mean.scenes for mean in means if mean.scenes is not None), default=None),
+        min(mean.freedom for mean in means),
+        min((mean.trainings for mean in means if mean.trainings), default=0),
+        means[0].left_out,
+    )
 
 
 class Units:
@@ -69,6 +113,8 @@ class Units:
         self.kind = kind
         self._names = list(UNITS[kind])
         self._keys = pd.MultiIndex.from_frame(rows[self._names].drop_duplicates().sort_values(self._names))
+        tasks = self._keys.get_level_values("task").to_list() if kind == "scene" else [""] * len(self._keys)
+        self.strata = find_strata(tasks)
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -78,7 +124,22 @@ class Units:
         return self._keys.get_indexer(pd.MultiIndex.from_frame(index.to_frame(index=False)[self._names]))
 
 
-def bootstrap_means(values: np.ndarray, numbers: np.ndarray, unit_count: int) -> Iterator[Mean | None]:
+def find_strata(tasks: Sequence[str]) -> tuple[int, ...]:
+    """The stratum that each unit is drawn within, numbered from 0: its task.
+
+    Tasks of one unit have nothing to draw and form one stratum together, or with the smallest other where there is one alone.
+    """
+    _, codes, sizes = np.unique(np.asarray(tasks, dtype=str), return_inverse=True, return_counts=True)
+    alone = sizes == 1
+    if alone.sum() == 1 and len(sizes) > 1:
+        alone[np.argmin(np.where(alone, np.inf, sizes))] = True
+    strata = np.where(alone[codes], -1, codes)
+    return tuple(np.unique(strata, return_inverse=True)[1].tolist())
+
+
+def bootstrap_means(
+    values: np.ndarray, numbers: np.ndarray, strata: tuple[int, ...], draws: int = DRAWS
+) -> Iterator[Mean | None]:
     """The mean of each column of scores, with its value in every bootstrap draw; None for a column without any score.
 
     A column's result does not depend, to the last bit, on the columns beside it or on the order of the rows.
@@ -86,29 +147,49 @@ def bootstrap_means(values: np.ndarray, numbers: np.ndarray, unit_count: int) ->
     Args:
         values: [n c] float, scores of n episodes; NaN where there is none.
         numbers: [n] int, the number of each episode's unit, as `Units.numbers` gives it.
-        unit_count: number of units of the whole table. Those without a score in a column are drawn too.
+        strata: stratum of each unit of the whole table (`Units.strata`). Units without a score in a column are drawn too.
+        draws: number of draws.
     """
     for first in range(0, values.shape[1], COLUMNS_AT_ONCE):
-        yield from _draw_block(values[:, first : first + COLUMNS_AT_ONCE].astype(np.float64), numbers, unit_count)
+        yield from _draw_block(values[:, first : first + COLUMNS_AT_ONCE].astype(np.float64), numbers, strata, draws)
 
 
-def _draw_block(values: np.ndarray, numbers: np.ndarray, unit_count: int) -> Iterator[Mean | None]:
+def _draw_block(values: np.ndarray, numbers: np.ndarray, strata: tuple[int, ...], draws: int) -> Iterator[Mean | None]:
     # `scipy.stats.bootstrap` gives the same up to chance, but gathers every drawn score: on two cores, a mean over 500 scenes
     # took it 79 ms (among 128, in batches of 100 draws) to 1.1 s (alone), and this 4 ms. All columns share the draws, and a
     # draw is a row of a matrix.
+    unit_count = len(strata)
     held = np.isfinite(values)
     lowest = np.min(values, axis=0, where=held, initial=np.inf)
     lowest = np.where(np.isfinite(lowest), lowest, 0)
     counts, sums = np.zeros((2, unit_count, values.shape[1]))
     np.add.at(counts, numbers, held)
     np.add.at(sums, numbers, _round_for_exact_sums(np.where(held, values - lowest, 0), unit_count * counts.max(axis=0)))
-    weights = draw_units(unit_count)
     full = counts[0, 0] if counts.size and np.ptp(counts) == 0 else 0  # then every draw holds as many episodes
-    drawn = np.full(counts.shape[1], unit_count * full) if full else weights @ counts
-    means = lowest + weights @ sums / np.where(drawn > 0, drawn, np.nan)
-    for i in range(values.shape[1]):
-        scenes = int((counts[:, i] > 0).sum())
-        yield Mean(means[:, i], int(counts[:, i].sum()), scenes) if scenes else None
+    groups = draw_units(strata, draws)
+    total = sum(scale * (weights @ sums[members]) for members, scale, weights in groups)
+    drawn = (
+        np.full(counts.shape[1], unit_count * full)
+        if full
+        else sum(scale * (weights @ counts[members]) for members, scale, weights in groups)
+    )
+    means = lowest + total / np.where(drawn > 0, drawn, np.nan)
+    scored = counts > 0
+    sizes = (counts.sum(axis=0).astype(int), scored.sum(axis=0), _freedom(scored, strata))
+    columns = np.ascontiguousarray(means.T)
+    for values_drawn, count, scenes, freedom in zip(columns, *(size.tolist() for size in sizes), strict=True):
+        yield Mean(values_drawn, count, scenes, freedom) if scenes else None
+
+
+def _freedom(scored: np.ndarray, strata: tuple[int, ...]) -> np.ndarray:
+    """Degrees of freedom [c] of means over the units that are scored [n c]: one less than the units of each stratum.
+
+    Strata with one scored unit count as one stratum together.
+    """
+    in_stratum = np.zeros((max(strata) + 1, scored.shape[1]))
+    np.add.at(in_stratum, np.asarray(strata), scored)
+    alone = (in_stratum == 1).sum(axis=0)
+    return np.maximum(np.maximum(in_stratum - 1, 0).sum(axis=0) + np.maximum(alone - 1, 0), 1)
 
 
 def _round_for_exact_sums(values: np.ndarray, terms: np.ndarray) -> np.ndarray:
@@ -122,12 +203,70 @@ def _round_for_exact_sums(values: np.ndarray, terms: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=4)
-def draw_units(count: int) -> np.ndarray:
-    """[1 + DRAWS count] float64, how often each unit is drawn: once each in the first row, then at random with replacement."""
-    drawn = np.random.default_rng(SEED).multinomial(count, np.full(count, 1 / count), DRAWS)
+def draw_units(strata: tuple[int, ...], draws: int = DRAWS) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]:
+    """How often each unit is drawn within its stratum: once each in the first row, then at random with replacement.
+
+    Args:
+        strata: stratum of each unit.
+        draws: number of draws.
+
+    Returns:
+        For each size n of strata: the numbers of their units [m] int; what a drawn unit counts [1 + draws 1] float64, 1 and
+        then n / (n - 1); and how often it is drawn [1 + draws m] float64, n - 1 times in a stratum.
+    """
+    rng, codes = np.random.default_rng(SEED), np.asarray(strata)
+    sizes = np.bincount(codes)
+    drawn = np.ones((1 + draws, len(codes)))
+    for stratum, size in enumerate(sizes):
+        if size > 1:
+            drawn[1:, codes == stratum] = rng.multinomial(size - 1, np.full(size, 1 / size), draws)
+    groups = []
+    for size in np.unique(sizes):
+        members = np.flatnonzero(sizes[codes] == size)
+        scale = np.full((1 + draws, 1), size / max(size - 1, 1))
+        scale[0] = 1
+        weights = np.ascontiguousarray(drawn[:, members])
+        for array in (members, scale, weights):
+            array.setflags(write=False)
+        groups.append((members, scale, weights))
+    return tuple(sorted(groups, key=lambda group: group[0][0]))
+
+
+@lru_cache(maxsize=64)
+def draw_trainings(variant: str, count: int, draws: int = DRAWS) -> np.ndarray:
+    """[1 + draws count] float64, the weight of each training of a variant in every draw: 1 each in the first row.
+
+    `count` - 1 are drawn and count for `count` / (`count` - 1), as units are; each variant has draws of its own.
+    """
+    rng = np.random.default_rng([SEED, *variant.encode()])
+    drawn = rng.multinomial(count - 1, np.full(count, 1 / count), draws) * (count / (count - 1))
     weights = np.concatenate([np.ones((1, count)), drawn])
     weights.setflags(write=False)
     return weights
+
+
+def pool_trainings(means: Sequence[Mean], variant: str, left_out: Sequence[tuple[str, int]] = ()) -> Mean:
+    """The mean of a variant over its trainings, each as heavy as another.
+
+    Trainings are drawn first, then scenes, the same scenes for all trainings (Owen 2007, "The pigeonhole bootstrap").
+
+    Args:
+        means: of each training, over the same episodes.
+        variant: name of the variant.
+        left_out: names of all variants of the table that have several trainings, and how many.
+    """
+    values, count = np.stack([mean.values for mean in means], axis=1), len(means)
+    weights = draw_trainings(variant, count, len(values) - 1) if count > 1 else np.ones((1, 1))
+    pooled = (values * weights).sum(axis=1) / count
+    first, numbers = means[0], tuple(number for _, number in left_out)
+    if not numbers:
+        return Mean(pooled, first.count, first.scenes, first.freedom, count)
+    padded = np.full(len(pooled) + sum(numbers), pooled[0])
+    padded[: len(pooled)] = pooled
+    if (variant, count) in left_out:
+        start = len(pooled) + sum(numbers[: left_out.index((variant, count))])
+        padded[start : start + count] = (values[0].sum() - values[0]) / (count - 1)
+    return Mean(padded, first.count, first.scenes, first.freedom, count, numbers)
 
 
 def every_draw(count: int, least: int) -> np.ndarray:
@@ -138,12 +277,3 @@ def every_draw(count: int, least: int) -> np.ndarray:
         least: least number of different units in a draw.
     """
     return np.array([drawn for drawn in product(range(count), repeat=count) if len(set(drawn)) >= least])
-
-
-def interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, float]:
-    """Ends of the share `level` of drawn values [1 + n]; the first is the point and does not count.
-
-    Values that do not exist (a draw without any episode) are left out.
-    """
-    low, high = np.nanquantile(values[1:], [(1 - level) / 2, (1 + level) / 2]).tolist()
-    return low, high

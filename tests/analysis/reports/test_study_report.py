@@ -16,6 +16,7 @@ from tests.synthetic import write_synthetic_data
 from xew.analysis.paper import read_paper
 from xew.analysis.report import Args, main
 from xew.analysis.reports import page
+from xew.analysis.reports.study import trainings_note
 from xew.analysis.scores import read_scores
 from xew.analysis.statistics.grades import PaperGrades, StudyGrades
 from xew.analysis.tables import formats
@@ -268,6 +269,25 @@ def test_figures_lie_beside_their_numbers(folder: Path) -> None:
     assert {Path(name).stem for name in shown} == pictures
     distance = pd.read_csv(figures / "distance.csv")
     assert list(distance["appearance"]) == [0.175, 0.063, 0.058, 0.107, 0.052]
+
+
+def test_one_training_is_said_to_be_one_wherever_there_is_an_interval(folder: Path, rows: pd.DataFrame) -> None:
+    report = folder / "report"
+    for name in ("index.html", "report.md", "tables/actions_full.tex", "tables/gap.tex", "tables/findings.tex"):
+        assert "of this training" in (report / name).read_text(), name
+    findings = pd.read_csv(report / "findings.csv")
+    assert set(findings.loc[(findings["of"] == "here") & findings["value"].notna(), "trainings"]) == {1}
+    assert {"verdict_in_family", "p_holds", "p_fails"} <= set(findings)
+    paper = read_paper()
+    flow = "fixed-optical_flow-none"
+    more = [rows.assign(training=0), rows[rows["variant"] == flow].assign(training=1)]
+    grades = StudyGrades(pd.concat(more), paper.infos, paper_axes(paper))
+    assert trainings_note(grades).startswith(f"Intervals are over scenes and the trainings of {flow} (2); those of ")
+    assert trainings_note(grades).endswith("are of this training.")
+    own = pd.concat(more).query("variant == @flow or variant == ''")
+    assert trainings_note(StudyGrades(own, paper.infos, paper_axes(paper))) == (
+        "Intervals are over 2 trainings of each model, and over scenes."
+    )
 
 
 def test_gains_are_relative_to_the_row_that_is_named(folder: Path, rows: pd.DataFrame) -> None:

@@ -1,6 +1,7 @@
 """Means by address, and what they vary over."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from tests.analysis.synthetic_study import TASKS, paper_axes, write_study
@@ -8,7 +9,7 @@ from xew.analysis.paper import read_paper
 from xew.analysis.scores import Scores, read_scores
 from xew.analysis.statistics.grades import SEEN, PaperGrades, StudyGrades, find_variant, relative_gain, row_keys
 from xew.protocol import PAPER_PARTS, PARTS, ROBOT_NAMES, SEEN_ROBOTS
-from xew.statistics import bootstrap_means, interval
+from xew.statistics import bootstrap_means
 
 
 @pytest.fixture(scope="module")
@@ -49,26 +50,27 @@ def test_intervals_are_those_of_resampled_scenes(grades: StudyGrades, scores: Sc
     rows = scores.rows[(scores.rows["variant"] == "fixed-optical_flow-none") & (scores.rows["metric"] == "lpips")]
     by_scene = rows[rows["robot"].isin(SEEN_ROBOTS)].groupby(["task", "seed"])["value"].mean()
     assert mean is not None
-    assert mean.values[1:].std() == pytest.approx(by_scene.std(ddof=0) / np.sqrt(12), rel=0.06)
-    low, high = interval(mean.values, 0.95)
+    within = by_scene.groupby("task").var(ddof=1).mean()  # scenes are drawn within tasks
+    assert mean.values[1:].std() == pytest.approx(np.sqrt(within / 12), rel=0.06) and mean.freedom == 12 - 4
+    low, high = mean.interval()
     assert low < mean.value < high
 
 
-@pytest.mark.parametrize(("scenes", "share"), [(6, 0.15), (10, 0.11), (20, 0.08), (100, 0.05)])
-def test_chance_resolves_as_often_as_is_said(scenes: int, share: float) -> None:
+@pytest.mark.parametrize("scenes", [6, 20, 100])
+def test_chance_resolves_as_often_as_is_said(scenes: int) -> None:
     differences = np.random.default_rng(1).normal(size=(1500, scenes))
-    ends = np.array([mean.interval() for mean in bootstrap_means(differences.T, np.arange(scenes), scenes) if mean])
-    assert np.mean((ends[:, 0] > 0) | (ends[:, 1] < 0)) == pytest.approx(share, abs=0.02)
+    ends = np.array([mean.interval() for mean in bootstrap_means(differences.T, np.arange(scenes), (0,) * scenes) if mean])
+    assert np.mean((ends[:, 0] > 0) | (ends[:, 1] < 0)) == pytest.approx(0.05, abs=0.02)
 
 
 def test_differences_are_paired_by_scene(grades: StudyGrades) -> None:
     """Scenes differ by 15 %, the two rows by 3 % within a scene: only pairing can tell them apart so well."""
     after, before = (grades.mean("actions", row, "piper", "lpips") for row in ("optical_flow", "joints"))
     assert after is not None and before is not None
-    gain = relative_gain(after, before, grades.metrics["lpips"]).values
-    assert gain[0] == pytest.approx((before.value - after.value) / before.value)
+    gain = relative_gain(after, before, grades.metrics["lpips"])
+    assert gain.value == pytest.approx((before.value - after.value) / before.value)
     unpaired = before.values[1:] - np.random.default_rng(0).permutation(after.values[1:])
-    assert np.ptp(interval(gain, 0.95)) * before.value < 0.5 * np.ptp(np.quantile(unpaired, [0.025, 0.975]))
+    assert np.ptp(gain.interval()) * before.value < 0.5 * np.ptp(np.quantile(unpaired, [0.025, 0.975]))
 
 
 def test_the_floor_is_what_the_estimators_miss_on_the_truth(grades: StudyGrades) -> None:
@@ -99,6 +101,41 @@ def test_an_adapted_model_takes_no_seen_robot_from_the_one_that_it_starts_from(g
     """It is graded on UR5 alone of the seen ones; the pool stays whole."""
     pool, alone = (grades.mean("few_shot", "reference", robots, "lpips", shared=True) for robots in (SEEN, "ur5_wsg"))
     assert pool is not None and alone is not None and (pool.count, alone.count) == (36, 12)
+
+
+def train_thrice(rows: pd.DataFrame, variant: str, spread: float) -> pd.DataFrame:
+    """The same scores with the column `training`, and two more trainings of a variant, worse and better by a share."""
+    rows = rows.assign(training=0)
+    own = rows[rows["variant"] == variant]
+    more = [own.assign(training=seed, value=own["value"] * (1 + sign * spread)) for seed, sign in ((1, 1), (2, -1))]
+    return pd.concat([rows, *more], ignore_index=True)
+
+
+def test_a_variant_of_several_trainings_is_their_mean_and_has_their_spread(grades: StudyGrades, scores: Scores) -> None:
+    flow = "fixed-optical_flow-none"
+    more = StudyGrades(train_thrice(scores.rows, flow, 0.2), scores.metrics, paper_axes(read_paper()))
+    assert more.trainings(flow) == 3 and more.trainings("fixed-joints-none") == 1
+    one, three = (one.mean("actions", "optical_flow", "piper", "lpips") for one in (grades, more))
+    assert one and three and (one.trainings, three.trainings) == (1, 3)
+    assert three.value == pytest.approx(one.value) and (three.count, three.scenes) == (one.count, one.scenes)
+    between = np.sqrt(2 / 3) * 0.2 * one.value / np.sqrt(2)  # sd of (0, 0.2, -0.2) over the root of three
+    assert three.values[1:-3].std() == pytest.approx(np.hypot(one.values[1:].std(), between), rel=0.1)
+    assert np.ptp(three.interval()) > 3 * np.ptp(one.interval())
+    same = [one.mean("actions", "joints", "piper", "lpips") for one in (grades, more)]
+    assert same[0] and same[1] and same[0].interval() == same[1].interval() and same[1].trainings == 1
+    gap = [one.difference("actions", "optical_flow", "joints", "piper", "lpips") for one in (grades, more)]
+    assert gap[0] and gap[1] and gap[1].value == pytest.approx(gap[0].value) and gap[1].trainings == 1
+    assert np.ptp(gap[1].interval()) > np.ptp(gap[0].interval())
+
+
+def test_episodes_that_one_training_lacks_count_for_none(scores: Scores) -> None:
+    flow = "fixed-optical_flow-none"
+    rows = train_thrice(scores.rows, flow, 0.2)
+    lost = (rows["training"] == 2) & (rows["task"] == TASKS[0])
+    mean = StudyGrades(rows[~lost], scores.metrics, {}).mean("actions", "optical_flow", "piper", "lpips")
+    kept = scores.rows[(scores.rows["variant"] == flow) & (scores.rows["task"] != TASKS[0])]
+    expected = kept[(kept["robot"] == "piper") & (kept["metric"] == "lpips")]["value"].mean()
+    assert mean and mean.count == 9 and mean.value == pytest.approx(expected)
 
 
 def test_the_papers_means_vary_by_what_prints_the_same() -> None:

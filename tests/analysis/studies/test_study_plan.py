@@ -80,6 +80,24 @@ def test_baselines_are_graded_once_and_over_all_robots(study: Study) -> None:
     assert [step.name for step in graded] == ["evaluate/fixed-optical_flow-none"]
 
 
+def test_every_training_seed_is_a_training_of_every_variant(study: Study) -> None:
+    study = load_study(DEBUG, ["--training-seeds", "3", "7"])
+    steps, once = plan(study), plan(load_study(DEBUG))
+    assert len(steps) == 3 + 4 * 2 * len(study.planned_variants) and set(once) < set(steps)
+    again = steps["adapt/few_shot-piper-1-seed_7"]
+    assert "train/fixed-optical_flow-nine_views-seed_7" in again.needs and "latents/few_shot-piper-1-seed_7" in again.needs
+    runs = {run.name: run for run in study.planned_runs}
+    settings = {name: build_experiment(study, runs[f"few_shot-piper-1{name}"]) for name in ("", "-seed_7")}
+    assert [settings[name]["train"]["seed"] for name in settings] == [3, 7]
+    assert settings["-seed_7"]["adapt"]["start_from"] == "studies/debug/runs/fixed-optical_flow-nine_views-seed_7"
+    assert (runs["fixed-irasim-seed_7"].of, runs["fixed-irasim"].of) == ("fixed-irasim", "fixed-irasim")
+    assert [step.name for step in steps.values() if "--baselines" in step.command] == ["evaluate/fixed-optical_flow-none"]
+    costs = estimate(study, steps)
+    assert costs["train/fixed-irasim-seed_7"] == costs["train/fixed-irasim"]
+    # One training has the experiment's own seed, as studies had before there were several.
+    assert "seed" not in build_experiment(load_study(DEBUG), load_study(DEBUG).planned_runs[0])["train"]
+
+
 def test_a_subset_keeps_what_it_starts_from(study: Study) -> None:
     names = [variant.name for variant in replace(study, variants=("few_shot-piper-*",)).planned_variants]
     assert names == ["fixed-optical_flow-nine_views", "few_shot-piper-1"]
@@ -96,6 +114,7 @@ def test_a_subset_keeps_what_it_starts_from(study: Study) -> None:
         (["--robots", "piper", "piper"], "a robot stands twice in piper, piper"),
         (["--tasks", "lift_pott"], "did you mean 'lift_pot'"),
         (["--tasks", "lift_pot", "lift_pot"], "a task stands twice"),
+        (["--training-seeds", "1", "1"], "a training seed stands twice in 1, 1"),
         (["--shots", "1", "5"], "unknown number of shots '5'; known: 1, 2, 3"),
         (["--variants", "loeo_*", "leo_*"], "variants 'leo_\\*' matches none of the parts"),
         (["--variants", "few_shot-piper-3"], "no variant"),

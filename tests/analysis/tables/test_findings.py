@@ -11,13 +11,20 @@ from xew.analysis.paper import read_paper
 from xew.analysis.scores import MetricInfo, Scores, read_scores
 from xew.analysis.statistics.grades import PaperGrades, StudyGrades
 from xew.analysis.tables.claims import CLAIMS
+from xew.analysis.tables.comparisons import Reader
 from xew.analysis.tables.findings import Finding, ask, findings_frame
-from xew.protocol import HELD_OUT_ROBOTS, SHOTS
+from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS
+from xew.statistics import holm
 
 UNRESOLVED_BY_ROUNDING = {"views saturate"}
 """A change of LPIPS by under 1 % is less than its third decimal tells."""
-FAILS_ON_THE_PAPER = {"pixel systems lead in all", "looks are significant", "looks predict everything"}
-"""Stricter questions, ours, which its own figures answer with no."""
+OF_OTHER_ROBOTS = {"gap", "only alignment closes the gap", "the frame flatters", "all systems degrade", "systems degrade much"}
+"""Claims about a gap, of which the paper prints no model that saw the robot."""
+DESCRIPTIVE = {"looks predict", "looks are stable", "kinematics are unstable", "looks before kinematics"}
+DESCRIPTIVE |= {"looks are significant", "looks before kinematics, always", "looks predict everything"}
+"""Claims about five robots, of which another pairing gives as much by chance."""
+FAILS_ON_THE_PAPER = {"pixel systems lead in all"}
+"""Stricter question, ours, which its own figures answer with no."""
 
 
 @pytest.fixture(scope="module")
@@ -36,12 +43,18 @@ def changed(rows: pd.DataFrame, variant: str, metric: str, factor: float, robot:
     return rows.assign(value=rows["value"].where(~chosen, rows["value"] * factor))
 
 
-def test_the_papers_figures_bear_out_what_it_claims_but_for_what_rounding_hides() -> None:
+def test_the_papers_figures_bear_out_what_it_claims_but_for_what_they_cannot_show() -> None:
     paper = read_paper()
     found = {finding.claim.name: finding for finding in ask(PaperGrades(paper, paper.infos))}
+    unresolved = UNRESOLVED_BY_ROUNDING | OF_OTHER_ROBOTS | DESCRIPTIVE
     for name, finding in found.items():
-        expected = "unresolved" if name in UNRESOLVED_BY_ROUNDING else "fails" if name in FAILS_ON_THE_PAPER else "holds"
-        assert finding.answer == ("not measured" if name == "remedies" else expected), name
+        expected = "unresolved" if name in unresolved else "fails" if name in FAILS_ON_THE_PAPER else "holds"
+        assert finding.answer == finding.in_family == ("not measured" if name == "remedies" else expected), name
+        assert finding.basis == ""
+    doubts = {name: found[name].comparisons[0].numbers for name in (*OF_OTHER_ROBOTS, *DESCRIPTIVE)}
+    assert all("other robots" in doubts[name] for name in OF_OTHER_ROBOTS)
+    assert all("five robots: descriptive" in doubts[name] for name in DESCRIPTIVE)
+    assert "exact p = 0.075" in doubts["looks predict"]
     values = {one.label: one.value for one in found["flow gains much"].comparisons}
     assert [round(100 * value) for value in values.values()] == [29, 57, 25, 116]
     assert found["catastrophic forgetting"].comparisons[0].value == pytest.approx((0.073 - 0.043) / 0.043)
@@ -52,9 +65,82 @@ def test_the_papers_figures_bear_out_what_it_claims_but_for_what_rounding_hides(
 
 
 def test_a_study_like_the_paper_is_answered_as_the_paper_is(scores: Scores) -> None:
-    found = {f.claim.name: f.answer for f in ask(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper())))}
-    assert {name for name, answer in found.items() if answer == "fails"} <= FAILS_ON_THE_PAPER | UNRESOLVED_BY_ROUNDING
-    assert sum(answer == "holds" for answer in found.values()) >= 22
+    found = ask(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper())))
+    answers = {f.claim.name: f.answer for f in found}
+    assert {name for name, answer in answers.items() if answer == "fails"} <= FAILS_ON_THE_PAPER
+    small = {"clip is no better", "all systems degrade"}  # by 0.7 % and by less than the noise floor of mask IoU
+    unresolved = {name for name, answer in answers.items() if answer == "unresolved"}
+    assert unresolved <= DESCRIPTIVE | UNRESOLVED_BY_ROUNDING | small
+    doubts = [a.numbers for f in found if f.claim.name == "all systems degrade" for a in f.comparisons if a.answer != "holds"]
+    assert doubts and all("noise floor" in doubt for doubt in doubts), doubts
+    assert {f.basis for f in found if f.comparisons} == {"of this training"}
+
+
+def test_the_gap_is_that_of_folds_on_the_same_robot(scores: Scores) -> None:
+    """A robot that is harder for all, those that saw it too, is no gap."""
+    rows = scores.rows
+    hard = (rows["robot"] == "piper") & (rows["metric"] == "lpips") & (rows["variant"] != "")
+    harder = rows.assign(value=rows["value"].where(~hard, rows["value"] * 3))
+    before, after = (asked(table, "gap", scores.metrics) for table in (rows, harder))
+    assert before.answer == after.answer == "holds"
+    assert [a.value for a in after.comparisons] == pytest.approx([a.value for a in before.comparisons])
+    means = rows[(rows["robot"] == "piper") & (rows["metric"] == "lpips")].groupby("variant")["value"].mean()
+    folds = means[[name for name in means.index if name.startswith("loeo_")]]
+    unseen = folds[[name for name in folds.index if name.startswith("loeo_piper")]].iloc[0]
+    saw = (folds.sum() - unseen) / 4
+    assert before.comparisons[1].value == pytest.approx((unseen - saw) / saw)
+    systems = [asked(table, "all systems degrade", scores.metrics) for table in (rows, harder)]
+    assert [a.value for a in systems[1].comparisons] == pytest.approx([a.value for a in systems[0].comparisons])
+    without = rows[~rows["variant"].str.startswith("loeo_")]
+    found = asked(without, "gap", scores.metrics)
+    assert found.answer == "unresolved" and all("no model that saw this one" in a.numbers for a in found.comparisons)
+
+
+def test_saturation_is_an_equivalence(scores: Scores) -> None:
+    """Nine views that change nothing saturate; that they cannot be told from one image is not enough, nor that they harm."""
+    one, nine = (f"fixed-optical_flow-{name}" for name in ("reference_image", "nine_views"))
+    rest = scores.rows[scores.rows["variant"] != nine]
+    same = scores.rows[scores.rows["variant"] == one].assign(variant=nine)
+    rng = np.random.default_rng(0)
+    answers = {}
+    for name, factor, spread in (("alike", 1.002, 0.004), ("noisy", 1.0, 0.2), ("harm", 1.2, 0.01)):
+        noise = 1 + spread * rng.normal(size=len(same))
+        value = np.clip(same["value"] * np.where(same["metric"] == "lpips", factor, 1) * noise, 0, 100)
+        answers[name] = asked(pd.concat([rest, same.assign(value=value)]), "views saturate", scores.metrics).answer
+    assert answers == {"alike": "holds", "noisy": "unresolved", "harm": "fails"}
+
+
+def test_an_exact_p_decides_claims_about_five_robots(scores: Scores) -> None:
+    paper = read_paper()
+    chosen = (scores.rows["metric"] == "lpips") & scores.rows["variant"].str.startswith("loeo_")
+    axis = pd.Series(paper_axes(paper)["appearance"], index=ROBOT_NAMES)
+    straight = scores.rows["robot"].map(axis) * (1 + 0.01 * np.random.default_rng(0).normal(size=len(scores.rows)))
+    rows = scores.rows.assign(value=scores.rows["value"].where(~chosen, straight))
+    assert (
+        asked(rows, "looks predict", scores.metrics).answer == asked(rows, "looks are stable", scores.metrics).answer == "holds"
+    )
+    turned = rows.assign(value=rows["value"].where(~chosen, 0.3 - straight))
+    assert (
+        asked(turned, "looks predict", scores.metrics).answer
+        == asked(turned, "looks are stable", scores.metrics).answer
+        == "fails"
+    )
+    claims = [claim for claim in CLAIMS if claim.name == "looks are stable"]
+    [sure] = ask(StudyGrades(rows, scores.metrics, paper_axes(paper)), claims)
+    [unsure] = ask(StudyGrades(rows, scores.metrics, paper_axes(paper), True, {"appearance": np.full(5, 0.05)}), claims)
+    assert (sure.answer, unsure.answer) == ("holds", "unresolved"), "distances that are known no better than they differ"
+
+
+def test_comparisons_and_claims_are_corrected_as_families(scores: Scores) -> None:
+    for finding in ask(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper()))):
+        for one in finding.comparisons:
+            assert (one.answer == "holds") == (one.p_holds <= 0.05) and (one.answer == "fails") == (one.p_fails <= 0.05)
+        if finding.in_family not in ("unresolved", "not measured"):
+            assert finding.in_family == finding.answer, "the answer among all is never bolder than that of the claim alone"
+    many = asked(scores.rows, "mask keeps outlines", scores.metrics)
+    alone = Reader(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper())))
+    plain = [c.p_values(0.95)[0] for c in many.claim.comparisons(alone)]
+    assert [a.p_holds for a in many.comparisons] == pytest.approx(list(holm(plain)))
 
 
 def test_a_claim_fails_where_the_scores_say_the_opposite(scores: Scores) -> None:
@@ -63,7 +149,8 @@ def test_a_claim_fails_where_the_scores_say_the_opposite(scores: Scores) -> None
     worse = changed(rows, flow, "lpips", 3.0, "piper")
     found = asked(worse, "flow looks best", scores.metrics)
     assert found.answer == "fails" and {a.answer for a in found.comparisons if "Franka" in a.label} == {"holds"}
-    assert asked(changed(rows, flow, "lpips", 0.1, "franka_panda"), "gap", scores.metrics).answer == "fails"
+    fold = "loeo_franka_panda-optical_flow-nine_views"
+    assert asked(changed(rows, fold, "lpips", 0.1, "franka_panda"), "gap", scores.metrics).answer == "fails"
     calm = changed(rows, "few_shot-franka_panda-1", "lpips", 0.55, "ur5_wsg")
     assert asked(calm, "forgetting", scores.metrics).answer == "fails"
     assert asked(calm, "catastrophic forgetting", scores.metrics).answer == "fails"
@@ -93,7 +180,7 @@ def test_a_share_of_a_gap_that_is_not_there_is_no_answer(scores: Scores) -> None
     for robot in HELD_OUT_ROBOTS:
         for shots in SHOTS:
             worse = changed(worse, f"few_shot-{robot}-{shots}", "lpips", 4.0 + 0.1 * shots, robot)
-        worse = changed(worse, "fixed-optical_flow-none", "region_lpips", 0.05, robot)
+        worse = changed(worse, "fixed-optical_flow-none", "region_lpips", 0.02, robot)
         worse = changed(worse, "fixed-optical_flow-robot_render", "region_lpips", 0.2, robot)
     for name in ("rays recover", "returns diminish", "only alignment closes the gap"):
         found = asked(worse, name, scores.metrics)
@@ -106,7 +193,8 @@ def test_a_render_that_gains_nothing_does_not_gain_more_than_views_that_harm(sco
         worse = changed(worse, "fixed-optical_flow-nine_views", "region_lpips", 3.0, robot)
         worse = changed(worse, "fixed-optical_flow-robot_render", "region_lpips", 4.0, robot)
     found = asked(worse, "render gains most", scores.metrics)
-    assert {a.answer for a in found.comparisons if "Region" in a.label} == {"fails"}
+    assert found.answer == "fails"
+    assert {a.answer for a in found.comparisons if "Region" in a.label and a.label.endswith(": render")} == {"fails"}
 
 
 def test_few_scenes_resolve_nothing(tmp_path: Path) -> None:

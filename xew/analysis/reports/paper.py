@@ -58,7 +58,8 @@ PRIMARY = "lpips"
 """Primary outcome of the paper, which calls all others exploratory."""
 CLAIMS_TEXT = (
     "Each claim of the paper as an inequality, asked of its own printed figures: it holds where all that prints the same lies "
-    "on its side. The last ones, “ours”, ask more than the paper claims. The paper prints no intervals, so a claim that holds "
+    "on its side. Gaps of unseen robots are unresolved, because it prints no model that saw them, and so is what rests on five "
+    "robots alone. The last ones, “ours”, ask more than the paper claims. The paper prints no intervals, so a claim that holds "
     "here holds for its episodes; whether it would for others its figures cannot say."
 )
 SCORES_TEXT = (
@@ -172,9 +173,9 @@ def _claims_sentence(claims: Sequence[Finding]) -> str:
 
 
 def _count_answers(claims: Sequence[Finding]) -> str:
-    """Text such as '25 claims: hold 24, fail 0, not to be told by the printed digits 1'."""
+    """Text such as '25 claims: hold 15, fail 0, not to be told by its figures 10'."""
     counts = [sum(one.answer == word for one in claims) for word in (HOLDS, FAILS, UNRESOLVED)]
-    return f"{len(claims)} claims: hold {counts[0]}, fail {counts[1]}, not to be told by the printed digits {counts[2]}"
+    return f"{len(claims)} claims: hold {counts[0]}, fail {counts[1]}, not to be told by its figures {counts[2]}"
 
 
 def _correlation_sentence(axis: str, result: Correlation) -> str:

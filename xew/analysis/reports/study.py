@@ -5,9 +5,10 @@ main table, what it looks like, and all metrics folded away.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
@@ -17,10 +18,11 @@ from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study_charts import study_charts
 from xew.analysis.reports.study_strips import Strip, study_strips
 from xew.analysis.scores import Scores, describe_scores, find_missing_scores
-from xew.analysis.statistics.grades import SEEN, Grades, PaperGrades, StudyGrades, relative_gain
+from xew.analysis.statistics.grades import Grades, PaperGrades, StudyGrades, relative_gain
 from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables import formats
 from xew.analysis.tables.builder import Builder
+from xew.analysis.tables.comparisons import OTHER_ROBOTS, NotMeasuredError, Reader
 from xew.analysis.tables.distances import (
     Distances,
     certainty_table,
@@ -38,7 +40,6 @@ from xew.analysis.tables.layouts import build_tables, count_table
 from xew.analysis.tables.outside import outside_tables
 from xew.analysis.tables.table import MARKS, Table
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
-from xew.statistics import interval
 
 TITLE = "Can the model render a robot that it has never seen?"
 PART_TITLES = {
@@ -93,6 +94,8 @@ class Content:
     """Notes on what is not there."""
     missing: pd.DataFrame
     """Scores that other models have."""
+    trainings: str
+    """Sentence that says whether intervals are of one training or of several."""
 
 
 def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances: Path | None, footer: str) -> Report:
@@ -111,11 +114,15 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
     paper = read_paper()
     known = read_distances(distances) if distances else printed_distances(paper)
     strips = study_strips(scores, data, rollouts) if data and rollouts else {}
-    grades = StudyGrades(scores.rows, scores.metrics, {axis: known.of(axis) for axis in AXES}, known.measured)
+    axes, spreads = ({axis: known.of(axis, column) for axis in AXES} for column in ("value", "spread"))
+    grades = StudyGrades(scores.rows, scores.metrics, axes, known.measured, spreads)
     printed = PaperGrades(paper, scores.metrics)
     planned = scores.attributes.get("study", {}).get("variants", {})
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
-    tables = [*build_tables(builder), *outside_tables(builder, scores.rows), count_table(builder), *distance_tables(known)]
+    note = trainings_note(grades)
+    scored = [*build_tables(builder), *outside_tables(builder, scores.rows)]
+    tables = [replace(table, caption=" ".join(filter(None, (table.caption, note)))) for table in scored]
+    tables += [count_table(builder), *distance_tables(known)]
     if builder.has_results("loeo"):
         tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
         tables.append(certainty_table(grades, known, paper))
@@ -130,9 +137,24 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
         strips,
         [*_missing_notes(builder, scores), *missing_note(missing)],
         missing,
+        note,
     )
     html = _write_html(content, scores, footer)
     return Report(html, _write_markdown(content), formats.tables_frame(tables), dict(_files(content)))
+
+
+def trainings_note(grades: StudyGrades) -> str:
+    """Sentence that says what the intervals of a study's tables are over: of this training, or of several."""
+    counts = {name: grades.trainings(name) for name in grades.variants}
+    several = {name: count for name, count in counts.items() if count > 1}
+    if not several:
+        return "Every interval is of this training: one of each model, over scenes." if counts else ""
+    if len(set(counts.values())) == 1:
+        return f"Intervals are over {next(iter(counts.values()))} trainings of each model, and over scenes."
+    named = ", ".join(f"{name} ({count})" for name, count in several.items())
+    rest = ", ".join(name for name in counts if name not in several)
+    ending = f"; those of {rest} are of this training" if rest else ""
+    return f"Intervals are over scenes and the trainings of {named}{ending}."
 
 
 def _sentences(grades: Grades, distances: Distances, findings: Sequence[Finding]) -> list[str]:
@@ -161,17 +183,17 @@ def _answer_sentence(findings: Sequence[Finding]) -> str:
 
 
 def _gap_sentence(grades: Grades) -> Iterator[str]:
-    seen = grades.mean("fixed", "fixed", SEEN, "lpips") if "lpips" in grades.metrics else None
-    parts = []
-    for robot in HELD_OUT_ROBOTS:
-        mean = grades.mean("fixed", "fixed", robot, "lpips") if seen else None
-        if mean and seen:
-            worse = -relative_gain(mean, seen, grades.metrics["lpips"]).values
-            low, high = interval(worse, grades.level)
-            ends = f"{_format_change(low)} to {_format_change(high)}"
-            parts.append(f"{_format_change(worse[0])} on {ROBOT_TITLES[robot]} ({ends})")
-    if parts and seen:
-        yield f"Told optical flow only, LPIPS is {seen.value:.3f} on robots seen in training; {' and '.join(parts)}."
+    reader, parts = Reader(grades), []
+    for robot in HELD_OUT_ROBOTS if reader.mean_of_seen(HELD_OUT_ROBOTS[0], "lpips") else ():
+        try:
+            gap = reader.unseen_gap(robot, "lpips")
+        except NotMeasuredError:
+            continue
+        if OTHER_ROBOTS not in gap.doubt:
+            ends = " to ".join(_format_change(end) for end in gap.number.interval(grades.level) if not np.isnan(end))
+            parts.append(f"{_format_change(gap.number.value)} on {ROBOT_TITLES[robot]}" + (f" ({ends})" if ends else ""))
+    if parts:
+        yield f"A model that never saw the robot has another LPIPS on it than models that did: {' and '.join(parts)}."
 
 
 def _best_sentences(grades: Grades) -> Iterator[str]:
@@ -253,12 +275,16 @@ def _write_html(content: Content, scores: Scores, footer: str) -> str:
 
 def _claims_section(content: Content) -> Markup:
     text = (
-        "Each claim of the paper as an inequality, asked of this study and of the paper's own printed figures. It holds where "
-        "every number lies on its side with its whole 95 % interval over scenes (for the paper: with all that prints the "
-        "same), and fails where one lies on the other side; anything else is unresolved. The last ones, “ours”, ask more "
-        "than the paper claims."
+        "Each claim of the paper as inequalities, asked of this study and of the paper's own printed figures. It holds where "
+        "every number lies on its side of the bound, and fails where one lies on the other side, each at 5 % after Holm's "
+        "correction for the comparisons of the claim (for the paper: with all that prints the same); anything else is "
+        "unresolved. “Among all claims” corrects once more, for all of them. That something saturates or is alike is an "
+        "equivalence: two one-sided tests with the margins that the claim names. The last ones, “ours”, ask more than the "
+        "paper claims."
     )
-    return page.section("Claims", page.paragraph(text), page.claims(content.findings, content.printed))
+    return page.section(
+        "Claims", page.paragraph(text), page.paragraph(content.trainings), page.claims(content.findings, content.printed)
+    )
 
 
 def _part_section(content: Content, part: str) -> Markup | None:
@@ -285,8 +311,9 @@ def _method_section(content: Content, scores: Scores) -> Markup:
     return page.section(
         "How it was measured",
         page.paragraph(
-            "Means over episodes with 95 % bootstrap intervals; scenes (task and seed) are resampled, the same ones for every "
-            "model and robot, so that all comparisons are paired. Behind a value, against the row that the caption names: "
+            f"Means over episodes with 95 % bootstrap intervals. {content.trainings} Scenes (seeds) are resampled within their "
+            "tasks, the same ones for every model and robot, so that all comparisons are paired. Behind a value, against the "
+            "row that the caption names: "
             f"{MARKS}. “True video, graded” is the truth in the model's place: what it lacks is the estimators' own error, "
             "the noise floor. The paper's values are of its own renders and a model of five billion weights; they stand "
             "beside ours where its protocol is the same."
@@ -305,7 +332,7 @@ def _write_markdown(content: Content) -> str:
         "",
         *(f"> {note}\n" for note in content.lacks),
     ]
-    lines += ["## Claims", "", formats.findings_markdown(content.findings, content.printed)]
+    lines += ["## Claims", "", content.trainings, "", formats.findings_markdown(content.findings, content.printed)]
     for part, (charts, shown, folded) in SECTIONS.items():
         if not any(name in content.tables for name in shown):
             continue

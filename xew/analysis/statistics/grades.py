@@ -4,12 +4,14 @@ A mean has an address that is the same for our study and for the paper: (part, r
 ("actions", "optical_flow", "franka_panda", "lpips"). Parts and rows are named as in `paper.py`; robots are one robot, or
 'seen' for those that a row's model was trained on, pooled.
 
-`StudyGrades` reads a score table: its means vary over bootstrap resamples of the scenes, one resample for all cells, so that
-whatever is computed of several means stays paired by scene. `PaperGrades` reads the printed tables: its means vary over what
-prints the same. Whoever computes a difference or a ratio does it on all these values at once and looks where they lie.
+`StudyGrades` reads a score table: its means vary over bootstrap resamples of each variant's trainings and of the scenes, one
+resample of scenes for all cells, so that whatever is computed of several means stays paired by scene. `PaperGrades` reads the
+printed tables: its means vary over what prints the same. Whoever computes a difference or a ratio does it on all these values
+at once (`xew.statistics.combine`) and looks where they lie.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import ClassVar, Protocol
 
@@ -17,9 +19,9 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.paper import Paper
-from xew.analysis.scores import TRUTH, MetricInfo
+from xew.analysis.scores import COPY, TRAINING, TRUTH, MetricInfo
 from xew.protocol import MULTI_VIEW, PARTS, ROBOT_NAMES, SPLITS, Variant
-from xew.statistics import DRAWS, LEVEL, Mean, bootstrap_means, noise_floor
+from xew.statistics import DRAWS, LEVEL, Mean, bootstrap_means, combine, find_strata, noise_floor, pool_trainings
 
 TOGETHER = {
     "few_shot": ("few_shot", "remedies"),
@@ -58,16 +60,13 @@ class Grades(Protocol):
 
     def axis(self, name: str) -> np.ndarray:
         """Mean distance of each robot to the other four, 'appearance' or 'kinematic', in the order of ROBOT_NAMES: [5], or
-        [1 + DRAWS 5] where it is known to some digits only."""
+        with a row for each of `Mean.values` where it is known to some digits only, or has a spread."""
 
 
 def relative_gain(after: Mean, before: Mean, metric: MetricInfo) -> Mean:
     """By how much a mean is better than another, of the latter: 0.1 is 10 %; positive is better whatever the metric."""
     sign = 1 if metric.higher_is_better else -1
-    with np.errstate(divide="ignore", invalid="ignore"):
-        gain = sign * (after.values - before.values) / np.abs(before.values)
-    scenes = [mean.scenes for mean in (after, before) if mean.scenes is not None]
-    return Mean(gain, min(after.count, before.count), min(scenes, default=None))
+    return combine(lambda new, old: sign * (new - old) / np.abs(old), after, before)
 
 
 def row_keys(part: str, variant: Variant) -> list[str]:
@@ -108,10 +107,13 @@ class StudyGrades:
     """A study's score table with the column `variant`.
 
     Args:
-        rows: columns variant, model, task, seed, robot, metric, value; each cell once.
+        rows: columns variant, model, task, seed, robot, metric, value; training where a variant may have several; each cell
+            once.
         metrics: what the table says of its metrics.
         axes: mean distances by axis, for correlations; in the order of ROBOT_NAMES.
         own_distances: these were measured, and are not the paper's.
+        spreads: standard deviation of the mean distances by axis, over which they are drawn as well; none where left out.
+        draws: number of bootstrap draws.
     """
 
     level = LEVEL
@@ -122,17 +124,26 @@ class StudyGrades:
         metrics: Sequence[MetricInfo],
         axes: Mapping[str, np.ndarray],
         own_distances: bool = False,
+        spreads: Mapping[str, np.ndarray] | None = None,
+        draws: int = DRAWS,
     ) -> None:
         self.own_distances = own_distances
         self.metrics = {metric.name: metric for metric in metrics}
-        self._axes = axes
+        self._axes, self._spreads, self._draws = axes, spreads or {}, draws
         # Baselines belong to no variant; they are found by the model's name.
         named = rows.assign(variant=rows["variant"].where(rows["variant"] != "", rows["model"]))
-        self._cells = named.pivot(index=["task", "seed"], columns=["variant", "robot", "metric"], values="value").sort_index()
-        self._columns: dict[tuple[str, str, str], int] = {}
-        for i, column in enumerate(self._cells.columns):
-            variant, robot, metric = map(str, column)
-            self._columns[variant, robot, metric] = i
+        named = named if TRAINING in named else named.assign(**{TRAINING: 0})
+        columns = ["variant", "robot", "metric", TRAINING]
+        self._cells = named.pivot(index=["task", "seed"], columns=columns, values="value").sort_index()
+        self._strata = find_strata(self._cells.index.get_level_values("task").to_list())
+        self._columns: dict[tuple[str, str, str, int], int] = {}
+        trainings: dict[str, set[int]] = {}
+        names = self._cells.columns.to_frame(index=False).itertuples(index=False, name=None)
+        for i, (variant, robot, metric, training) in enumerate(names):
+            self._columns[str(variant), str(robot), str(metric), int(training)] = i
+            trainings.setdefault(str(variant), set()).add(int(training))
+        self._trainings = {variant: tuple(sorted(found)) for variant, found in trainings.items()}
+        self._several = [(name, len(found)) for name, found in sorted(self._trainings.items()) if len(found) > 1]
         self._cache: dict[tuple[str, tuple[str, ...], str, str], Mean | None] = {}
 
     @property
@@ -140,66 +151,105 @@ class StudyGrades:
         """(task, seed) of all that is graded."""
         return self._cells.index.tolist()
 
+    @property
+    def variants(self) -> list[str]:
+        """Names of the variants that were graded, without the baselines."""
+        return [name for name in self._trainings if name not in (COPY, TRUTH)]
+
+    def trainings(self, variant: str) -> int:
+        """Number of trainings of a variant that were graded."""
+        return len(self._trainings.get(variant, ()))
+
     def mean(self, part: str, row: str, robots: str, metric: str, shared: bool = False) -> Mean | None:
         variant = find_variant(part, row)
         return self.variant_mean(variant.name, pooled(variant, robots), metric, part if shared else "")
 
     def has(self, variant: str) -> bool:
         """Was anything of a variant graded?"""
-        return variant in self._variants
+        return variant in self._trainings
 
     def baseline(self, model: str, robots: Sequence[str], metric: str) -> Mean | None:
         """Mean of COPY or TRUTH."""
         return self.variant_mean(model, tuple(robots), metric)
 
     def variant_mean(self, variant: str, robots: tuple[str, ...], metric: str, shared_part: str = "") -> Mean | None:
-        """Mean over all episodes of some robots, or over those that every measured variant of a part has."""
+        """Mean over all episodes of some robots, or over those that every measured variant of a part has.
+
+        Of a variant with several trainings it is their mean, over the episodes that all of them have.
+        """
         key = (variant, robots, metric, shared_part)
         if key not in self._cache:
-            values = self._scores(variant, robots, metric)
+            # Tables show all metrics of a variant and robot, and one product of matrices is quicker than ten.
+            metrics = [metric] if shared_part or metric not in self.metrics else list(self.metrics)
+            scores = [self._scores(variant, robots, name) for name in metrics]
             if shared_part:
-                values = np.where(self._shared(shared_part, robots, metric), values, np.nan)
-            self._cache[key] = self._bootstrap(values)
+                scores = [
+                    np.where(self._shared(shared_part, robots, name), x, np.nan)
+                    for x, name in zip(scores, metrics, strict=True)
+                ]
+            for name, mean in zip(metrics, self._bootstrap(variant, scores), strict=True):
+                self._cache[variant, robots, name, shared_part] = mean
         return self._cache[key]
 
     def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
-        after, before = (
-            self._scores(variant.name, pooled(variant, robots), metric)
-            for variant in (find_variant(part, row), find_variant(part, base))
-        )
-        shared = self._shared(part, pooled(find_variant(part, row), robots), metric)
-        return self._bootstrap(np.where(shared, after - before, np.nan))
+        after, before = (find_variant(part, key) for key in (row, base))
+        if max(self.trainings(after.name), self.trainings(before.name)) > 1:
+            means = [self.mean(part, key, robots, metric, shared=True) for key in (row, base)]
+            return combine(np.subtract, *(mean for mean in means if mean)) if all(means) else None
+        shared = self._shared(part, pooled(after, robots), metric)
+        new, old = (self._scores(variant.name, pooled(variant, robots), metric) for variant in (after, before))
+        return self._bootstrap(after.name, [np.where(shared, new - old, np.nan)])[0]
 
     def floor(self, robots: str, metric: str) -> float:
         info = self.metrics[metric]
         truth = self.baseline(TRUTH, SPLITS["fixed"].train_robots if robots == SEEN else (robots,), metric)
         return noise_floor(truth.value if truth else None, info.best, info.estimated)
 
-    def _bootstrap(self, values: np.ndarray) -> Mean | None:
-        """The mean of scores [s r] of all scenes and some robots; None without any score."""
-        scenes, robots = values.shape
-        return next(bootstrap_means(values.reshape(-1, 1), np.repeat(np.arange(scenes), robots), scenes))
-
     def axis(self, name: str) -> np.ndarray:
-        """Mean distances [5] float64 to the other four robots: the paper's, or the study's own (`own_distances`)."""
-        return self._axes[name]
+        """Mean distances to the other four robots, the paper's or the study's own (`own_distances`): [5] float64, or where they
+        have a spread [1 + n + k 5], drawn from a normal distribution, in rows as those of `Mean.values`.
+        """
+        values, spread = self._axes[name], self._spreads.get(name, np.zeros(5))
+        if not (spread > 0).any():
+            return values
+        rows = 1 + self._draws + sum(count for _, count in self._several)
+        drawn = np.repeat(values[None], rows, axis=0)
+        rng = np.random.default_rng(list(name.encode()))
+        drawn[1 : 1 + self._draws] += spread * rng.standard_normal((self._draws, len(values)))
+        return drawn
+
+    def _bootstrap(self, variant: str, scores: Sequence[np.ndarray]) -> list[Mean | None]:
+        """The mean of each of some metrics' scores [k s r] of all trainings, scenes and some robots; None without any score."""
+        trainings, scenes, robots = scores[0].shape
+        columns = np.stack([x.reshape(trainings, scenes * robots) for x in scores], axis=-1)  # [k s*r m]
+        flat = columns.transpose(1, 2, 0).reshape(scenes * robots, -1)
+        found = list(bootstrap_means(flat, np.repeat(np.arange(scenes), robots), self._strata, self._draws))
+        means = []
+        for i in range(len(scores)):
+            own = [mean for mean in found[i * trainings : (i + 1) * trainings] if mean is not None]
+            mean = pool_trainings(own, variant, self._several) if own else None
+            means.append(replace(mean, trainings=0) if mean and variant in (COPY, TRUTH) else mean)
+        return means
 
     def _scores(self, variant: str, robots: tuple[str, ...], metric: str) -> np.ndarray:
-        """Scores [s r] of all scenes, NaN where there is none."""
-        empty = np.full(len(self._cells), np.nan)
-        columns = [self._columns.get((variant, robot, metric)) for robot in robots]
-        return np.stack([empty if i is None else self._values[:, i] for i in columns], axis=1)
+        """Scores [k s r] of all trainings and scenes, NaN where there is none; also where another of the trainings has none."""
+        empty, found = np.full(len(self._cells), np.nan), []
+        for training in self._trainings.get(variant, (0,)):
+            columns = [self._columns.get((variant, robot, metric, training)) for robot in robots]
+            found.append(np.stack([empty if i is None else self._values[:, i] for i in columns], axis=1))
+        scores = np.stack(found)
+        if len(scores) == 1:
+            return scores
+        held = ~np.isnan(scores)
+        graded = held.any(axis=(1, 2))
+        return np.where(held[graded].all(axis=0), scores, np.nan)
 
     def _shared(self, part: str, robots: tuple[str, ...], metric: str) -> np.ndarray:
         """Which cells [s r] all variants of a part have that were asked for these robots and have any."""
         asked = [variant for variant in variants_of(part) if set(robots) <= set(variant.graded_robots)]
-        held = [~np.isnan(self._scores(variant.name, robots, metric)) for variant in asked]
+        held = [~np.isnan(self._scores(variant.name, robots, metric)).all(axis=0) for variant in asked]
         measured = [cells for cells in held if cells.any()]
         return np.logical_and.reduce(measured or [np.ones((len(self._cells), len(robots)), bool)])
-
-    @cached_property
-    def _variants(self) -> set[str]:
-        return {variant for variant, _, _ in self._columns}
 
     @cached_property
     def _values(self) -> np.ndarray:
@@ -235,7 +285,7 @@ class PaperGrades:
 
     def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
         after, before = (self.mean(part, key, robots, metric) for key in (row, base))
-        return None if after is None or before is None else Mean(after.values - before.values, 0, None)
+        return None if after is None or before is None else combine(np.subtract, after, before)
 
     def print(self, part: str, row: str, robots: str, metric: str) -> str:
         """A value with as many decimals as the paper prints; '' where it prints none."""

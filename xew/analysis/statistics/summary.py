@@ -103,7 +103,7 @@ def verdict_on_copy(
 def _bootstrap(scores: pd.Series, units: Units | None) -> Mean:
     index = cast(pd.MultiIndex, scores.index)
     units = units or Units(index.to_frame(index=False))
-    mean = next(bootstrap_means(scores.to_numpy(np.float64)[:, None], units.numbers(index), len(units)))
+    mean = next(bootstrap_means(scores.to_numpy(np.float64)[:, None], units.numbers(index), units.strata))
     assert mean is not None, "no episode"
     return mean
 

@@ -7,7 +7,7 @@ and conditioning of each variant follow from the protocol.
 
 import fnmatch
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +78,27 @@ class Machine:
 
 
 @dataclass(frozen=True)
+class Run(Variant):
+    """One training of a variant; its name is the variant's, with an ending from the second training on."""
+
+    of: str = ""
+    """Name of the variant."""
+    seed: int | None = None
+    """Seed of the training; that of the experiment where the study names none."""
+
+    @property
+    def start(self) -> "Run | None":
+        """The training of the same seed that an adapted one starts from."""
+        base = super().start
+        return None if base is None else make_run(base, self.seed, self.name.removeprefix(self.of))
+
+
+def make_run(variant: Variant, seed: int | None, ending: str) -> Run:
+    """One training of a variant."""
+    return Run(**{**asdict(variant), "name": variant.name + ending}, of=variant.name, seed=seed)
+
+
+@dataclass(frozen=True)
 class Study:
     """A study: the variants that it compares, and their settings."""
 
@@ -101,6 +122,8 @@ class Study:
     """Number of training seeds of each task."""
     test_seeds: int = TEST_SEEDS_PER_TASK
     """Number of test seeds of each task."""
+    training_seeds: tuple[int, ...] = ()
+    """Seeds of the trainings of every variant, each a training of its own; one, with the experiment's seed, where left out."""
     settings: Settings = field(default_factory=dict)
     """Settings laid over the experiment for every variant."""
     adaptation: Settings = field(default_factory=dict)
@@ -143,6 +166,17 @@ class Study:
                 found.setdefault(variant.start.name, variant.start)
             found.setdefault(variant.name, variant)
         return tuple(sorted(found.values(), key=lambda variant: variant.target is not None))
+
+    @property
+    def planned_runs(self) -> tuple[Run, ...]:
+        """The trainings of the study's variants: all of the first seed, then those of the next."""
+        endings = ["", *(f"-seed_{seed}" for seed in self.training_seeds[1:])]
+        seeds = self.training_seeds or (None,)
+        return tuple(
+            make_run(variant, seed, ending)
+            for seed, ending in zip(seeds, endings, strict=True)
+            for variant in self.planned_variants
+        )
 
     def _includes(self, variant: Variant) -> bool:
         """Whether a variant of a part is one of this study."""
@@ -191,6 +225,7 @@ def _check_names(study: Study, path: Path) -> None:
         ("robot", study.robots, ROBOT_NAMES),
         ("number of shots", shots, known_shots),
         ("task", study.tasks, study.tasks),  # known: checked above, and may be outside tasks
+        ("training seed", tuple(map(str, study.training_seeds)), tuple(map(str, study.training_seeds))),
     ):
         for name in names:
             if name not in known:
@@ -215,6 +250,8 @@ def build_experiment(study: Study, variant: Variant) -> Settings:
         settings = merge_settings(settings, study.remedies.get(variant.remedy, {}))
         start = {"start_from": str(run_folder(study, variant.start)), "robots": [variant.target], "episodes": variant.shots}
         settings = merge_settings(settings, {"adapt": start})
+    if isinstance(variant, Run) and variant.seed is not None:
+        settings = merge_settings(settings, {"train": {"seed": variant.seed}})
     given = {
         "data": str(study.data_folder),
         "out": str(run_folder(study, variant)),

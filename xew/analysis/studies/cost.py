@@ -34,7 +34,7 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     episodes = study.task_count * (study.train_seeds + study.test_seeds) * len(study.robots)
     costs["generate"] = Cost(episodes, "episodes", rates.start_s + episodes * rates.episode_s, episodes * rates.episode_mb)
     encoded: set[tuple[str, ...]] = set()
-    for variant in study.planned_variants:
+    for variant in study.planned_runs:
         experiment = build_experiment(study, variant)
         streams = _count_new_streams(variant, experiment, encoded) * study.training_count(variant)
         updates, graded = count_optimizer_steps(study, variant, experiment), sum(study.graded_counts(variant).values())

@@ -33,7 +33,7 @@ class Step:
     kind: str
     """One of KINDS."""
     variant: str
-    """Name of a variant; empty for a step that serves all."""
+    """Name of a variant's training (`Run`); empty for a step that serves all."""
     command: tuple[str, ...]
     """Module and arguments."""
     needs: tuple[str, ...]
@@ -54,10 +54,10 @@ class Step:
 
 def plan(study: Study) -> dict[str, Step]:
     """All steps of a study by name, each after those that it needs."""
-    experiments = {variant.name: build_experiment(study, variant) for variant in study.planned_variants}
+    experiments = {run.name: build_experiment(study, run) for run in study.planned_runs}
     steps = [_plan_generate(study)]
     firsts: dict[str, str] = {}
-    for number, variant in enumerate(study.planned_variants):
+    for number, variant in enumerate(study.planned_runs):
         experiment = experiments[variant.name]
         first = firsts.setdefault(variant.split, f"latents/{variant.name}")
         steps += [
@@ -80,7 +80,7 @@ def sort_steps(steps: Mapping[str, Step]) -> list[Step]:
 def write_configs(study: Study) -> dict[str, Path]:
     """Write every variant's config where its commands read it; returns those that are new or changed."""
     changed = {}
-    for variant in study.planned_variants:
+    for variant in study.planned_runs:
         path, text = _config_path(study, variant), yaml.safe_dump(build_experiment(study, variant), sort_keys=False)
         if not path.exists() or path.read_text() != text:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -196,7 +196,11 @@ def _plan_analyse(study: Study, needs: tuple[str, ...]) -> Step:
         "",
         ("xew.analysis.study_analyse", str(study.out)),
         needs=needs,
-        inputs=[[asdict(variant) for variant in study.planned_variants], source_digest("analysis", "statistics")],
+        inputs=[
+            [asdict(variant) for variant in study.planned_variants],
+            *study.training_seeds,
+            source_digest("analysis", "statistics"),
+        ],
         product=study.out / "report" / "index.html",
         gpus=0,
     )

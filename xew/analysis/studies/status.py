@@ -17,9 +17,9 @@ COLUMNS = ("latents", "train", "rollout", "evaluate")
 def format_status(study: Study, steps: Mapping[str, Step], ledger: Ledger, failed: Mapping[str, str] | None = None) -> str:
     """A row per variant and a column per kind of step: the time of what is done, FAILED, blocked, begun, or '-'."""
     find_done_steps(steps, ledger)
-    width = max(len(variant.name) for variant in study.planned_variants) + 2
+    width = max(len(variant.name) for variant in study.planned_runs) + 2
     lines = [f"{'variant':<{width}}" + "".join(f"{kind:>12}" for kind in COLUMNS)]
-    for variant in study.planned_variants:
+    for variant in study.planned_runs:
         training = "adapt" if variant.target else "train"
         names = [f"{training if kind == 'train' else kind}/{variant.name}" for kind in COLUMNS]
         states = (_format_state(steps[name], ledger, failed or {}) for name in names)

@@ -5,11 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from xew.analysis.correlation import exact_p
 from xew.analysis.paper import PAPER_TITLES
 from xew.analysis.statistics.grades import SEEN, Grades, relative_gain
 from xew.analysis.tables.labels import SHORT_ROBOTS
-from xew.protocol import ROBOT_NAMES
-from xew.statistics import MIN_SCENES, Mean, interval
+from xew.protocol import ROBOT_NAMES, SEEN_ROBOTS
+from xew.statistics import MIN_SCENES, SIGNIFICANCE, Mean, combine
+
+OTHER_ROBOTS = "measured on other robots: no model that saw this one was graded"
+"""Doubt about a gap that is told from seen robots, which may be easier or harder to render."""
+FEW_ROBOTS = "five robots: descriptive"
+"""Doubt about a correlation that another pairing of distances with scores gives as well."""
 
 
 class NotMeasuredError(Exception):
@@ -21,16 +27,34 @@ class Comparison:
     """One number that a claim bounds."""
 
     label: str
-    values: np.ndarray
-    """[1 + n] float64: the number, then its values in n bootstrap draws."""
+    number: Mean
     above: float = -np.inf
     """Bound that the number has to lie above."""
     below: float = np.inf
-    """Bound that the number has to lie below."""
+    """Bound that the number has to lie below; with `above` the margins of an equivalence."""
     percent: bool = True
     """Whether it is printed as a percentage, else with three decimals."""
     doubt: str = ""
     """Reason why it cannot be resolved whatever the interval says, or ''."""
+    exact: tuple[float, float] = (0.0, 0.0)
+    """Exact p of the claim and of its opposite over pairings of robots, which have to be small too; 0 where none is asked."""
+
+    def p_values(self, level: float) -> tuple[float, float]:
+        """The p of the claim and the p of its opposite, each to be compared with SIGNIFICANCE.
+
+        Of one bound, both are twice the one-sided p, so that they agree with an interval of level 1 - SIGNIFICANCE. Between two
+        bounds, the claim is an equivalence: the larger p of two one-sided tests, without the factor (Schuirmann 1987, "A
+        comparison of the two one-sided tests procedure and the power approach").
+        """
+        sides = [(self.number.p_above, self.above), (self.number.p_below, self.below)]
+        asked = [test(bound, level) for test, bound in sides if np.isfinite(bound)]
+        others = [
+            test(bound, level)
+            for test, bound in ((self.number.p_below, self.above), (self.number.p_above, self.below))
+            if np.isfinite(bound)
+        ]
+        claim = asked[0] * 2 if len(asked) == 1 else max(asked)
+        return min(max(claim, self.exact[0]), 1.0), min(max(2 * min(others), self.exact[1]), 1.0)
 
 
 @dataclass(frozen=True)
@@ -52,6 +76,7 @@ class Reader:
 
     def __init__(self, grades: Grades) -> None:
         self.grades = grades
+        self._seen: dict[tuple[str, str], Mean | None] = {}
 
     def mean(self, part: str, row: str, robots: str, metric: str) -> Mean:
         """The mean at an address, over the cells that all rows of the part have."""
@@ -68,45 +93,94 @@ class Reader:
         new, old = self.mean(part, after, robots, metric), self.mean(part, before, robots, metric)
         label = f"{SHORT_ROBOTS.get(robots, 'seen')} {PAPER_TITLES[metric]}"
         # Where a bound from above is asked for, smallness is the claim, and the floor does not speak against it.
-        doubt = self._doubt((new, old), robots, metric) if above > -np.inf else self._doubt_of_few((new, old))
-        return Comparison(label, relative_gain(new, old, self.grades.metrics[metric]).values, above, below, doubt=doubt)
+        doubt = self._doubt_of_few((new, old)) if below < np.inf else self._doubt((new, old), robots, metric)
+        return Comparison(label, relative_gain(new, old, self.grades.metrics[metric]), above, below, doubt=doubt)
 
-    def worse_than_seen(
-        self, part: str, row: str, robots: str, metric: str, above: float = 0, below: float = np.inf
-    ) -> Comparison:
-        """The loss of a row on another robot, as a share of its score on seen robots; positive is worse."""
-        new, old = self.mean(part, row, robots, metric), self.mean(part, row, SEEN, metric)
-        label = f"{SHORT_ROBOTS[robots]} {PAPER_TITLES[metric]}"
-        values = -relative_gain(new, old, self.grades.metrics[metric]).values
-        return Comparison(label, values, above, below, doubt=self._doubt((new, old), robots, metric))
+    def mean_of_seen(self, robot: str, metric: str) -> Mean | None:
+        """Mean on a robot over the leave-one-embodiment-out folds that saw it; None where none was graded."""
+        if (robot, metric) not in self._seen:
+            rows = [f"loeo_{other}" for other in ROBOT_NAMES if other != robot] if metric in self.grades.metrics else []
+            means = [self.grades.mean("loeo", row, robot, metric, shared=True) for row in rows]
+            known = [mean for mean in means if mean is not None]
+            self._seen[robot, metric] = combine(_average, *known) if known else None
+        return self._seen[robot, metric]
 
-    def share(self, start: Mean, after: Mean, end: Mean, metric: str) -> tuple[np.ndarray, str]:
-        """The share of the gap from a start to a better end that is closed [1 + n] float64, and a doubt about it, or ''.
+    def unseen_gap(self, robot: str, metric: str) -> Comparison:
+        """The loss of the fold that did not see a robot from those that did, on this robot's same episodes; positive is worse.
+
+        It is a share of their score. All folds are trained on four robots and have the same conditions. Where they were not
+        graded, it is the loss of the reference model from seen robots, in doubt.
+        """
+        saw, fold = self.mean_of_seen(robot, metric), f"loeo_{robot}"
+        if saw is None or self.grades.mean("loeo", fold, robot, metric) is None:
+            return self.worse_than_seen("fixed", "fixed", robot, metric)
+        label = f"{SHORT_ROBOTS[robot]} {PAPER_TITLES[metric]}"
+        unseen = self.mean("loeo", fold, robot, metric)
+        doubt = self._doubt((unseen, saw), robot, metric)
+        return Comparison(label, _loss(unseen, saw, self.grades, metric), above=0, doubt=doubt)
+
+    def worse_than_seen(self, part: str, row: str, robot: str, metric: str, above: float = 0) -> Comparison:
+        """The loss of a row on a robot that it did not see from what it would score had it seen it; positive is worse.
+
+        That is its score on seen robots, times how much harder this robot is than those for the folds that saw each. Where they
+        were not graded, it is its score on seen robots, in doubt.
+        """
+        new, old = self.mean(part, row, robot, metric), self.mean(part, row, SEEN, metric)
+        label = f"{SHORT_ROBOTS[robot]} {PAPER_TITLES[metric]}"
+        saw = [self.mean_of_seen(name, metric) for name in (robot, *SEEN_ROBOTS)]
+        known = [mean for mean in saw if mean is not None]
+        if len(known) < len(saw):
+            doubt = self._doubt((new, old), robot, metric) or OTHER_ROBOTS
+            return Comparison(label, _loss(new, old, self.grades, metric), above, doubt=doubt)
+        expected = combine(lambda score, own, *others: score * own / _average(*others), old, *known)
+        doubt = self._doubt((new, expected), robot, metric)
+        return Comparison(label, _loss(new, expected, self.grades, metric), above, doubt=doubt)
+
+    def share(self, start: Mean, after: Mean, end: Mean, metric: str) -> tuple[Mean, str]:
+        """The share of the gap from a start to a better end that is closed, and a doubt about it, or ''.
 
         Without such a gap there is no share: if the end were worse than the start, a worse score would seem to close it.
         """
-        gap = (end.values - start.values) * (1 if self.grades.metrics[metric].higher_is_better else -1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share = (after.values - start.values) / (end.values - start.values)
-        no_gap = "" if interval(gap, self.grades.level)[0] > 0 else "no gap to close"
+        sign = 1 if self.grades.metrics[metric].higher_is_better else -1
+        gap = combine(lambda new, old: sign * (new - old), end, start)
+        share = combine(lambda old, new, goal: (new - old) / (goal - old), start, after, end)
+        no_gap = "" if 2 * gap.p_above(0, self.grades.level) <= SIGNIFICANCE else "no gap to close"
         return share, self._doubt_of_few((start, after, end)) or no_gap
 
     def closed_share(
-        self, part: str, after: str, before: str, robots: str, metric: str, goal: tuple[str, str]
-    ) -> tuple[np.ndarray, str]:
-        """`share` [1 + n] of the gap from a row to the goal (part and row, on seen robots) that another row closes."""
-        old, new = self.mean(part, before, robots, metric), self.mean(part, after, robots, metric)
-        return self.share(old, new, self.mean(*goal, SEEN, metric), metric)
+        self, part: str, after: str, before: str, robot: str, metric: str, goal: tuple[str, str]
+    ) -> tuple[Mean, str]:
+        """`share` of the gap that another row closes, from a row to the folds that saw the robot.
 
-    def loeo(self, metric: str) -> np.ndarray:
-        """Scores of each robot when it was held out [1 + n 5] float64, with the sign turned so that higher is worse."""
+        Where they were not graded, it is the gap to the goal (part and row) on seen robots, in doubt.
+        """
+        old, new = self.mean(part, before, robot, metric), self.mean(part, after, robot, metric)
+        saw = self.mean_of_seen(robot, metric)
+        share, doubt = self.share(old, new, saw or self.mean(*goal, SEEN, metric), metric)
+        return share, doubt or ("" if saw else OTHER_ROBOTS)
+
+    def correlation(
+        self, label: str, metric: str, statistic: Callable[..., np.ndarray], axes: Sequence[str], above: float = 0
+    ) -> Comparison:
+        """A statistic of distances and scores over the five folds, with its exact p over all pairings of robots.
+
+        Args:
+            label: what it is.
+            metric: whose scores.
+            statistic: of the distances on each of `axes` and the scores, all [... 5] float64, to [...].
+            axes: kinds of distance.
+            above: bound of the claim.
+        """
         means = [self.mean("loeo", f"loeo_{robot}", robot, metric) for robot in ROBOT_NAMES]
-        sign = -1 if self.grades.metrics[metric].higher_is_better else 1
-        return sign * np.stack([mean.values for mean in means], axis=1)
-
-    def doubt_of_few_scenes(self, part: str, row: str, robots: str, metric: str) -> str:
-        """Text that says that a mean rests on too few scenes, or ''."""
-        return self._doubt_of_few((self.mean(part, row, robots, metric),))
+        sign = -1 if self.grades.metrics[metric].higher_is_better else 1  # higher is worse
+        distances = [self.grades.axis(axis) for axis in axes]
+        number = combine(lambda *scores: statistic(*distances, sign * np.stack(scores, axis=-1)), *means)
+        points = [np.atleast_2d(axis)[0] for axis in distances]
+        scores = sign * np.array([mean.value for mean in means])
+        p = exact_p(lambda paired: statistic(*points, paired), scores)
+        few = self._doubt_of_few(means) or (f"{FEW_ROBOTS}, exact p = {p:.3f}" if p > SIGNIFICANCE else "")
+        exact = (p, 1.0) if number.value > 0 else (1.0, p)
+        return Comparison(label, number, above, percent=False, doubt=few, exact=exact)
 
     def _doubt_of_few(self, means: Sequence[Mean]) -> str:
         few = any(mean.scenes is not None and mean.scenes < MIN_SCENES for mean in means)
@@ -117,3 +191,11 @@ class Reader:
         inside = floor > 0 and abs(means[0].value - means[1].value) <= floor
         unknown = "no noise floor: the true video was not graded" if np.isnan(floor) else ""
         return self._doubt_of_few(means) or unknown or (f"inside the noise floor of {floor:.3g}" if inside else "")
+
+
+def _average(*values: np.ndarray) -> np.ndarray:
+    return np.stack(values).sum(axis=0) / len(values)
+
+
+def _loss(new: Mean, old: Mean, grades: Grades, metric: str) -> Mean:
+    return combine(np.negative, relative_gain(new, old, grades.metrics[metric]))

@@ -46,10 +46,10 @@ class Distances:
         """Kinds of distance that are known."""
         return [axis for axis in AXIS_TITLES if axis in set(self.robots["feature"])]
 
-    def of(self, feature: str) -> np.ndarray:
-        """A feature of all robots: [5] float64 in the order of ROBOT_NAMES."""
-        column = self.robots[self.robots["feature"] == feature].set_index("robot")["value"]
-        return column.reindex(list(ROBOT_NAMES)).to_numpy(np.float64)
+    def of(self, feature: str, column: str = "value") -> np.ndarray:
+        """A feature of all robots, or its spread (`column`): [5] float64 in the order of ROBOT_NAMES."""
+        found = self.robots[self.robots["feature"] == feature].set_index("robot")[column]
+        return found.reindex(list(ROBOT_NAMES)).to_numpy(np.float64)
 
 
 def read_distances(folder: Path) -> Distances:

@@ -1,13 +1,14 @@
 """The answers to claims: each claim's inequalities, asked of the numbers of a study or of the paper.
 
-A claim holds where every comparison lies on its side of the bound with its whole interval, it fails where one lies on the
-other side with its whole interval, and it is unresolved in between: also where a difference is inside the noise floor, where
-a share is asked of a gap that may not be there, or where there are fewer than MIN_SCENES scenes. Asked of the paper's own
-figures, the interval is what prints the same.
+Every comparison has two p-values, of what is claimed and of its opposite, each corrected by Holm's method for the comparisons
+of its claim. A claim holds where all of its comparisons do, it fails where the opposite of one is significant, and it is
+unresolved in between: also where a difference is inside the noise floor, where a share is asked of a gap that may not be there,
+where five robots are too few, or where there are fewer than MIN_SCENES scenes. A second answer counts all claims as one family,
+by Holm's method once more. Asked of the paper's own figures, p is 0 or 1: whether all that prints the same lies on one side.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -15,7 +16,7 @@ import pandas as pd
 from xew.analysis.statistics.grades import Grades
 from xew.analysis.tables.claims import CLAIMS
 from xew.analysis.tables.comparisons import Claim, Comparison, NotMeasuredError, Reader
-from xew.statistics import interval
+from xew.statistics import SIGNIFICANCE, holm
 
 HOLDS, FAILS, UNRESOLVED, UNMEASURED = "holds", "fails", "unresolved", "not measured"
 """The answers to a claim."""
@@ -33,6 +34,12 @@ class AnsweredComparison:
     high: float
     answer: str
     """One of HOLDS, FAILS and UNRESOLVED."""
+    p_holds: float = np.nan
+    """p of what is claimed, corrected for the comparisons of the claim; 1 where there is a doubt."""
+    p_fails: float = np.nan
+    """p of the opposite."""
+    trainings: int = 0
+    """Least number of trainings that it rests on; 0 where none is known (the paper)."""
 
     @property
     def text(self) -> str:
@@ -51,6 +58,24 @@ class Finding:
     """Comparisons of the claim; empty where something was not measured."""
     missing: str = ""
     """Name of what was not measured, if anything."""
+    in_family: str = UNMEASURED
+    """Answer where all claims that were measured count as one family of tests."""
+
+    @property
+    def p_holds(self) -> float:
+        """p of the claim: the largest of its comparisons'."""
+        return max((one.p_holds for one in self.comparisons), default=1.0)
+
+    @property
+    def p_fails(self) -> float:
+        """p of its opposite: the smallest of its comparisons'."""
+        return min((one.p_fails for one in self.comparisons), default=1.0)
+
+    @property
+    def basis(self) -> str:
+        """Text that says whose result it is: 'of this training', or of how many; '' for the paper."""
+        least = min((one.trainings for one in self.comparisons if one.trainings), default=0)
+        return "" if not least else "of this training" if least == 1 else f"of {least} trainings"
 
     def span(self) -> str:
         """Text with the smallest and the largest number."""
@@ -60,32 +85,44 @@ class Finding:
 
 
 def ask(grades: Grades, claims: Sequence[Claim] | None = None) -> list[Finding]:
-    """The answer to each claim."""
+    """The answer to each claim, alone and among all."""
     reader = Reader(grades)
-    return [_ask_claim(claim, reader) for claim in (CLAIMS if claims is None else claims)]
+    found = [_ask_claim(claim, reader) for claim in (CLAIMS if claims is None else claims)]
+    measured = [finding for finding in found if finding.answer != UNMEASURED]
+    corrected = zip(holm([f.p_holds for f in measured]), holm([f.p_fails for f in measured]), strict=True)
+    in_family = [_answer(float(claim), float(opposite)) for claim, opposite in corrected]
+    known = iter(in_family)
+    return [finding if finding.answer == UNMEASURED else replace(finding, in_family=next(known)) for finding in found]
 
 
 def _ask_claim(claim: Claim, reader: Reader) -> Finding:
+    level = reader.grades.level
     try:
-        comparisons = tuple(_answer_comparison(comparison, reader.grades.level) for comparison in claim.comparisons(reader))
+        asked = list(claim.comparisons(reader))
     except NotMeasuredError as missing:
         return Finding(claim, UNMEASURED, (), str(missing))
+    p_values = np.array([comparison.p_values(level) for comparison in asked])
+    claims, opposites = holm(p_values[:, 0]), holm(p_values[:, 1])
+    comparisons = tuple(_answer_comparison(*each, level) for each in zip(asked, claims, opposites, strict=True))
     answers = {one.answer for one in comparisons}
     return Finding(claim, next(answer for answer in (FAILS, UNRESOLVED, HOLDS) if answer in answers), comparisons)
 
 
-def _answer_comparison(comparison: Comparison, level: float) -> AnsweredComparison:
-    value, (low, high) = float(comparison.values[0]), interval(comparison.values, level)
-    answer = UNRESOLVED
-    if not comparison.doubt:
-        if comparison.above < low and high < comparison.below:
-            answer = HOLDS
-        elif high <= comparison.above or low >= comparison.below:
-            answer = FAILS
+def _answer(p_holds: float, p_fails: float) -> str:
+    return HOLDS if p_holds <= SIGNIFICANCE else FAILS if p_fails <= SIGNIFICANCE else UNRESOLVED
+
+
+def _answer_comparison(comparison: Comparison, p_holds: float, p_fails: float, level: float) -> AnsweredComparison:
+    number, doubt = comparison.number, f" ({comparison.doubt})" if comparison.doubt else ""
+    value, (low, high) = number.value, number.interval(level)
+    if comparison.doubt:
+        p_holds = p_fails = 1.0
     show = _format_share if comparison.percent else _format_plain
-    ends = "" if low == high or comparison.doubt.startswith("fewer") else f" [{show(low)}, {show(high)}]"
-    doubt = f" ({comparison.doubt})" if comparison.doubt else ""
-    return AnsweredComparison(comparison.label, f"{show(value)}{ends}{doubt}", value, low, high, answer)
+    ends = "" if low == high or np.isnan(low) else f" [{show(low)}, {show(high)}]"
+    numbers, answer = f"{show(value)}{ends}{doubt}", _answer(p_holds, p_fails)
+    return AnsweredComparison(
+        comparison.label, numbers, value, low, high, answer, float(p_holds), float(p_fails), number.trainings
+    )
 
 
 def _format_share(value: float) -> str:
@@ -98,14 +135,18 @@ def _format_plain(value: float) -> str:
 
 
 def findings_frame(findings: Sequence[Finding], of: str) -> pd.DataFrame:
-    """A tidy frame of claims, one row per comparison: of claim where says test verdict comparison value low high answer.
+    """A tidy frame of claims, one row per comparison.
 
-    `verdict` is the answer to the claim, `answer` that of the comparison; `of` says whose numbers they are.
+    Columns: of claim where says test verdict verdict_in_family comparison value low high answer p_holds p_fails trainings.
+    `verdict` is the answer to the claim, `verdict_in_family` that where all claims are one family, `answer` that of the
+    comparison with its corrected p-values; `of` says whose numbers they are.
     """
-    columns = ["of", "claim", "where", "says", "test", "verdict", "comparison", "value", "low", "high", "answer"]
+    columns = ["of", "claim", "where", "says", "test", "verdict", "verdict_in_family", "comparison", "value", "low", "high"]
+    columns += ["answer", "p_holds", "p_fails", "trainings"]
     rows = [
-        (of, f.claim.name, f.claim.where, f.claim.says, f.claim.test, f.answer, a.label, a.value, a.low, a.high, a.answer)
+        (of, f.claim.name, f.claim.where, f.claim.says, f.claim.test, f.answer, f.in_family, a.label, a.value, a.low, a.high,
+         a.answer, a.p_holds, a.p_fails, a.trainings)
         for f in findings
         for a in f.comparisons or (AnsweredComparison(f.missing, "", np.nan, np.nan, np.nan, UNMEASURED),)
-    ]
+    ]  # fmt: skip
     return pd.DataFrame(rows, columns=columns)

@@ -151,21 +151,23 @@ def tables_frame(tables: Sequence[Table]) -> pd.DataFrame:
 
 
 def findings_markdown(findings: Sequence[Finding], papers: Sequence[Finding] = ()) -> str:
-    """A Markdown table of claims: test, answer with numbers, and where given the answer on the paper's own figures."""
+    """A Markdown table of claims: test, both answers with numbers, and where given the answer on the paper's own figures."""
     beside = [["the paper's own figures"], *([paper.answer] for paper in papers)] if papers else [[]] * (len(findings) + 1)
-    lines = [_markdown_line(["claim", "test", "verdict", "numbers", *beside[0]]), "|---" * (4 + bool(papers)) + "|"]
+    heads = ["claim", "test", "verdict", "among all claims", "numbers", *beside[0]]
+    lines = [_markdown_line(heads), "|---" * len(heads) + "|"]
     for finding, last in zip(findings, beside[1:], strict=True):
         numbers = "; ".join(one.text for one in finding.comparisons) or f"missing: {finding.missing}"
-        claim = finding.claim
-        lines.append(_markdown_line([f"{claim.says} ({claim.where})", claim.test, f"**{finding.answer}**", numbers, *last]))
+        claim, basis = finding.claim, f" ({finding.basis})" if finding.basis else ""
+        cells = [f"{claim.says} ({claim.where})", claim.test, f"**{finding.answer}**{basis}", finding.in_family, numbers, *last]
+        lines.append(_markdown_line(cells))
     return "\n".join(lines)
 
 
 def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = ()) -> str:
-    """A LaTeX table of claims: test, answer, and where given the answer on the paper's own figures."""
+    """A LaTeX table of claims: test, both answers, and where given the answer on the paper's own figures."""
     beside = [["paper"], *([paper.answer] for paper in papers)] if papers else [[]] * (len(findings) + 1)
     rows = [
-        _latex_line([_escape(text) for text in (finding.claim.says, finding.claim.test, finding.answer, *last)])
+        _latex_line([_escape(text) for text in (finding.claim.says, finding.claim.test, *_both_answers(finding), *last)])
         for finding, last in zip(findings, beside[1:], strict=True)
     ]
     return "\n".join(
@@ -173,16 +175,27 @@ def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = ()) 
             r"% \usepackage{booktabs,amssymb}",
             r"\begin{table*}[t]",
             r"\centering\footnotesize",
-            rf"\begin{{tabular}}{{@{{}}p{{0.36\textwidth}}p{{0.36\textwidth}}l{'l' * bool(papers)}@{{}}}}",
+            rf"\begin{{tabular}}{{@{{}}p{{0.32\textwidth}}p{{0.32\textwidth}}ll{'l' * bool(papers)}@{{}}}}",
             r"\toprule",
-            _latex_line(["claim", "test", "verdict", *beside[0]]),
+            _latex_line(["claim", "test", "verdict", "among all", *beside[0]]),
             r"\midrule",
             *rows,
             r"\bottomrule",
             r"\end{tabular}",
-            r"\caption{\textbf{Findings.} Each claim as an inequality.}",
+            rf"\caption{{\textbf{{Findings.}} Each claim as inequalities; {_escape(_findings_caption(findings))}}}",
             r"\label{tab:findings}",
             r"\end{table*}",
             "",
         ]
     )
+
+
+def _both_answers(finding: Finding) -> tuple[str, str]:
+    return finding.answer, finding.in_family
+
+
+def _findings_caption(findings: Sequence[Finding]) -> str:
+    """Text that says what corrections are made, and whose results these are."""
+    bases = ", ".join(dict.fromkeys(finding.basis for finding in findings if finding.basis))
+    text = "p-values are corrected by Holm's method for the comparisons of a claim, and once more for all claims."
+    return f"{text} Results are {bases}." if bases else text

@@ -76,7 +76,7 @@ def _columns(table: pd.DataFrame) -> list[Column]:
 
 def _bootstrap(values: np.ndarray, table: pd.DataFrame, units: Units) -> list[Mean]:
     """The mean of each column [n c] of a robot's episodes, which are the rows of its table."""
-    means = bootstrap_means(values, units.numbers(cast(pd.MultiIndex, table.index)), len(units))
+    means = bootstrap_means(values, units.numbers(cast(pd.MultiIndex, table.index)), units.strata)
     return [mean or Mean(np.full(1, np.nan), 0, 0) for mean in means]
 
 
