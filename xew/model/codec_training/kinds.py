@@ -30,7 +30,10 @@ class Kind(Protocol):
 
     file: ClassVar[str]
     """Name of the file of its weights, and of its report, without ending."""
-    size: Any
+
+    @property
+    def size(self) -> Any:
+        """Size of the autoencoder, a dataclass."""
 
     @property
     def name(self) -> str:

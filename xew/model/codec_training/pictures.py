@@ -8,7 +8,7 @@ taken; those that describe a robot are drawn once a robot and taken whole, in gr
 """
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from xew.dataset import Episode
 from xew.episode import EpisodeError, Record, read_states
 from xew.model import conditions
 from xew.model.cache.clips import take_frames
-from xew.model.conditions import Command, make_command
+from xew.model.conditions import make_command
 from xew.model.video.frames import TEMPORAL_FACTOR, to_model_size
 from xew.threads import map_in_order
 
@@ -102,7 +102,7 @@ def gather_pictures(
         EpisodeError: a video is missing or damaged.
     """
     aligned = [name for name in streams if name in ALIGNED]
-    short = _draw_descriptions(episodes, [name for name in streams if name in UNALIGNED], cut)
+    short = _cut_descriptions(episodes, [name for name in streams if name in UNALIGNED], cut)
     firsts = np.cumsum([0, *(len(cut.starts(record)) for _, record in episodes)])
     counts = {name: int(firsts[-1]) for name in aligned} | {name: len(clips) for name, clips in short.items()}
     total = sum(counts.values())
@@ -175,22 +175,23 @@ def read_aligned(
     return found
 
 
-def draw_description(name: str, episode: Episode) -> Video:
-    """The pictures [t h w 3] uint8 of a stream that describes the robot of an episode."""
+def draw_descriptions(streams: Sequence[str], episode: Episode) -> dict[str, Video]:
+    """The pictures [t h w 3] uint8 of the streams that describe the robot of an episode, by name."""
     folder, record = episode
-    states = read_states(folder)
-    command: Command = make_command(folder, record, states)
-    return UNALIGNED[name](command)
+    command = make_command(folder, record, read_states(folder)) if streams else None
+    return {name: UNALIGNED[name](command) for name in streams if command is not None}
 
 
-def _draw_descriptions(episodes: Sequence[Episode], streams: Sequence[str], cut: Cut) -> dict[str, np.ndarray]:
+def _cut_descriptions(episodes: Sequence[Episode], streams: Sequence[str], cut: Cut) -> dict[str, np.ndarray]:
     """Clips [n t h w 3] of the streams that describe robots, each robot once."""
-    robots: Mapping[str, Episode] = {record.robot: (folder, record) for folder, record in reversed(episodes)}
+    if not streams:
+        return {}
+    robots = {record.robot: (folder, record) for folder, record in reversed(episodes)}
+    drawn = map_in_order(lambda robot: draw_descriptions(streams, robots[robot]), sorted(robots))
     found: dict[str, list[np.ndarray]] = {name: [] for name in streams}
-    for name in streams:
-        for robot in tqdm(sorted(robots), desc=name, unit="robot"):
-            video = to_model_size(draw_description(name, robots[robot]), cut.height, cut.width)
-            found[name].append(cut_description(video, cut.frames))
+    for videos in tqdm(drawn, desc="robots", total=len(robots), unit="robot"):
+        for name, video in videos.items():
+            found[name].append(cut_description(to_model_size(video, cut.height, cut.width), cut.frames))
     return {name: np.concatenate(clips) for name, clips in found.items()}
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Bool, UInt8
 from tqdm import tqdm
 
 from xew.dataset import Dataset, Episode
-from xew.model.codec_training.pictures import ALIGNED, differs_from_corner, draw_description, read_aligned
+from xew.model.codec_training.pictures import ALIGNED, differs_from_corner, draw_descriptions, read_aligned
 from xew.model.codec_training.settings import CodecExperiment, expand_robots, select_episodes
 from xew.model.codecs.ceiling import LPIPS_EVERY, choose_evenly, reconstruct
 from xew.model.codecs.codec import Codec
@@ -55,7 +55,7 @@ class Truth(NamedTuple):
 
 def choose_robots(experiment: CodecExperiment, dataset: Dataset) -> list[str]:
     """Robots to report on: those asked for, or all that were not trained on; then a few that were."""
-    seeds, trained = "test" if experiment.report.test_seeds else "train", experiment.train_robots
+    seeds, trained = experiment.report.seeds, experiment.train_robots
     everybody = {record.robot for _, record in dataset.cells}
     present = sorted({record.robot for _, record in select_episodes(dataset, everybody, seeds)})
     asked = expand_robots(experiment.report.robots) or tuple(robot for robot in present if robot not in trained)
@@ -73,7 +73,7 @@ def measure_codec(experiment: CodecExperiment, codec: Codec, dataset: Dataset, p
         pictures: folder for contact sheets; none are drawn where left out.
     """
     found = []
-    seeds = "test" if experiment.report.test_seeds else "train"
+    seeds = experiment.report.seeds
     for robot in tqdm(choose_robots(experiment, dataset), desc="report", unit="robot"):
         episodes = choose_evenly(select_episodes(dataset, (robot,), seeds), experiment.report.clips)
         truths = read_truths(episodes, list(experiment.streams), experiment.clip.frames)
@@ -96,10 +96,9 @@ def read_truths(episodes: Sequence[Episode], streams: Sequence[str], frames: int
         for name, (video, region) in read.items():
             assert region is not None
             truths[name].append(Truth(video, region))
-    for name in streams:
-        if name not in ALIGNED:
-            video = draw_description(name, episodes[0])
-            truths[name].append(Truth(video, differs_from_corner(video)))
+    described = [name for name in streams if name not in ALIGNED]
+    for name, video in draw_descriptions(described, episodes[0]).items():
+        truths[name].append(Truth(video, differs_from_corner(video)))
     return truths
 
 

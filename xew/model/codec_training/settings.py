@@ -16,6 +16,7 @@ from xew.protocol import SPLITS, seed_split
 
 SEVERAL_BODIES = re.compile(r"(\w+):(\d+)(?:-(\d+))?")
 """Name of one procedural body, or of a range of them: body:17, body:0-63."""
+Seeds = Literal["train", "test"]
 SMALLEST_SIDE = 32
 """Least side [pixels] of a picture that LPIPS takes."""
 
@@ -101,6 +102,11 @@ class ReportSettings:
     """Whether test seeds are read, and not training seeds."""
     pictures: bool = True
     """Whether contact sheets are drawn."""
+
+    @property
+    def seeds(self) -> Seeds:
+        """Family of the seeds that are read."""
+        return "test" if self.test_seeds else "train"
 
 
 @dataclass(frozen=True)
@@ -228,7 +234,7 @@ def expand_robots(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(keys)
 
 
-def select_episodes(dataset: Dataset, robots: Collection[str], seeds: Literal["train", "test"]) -> list[Episode]:
+def select_episodes(dataset: Dataset, robots: Collection[str], seeds: Seeds) -> list[Episode]:
     """Episodes with pictures of some robots and a family of seeds, sorted; possibly none.
 
     A codec needs no pairs, so seeds at which another robot has failed count too where this one's pictures are there.
