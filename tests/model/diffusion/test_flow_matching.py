@@ -63,3 +63,16 @@ def test_the_target_is_the_video_behind_the_shown_reference(latents: jax.Array) 
     change = plain.noisy[:, :1] - latents[:, :1]
     assert np.abs(np.asarray(change)).max() > 0.1
     np.testing.assert_allclose((relative.velocity - plain.velocity)[:, 1:], np.repeat(change, 2, 1), atol=1e-5)
+
+
+def test_velocity_of_clean_latents_is_the_pair_s(latents: jax.Array) -> None:
+    """With the true clean latents it is the target, and under the smallest level it is that much smaller, not larger."""
+    pair = fm.training_pair(jax.random.key(1), latents, 5.0)
+    found = fm.velocity_of_clean(latents, pair.noisy, pair.sigma)
+    high = np.asarray(pair.sigma) >= fm.SMALLEST_LEVEL
+    assert high.any()
+    np.testing.assert_allclose(found[high, 1:], pair.velocity[high, 1:], atol=1e-4)
+    low = jnp.full(len(latents), fm.SMALLEST_LEVEL / 2)
+    np.testing.assert_allclose(
+        fm.velocity_of_clean(latents, latents + 1, low), np.full(SHAPE, 1 / fm.SMALLEST_LEVEL), rtol=1e-4
+    )

@@ -19,6 +19,8 @@ REFERENCE_NOISE = 0.1
 """Largest standard deviation of the noise that perturbs the reference latent in training; it is drawn uniformly (FlowWAM)."""
 
 
+SMALLEST_LEVEL = 0.05
+"""Noise level under which a prediction of clean latents is divided by no less."""
 ReplaceReference = Callable[[Array, Array], Array]
 """Function (latents [b t h w c], another reference [b 1 h w c]) -> latents [b t h w c] of the same later frames behind it."""
 
@@ -91,3 +93,13 @@ def sampling_sigmas(steps: int, shift: float) -> Float[np.ndarray, " levels"]:
 def shift_sigma(sigma: Float[np.ndarray, "*n"], shift: float) -> Float[np.ndarray, "*n"]:
     """Noise levels [...] float64 moved toward 1: s u / (1 + (s - 1) u)."""
     return shift * sigma / (1 + (shift - 1) * sigma)
+
+
+def velocity_of_clean(
+    clean: Float[Array, "b t h w c"], noisy: Float[Array, "b t h w c"], sigma: Float[Array, " b"]
+) -> Float[Array, "b t h w c"]:
+    """Velocity [b t h w c] that leads from noisy latents [b t h w c] at noise levels [b] to predicted clean ones [b t h w c].
+
+    (x_sigma - x_0) / sigma, where sigma is at least `SMALLEST_LEVEL`: an error of the prediction is not blown up further.
+    """
+    return (noisy - clean) / jnp.maximum(sigma, SMALLEST_LEVEL)[:, None, None, None, None]
