@@ -46,7 +46,7 @@ SLOW = (
     "tests/model/test_pipeline.py",
     "tests/model/test_rollout.py",
     "tests/model/test_systems.py",
-    "tests/model/test_train_vae.py",
+    "tests/model/test_train_codec.py",
     "tests/model/text/",
     "tests/model/training/test_training.py",
     "tests/sim_warp/assets/",

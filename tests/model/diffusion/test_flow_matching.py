@@ -51,3 +51,28 @@ def test_loss_ignores_the_reference_frame(latents: jax.Array) -> None:
     wrong_reference = pair.velocity.at[:, 0].add(100.0)
     np.testing.assert_array_equal(fm.sample_losses(wrong_reference, pair), np.zeros(len(latents)))
     np.testing.assert_allclose(fm.sample_losses(pair.velocity + 2, pair), np.full(len(latents), 4.0), rtol=1e-5)
+
+
+def test_the_target_is_the_video_behind_the_shown_reference(latents: jax.Array) -> None:
+    """Where later latents are differences from the first, the pair's are those from the perturbed one; else none changes."""
+    plain = fm.training_pair(jax.random.key(1), latents, 5.0)
+    relative = fm.training_pair(
+        jax.random.key(1), latents, 5.0, lambda clip, first: fm.put_first(clip + clip[:, :1] - first, first)
+    )
+    np.testing.assert_array_equal(relative.noisy[:, 0], plain.noisy[:, 0])
+    change = plain.noisy[:, :1] - latents[:, :1]
+    assert np.abs(np.asarray(change)).max() > 0.1
+    np.testing.assert_allclose((relative.velocity - plain.velocity)[:, 1:], np.repeat(change, 2, 1), atol=1e-5)
+
+
+def test_velocity_of_clean_latents_is_the_pair_s(latents: jax.Array) -> None:
+    """With the true clean latents it is the target, and under the smallest level it is that much smaller, not larger."""
+    pair = fm.training_pair(jax.random.key(1), latents, 5.0)
+    found = fm.velocity_of_clean(latents, pair.noisy, pair.sigma)
+    high = np.asarray(pair.sigma) >= fm.SMALLEST_LEVEL
+    assert high.any()
+    np.testing.assert_allclose(found[high, 1:], pair.velocity[high, 1:], atol=1e-4)
+    low = jnp.full(len(latents), fm.SMALLEST_LEVEL / 2)
+    np.testing.assert_allclose(
+        fm.velocity_of_clean(latents, latents + 1, low), np.full(SHAPE, 1 / fm.SMALLEST_LEVEL), rtol=1e-4
+    )

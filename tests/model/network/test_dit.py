@@ -57,6 +57,13 @@ def test_zero_velocity_at_the_start(inputs: tuple[jax.Array, jax.Array, jax.Arra
     assert not np.any(model(latents, {}, sigma, text))
 
 
+def test_velocity_follows_from_clean_latents(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+    """With the same parameters: what the one model calls velocity, the other calls clean latents."""
+    latents, sigma, text = inputs
+    found, clean = (tiny(prediction=name)(latents, {}, sigma, text) for name in ("clean", "velocity"))
+    np.testing.assert_allclose(found, (latents - clean) / sigma[:, None, None, None, None], atol=TOLERANCE)
+
+
 def test_one_stream_is_the_plain_block_stack(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
     """Scan over stacked layers = calling each layer's block in turn."""
     latents, sigma, text = inputs

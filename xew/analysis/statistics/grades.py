@@ -19,8 +19,8 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.paper import Paper
-from xew.analysis.scores import COPY, TRAINING, TRUTH, MetricInfo
-from xew.protocol import MULTI_VIEW, PARTS, ROBOT_NAMES, SPLITS, Variant
+from xew.analysis.scores import TRAINING, MetricInfo
+from xew.protocol import BASELINES, MULTI_VIEW, PARTS, ROBOT_NAMES, SPLITS, Variant
 from xew.statistics import DRAWS, LEVEL, Mean, bootstrap_means, combine, find_strata, noise_floor, pool_trainings
 
 TOGETHER = {
@@ -154,7 +154,7 @@ class StudyGrades:
     @property
     def variants(self) -> list[str]:
         """Names of the variants that were graded, without the baselines."""
-        return [name for name in self._trainings if name not in (COPY, TRUTH)]
+        return [name for name in self._trainings if name not in BASELINES]
 
     def trainings(self, variant: str) -> int:
         """Number of trainings of a variant that were graded."""
@@ -228,7 +228,7 @@ class StudyGrades:
         for i in range(len(scores)):
             own = [mean for mean in found[i * trainings : (i + 1) * trainings] if mean is not None]
             mean = pool_trainings(own, variant, self._several) if own else None
-            means.append(replace(mean, trainings=0) if mean and variant in (COPY, TRUTH) else mean)
+            means.append(replace(mean, trainings=0) if mean and variant in BASELINES else mean)
         return means
 
     def _scores(self, variant: str, robots: tuple[str, ...], metric: str) -> np.ndarray:

@@ -3,4 +3,4 @@
 Every codec is causal in time: it encodes the first frame alone, then groups of four.
 """
 
-__all__ = ["ceiling", "codec", "vae", "vae_chunks", "vae_layers", "vae_layouts"]
+__all__ = ["ceiling", "codec", "conv_autoencoder", "vae", "vae_chunks", "vae_layers", "vae_layouts"]

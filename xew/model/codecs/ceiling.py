@@ -50,13 +50,25 @@ def measure_ceiling(
 
     scores = []
     for video in videos:
-        truth = video[:frames]
-        clip = truth[np.minimum(np.arange(frames), len(truth) - 1)]
-        decoded = to_camera_size(codec.decode(codec.encode(to_model_size(clip, height, width))))[: len(truth)]
-        pair = jnp.asarray(decoded), jnp.asarray(truth)
+        decoded = reconstruct(codec, video[:frames], frames, height, width)
+        pair = jnp.asarray(decoded), jnp.asarray(video[:frames])
         scores.append((np.mean(psnr(*pair)), np.mean(lpips(*(video[::LPIPS_EVERY] for video in pair)))))
     means = np.mean(scores, axis=0)
     return Ceiling(float(means[0]), float(means[1]), len(scores))
+
+
+def reconstruct(
+    codec: Codec, truth: UInt8[np.ndarray, "t 240 320 3"], frames: int, height: int, width: int
+) -> UInt8[np.ndarray, "t 240 320 3"]:
+    """What the codec leaves of a video, at the camera's size: [t 240 320 3] uint8.
+
+    Args:
+        codec: the codec.
+        truth: [t 240 320 3] uint8, at most `frames` of them; fewer are continued by their last frame, which is not returned.
+        frames, height, width: of the model's clip.
+    """
+    clip = truth[np.minimum(np.arange(frames), len(truth) - 1)]
+    return to_camera_size(codec.decode(codec.encode(to_model_size(clip, height, width))))[: len(truth)]
 
 
 def choose_evenly(items: Sequence[T], count: int) -> list[T]:

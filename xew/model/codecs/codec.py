@@ -23,6 +23,13 @@ from jax import Array, lax
 from jaxtyping import Float, Shaped, UInt8
 
 from xew.config import ConfigError, parse, pick
+from xew.model.codecs.conv_autoencoder import (
+    AutoencoderSize,
+    ConvAutoencoder,
+    find_weights,
+    load_autoencoder,
+    save_autoencoder,
+)
 from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae
 from xew.model.codecs.vae_layers import as_row
 from xew.model.codecs.vae_layouts import load_vae, save_vae
@@ -32,6 +39,10 @@ Pictures = UInt8[np.ndarray, "t h w 3"]
 Latents = Float[np.ndarray, "k y x c"]
 FrameBatch = Float[Array, "b t h w 3"]
 LatentBatch = Float[Array, "b k y x c"]
+PACKAGED_WEIGHTS = Path(__file__).with_name("conv_autoencoder.safetensors")
+"""Weights of conv_autoencoder that come with the package."""
+PACKAGED_SHAPE = (16, 48)
+"""Spatial factor and channels of the packaged weights."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +60,10 @@ class CodecSettings:
     vae: str = "wan22"
     """Size of wan_vae, one of VAES."""
     weights: Path | None = None
-    """Weights of wan_vae: Wan2.2_VAE.pth, the vae folder of the diffusers layout, or what `train_vae` wrote."""
+    """Weights of wan_vae: Wan2.2_VAE.pth, the vae folder of the diffusers layout, or what `train_codec` wrote. Of
+    conv_autoencoder: what `train_codec` wrote; those of the package where left out."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """Type of wan_vae's activations."""
+    """Type of the activations of wan_vae and conv_autoencoder."""
     chunk: int = 8
     """Number of latent frames that go through wan_vae at once; more is faster and takes more memory, 0 takes all."""
 
@@ -62,6 +74,8 @@ class Codec(Protocol):
 
     fitted: ClassVar[bool]
     """Whether it is fitted to the training episodes, and not read from weights."""
+    relative: ClassVar[bool]
+    """Whether later latents are coded relative to the first frame, so that another first frame changes them."""
 
     @property
     def spatial_factor(self) -> int:
@@ -93,6 +107,17 @@ class Codec(Protocol):
         It is rounded as if it had been a picture in between, so it is what a rollout begins its next chunk with.
         """
 
+    def replace_reference(self, latents: LatentBatch, reference: Float[Array, "b 1 y x c"]) -> LatentBatch:
+        """Latents of the same later frames behind another first frame; may be traced.
+
+        Args:
+            latents: [b t' h' w' c] of a clip.
+            reference: [b 1 h' w' c], the latent of another first frame.
+
+        Returns:
+            [b t' h' w' c], which begin with the reference and decode to the clip's later frames.
+        """
+
     def save(self, folder: Path) -> None:
         """Write all that `load` needs into a folder, under names of its own."""
 
@@ -112,6 +137,7 @@ class Codec(Protocol):
 class BatchCodec:
     """A codec's functions on pictures and on single clips, from its `encode_batch` and `decode_batch`."""
 
+    relative: ClassVar[bool] = False
     spatial_factor: int
     encode_batch: Callable[[Array], Array]
     decode_batch: Callable[[Array], Array]
@@ -128,6 +154,10 @@ class BatchCodec:
     def next_reference(self, latents: LatentBatch) -> Float[Array, "b 1 y x c"]:
         """The last decoded frame as a picture, encoded alone: [b t' h' w' c] -> [b 1 h' w' c]."""
         return self.encode_batch(to_signed(to_pictures(self.decode_batch(latents)[:, -1:])))
+
+    def replace_reference(self, latents: LatentBatch, reference: Float[Array, "b 1 y x c"]) -> LatentBatch:
+        """Put another first latent [b 1 h' w' c] before those that follow, which do not depend on it: [b t' h' w' c]."""
+        return jnp.concatenate([reference, latents[:, 1:]], axis=1)
 
 
 @jax.jit
@@ -186,6 +216,7 @@ class PatchCodec(BatchCodec):
     """
 
     fitted: ClassVar[bool] = True
+    relative: ClassVar[bool] = True
 
     spatial_factor: int
     first: Basis
@@ -213,6 +244,15 @@ class PatchCodec(BatchCodec):
     def decode_batch(self, latents: LatentBatch) -> FrameBatch:
         """Latents [b t' h' w' c] -> frames [b t h w 3] float32, about in [-1, 1]."""
         return join_patches(self.first.decode(latents[:, :1]), self.later.decode(latents[:, 1:]), self.spatial_factor)
+
+    def replace_reference(self, latents: LatentBatch, reference: Float[Array, "b 1 y x c"]) -> LatentBatch:
+        """Latents [b t' h' w' c] of the same later frames as differences from another first frame [b 1 h' w' c].
+
+        The part of the change that the components hold is taken from every difference; their mean is zero.
+        """
+        change = self.first.decode(reference) - self.first.decode(latents[:, :1])
+        shifted = latents[:, 1:] - self.later.encode(jnp.tile(change, TEMPORAL_FACTOR))
+        return jnp.concatenate([reference, shifted], axis=1)
 
     def save(self, folder: Path) -> None:
         """Write codec.npz."""
@@ -345,7 +385,7 @@ class WanVaeCodec(BatchCodec):
         if settings.weights is None:
             raise ConfigError(
                 "the codec wan_vae needs codec.weights: Wan2.2_VAE.pth, the vae folder of Wan2.2-TI2V-5B-Diffusers, or the"
-                " folder of an autoencoder trained by `python -m xew.model.train_vae CONFIG`."
+                " folder of an autoencoder trained by `python -m xew.model.train_codec CONFIG`."
             )
         return cls.from_weights(settings.weights, pick(VAES, settings.vae, "autoencoder"), settings.dtype, settings.chunk)
 
@@ -361,14 +401,124 @@ class WanVaeCodec(BatchCodec):
         """The codec of an autoencoder."""
         graph, params = nnx.split(vae)
         dtype = jnp.dtype(vae.dtype).name
-        digest = hashlib.sha256(f"wan_vae {vae.size} {dtype}".encode())
-        for path, leaf in sorted(nnx.to_flat_state(params), key=lambda item: str(item[0])):
-            digest.update(f"{path}".encode())
-            digest.update(np.asarray(jax.device_get(leaf.get_value())).tobytes())
-        return cls(params, graph, vae.size, dtype, chunk, digest.hexdigest())
+        return cls(params, graph, vae.size, dtype, chunk, hash_leaves(f"wan_vae {vae.size} {dtype}", params))
 
 
-CODECS: dict[str, type[Codec]] = {"patch_pca": PatchCodec, "wan_vae": WanVaeCodec}
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("params",), meta_fields=("graph", "size", "dtype", "hash"))
+@dataclass(frozen=True)
+class ConvAutoencoderCodec(BatchCodec):
+    """The project's own autoencoder of groups of four frames; see `xew.model.codecs.conv_autoencoder`.
+
+    Groups stand alone, so that no latent and no decoded frame depends on the first frame but the first itself.
+    """
+
+    fitted: ClassVar[bool] = False
+
+    params: Any
+    """State of a `ConvAutoencoder` with the statistics of its latents."""
+    graph: nnx.GraphDef
+    size: AutoencoderSize
+    dtype: str
+    hash: str
+
+    @property
+    def spatial_factor(self) -> int:  # type: ignore[override]
+        return self.size.spatial_factor
+
+    @property
+    def channels(self) -> int:
+        return self.size.channels
+
+    @property
+    def autoencoder(self) -> ConvAutoencoder:
+        """The autoencoder itself."""
+        return nnx.merge(self.graph, self.params)
+
+    def encode_batch(self, frames: FrameBatch) -> LatentBatch:
+        """Frames [b t h w 3] in [-1, 1] -> standardized latents [b t' h' w' c] float32."""
+        return self.autoencoder.encode(frames)
+
+    def decode_batch(self, latents: LatentBatch) -> FrameBatch:
+        """Latents [b t' h' w' c] -> frames [b t h w 3] float32 in [-1, 1]."""
+        return self.autoencoder.decode(latents)
+
+    def next_reference(self, latents: LatentBatch) -> Float[Array, "b 1 y x c"]:
+        """The last decoded frame as a picture, encoded alone: [b t' h' w' c] -> [b 1 h' w' c]; one group is decoded."""
+        autoencoder = self.autoencoder
+        return autoencoder.encode(to_signed(to_pictures(autoencoder.decode_last(latents))))
+
+    def save(self, folder: Path) -> None:
+        """Write autoencoder.safetensors and autoencoder.json; weights that are there already are not written again."""
+        description = {"size": asdict(self.size), "dtype": self.dtype, "hash": self.hash}
+        file = folder / "autoencoder.json"
+        if not file.exists() or json.loads(file.read_text())["hash"] != self.hash:
+            save_autoencoder(self.autoencoder, folder / "autoencoder.safetensors")
+        file.write_text(json.dumps(description, indent=1) + "\n")
+
+    @classmethod
+    def load(cls, folder: Path) -> "ConvAutoencoderCodec":
+        """Read autoencoder.safetensors and autoencoder.json."""
+        stored = json.loads((folder / "autoencoder.json").read_text())
+        return cls.from_weights(folder / "autoencoder.safetensors", stored["dtype"])
+
+    @classmethod
+    def check(cls, settings: CodecSettings) -> None:
+        found = settings.spatial_factor, settings.channels
+        if settings.weights is None and found != PACKAGED_SHAPE:
+            raise ConfigError(
+                f"codec.spatial_factor is {found[0]} and codec.channels {found[1]}; the packaged conv_autoencoder has"
+                f" {PACKAGED_SHAPE[0]} and {PACKAGED_SHAPE[1]}: write those, or name others by codec.weights."
+            )
+
+    @classmethod
+    def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> "ConvAutoencoderCodec":
+        """Read the weights of a config, or those of the package.
+
+        Raises:
+            ConfigError: they are missing or broken, or have another factor or number of channels.
+        """
+        weights = settings.weights or PACKAGED_WEIGHTS
+        if settings.weights is None and not weights.exists():
+            raise ConfigError(
+                "this copy of the package has no weights for the codec conv_autoencoder; train one by `python -m"
+                " xew.model.train_codec configs/codec.yaml` and name its folder by codec.weights."
+            )
+        codec = cls.from_weights(weights, settings.dtype)
+        if (codec.spatial_factor, codec.channels) != (settings.spatial_factor, settings.channels):
+            raise ConfigError(
+                f"codec.spatial_factor is {settings.spatial_factor} and codec.channels {settings.channels};"
+                f" {find_weights(weights)} has {codec.spatial_factor} and {codec.channels}: write those."
+            )
+        return codec
+
+    @classmethod
+    def from_weights(cls, weights: Path, dtype: str = "float32") -> "ConvAutoencoderCodec":
+        """A codec from a file of weights, or from the folder that holds it."""
+        return cls.from_autoencoder(load_autoencoder(weights, jnp.dtype(dtype)))
+
+    @classmethod
+    def from_autoencoder(cls, autoencoder: ConvAutoencoder) -> "ConvAutoencoderCodec":
+        """The codec of an autoencoder."""
+        graph, params = nnx.split(autoencoder)
+        dtype = jnp.dtype(autoencoder.dtype).name
+        name = f"conv_autoencoder {autoencoder.size} {dtype}"
+        return cls(params, graph, autoencoder.size, dtype, hash_leaves(name, params))
+
+
+CODECS: dict[str, type[Codec]] = {
+    "patch_pca": PatchCodec,
+    "conv_autoencoder": ConvAutoencoderCodec,
+    "wan_vae": WanVaeCodec,
+}
+
+
+def hash_leaves(name: str, params: Any) -> str:
+    """SHA-256 of a name and of all leaves of a module's state with their paths."""
+    digest = hashlib.sha256(name.encode())
+    for path, leaf in sorted(nnx.to_flat_state(params), key=lambda item: str(item[0])):
+        digest.update(f"{path}".encode())
+        digest.update(np.asarray(jax.device_get(leaf.get_value())).tobytes())
+    return digest.hexdigest()
 
 
 def codec_class(settings: CodecSettings) -> type[Any]:

@@ -4,6 +4,7 @@ x_sigma = (1 - sigma) x_0 + sigma n; the network predicts the velocity n - x_0. 
 clean in training but for a small perturbation, put back after every sampling step, and never in the loss.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -18,6 +19,12 @@ REFERENCE_NOISE = 0.1
 """Largest standard deviation of the noise that perturbs the reference latent in training; it is drawn uniformly (FlowWAM)."""
 
 
+SMALLEST_LEVEL = 0.05
+"""Noise level under which a prediction of clean latents is divided by no less."""
+ReplaceReference = Callable[[Array, Array], Array]
+"""Function (latents [b t h w c], another reference [b 1 h w c]) -> latents [b t h w c] of the same later frames behind it."""
+
+
 class TrainingPair(NamedTuple):
     """What one training example asks of the network."""
 
@@ -29,13 +36,23 @@ class TrainingPair(NamedTuple):
     """Noise level [b] float32 of latent frames 1 and on."""
 
 
-def training_pair(key: Key[Array, ""], latents: Float[Array, "b t h w c"], shift: float) -> TrainingPair:
+def put_first(latents: Float[Array, "b t h w c"], reference: Float[Array, "b 1 h w c"]) -> Float[Array, "b t h w c"]:
+    """Latents [b t h w c] whose first frame is the given one [b 1 h w c], of a codec whose later latents stand alone."""
+    return jnp.concatenate([reference, latents[:, 1:]], axis=1)
+
+
+def training_pair(
+    key: Key[Array, ""], latents: Float[Array, "b t h w c"], shift: float, replace_reference: ReplaceReference = put_first
+) -> TrainingPair:
     """Noisy latents and their velocity, at a level drawn for each sample.
+
+    What is to be predicted is the same video behind the reference that is shown, which is perturbed.
 
     Args:
         key: of the random numbers.
         latents: [b t h w c] float32, clean.
         shift: moves the `TRAIN_LEVELS` levels, which are drawn uniformly, toward noise.
+        replace_reference: the codec's `replace_reference`, where its later latents depend on the first.
     """
     key_level, key_noise, key_strength, key_reference = jax.random.split(key, 4)
     batch = latents.shape[0]
@@ -44,7 +61,7 @@ def training_pair(key: Key[Array, ""], latents: Float[Array, "b t h w c"], shift
     noise = jax.random.normal(key_noise, latents.shape, jnp.float32)
     strength = jax.random.uniform(key_strength, (batch, 1, 1, 1, 1), maxval=REFERENCE_NOISE)
     reference = latents[:, :1] + strength * jax.random.normal(key_reference, latents[:, :1].shape, jnp.float32)
-    level = sigma[:, None, None, None, None]
+    level, latents = sigma[:, None, None, None, None], replace_reference(latents, reference)
     noisy = (1 - level) * latents + level * noise
     return TrainingPair(jnp.concatenate([reference, noisy[:, 1:]], axis=1), noise - latents, sigma)
 
@@ -76,3 +93,13 @@ def sampling_sigmas(steps: int, shift: float) -> Float[np.ndarray, " levels"]:
 def shift_sigma(sigma: Float[np.ndarray, "*n"], shift: float) -> Float[np.ndarray, "*n"]:
     """Noise levels [...] float64 moved toward 1: s u / (1 + (s - 1) u)."""
     return shift * sigma / (1 + (shift - 1) * sigma)
+
+
+def velocity_of_clean(
+    clean: Float[Array, "b t h w c"], noisy: Float[Array, "b t h w c"], sigma: Float[Array, " b"]
+) -> Float[Array, "b t h w c"]:
+    """Velocity [b t h w c] that leads from noisy latents [b t h w c] at noise levels [b] to predicted clean ones [b t h w c].
+
+    (x_sigma - x_0) / sigma, where sigma is at least `SMALLEST_LEVEL`: an error of the prediction is not blown up further.
+    """
+    return (noisy - clean) / jnp.maximum(sigma, SMALLEST_LEVEL)[:, None, None, None, None]

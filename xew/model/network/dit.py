@@ -23,6 +23,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Float, Int
 
 from xew.model.devices.sharding import gather_parameters, shard_over_batch
+from xew.model.diffusion.flow_matching import velocity_of_clean
 from xew.model.network.blocks import (
     REMAT,
     AttentionName,
@@ -63,6 +64,7 @@ Text = Float[Array, "b l e"] | Int[Array, "b l"]
 TokenGrid = tuple[int, int, int]
 """Number of tokens in time, height and width."""
 Visibility = Literal["joint", "one_way"]
+Prediction = Literal["velocity", "clean"]
 TimeEmbedding = Literal["exact", "flowwam"]
 
 MODELS = {
@@ -111,6 +113,7 @@ class WorldModel(nnx.Module):
         time: "exact", or "flowwam": the rounding with which FlowWAM's published weights were trained.
         history: when the frames of the stream history were, in latent frames from the clip's first (negative).
         words: rows of a learned table of words; text is then ids [b l] instead of embeddings. 0 has none.
+        prediction: what the head computes, from which the velocity follows: "velocity" itself, or "clean" latents.
     """
 
     def __init__(
@@ -128,9 +131,11 @@ class WorldModel(nnx.Module):
         time: TimeEmbedding = "exact",
         history: Sequence[float] = (),
         words: int = 0,
+        prediction: Prediction = "velocity",
         rngs: nnx.Rngs,
     ) -> None:
         self.size, self.channels, self.dtype, self.residual = size, channels, dtype, residual
+        self.prediction = prediction
         self.remat, self.unroll, self.visibility, self.time = remat, unroll, visibility, time
         self.history = tuple(history)
         # Earlier frames come right after RGB's tokens, so that all frames that have a context of their own are one piece.
@@ -185,7 +190,8 @@ class WorldModel(nnx.Module):
         time, levels = self.add_frame_vectors(self.embed_time(sigma), levels, latents.shape, conditions)
         context = self.framed_context(text, latents.shape, conditions)
         tokens = self.apply_blocks(tokens, self.modulation(time), levels, rotary, context, rgb, cache)
-        return unpatchify(self.head(tokens[:, :rgb].astype(jnp.float32), time, levels[:rgb]), latents.shape)
+        predicted = unpatchify(self.head(tokens[:, :rgb].astype(jnp.float32), time, levels[:rgb]), latents.shape)
+        return velocity_of_clean(predicted, latents, sigma) if self.prediction == "clean" else predicted
 
     def condition_cache(self, conditions: Conditions, text: Text) -> ConditionCache:
         """Keys and values of the condition tokens in every layer; they hold for all steps of sampling a clip.

@@ -44,11 +44,15 @@ FREE_TO_CHANGE = (
     "model.unroll",
     "train.accumulate",
     "train.epochs",
+    "train.seconds",
     "train.steps",
     "train.log_every",
     "train.save_every",
     "train.sample_every",
     "train.keep_checkpoints",
+    "pictures.device_share",
+    "pictures.host_gb",
+    "report.",
     "rollout.",
 )
 """Settings that a resumed run may change; any other would make it another experiment."""

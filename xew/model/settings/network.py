@@ -43,5 +43,6 @@ class Network:
             time=settings.time,
             history=tuple(frame / TEMPORAL_FACTOR for frame in settings.history),
             words=self.words,
+            prediction=settings.prediction,
             rngs=nnx.Rngs(self.seed),
         )

@@ -6,6 +6,7 @@ from typing import Literal
 
 from xew.model.network.dit import (
     AttentionName,
+    Prediction,
     RematName,
     TimeEmbedding,
     Visibility,
@@ -55,6 +56,8 @@ class ModelSettings:
     """one_way: condition tokens see condition tokens only, and are computed once a clip when sampling. A departure."""
     time: TimeEmbedding = "exact"
     """flowwam: with the rounding under which FlowWAM's published weights were trained."""
+    prediction: Prediction = "velocity"
+    """clean: the network predicts clean latents, and the velocity follows from them. A departure."""
     weights: Path | None = None
     """Published weights to start from: official Wan, diffusers, FlowWAM (dit_layouts.load_dit); from nothing if left out."""
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import jax
 import numpy as np
-import optax
 from jax.experimental import multihost_utils
 from tqdm import tqdm
 
@@ -31,7 +30,10 @@ class Timetable:
     save_every: int
     sample_every: int
     """0 draws no samples."""
-    learning_rate: optax.Schedule
+    learning_rate: Callable[[int], Any]
+    """Function from the number of steps taken to the rate of the next."""
+    is_over: Callable[[int], bool] | None = None
+    """Function from the number of steps taken to whether the training ends before `steps`, as one with a budget of time."""
 
 
 @dataclass
@@ -131,14 +133,15 @@ def run_steps(
         place: brings a batch to the devices; its time counts as waiting for data.
     """
     begin, stop, log = int(state.step), StopSignal(), session.log
-    progress = tqdm(range(begin, timetable.steps), desc="train", initial=begin, total=timetable.steps, file=sys.stderr)
+    total = timetable.steps if timetable.is_over is None else None
+    progress = tqdm(iter(range(begin, timetable.steps)), desc="train", initial=begin, total=total, file=sys.stderr)
     for step in (number + 1 for number in progress):
         asked = time.perf_counter()
         batch = place(next(batches))
         wait_s = time.perf_counter() - asked
         state, result = take_step(state, batch)
         meter.add(result, wait_s)
-        last = step == timetable.steps
+        last = step == timetable.steps or (timetable.is_over is not None and timetable.is_over(step))
         logs = step % timetable.log_every == 0 or last
         stops = (logs or jax.process_count() == 1) and stop.is_agreed()
         saves = step % timetable.save_every == 0 or last or stops
@@ -153,10 +156,13 @@ def run_steps(
         if saves or stops:
             save_state(session.checkpoints, state, batches.get_state())
         if stops and not last:  # whoever asked will not wait for samples
-            progress.write(f"stopped at step {step} of {timetable.steps} and saved; continue with --resume", file=sys.stderr)
+            of = "" if total is None else f" of {total}"
+            progress.write(f"stopped at step {step}{of} and saved; continue with --resume", file=sys.stderr)
             break
         if timetable.sample_every and (step % timetable.sample_every == 0 or last):
             with meter.pause():
                 draw_samples(state, step)
+        if last:
+            break
     stop.release()
     return state

@@ -1,0 +1,238 @@
+"""Pictures that an autoencoder learns from: clips of every stream, decoded or drawn once and kept in memory.
+
+Reads  episodes
+Writes `Pictures`: uint8 [n t h w 3] of all clips, the robot's pixels in them, and which stream each is of
+
+Streams that have a frame for each frame of an episode are cut into clips one after another, of which every `every`-th is
+taken; those that describe a robot are drawn once a robot and taken whole, in groups as a codec takes them.
+"""
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from jaxtyping import Bool, UInt8
+from tqdm import tqdm
+
+from xew.config import ConfigError
+from xew.dataset import Episode
+from xew.episode import EpisodeError, Record, read_states
+from xew.model import conditions
+from xew.model.cache.clips import take_frames
+from xew.model.conditions import make_command
+from xew.model.video.frames import TEMPORAL_FACTOR, to_model_size
+from xew.threads import map_in_order
+
+STORED = {"rgb": "rgb.mkv", "robot_render": "robot.mkv"}
+"""Streams that every episode has as a file."""
+DRAWN = {"optical_flow": conditions.optical_flow, "mask": conditions.robot_mask, "ray_map": conditions.ray_map}
+"""Streams of pictures that are drawn from an episode's commands."""
+ALIGNED = (*STORED, *DRAWN)
+"""Streams that have a frame for each frame of an episode."""
+UNALIGNED = {
+    "reference_image": conditions.reference_image,
+    "nine_views": conditions.nine_views,
+    "articulation_clip": conditions.articulation_clip,
+}
+"""Streams of 4 k + 1 pictures that describe a robot, the same in all of its episodes."""
+
+Video = UInt8[np.ndarray, "t h w 3"]
+Masks = Bool[np.ndarray, "t h w"]
+
+
+@dataclass(frozen=True)
+class Cut:
+    """What is cut out of a video."""
+
+    frames: int
+    """Number of frames of a clip."""
+    every: int
+    height: int
+    """Height to which frames are brought."""
+    width: int
+
+    def starts(self, record: Record) -> list[int]:
+        """First frames of an episode's clips; where the first of them lies differs from episode to episode."""
+        stride = self.every * self.frames
+        phase = zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode()) % stride
+        last = record.frame_count - self.frames
+        return list(range(phase, last + 1, stride)) or [max(last, 0)]
+
+    @property
+    def clip_bytes(self) -> int:
+        """Number of bytes of a clip."""
+        return self.frames * self.height * self.width * 3
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """All clips that are learned from."""
+
+    clips: Any
+    """[n t h w 3] uint8, in the host's memory or on a device."""
+    regions: Any
+    """[n k h w] uint8, one bit a frame from the highest on: the robot's pixels; None where they are not asked for."""
+    streams: dict[str, range]
+    """Stream -> numbers of its clips."""
+
+    def describe(self) -> str:
+        """How many clips of which streams there are, and their size."""
+        counts = ", ".join(f"{len(numbers)} of {name}" for name, numbers in self.streams.items())
+        return f"{len(self.clips)} clips ({counts}), {self.clips.nbytes / 1e9:.2f} GB"
+
+
+def gather_pictures(
+    episodes: Sequence[Episode], streams: Sequence[str], cut: Cut, host_gb: float, *, regions: bool = False
+) -> Pictures:
+    """Decode and draw the clips of some streams of some episodes, in threads.
+
+    Args:
+        episodes: those to learn from.
+        streams: names among ALIGNED and UNALIGNED.
+        cut: what is taken of a video.
+        host_gb: largest size of all clips [GB].
+        regions: whether the robot's pixels are kept too.
+
+    Raises:
+        ConfigError: there would be more than `host_gb`.
+        EpisodeError: a video is missing or damaged.
+    """
+    aligned = [name for name in streams if name in ALIGNED]
+    short = _cut_descriptions(episodes, [name for name in streams if name in UNALIGNED], cut)
+    firsts = np.cumsum([0, *(len(cut.starts(record)) for _, record in episodes)])
+    counts = {name: int(firsts[-1]) for name in aligned} | {name: len(clips) for name, clips in short.items()}
+    total = sum(counts.values())
+    if total * cut.clip_bytes > host_gb * 1e9:
+        raise ConfigError(
+            f"{total} clips of {cut.width}x{cut.height} are {total * cut.clip_bytes / 1e9:.1f} GB, more than pictures.host_gb"
+            f" {host_gb:g}; raise pictures.every (now {cut.every}), or name fewer streams or robots."
+        )
+    ends = np.cumsum(list(counts.values()))
+    ranges = {name: range(int(end) - counts[name], int(end)) for name, end in zip(counts, ends, strict=True)}
+    clips = np.empty((total, cut.frames, cut.height, cut.width, 3), np.uint8)
+    bits = np.zeros((total, -(-cut.frames // 8), cut.height, cut.width), np.uint8) if regions else None
+
+    def put(name: str, offset: int, found: np.ndarray, masks: np.ndarray | None) -> None:
+        place = slice(ranges[name].start + offset, ranges[name].start + offset + len(found))
+        clips[place] = found
+        if bits is not None and masks is not None:
+            bits[place] = np.packbits(masks, axis=1)
+
+    def load(number: int) -> None:
+        folder, record = episodes[number]
+        starts = cut.starts(record)
+        times = np.minimum(np.add.outer(starts, np.arange(cut.frames)), record.frame_count - 1)
+        read = read_aligned(folder, record, aligned, times.ravel().tolist(), regions=regions)
+        for name, (video, mask) in read.items():
+            shape = len(starts), cut.frames, cut.height, cut.width
+            found = to_model_size(video, cut.height, cut.width).reshape(*shape, 3)
+            masks = None if mask is None else mask_to_model_size(mask, cut).reshape(shape)
+            put(name, int(firsts[number]), found, masks)
+
+    for name, found in short.items():
+        masks = differs_from_corner(found.reshape(-1, *found.shape[2:])).reshape(found.shape[:-1]) if regions else None
+        put(name, 0, found, masks)
+    if aligned:
+        loaded = map_in_order(load, range(len(episodes)))
+        for _ in tqdm(loaded, desc="pictures", total=len(episodes), unit="episode"):
+            pass
+    return Pictures(clips, bits, ranges)
+
+
+def read_aligned(
+    folder: Path, record: Record, streams: Sequence[str], times: Sequence[int], *, regions: bool = True
+) -> dict[str, tuple[Video, Masks | None]]:
+    """Frames [t 240 320 3] of an episode's streams at some times, each with the robot's pixels in them [t 240 320].
+
+    Args:
+        folder, record: the episode.
+        streams: names among ALIGNED.
+        times: numbers of frames.
+        regions: whether the robot's pixels are wanted; None stands for them where they are not.
+
+    Raises:
+        EpisodeError: a video is missing or damaged.
+    """
+    drawn = any(name in DRAWN for name in streams)
+    states = read_states(folder) if drawn or regions else None
+    command = make_command(folder, record, states) if states is not None and drawn else None
+    chosen, found = np.asarray(times), {}
+    for name in streams:
+        if name in STORED:
+            frames = read_frames(folder / STORED[name], set(times))
+            video = np.stack([frames[time] for time in times])
+        else:
+            assert command is not None
+            video = DRAWN[name](command)[chosen]
+        mask = None
+        if regions and states is not None:
+            mask = states.robot_mask[chosen] if name == "rgb" else differs_from_corner(video)
+        found[name] = video, mask
+    return found
+
+
+def draw_descriptions(streams: Sequence[str], episode: Episode) -> dict[str, Video]:
+    """The pictures [t h w 3] uint8 of the streams that describe the robot of an episode, by name."""
+    folder, record = episode
+    command = make_command(folder, record, read_states(folder)) if streams else None
+    return {name: UNALIGNED[name](command) for name in streams if command is not None}
+
+
+def _cut_descriptions(episodes: Sequence[Episode], streams: Sequence[str], cut: Cut) -> dict[str, np.ndarray]:
+    """Clips [n t h w 3] of the streams that describe robots, each robot once."""
+    if not streams:
+        return {}
+    robots = {record.robot: (folder, record) for folder, record in reversed(episodes)}
+    drawn = map_in_order(lambda robot: draw_descriptions(streams, robots[robot]), sorted(robots))
+    found: dict[str, list[np.ndarray]] = {name: [] for name in streams}
+    for videos in tqdm(drawn, desc="robots", total=len(robots), unit="robot"):
+        for name, video in videos.items():
+            found[name].append(cut_description(to_model_size(video, cut.height, cut.width), cut.frames))
+    return {name: np.concatenate(clips) for name, clips in found.items()}
+
+
+def cut_description(video: Video, frames: int) -> UInt8[np.ndarray, "n f h w 3"]:
+    """Clips [n frames h w 3] of a short video [t h w 3] of 4 k + 1 frames.
+
+    Groups of four as a codec takes them, the first frame four times; else its beginning, its last frame repeated.
+    """
+    if frames != TEMPORAL_FACTOR:
+        return take_frames(video, 0, frames)[None]
+    groups = np.concatenate([np.repeat(video[:1], TEMPORAL_FACTOR - 1, axis=0), video])
+    return groups.reshape(-1, TEMPORAL_FACTOR, *video.shape[1:])
+
+
+def differs_from_corner(video: Video) -> Masks:
+    """Pixels [t h w] bool of a drawn video [t h w 3] that are not the background, which is the color of its first pixel."""
+    return (video != video[:1, :1, :1]).any(axis=-1)
+
+
+def mask_to_model_size(mask: Masks, cut: Cut) -> Bool[np.ndarray, "t y x"]:
+    """Masks [t 240 320] bool as the model sees them: [t height width]."""
+    pictures = np.repeat(mask[..., None], 3, axis=-1).astype(np.uint8) * 255
+    return to_model_size(pictures, cut.height, cut.width)[..., 0] > 127
+
+
+def read_frames(path: Path, wanted: set[int]) -> dict[int, np.ndarray]:
+    """Read frames of a video by number, each uint8 [h w 3]. Raises EpisodeError if it does not hold them."""
+    frames: dict[int, np.ndarray] = {}
+    try:
+        with av.open(str(path)) as container:
+            container.streams.video[0].codec_context.thread_count = 1
+            for number, frame in enumerate(container.decode(video=0)):
+                if number in wanted:
+                    frames[number] = frame.to_ndarray(format="rgb24")
+                if len(frames) == len(wanted):
+                    break
+    except (av.FFmpegError, IndexError):
+        frames = {}
+    if len(frames) < len(wanted):
+        raise EpisodeError(
+            f"{path} is missing, damaged or shorter than its episode; make its videos by `python -m xew.sim_warp.inspect DATA"
+            " --render`, or delete the episode and generate it again."
+        )
+    return frames

@@ -1,0 +1,258 @@
+"""What the configs of `train_codec` hold, and the checks of it."""
+
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from xew.config import ConfigError, load, pick
+from xew.dataset import Dataset, Episode
+from xew.model.codec_training.kinds import KINDS, Kind
+from xew.model.codec_training.pictures import ALIGNED, UNALIGNED, Cut
+from xew.model.settings.checks import check_least
+from xew.model.settings.settings import Clip
+from xew.protocol import SPLITS, seed_split
+
+SEVERAL_BODIES = re.compile(r"(\w+):(\d+)(?:-(\d+))?")
+"""Name of one procedural body, or of a range of them: body:17, body:0-63."""
+Seeds = Literal["train", "test"]
+SMALLEST_SIDE = 32
+"""Least side [pixels] of a picture that LPIPS takes."""
+
+
+@dataclass(frozen=True)
+class PictureSettings:
+    """Which frames are learned from, and where they are kept."""
+
+    every: int = 3
+    """Clips are taken one after another, each `every`-th of them; 1 takes all of a video."""
+    frames: int = 17
+    """Number of frames of a clip of wan_vae, 4 k + 1; conv_autoencoder takes groups of four. Latents further on than any that
+    were trained lose 5 dB with clips of 5 frames."""
+    device_share: float = 0.4
+    """Largest share of an accelerator's memory that the pictures may take; where they take more, they stay in the host's."""
+    host_gb: float = 64.0
+    """Largest size of all pictures together [GB]; more is an error before anything is decoded."""
+
+
+@dataclass(frozen=True)
+class CodecTrainSettings:
+    """How the autoencoder learns."""
+
+    batch: int
+    """Number of clips a step."""
+    steps: int = 0
+    """Number of steps; give this or `seconds`."""
+    seconds: float = 0.0
+    """Time [s] of training after the first step, which compiles; the rate follows the time. What has passed before an
+    interruption counts."""
+    seed: int = 0
+    learning_rate: float = 1e-3
+    warmup_steps: int = 200
+    decay_to: float = 0.02
+    """Cosine decay of the rate to this part of its peak at the end."""
+    weight_decay: float = 0.01
+    clip_norm: float = 1.0
+    ema_decay: float = 0.998
+    l1: float = 1.0
+    """Weight of the mean absolute difference, on a scale of -1 to 1."""
+    mse: float = 2.0
+    """Weight of the mean squared difference, on the same scale."""
+    lpips: float = 0.2
+    """Weight of LPIPS."""
+    lpips_frames: int = 1
+    """Number of frames of each clip that LPIPS is taken on, drawn anew each step; 0 takes all."""
+    penalty: float = 1e-3
+    """Weight of what keeps latents small: their mean square, of wan_vae the divergence from the unit normal distribution."""
+    noise: float = 0.1
+    """Standard deviation of the noise on latents before they are decoded; wan_vae draws its own."""
+    region: float = 0.0
+    """Weight of the robot's pixels beyond that of the others, in l1 and mse."""
+    still: float = 0.1
+    """Share of samples that show one frame of the clip at all times, as a codec's first group does."""
+    permute: float = 0.25
+    """Share of samples whose color channels change places."""
+    flip: bool = False
+    """Whether half of the samples are mirrored."""
+    jitter: float = 0.0
+    """Largest change of a color channel's gain and offset, in half of the samples, on a scale of -1 to 1."""
+    crop: int = 0
+    """Side [pixels] of the squares that are cut out at random; 0 takes whole pictures."""
+    statistics_clips: int = 2048
+    """Number of clips from which the mean and deviation of the latents are computed at the end."""
+    log_every: int = 50
+    save_every: int = 2000
+    sample_every: int = 2000
+    """Number of steps between sample pictures; 0 draws none."""
+    keep_checkpoints: int = 1
+
+
+@dataclass(frozen=True)
+class ReportSettings:
+    """What the report at the end is measured on: training seeds of robots that were not trained on, unless asked otherwise."""
+
+    clips: int = 4
+    """Number of clips of each robot and stream."""
+    trained_robots: int = 3
+    """Number of robots that were trained on which are measured beside the others."""
+    robots: tuple[str, ...] = ()
+    """Robots that are measured beside those; all that were not trained on where left out."""
+    test_seeds: bool = False
+    """Whether test seeds are read, and not training seeds."""
+    pictures: bool = True
+    """Whether contact sheets are drawn."""
+
+    @property
+    def seeds(self) -> Seeds:
+        """Family of the seeds that are read."""
+        return "test" if self.test_seeds else "train"
+
+
+@dataclass(frozen=True)
+class CodecExperiment:
+    """What configs/codec*.yaml and configs/vae_*.yaml hold."""
+
+    data: Path
+    """Episodes, made by `python -m xew.sim_warp.generate`."""
+    out: Path
+    clip: Clip
+    """Clip of the world model that is to use it: the size of the pictures, and what the report is measured on."""
+    train: CodecTrainSettings
+    kind: str = "conv_autoencoder"
+    """One of KINDS."""
+    size: str = "base"
+    """Size of the autoencoder: tiny or base, of wan_vae tiny, small or wan22."""
+    robots: tuple[str, ...] = ()
+    """Robots that are learned from, by name (`body:0-63` names 64 procedural bodies); those of `split` where left out."""
+    split: str = "fixed"
+    """Split, one of protocol.SPLITS, whose training robots are learned from where no robots are named."""
+    streams: dict[str, float] = field(default_factory=lambda: {"rgb": 4.0, "robot_render": 2.0, "optical_flow": 1.0})
+    """Share of the samples that each stream of pictures has, by name: the scene, and conditions that are pictures."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Type of the activations."""
+    pictures: PictureSettings = field(default_factory=PictureSettings)
+    report: ReportSettings = field(default_factory=ReportSettings)
+
+    @property
+    def autoencoder(self) -> Kind:
+        """The kind of autoencoder at its size."""
+        return pick(KINDS, self.kind, "kind of autoencoder").of_size(self.size)
+
+    @property
+    def train_robots(self) -> tuple[str, ...]:
+        """Keys of the robots that are learned from."""
+        return expand_robots(self.robots) or pick(SPLITS, self.split, "split").train_robots
+
+    @property
+    def cut(self) -> Cut:
+        """What is cut out of a video."""
+        frames = self.autoencoder.clip_frames(self.pictures.frames)
+        return Cut(frames, self.pictures.every, self.clip.height, self.clip.width)
+
+
+LEAST = {
+    "clip.frames": 1,
+    "train.steps": 0,
+    "train.seconds": 0,
+    "train.batch": 1,
+    "train.learning_rate": 0,
+    "train.warmup_steps": 0,
+    "train.decay_to": 0,
+    "train.ema_decay": 0,
+    "train.l1": 0,
+    "train.mse": 0,
+    "train.lpips": 0,
+    "train.lpips_frames": 0,
+    "train.penalty": 0,
+    "train.noise": 0,
+    "train.region": 0,
+    "train.still": 0,
+    "train.permute": 0,
+    "train.jitter": 0,
+    "train.crop": 0,
+    "train.statistics_clips": 1,
+    "train.log_every": 1,
+    "train.save_every": 1,
+    "train.sample_every": 0,
+    "train.keep_checkpoints": 1,
+    "pictures.every": 1,
+    "pictures.device_share": 0,
+    "pictures.host_gb": 0,
+    "report.clips": 1,
+    "report.trained_robots": 0,
+}
+"""Numbers of a config that mean nothing below."""
+
+
+def load_codec_experiment(path: Path | str, overrides: Sequence[str] = ()) -> CodecExperiment:
+    """Read and check a config. Raises ConfigError with what does not exist or does not fit."""
+    return check_codec_experiment(load(CodecExperiment, path, overrides), path)
+
+
+def check_codec_experiment(experiment: CodecExperiment, path: Path | str) -> CodecExperiment:
+    """The experiment itself. Raises ConfigError, naming its path, if one of its choices does not exist or does not fit."""
+    check_least(LEAST, experiment, str(path))
+    check_streams(experiment.streams)
+    _ = experiment.train_robots
+    factor, clip, train = experiment.autoencoder.spatial_factor, experiment.clip, experiment.train
+    if (train.steps > 0) == (train.seconds > 0):
+        raise ConfigError(f"{path}: train.steps is {train.steps}, train.seconds {train.seconds:g}; give one of them, over 0.")
+    for name, frames in (("clip.frames", clip.frames), ("pictures.frames", experiment.pictures.frames)):
+        if frames % 4 != 1:
+            raise ConfigError(f"{path}: {name} is {frames}; it must be 4 k + 1, for example {max(5, frames // 4 * 4 + 1)}.")
+    for name, side in (("clip.height", clip.height), ("clip.width", clip.width), ("train.crop", train.crop)):
+        if (side or name != "train.crop") and (side % factor or side < SMALLEST_SIDE):
+            raise ConfigError(
+                f"{path}: {name} is {side}; it must be a multiple of {factor} (the factor of {experiment.kind}"
+                f" {experiment.size}) and at least {SMALLEST_SIDE} (for LPIPS)."
+            )
+    return experiment
+
+
+def check_streams(streams: dict[str, float]) -> None:
+    """Raise ConfigError unless every name is a stream of pictures with a share of at least 0, and one has more."""
+    known = (*ALIGNED, *UNALIGNED)
+    for name, share in streams.items():
+        pick(dict.fromkeys(known, ""), name, "stream of pictures")
+        if not share >= 0:
+            raise ConfigError(f"streams: {name} has the share {share:g}; it must be at least 0.")
+    if not any(streams.values()):
+        raise ConfigError(f"streams names none with a share over 0; name some of {', '.join(known)}.")
+
+
+def expand_robots(names: Sequence[str]) -> tuple[str, ...]:
+    """Keys of robots by their names: body:17 is body_17, body:0-63 are 64 of them, and others stay as they are."""
+    keys: list[str] = []
+    for name in names:
+        found = SEVERAL_BODIES.fullmatch(name)
+        if found is None:
+            keys.append(name)
+            continue
+        first, last = int(found[2]), int(found[3] or found[2])
+        keys += [f"{found[1]}_{number}" for number in range(first, last + 1)]
+    return tuple(keys)
+
+
+def select_episodes(dataset: Dataset, robots: Collection[str], seeds: Seeds) -> list[Episode]:
+    """Episodes with pictures of some robots and a family of seeds, sorted; possibly none.
+
+    A codec needs no pairs, so seeds at which another robot has failed count too where this one's pictures are there.
+    """
+    return [
+        (folder, record)
+        for folder, record in dataset.cells
+        if record.success and record.videos and record.robot in robots and seed_split(record.seed) == seeds
+    ]
+
+
+def training_episodes(dataset: Dataset, robots: Sequence[str]) -> list[Episode]:
+    """Episodes of training seeds of some robots. Raises ConfigError if there is none at all."""
+    episodes = select_episodes(dataset, robots, "train")
+    if not episodes:
+        raise ConfigError(
+            f"{dataset.root} has no training episode with videos of {', '.join(robots[:6])}"
+            f"{' …' if len(robots) > 6 else ''}; it has {', '.join(sorted({r.robot for _, r in dataset.cells})) or 'nothing'}."
+            f" Make some: python -m xew.sim_warp.generate --robots {' '.join(robots[:6])} --out {dataset.root}"
+        )
+    return episodes

@@ -1,0 +1,286 @@
+"""A convolutional autoencoder of groups of four frames (Flax NNX): small, two-dimensional, each group by itself.
+
+Reads  frames [b t h w 3] in [-1, 1], t = 4 k + 1; the first frame is a group of its own, taken four times
+Writes latents [b k+1 h/factor w/factor c], and frames back
+To add a size: one line in AUTOENCODERS.
+
+The four frames of a group and small squares of pixels are channels from the first layer on, so that there is no convolution
+over time: what a latent says depends on its own group alone, and so does what is decoded from it. Sides are halved by taking
+squares of pixels into the channels and mixing these (Shi et al., arXiv 1609.05158, in both directions).
+
+Shape letters: b batch, n groups, t h w video, i o channels in and out.
+"""
+
+import itertools
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import ml_dtypes
+import numpy as np
+from flax import nnx
+from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import Float
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from xew.config import ConfigError, parse
+from xew.files import replacing
+from xew.model.codecs.vae import LatentStatistic
+from xew.model.codecs.vae_layers import Conv, Layers, RmsNorm, as_row, patchify, unpatchify
+from xew.model.video.frames import TEMPORAL_FACTOR
+from xew.model.weights.layout import Source
+from xew.model.weights.reading import fill, read_tensors
+
+Groups = Float[Array, "n 4 h w 3"]
+Features = Float[Array, "n y x c"]
+Inputs = Float[Array, "n y x i"]
+Outputs = Float[Array, "n y2 x2 o"]
+SIZE = "size"
+"""Entry of a weights file's metadata that holds the size of the autoencoder, in JSON."""
+
+
+@dataclass(frozen=True)
+class AutoencoderSize:
+    """Everything that distinguishes one size of the autoencoder from another."""
+
+    encoder_widths: tuple[int, ...]
+    """Widths of the encoder's stages, from pixels to latents; between two stages the sides are halved."""
+    encoder_blocks: tuple[int, ...]
+    """Numbers of residual blocks of the encoder's stages."""
+    decoder_widths: tuple[int, ...]
+    """Widths of the decoder's stages, in the same order: from pixels to latents."""
+    decoder_blocks: tuple[int, ...]
+    channels: int = 48
+    """Number of channels of the latents."""
+    patch: int = 4
+    """Number of pixels a side that become channels before the first layer."""
+
+    def __post_init__(self) -> None:
+        stages = (self.encoder_widths, self.encoder_blocks, self.decoder_widths, self.decoder_blocks)
+        if len({len(stage) for stage in stages}) != 1:
+            raise ValueError(f"{self}: encoder and decoder have as many stages, each with a width and a number of blocks")
+
+    @property
+    def spatial_factor(self) -> int:
+        """Number of pixels a side of a latent."""
+        return self.patch * 2 ** (len(self.encoder_widths) - 1)
+
+
+AUTOENCODERS = {
+    "tiny": AutoencoderSize((16, 24, 32), (1, 1, 1), (16, 24, 32), (1, 1, 1)),
+    "base": AutoencoderSize((64, 128, 176), (2, 2, 2), (96, 192, 256), (4, 4, 3)),
+}
+
+
+class ConvAutoencoder(nnx.Module):
+    """Encoder and decoder of groups of four frames.
+
+    Args:
+        size: one of `AUTOENCODERS`.
+        dtype: of activations and products; parameters stay float32, norms are computed in it.
+    """
+
+    def __init__(self, size: AutoencoderSize, *, dtype: DTypeLike = jnp.float32, rngs: nnx.Rngs) -> None:
+        self.size, self.dtype = size, dtype
+        layers = Layers(jnp.dtype(dtype), "frames", rngs)
+        self.encoder, self.decoder = Encoder(size, layers), Decoder(size, layers)
+        self.latents_mean = LatentStatistic(jnp.zeros(size.channels))
+        self.latents_std = LatentStatistic(jnp.ones(size.channels))
+
+    def encode_groups(self, groups: Groups) -> Features:
+        """Latents [n h' w' c] float32, not standardized, of groups of frames [n 4 h w 3] in [-1, 1]."""
+        n, _, h, w, _ = groups.shape
+        stacked = groups.astype(self.dtype).transpose(0, 2, 3, 1, 4).reshape(n, 1, h, w, TEMPORAL_FACTOR * 3)
+        return self.encoder(patchify(stacked, self.size.patch)[:, 0]).astype(jnp.float32)
+
+    def decode_groups(self, latents: Features) -> Groups:
+        """Groups of frames [n 4 h w 3] float32, not clipped, of latents [n h' w' c] that are not standardized."""
+        stacked = unpatchify(self.decoder(latents.astype(self.dtype))[:, None], self.size.patch)[:, 0]
+        n, h, w, _ = stacked.shape
+        return stacked.astype(jnp.float32).reshape(n, h, w, TEMPORAL_FACTOR, 3).transpose(0, 3, 1, 2, 4)
+
+    def encode(self, frames: Float[Array, "b t h w 3"]) -> Float[Array, "b k y x c"]:
+        """Standardized latents [b k+1 h' w' c] float32 of frames [b t h w 3] in [-1, 1], t = 4 k + 1."""
+        b, t, h, w, _ = frames.shape
+        if t % TEMPORAL_FACTOR != 1 or h % self.size.spatial_factor or w % self.size.spatial_factor:
+            raise ValueError(
+                f"frames are {frames.shape}; expected [b t h w 3] with t = 4 k + 1 and sides in {self.size.spatial_factor}s"
+            )
+        first = jnp.repeat(frames[:, :1], TEMPORAL_FACTOR - 1, axis=1)
+        groups = jnp.concatenate([first, frames], axis=1).reshape(-1, TEMPORAL_FACTOR, h, w, 3)
+        latents = self.encode_groups(groups)
+        standard = (latents - as_row(self.latents_mean[...], 4)) / as_row(self.latents_std[...], 4)
+        return standard.reshape(b, -1, *standard.shape[1:])
+
+    def decode(self, latents: Float[Array, "b k y x c"]) -> Float[Array, "b t h w 3"]:
+        """Frames [b t h w 3] float32 in [-1, 1] of standardized latents [b k+1 h' w' c]; the first is the mean of its four."""
+        b, k = latents.shape[:2]
+        groups = self._decode_standard(latents.reshape(b * k, *latents.shape[2:]))
+        groups = groups.reshape(b, k, *groups.shape[1:])
+        first = groups[:, 0].mean(axis=1, keepdims=True)
+        later = groups[:, 1:].reshape(b, -1, *groups.shape[3:])
+        return jnp.clip(jnp.concatenate([first, later], axis=1), -1, 1)
+
+    def decode_last(self, latents: Float[Array, "b k y x c"]) -> Float[Array, "b 1 h w 3"]:
+        """The last frame [b 1 h w 3] that `decode` gives of latents [b k+1 h' w' c]; no other group is decoded."""
+        groups = self._decode_standard(latents[:, -1])
+        last = groups[:, -1:] if latents.shape[1] > 1 else groups.mean(axis=1, keepdims=True)
+        return jnp.clip(last, -1, 1)
+
+    def _decode_standard(self, latents: Array) -> Array:
+        raw = latents.astype(jnp.float32) * as_row(self.latents_std[...], 4) + as_row(self.latents_mean[...], 4)
+        return self.decode_groups(raw)
+
+
+class Encoder(nnx.Module):
+    """Patches of groups [n h/patch w/patch 12*patch^2] -> latents [n h' w' c]."""
+
+    def __init__(self, size: AutoencoderSize, layers: Layers) -> None:
+        widths = size.encoder_widths
+        self.conv_in = Conv((3, 3, TEMPORAL_FACTOR * 3 * size.patch**2, widths[0]), layers)
+        counts = size.encoder_blocks
+        self.stages = nnx.List([Stage(width, count, layers) for width, count in zip(widths, counts, strict=True)])
+        pairs = itertools.pairwise(widths)
+        self.halve = nnx.List([layers.pointwise(4 * i, o, axes=2) for i, o in pairs])
+        self.norm_out = RmsNorm(widths[-1])
+        self.conv_out = Conv((3, 3, widths[-1], size.channels), layers)
+
+    def __call__(self, x: Inputs) -> Outputs:
+        """Patches [n y x i] -> latents [n h' w' c]."""
+        x = convolve(self.conv_in, x)
+        for number, stage in enumerate(self.stages):
+            x = stage(x)
+            if number < len(self.halve):
+                x = self.halve[number](patchify(x[:, None], 2)[:, 0])
+        return convolve(self.conv_out, nnx.silu(self.norm_out(x)))
+
+
+class Decoder(nnx.Module):
+    """Latents [n h' w' c] -> patches of groups [n h/patch w/patch 12*patch^2]."""
+
+    def __init__(self, size: AutoencoderSize, layers: Layers) -> None:
+        widths, counts = size.decoder_widths[::-1], size.decoder_blocks[::-1]
+        self.conv_in = Conv((3, 3, size.channels, widths[0]), layers)
+        self.stages = nnx.List([Stage(width, count, layers) for width, count in zip(widths, counts, strict=True)])
+        pairs = itertools.pairwise(widths)
+        self.double = nnx.List([layers.pointwise(i, 4 * o, axes=2) for i, o in pairs])
+        self.norm_out = RmsNorm(widths[-1])
+        self.conv_out = Conv((3, 3, widths[-1], TEMPORAL_FACTOR * 3 * size.patch**2), layers)
+
+    def __call__(self, x: Inputs) -> Outputs:
+        """Latents [n h' w' c] -> patches [n y x o]."""
+        x = convolve(self.conv_in, x)
+        for number, stage in enumerate(self.stages):
+            x = stage(x)
+            if number < len(self.double):
+                x = unpatchify(self.double[number](x)[:, None], 2)[:, 0]
+        return convolve(self.conv_out, nnx.silu(self.norm_out(x)))
+
+
+class Stage(nnx.Module):
+    """Residual blocks of one width: [n y x c] -> [n y x c]."""
+
+    def __init__(self, width: int, count: int, layers: Layers) -> None:
+        self.blocks = nnx.List([Block(width, layers) for _ in range(count)])
+
+    def __call__(self, x: Features) -> Features:
+        """Features [n y x c] -> [n y x c]."""
+        for block in self.blocks:
+            x = block(x)
+        return x
+
+
+class Block(nnx.Module):
+    """Two convolutions, each after a norm, beside a shortcut: [n y x c] -> [n y x c]. It begins as the shortcut alone."""
+
+    def __init__(self, width: int, layers: Layers) -> None:
+        self.norm1, self.norm2 = RmsNorm(width), RmsNorm(width)
+        self.conv1 = Conv((3, 3, width, width), layers)
+        self.conv2 = Conv((3, 3, width, width), layers, zero=True)
+
+    def __call__(self, x: Features) -> Features:
+        """Features [n y x c] -> [n y x c]."""
+        y = convolve(self.conv1, nnx.silu(self.norm1(x)))
+        return x + convolve(self.conv2, nnx.silu(self.norm2(y)))
+
+
+def convolve(conv: Conv, x: Inputs) -> Float[Array, "n y x o"]:
+    """Convolve pictures [n y x i] with a kernel [3 3 i o], zeros around them: [n y x o]."""
+    return conv.apply(x, stride=1, padding=((1, 1), (1, 1)))
+
+
+def abstract_autoencoder(size: AutoencoderSize, dtype: DTypeLike = jnp.float32) -> ConvAutoencoder:
+    """An autoencoder whose leaves have no values yet; weights are loaded into it."""
+    return nnx.eval_shape(lambda: ConvAutoencoder(size, dtype=dtype, rngs=nnx.Rngs(0)))
+
+
+def count_parameters(size: AutoencoderSize) -> int:
+    """Number of parameters of an autoencoder of this size."""
+    params = nnx.state(abstract_autoencoder(size), nnx.Param)
+    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(params))
+
+
+class NamedLeaf(NamedTuple):
+    """A leaf of an autoencoder under its name in a file of weights."""
+
+    name: str
+    variable: nnx.Variable
+
+
+def list_leaves(autoencoder: ConvAutoencoder) -> list[NamedLeaf]:
+    """All leaves of an autoencoder, the statistics of its latents included, by name."""
+    return [NamedLeaf(".".join(map(str, path)), leaf) for path, leaf in nnx.to_flat_state(nnx.state(autoencoder))]
+
+
+def save_autoencoder(autoencoder: ConvAutoencoder, path: Path) -> None:
+    """Write an autoencoder as .safetensors that says its own size: kernels rounded to bfloat16, the rest in float32.
+
+    Raises:
+        ConfigError: the file cannot be written.
+    """
+    tensors = {}
+    for name, variable in list_leaves(autoencoder):
+        value = np.asarray(jax.device_get(variable.get_value()))
+        tensors[name] = value.astype(ml_dtypes.bfloat16) if name.endswith(".kernel") else value
+    try:
+        with replacing(path) as partial:
+            save_file(tensors, partial, metadata={SIZE: json.dumps(asdict(autoencoder.size))})
+            partial.chmod(0o644)
+    except (OSError, SafetensorError) as error:
+        raise ConfigError(f"cannot write the weights {path}: {error}.") from error
+
+
+def load_autoencoder(path: Path, dtype: DTypeLike = jnp.float32) -> ConvAutoencoder:
+    """Read an autoencoder that `save_autoencoder` wrote; a folder stands for the one .safetensors in it.
+
+    Raises:
+        ConfigError: there is no such file, it is broken, or it is of another kind.
+    """
+    file = find_weights(path)
+    tensors = read_tensors(file)
+    with safe_open(file, framework="numpy") as stored:
+        size = (stored.metadata() or {}).get(SIZE)
+    if size is None:
+        raise ConfigError(
+            f"{file} does not say the size of its autoencoder, so it is none of ours; expected what"
+            " `python -m xew.model.train_codec CONFIG` wrote."
+        )
+    autoencoder = abstract_autoencoder(parse(AutoencoderSize, json.loads(size), str(file)), dtype)
+    fill(autoencoder, tensors, {name: Source((name,)) for name, _ in list_leaves(autoencoder)})
+    return autoencoder
+
+
+def find_weights(path: Path) -> Path:
+    """The file of weights that a path names: itself, or the one .safetensors of a folder. Raises ConfigError if none."""
+    if not path.is_dir():
+        return path
+    files = sorted(path.glob("*.safetensors"))
+    if len(files) != 1:
+        found = ", ".join(file.name for file in files) or "no .safetensors"
+        raise ConfigError(f"{path} holds {found}; name one file of weights.")
+    return files[0]

@@ -1,0 +1,205 @@
+"""Training an autoencoder on the project's own frames: episodes to a file of weights that a codec reads.
+
+Reads  episodes of training seeds; test seeds only where `report.test_seeds` asks for them
+Writes <out>/autoencoder.safetensors and autoencoder.json (of wan_vae: vae.*), which `codec.weights: <out>` reads;
+       report.md and pictures of what the codec leaves, config, checkpoints, metrics
+
+The loss is L1 + MSE + LPIPS + a small penalty on latents, without an adversary: frames are rendered, and sharp edges are few.
+Command: python -m xew.model.train_codec CONFIG [--resume | --overwrite] [--train.seconds … and other overrides]
+"""
+
+import functools
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from xew.command_line import parse_command
+from xew.compilation import keep_compiled_programs
+from xew.config import load, user_errors
+from xew.dataset import Dataset, Episode, read_dataset
+from xew.files import file_digest
+from xew.model.codec_training.kinds import Kind
+from xew.model.codec_training.pictures import Pictures, gather_pictures, read_frames
+from xew.model.codec_training.report import measure_codec, report_rows, report_scalars, write_report
+from xew.model.codec_training.sampling import Batches, place_pictures
+from xew.model.codec_training.settings import (
+    CodecExperiment,
+    check_codec_experiment,
+    load_codec_experiment,
+    training_episodes,
+)
+from xew.model.codec_training.step import init_codec_state, make_codec_step, summarize
+from xew.model.codecs.codec import to_pictures, to_signed
+from xew.model.runs.checkpoint import TrainState, restore_state
+from xew.model.runs.folder import check_one_of, claim_run
+from xew.model.runs.log import RunLog
+from xew.model.runs.session import open_session
+from xew.model.training.loop import STOPPED, Meter, Timetable, run_steps
+from xew.model.video.comparison import strip
+from xew.model.video.frames import to_model_size
+
+SMALLEST_DEVIATION = 1e-3
+"""Smallest deviation of a latent channel, so that one that the autoencoder leaves unused is not blown up."""
+ENDLESS = 2**40
+"""Number of steps of a training whose time ends it."""
+
+
+@dataclass(frozen=True)
+class Flags:
+    """Options of the command itself."""
+
+    resume: bool = False
+    """Continue the run in --out if there is one."""
+    overwrite: bool = False
+    """Replace the run in --out."""
+
+
+@user_errors
+def main(arguments: Sequence[str] | None = None, prog: str = "python -m xew.model.train_codec") -> None:
+    """Train an autoencoder."""
+    read = functools.partial(load, CodecExperiment)
+    command = parse_command(Flags, CodecExperiment, read, arguments, prog=prog, description=__doc__.splitlines()[0])
+    experiment, flags = check_codec_experiment(command.config, command.path), command.flags
+    check_one_of(flags.resume, flags.overwrite)
+    keep_compiled_programs()
+    if not train_codec(experiment, resume=flags.resume, overwrite=flags.overwrite):
+        sys.exit(STOPPED)
+
+
+def train_codec(experiment: CodecExperiment, *, resume: bool = False, overwrite: bool = False) -> bool:
+    """Train to the end, from the start or from the latest checkpoint; then measure, and write the weights.
+
+    Returns:
+        Whether the end was reached.
+    """
+    settings = experiment.train
+    dataset = read_dataset(experiment.data)
+    episodes = training_episodes(dataset, experiment.train_robots)
+    claim_run(experiment.out, experiment, load_codec_experiment, resume=resume, overwrite=overwrite)
+    pictures = load_pictures(experiment, episodes)
+    batches = Batches(pictures, experiment.streams, settings)
+    print(f"{'device' if batches.on_device else 'host'} memory: {pictures.describe()}")
+
+    graph, statistics, state = init_codec_state(experiment)
+    with open_session(experiment.out, settings.keep_checkpoints) as session:
+        log = session.log
+        assert log is not None, "autoencoders are trained by one process"
+        if session.step:
+            state, position = restore_state(session.checkpoints, state)
+            batches.set_state(position)
+
+        def draw_samples(state: TrainState, step: int) -> None:
+            module = nnx.merge(graph, state.ema, statistics)
+            log.image(step, "sample", sample_picture(experiment.autoencoder, module, episodes[0], experiment))
+
+        if not batches.is_over(int(state.step)):
+            steps = settings.steps or ENDLESS
+            timetable = Timetable(
+                steps,
+                settings.log_every,
+                settings.save_every,
+                settings.sample_every,
+                batches.rate,
+                batches.is_over if settings.seconds else None,
+            )
+            take_step = make_codec_step(graph, statistics, experiment)
+            state = run_steps(timetable, session, Meter(summarize, settings.batch), take_step, state, batches, draw_samples)
+        ended = batches.is_over(int(state.step))
+        if ended:
+            print(f"{int(state.step)} steps in {batches.clock.elapsed:.0f} s")
+            finish(experiment, nnx.merge(graph, state.ema, statistics), batches, dataset, int(state.step), log)
+    return ended
+
+
+def load_pictures(experiment: CodecExperiment, episodes: Sequence[Episode]) -> Pictures:
+    """Decode and draw what is learned from, and put it on the device where it has room."""
+    begin = time.perf_counter()
+    streams = [name for name, share in experiment.streams.items() if share]
+    host_gb, regions = experiment.pictures.host_gb, experiment.train.region > 0
+    pictures = gather_pictures(episodes, streams, experiment.cut, host_gb, regions=regions)
+    placed = place_pictures(pictures, experiment.pictures.device_share)
+    print(f"{len(episodes)} episodes read in {time.perf_counter() - begin:.0f} s")
+    return placed
+
+
+def sample_picture(kind: Kind, module: Any, episode: Episode, experiment: CodecExperiment) -> np.ndarray:
+    """A strip [2h w 3] uint8 of one training clip of an episode's scene, true above decoded."""
+    folder, record = episode
+    cut = experiment.cut
+    times = np.minimum(np.arange(cut.frames), record.frame_count - 1)
+    frames = read_frames(folder / "rgb.mkv", set(times.tolist()))
+    clip = to_model_size(np.stack([frames[int(time)] for time in times]), cut.height, cut.width)
+    return strip(clip, np.asarray(reconstruct_clip(kind, module, clip)))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def reconstruct_clip(kind: Kind, module: Any, clip: jax.Array) -> jax.Array:
+    """What the autoencoder leaves of one clip [t h w 3] uint8, without noise."""
+    return to_pictures(kind.reconstruct(module, to_signed(clip[None]), jax.random.key(0), 0.0)[0][0])
+
+
+def finish(experiment: CodecExperiment, module: Any, batches: Batches, dataset: Dataset, step: int, log: RunLog) -> None:
+    """Compute the statistics of the latents, write the weights with them, measure what they leave, and write the report."""
+    kind, out = experiment.autoencoder, experiment.out
+    mean, std = latent_statistics(kind, module, batches, experiment.train.statistics_clips)
+    module.latents_mean.set_value(mean)
+    module.latents_std.set_value(std)
+    weights = out / f"{kind.file}.safetensors"
+    kind.save(module, weights)
+    codec = kind.open(weights, experiment.dtype)
+    description = {
+        "kind": experiment.kind,
+        "size": asdict(kind.size),
+        "dtype": experiment.dtype,
+        **kind.describe(codec),
+        "hash": codec.hash,
+        "file": file_digest(weights),
+        "bytes": weights.stat().st_size,
+        "steps": step,
+        "seconds": round(batches.clock.elapsed, 1),
+        "latents_mean": mean.tolist(),
+        "latents_std": std.tolist(),
+    }
+    write_description(experiment, description)  # kept also where the report fails
+    qualities = measure_codec(experiment, codec, dataset, out / "pictures" if experiment.report.pictures else None)
+    write_description(experiment, description | {"reconstruction": report_rows(qualities)})
+    if qualities:
+        log.scalars(step, report_scalars(qualities))
+        print(write_report(qualities, experiment))
+    print(f"{weights} ({weights.stat().st_size / 1e6:.2f} MB): use it by {kind.options(out)}")
+
+
+def write_description(experiment: CodecExperiment, description: dict[str, Any]) -> None:
+    """Write the file beside the weights."""
+    path = experiment.out / f"{experiment.autoencoder.file}.json"
+    path.write_text(json.dumps(description, indent=1) + "\n")
+
+
+def latent_statistics(kind: Kind, module: Any, batches: Batches, count: int) -> tuple[jax.Array, jax.Array]:
+    """Mean and standard deviation [c] of the latents of about `count` clips, drawn as in training and shown as they are."""
+
+    @jax.jit
+    def moments(module: Any, clips: jax.Array) -> tuple[jax.Array, jax.Array]:
+        latents = kind.latents(module, to_signed(clips))
+        return latents.mean(axis=(0, 1, 2)), jnp.square(latents).mean(axis=(0, 1, 2))
+
+    rounds = max(1, count // batches.settings.batch)
+    found = []
+    for number in range(rounds):
+        clips, _ = batches.pick(ENDLESS + number)
+        found.append([np.asarray(part, np.float64) for part in moments(module, clips)])
+    mean, squares = np.mean(found, axis=0)
+    std = np.sqrt(np.maximum(squares - np.square(mean), 0))
+    return jnp.asarray(mean, jnp.float32), jnp.asarray(np.maximum(std, SMALLEST_DEVIATION), jnp.float32)
+
+
+if __name__ == "__main__":
+    main()
