@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.paper import Paper
-from xew.analysis.scores import TRAINING, MetricInfo
+from xew.analysis.scores import TRAINING, TRUTH, MetricInfo
 from xew.protocol import BASELINES, MULTI_VIEW, PARTS, ROBOT_NAMES, SPLITS, Variant
 from xew.statistics import DRAWS, LEVEL, Mean, bootstrap_means, combine, find_strata, noise_floor, pool_trainings
 
@@ -169,7 +169,7 @@ class StudyGrades:
         return variant in self._trainings
 
     def baseline(self, model: str, robots: Sequence[str], metric: str) -> Mean | None:
-        """Mean of COPY or TRUTH."""
+        """Mean of a baseline."""
         return self.variant_mean(model, tuple(robots), metric)
 
     def variant_mean(self, variant: str, robots: tuple[str, ...], metric: str, shared_part: str = "") -> Mean | None:
