@@ -3,6 +3,8 @@
 It follows the paper's section 3 and its appendix. Every room may read this file, which imports nothing of ours.
 """
 
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 ROBOT_NAMES = ("aloha_agilex", "arx_x5", "ur5_wsg", "franka_panda", "piper")
@@ -10,6 +12,10 @@ ROBOT_NAMES = ("aloha_agilex", "arx_x5", "ur5_wsg", "franka_panda", "piper")
 SEEN_ROBOTS = ("aloha_agilex", "arx_x5", "ur5_wsg")
 HELD_OUT_ROBOTS = ("franka_panda", "piper")
 """Roles in the fixed split: three robots train, two are held out and reported apart, never averaged."""
+
+BODY_NAME = re.compile(r"body[:_](\d+)")
+BODY_RANGE = re.compile(r"body:(\d+)-(\d+)")
+"""Forms of the names of one procedural body and of several in a row, as users write them."""
 
 ACTION_DIM = 16
 """Length of a command: left arm 7 joints [rad], left gripper, right arm 7 joints [rad], right gripper. Grippers go from 0,
@@ -37,6 +43,25 @@ TEST_SEEDS_PER_TASK = 20
 
 TEST_SEED_START = 1_000_000
 """First test seed. Training seeds count up from 0 and never reach it."""
+
+
+def body_key(number: int) -> str:
+    """The key of a procedural body in folders, headers and score tables: no colon, which Windows does not allow in a path."""
+    return f"body_{number}"
+
+
+def expand_robots(names: Iterable[str]) -> tuple[str, ...]:
+    """Robots as keys: `body:17` becomes `body_17` and `body:0-63` all of `body_0` to `body_63`; other names stay as they are."""
+    keys: list[str] = []
+    for name in names:
+        if several := BODY_RANGE.fullmatch(name):
+            first, last = int(several[1]), int(several[2])
+            keys += [body_key(number) for number in range(first, last + 1)] or [name]
+        elif one := BODY_NAME.fullmatch(name):
+            keys.append(body_key(int(one[1])))
+        else:
+            keys.append(name)
+    return tuple(keys)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from xew.sim_warp.physics.worlds import (
 )
 from xew.sim_warp.plan import HOME, LEFT, RIGHT, Timeline
 from xew.sim_warp.production.cells import Cell, Job, plan_cells
-from xew.sim_warp.production.expert import joint_commands
+from xew.sim_warp.kinematics.expert import joint_commands
 from xew.sim_warp.production.outcome import DEEPEST_IN_TABLE
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.scene import Scene, scene_rng

@@ -278,7 +278,7 @@ BAD_CONFIGS: list[tuple[dict[str, Any], str]] = [
     ({"gripper_name": [{"base": "grip_a", "mimic": []}]}, "expected a base joint and one mimic of"),
     ({"gripper_name": [{"base": "grip_c", "mimic": [["grip_b", 1, 0]]}]}, "small.urdf has no joint grip_c; it has arm1"),
     ({"robot_pose": [[0, 0, 0]]}, "robot_pose is [[0, 0, 0]]; expected lists of x y z and a quaternion w x y z"),
-    ({"robot_pose": [[0, -3, 0.75, 0.707, 0, 0, 0.707]]}, "cannot bring its tool home"),
+    ({"robot_pose": [[0, -3, 0.75, 0.707, 0, 0, 0.707]]}, "cannot bring its tools home"),
     ({"ee_joints": ["nowhere"]}, "has no link or joint nowhere; name the one that carries the tool"),
     ({"arm_joints_name": [["arm1", "arm2"]]}, "have 2 and 2 joints; expected equal arms of six or seven"),
     ({"homestate": [[0, 0]]}, "a home has 2 joints, the arm 6"),

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError
 from xew.episode import complete_folder
-from xew.protocol import ROBOT_NAMES
+from xew.protocol import BODY_NAME, ROBOT_NAMES, expand_robots
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
 from xew.sim_warp.robots.user.draft import OWN, ArmDraft, RobotDraft, find_description, read_draft
@@ -71,12 +71,12 @@ def _load(description: Path, modified: int) -> RobotSpec:
 
 
 def robot_key(description: Path) -> str:
-    """A name for folders: that of a URDF file, else of the folder; `_own` sets it apart from the project's robots."""
+    """A name for folders: that of a URDF file, else of the folder; `_own` sets it apart from the project's robots and bodies."""
     name = description.stem if description.suffix == ".urdf" else description.parent.name
     key = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_-")
     if not key:
         raise ConfigError(f"{description}: the name {name!r} gives no key for the robot; give the folder a name of letters.")
-    return f"{key}_own" if key in ROBOT_NAMES else key
+    return f"{key}_own" if key in ROBOT_NAMES or BODY_NAME.fullmatch(key) else key
 
 
 # --- What a draft leaves open.
@@ -202,17 +202,14 @@ def _settle(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
     left, right = _fill_right_arm(draft.arms)
     if left.root_pose is not None and left.home is not None and right.home is not None:
         return robot
-    bases = robot.arms[0].root_pose, robot.arms[1].root_pose
     near = (_posture(left, robot, source), _posture(right, robot, source))
-
-    def settle(robot: RobotSpec) -> RobotSpec:
-        if left.root_pose is None:
-            return placement.find_place(robot, near)
-        if not robot.one_urdf_holds_both_arms and bases[0][0] == bases[1][0]:
-            return placement.find_distance(robot, near, draft.distance)
-        return placement.find_homes(robot, near)
-
-    return settle(robot) if left.tool_pose else placement.try_turned_tools(robot, settle)
+    turn = list if left.tool_pose else placement.with_turned_tools
+    if left.root_pose is None:
+        return placement.place(turn(placement.standard_places(robot)), near).robot
+    if not robot.one_urdf_holds_both_arms and robot.arms[0].root_pose[0] == robot.arms[1].root_pose[0]:
+        gaps = placement.DISTANCES if draft.distance is None else (draft.distance,)
+        return placement.place_at(robot, turn(placement.move_apart(robot, gap) for gap in gaps), near).robot
+    return placement.place_at(robot, turn([robot]), near).robot
 
 
 def _posture(arm: ArmDraft, robot: RobotSpec, source: str) -> np.ndarray | None:
@@ -227,12 +224,13 @@ def _posture(arm: ArmDraft, robot: RobotSpec, source: str) -> np.ndarray | None:
 
 
 def adopt_robots(names: Sequence[str], data: Path) -> tuple[str, ...]:
-    """Robots as jobs name them: paths become keys, and what lies there is kept in `<data>/robots/<key>`.
+    """Robots as jobs name them: paths become keys, and what lies there is kept in `<data>/robots/<key>`; `body:0-7` becomes the
+    keys of eight bodies.
 
     Raises:
         ConfigError: a robot cannot be used, or the data set holds another of that key.
     """
-    return tuple(_adopt(Path(name), data) if is_path(name) else name for name in names)
+    return tuple(_adopt(Path(name), data) if is_path(name) else name for name in expand_robots(names))
 
 
 def kept_robot(key: str, data: Path | None = None) -> RobotSpec | None:

@@ -1,0 +1,124 @@
+"""The command that finds out which procedural bodies work, and where they stand: the catalog behind `body:17`.
+
+Reads  the designs of candidates, in numeric order
+Writes the catalog: for every body the number of its candidate, base poses and homes, so that loading one searches for nothing
+
+A candidate that fails the check is skipped: from some place both of its arms must follow the plans of eight tasks and two seeds
+each (`trials.trial_plans`), within the limits and speeds of its joints. Numbers that are known keep their bodies: a longer catalog begins
+like a shorter one. Bodies are written as they are found; the command goes on from there unless it is told to begin anew.
+
+Command: python -m xew.sim_warp.robots.bodies [--count 96 --anew --workers 2 --out FILE]
+"""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import count as count_from
+from itertools import islice, product
+from pathlib import Path
+
+import numpy as np
+import tyro
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from xew.config import ConfigError, user_errors
+from xew.files import replacing
+from xew.sim_warp.devices.workers import Workers, quiet_warp
+from xew.sim_warp.embodiment.spec import RobotSpec
+from xew.sim_warp.geometry.poses import Pose
+from xew.sim_warp.robots.procedural.bodies import CATALOG, Entry, catalog_text, read_catalog, unplaced_body
+from xew.sim_warp.robots.procedural.design import BodyDesign, design_body
+from xew.sim_warp.robots.user.placement import YAW_90, move_apart, move_to, place
+
+BODY_COUNT = 96
+"""Number of bodies in the packaged catalog."""
+LEAST_SHARE = 1.0
+"""Least share of the trial plans that a body follows."""
+GAPS, BASE_Y = (0.6, 0.45, 0.75), (-0.45, -0.55, -0.65)
+BASE_Z = {"upright": (0.75, 0.55), "tilted": (0.75, 0.6), "frame": (0.75, 0.95)}
+"""Places that are tried [m]: distances between the bases, and where they stand, by the kind of mount."""
+
+
+def body_places(design: BodyDesign, robot: RobotSpec) -> list[RobotSpec]:
+    """A body at every place that is tried."""
+    rotation = (Rotation.from_quat(YAW_90) * Rotation.from_euler("y", design.lean)).as_quat(canonical=True)
+    turn = np.round(rotation, 7).tolist()
+    places = product(GAPS, BASE_Y, BASE_Z[design.mount])
+    return [move_apart(move_to(robot, (0.0, y, z, *turn)), gap) for gap, y, z in places]
+
+
+def try_candidate(number: int) -> tuple[int, Entry | str]:
+    """Look for a place for a candidate; what the catalog holds of it, or why it is skipped."""
+    design = design_body(number)
+    robot = unplaced_body(design, f"candidate_{number}", f"Candidate {number}")
+    try:
+        placed = place(body_places(design, robot))
+    except ConfigError as error:
+        return number, str(error).partition(": ")[2]
+    if placed.share < LEAST_SHARE:
+        problem = next(problem for problem in placed.problems if problem is not None)
+        return number, f"follows {placed.share:.0%} of the plans ({problem})"
+    left, right = placed.robot.arms
+    return number, Entry(number, (_rounded(left.root_pose), _rounded(right.root_pose)), (left.home, right.home))
+
+
+def find_bodies(known: tuple[Entry, ...], count: int, workers: int) -> Iterator[tuple[int, Entry | str]]:
+    """Candidates after the known ones in numeric order, until `count` bodies are known; skipped ones with the reason."""
+    found, numbers = len(known), count_from(known[-1].candidate + 1 if known else 0)
+    if found >= count:
+        return
+    if workers == 1:
+        for number in numbers:
+            yield (result := try_candidate(number))
+            found += isinstance(result[1], Entry)
+            if found == count:
+                return
+    with Workers(workers) as pool:
+        while found < count:
+            batch = list(islice(numbers, 2 * workers))
+            for result in sorted(pool.run(try_candidate, batch), key=lambda result: result[0]):
+                if found < count:
+                    yield result
+                    found += isinstance(result[1], Entry)
+
+
+def _rounded(pose: Pose) -> Pose:
+    x, y, z, qx, qy, qz, qw = (round(float(value), 7) for value in pose)
+    return x, y, z, qx, qy, qz, qw
+
+
+@dataclass(frozen=True)
+class Args:
+    """Find procedural bodies that work."""
+
+    count: int = BODY_COUNT
+    """Number of bodies in the catalog."""
+    anew: bool = False
+    """Forget the bodies that the file knows."""
+    workers: int = os.cpu_count() or 1
+    out: Path = CATALOG
+    """File of the catalog."""
+
+
+@user_errors
+def main() -> None:
+    quiet_warp()
+    args = tyro.cli(Args, description=__doc__)
+    entries = list(read_catalog(args.out)) if args.out.is_file() and not args.anew else []
+    skipped = 0
+    with tqdm(total=args.count, initial=len(entries), desc="bodies", unit="body") as bar:
+        for number, result in find_bodies(tuple(entries), args.count, args.workers):
+            if isinstance(result, str):
+                skipped += 1
+                bar.write(f"candidate {number} is skipped: {result}")
+                continue
+            entries.append(result)
+            with replacing(args.out) as path:
+                path.write_text(catalog_text(entries), encoding="utf-8", newline="\n")
+            bar.update()
+    print(f"{args.out}: {len(entries)} bodies; {skipped} candidates were skipped")
+
+
+if __name__ == "__main__":
+    main()
