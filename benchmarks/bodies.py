@@ -1,16 +1,18 @@
 """Procedural bodies measured: how often they succeed, how far they lie apart, how fast they are generated and loaded.
 
-    python benchmarks/bodies.py yields [--bodies 32 --seeds 4]      # experts in physics beside the five robots' (docs/bodies.md)
+    python benchmarks/bodies.py yields [--bodies 32 --seeds 4]      # experts in physics, beside the five robots'
     python benchmarks/bodies.py plans [--bodies 96 --seeds 2]       # the same without physics: which plans the arms follow
     python benchmarks/bodies.py distances [--bodies 64 --plot docs/img/body_distances.png]
     python benchmarks/bodies.py rate [--bodies 64 --seeds 2]        # frames a second of generate, beside the five robots'
-    python benchmarks/bodies.py loading [--bodies 16]               # time to load a body in a fresh process' caches
+    python benchmarks/bodies.py loading [--bodies 16]               # CPU time to load a body whose files are in the cache
+    python benchmarks/bodies.py everything --out OUT                # all of these, and the digests of all bodies
 
 `yields` and `rate` take minutes on a GPU with 16 cores, hours on a laptop. `yields` exits with 1 where fewer than 80 % of the
 cells of bodies succeed, `rate` where bodies are generated at less than 0.8 of the five robots' rate.
 """
 
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -78,6 +80,14 @@ class Loading:
     """Load bodies whose files are in the cache folder, in this process for the first time."""
 
     bodies: int = 16
+
+
+@dataclass(frozen=True)
+class Everything:
+    """Run all of the above, each in a process of its own, and write what they print to files."""
+
+    out: Path
+    """Folder for a text file each, and the plot of distances."""
 
 
 def count_yields(args: Yields) -> int:
@@ -176,7 +186,9 @@ def plot_distances(kinematic: np.ndarray, appearance: np.ndarray, kinds: dict[st
     styles = {"among bodies": ("#b8bcc4", 6, 1), "five to bodies": ("#2f7fc1", 10, 2), "among the five": ("#d1351b", 60, 3)}
     for title, (color, size, order) in styles.items():
         chosen = kinds[title]
-        axes.scatter(kinematic[chosen], appearance[chosen], s=size, c=color, zorder=order, label=f"{title} ({chosen.sum()})", lw=0)
+        axes.scatter(
+            kinematic[chosen], appearance[chosen], s=size, c=color, zorder=order, label=f"{title} ({chosen.sum()})", lw=0
+        )
     axes.set_xlabel("kinematic distance [m]")
     axes.set_ylabel("appearance distance")
     axes.set_xlim(left=0)
@@ -234,17 +246,38 @@ def time_loading(args: Loading) -> int:
     return int(max(times) > 50)
 
 
+def run_everything(args: Everything) -> int:
+    """Print what each command prints and keep it; the number of commands that failed."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    this = [sys.executable, str(Path(__file__))]
+    failed = 0
+    for name, command in {
+        "digest": [sys.executable, "-m", "xew.sim_warp.robots.bodies", "--digest"],
+        "loading": [*this, "loading"],
+        "yields": [*this, "yields"],
+        "rate": [*this, "rate"],
+        "distances": [*this, "distances", "--plot", str(args.out / "body_distances.png")],
+    }.items():
+        begin = time.perf_counter()
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+        (args.out / f"{name}.txt").write_text(done.stdout)
+        print(f"{done.stdout}{name}: {time.perf_counter() - begin:.0f} s, exit code {done.returncode}\n", flush=True)
+        failed += done.returncode != 0
+    return failed
+
+
 COMMANDS = {
     Yields: count_yields,
     Plans: follow_plans,
     Distances: compare_distances,
     Rate: measure_rate,
     Loading: time_loading,
+    Everything: run_everything,
 }
 
 
 def main() -> int:
-    chosen = tyro.cli(Yields | Plans | Distances | Rate | Loading)  # type: ignore[call-overload]
+    chosen = tyro.cli(Yields | Plans | Distances | Rate | Loading | Everything)  # type: ignore[call-overload]
     return COMMANDS[type(chosen)](chosen)
 
 

@@ -51,7 +51,7 @@ def body_key(number: int) -> str:
 
 
 def expand_robots(names: Iterable[str]) -> tuple[str, ...]:
-    """Robots as keys: `body:17` becomes `body_17` and `body:0-63` all of `body_0` to `body_63`; other names stay as they are."""
+    """Robots as keys: `body:17` becomes `body_17` and `body:0-63` all of `body_0` to `body_63`; others stay as they are."""
     keys: list[str] = []
     for name in names:
         if several := BODY_RANGE.fullmatch(name):
@@ -76,7 +76,32 @@ FIXED = Split(SEEN_ROBOTS, HELD_OUT_ROBOTS)
 """Split of most tables: three robots train, two are held out."""
 LOEO = {held_out: Split(tuple(r for r in ROBOT_NAMES if r != held_out), (held_out,)) for held_out in ROBOT_NAMES}
 """Leave-one-embodiment-out (LOEO): five folds, each named by the robot that it holds out."""
-SPLITS = {"fixed": FIXED} | {f"loeo_{robot}": split for robot, split in LOEO.items()}
+
+TRAINING_BODIES = expand_robots(["body:0-63"])
+"""Procedural bodies that models may train on, in the order in which a scaling protocol takes them."""
+UNSEEN_BODIES = expand_robots(["body:64-95"])
+"""Bodies that no model trains on; test episodes of theirs are graded."""
+VALIDATION_BODIES = expand_robots(["body:96-103"])
+"""Bodies by which choices are made, so that neither held-out robots nor test bodies have a part in them."""
+BODY_SCALES = (4, 16, 64)
+"""Numbers of bodies (K) that the scaling protocol trains on."""
+_TESTED = (*HELD_OUT_ROBOTS, *UNSEEN_BODIES)
+SCALING = {
+    "scaling_seen": Split(SEEN_ROBOTS, _TESTED),
+    **{f"scaling_bodies_{count}": Split(TRAINING_BODIES[:count], _TESTED) for count in BODY_SCALES},
+    **{f"scaling_seen_bodies_{count}": Split((*SEEN_ROBOTS, *TRAINING_BODIES[:count]), _TESTED) for count in BODY_SCALES},
+}
+"""The scaling protocol: the three robots, K bodies, or both; all are tested on Panda, PiPER and 32 unseen bodies."""
+DISTANCE = Split(SEEN_ROBOTS, TRAINING_BODIES)
+"""The distance protocol: one model of the three robots, tested on 64 bodies, error against distance."""
+VALIDATION = Split(SEEN_ROBOTS, VALIDATION_BODIES)
+"""The fixed split's training robots, with the bodies by which choices are made in place of the held-out robots."""
+SPLITS = (
+    {"fixed": FIXED}
+    | {f"loeo_{robot}": split for robot, split in LOEO.items()}
+    | SCALING
+    | {"distance": DISTANCE, "validation": VALIDATION}
+)
 """All splits by key."""
 
 SHOTS = (1, 2, 3)
@@ -202,6 +227,16 @@ def training_counts(
     if variant.target is not None:
         return {variant.target: tasks * variant.shots} if variant.target in robots else {}
     return {robot: tasks * train_seeds for robot in SPLITS[variant.split].train_robots if robot in robots}
+
+
+def split_counts(
+    split: Split,
+    tasks: int = TASK_COUNT,
+    train_seeds: int = TRAIN_SEEDS_PER_TASK,
+    test_seeds: int = TEST_SEEDS_PER_TASK,
+) -> tuple[int, int]:
+    """Numbers of training episodes of a split and of test episodes of its held-out robots: 1,250 and 500 a robot."""
+    return len(split.train_robots) * tasks * train_seeds, len(split.held_out_robots) * tasks * test_seeds
 
 
 def seed_split(seed: int) -> str:

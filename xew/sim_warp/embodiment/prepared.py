@@ -68,7 +68,9 @@ def read_prepared(path: Path) -> Prepared | None:
         visual = None
         if sizes is not None:
             vertices, triangles = slice(vertex, vertex + sizes[0]), slice(triangle, triangle + sizes[1])
-            visual = Mesh(arrays["vertices"][vertices], *(arrays[name][triangles] for name in ("triangles", "colors", "normals")))
+            visual = Mesh(
+                arrays["vertices"][vertices], *(arrays[name][triangles] for name in ("triangles", "colors", "normals"))
+            )
             vertex, triangle = vertices.stop, triangles.stop
         hulls = []
         for name, count in collisions:

@@ -157,7 +157,10 @@ def _load(path: Path, modified: int) -> Urdf:
     if not root:
         raise UrdfError(f"{path}: there is no link without a parent; links must form one tree.")
     meshes = {name: file.files[0] for name, file in source.meshes.items()}
-    read = [*(source.prepared.meshes.values() if source.prepared else ()), *(f for mesh in source.meshes.values() for f in mesh.files)]
+    read = [
+        *(source.prepared.meshes.values() if source.prepared else ()),
+        *(f for mesh in source.meshes.values() for f in mesh.files),
+    ]
     meshes, files = meshes | dict(source.prepared.meshes if source.prepared else {}), dict.fromkeys([path, *read])
     urdf = Urdf(robot.name, path, root, links, joints, meshes, tuple(files))
     _check_tree(urdf)

@@ -89,7 +89,7 @@ class ArmSolver:
         return Solution(joint_pos, *self._errors(arm, tool_pose, joint_pos))
 
     def solve_in_base(self, tool_pose: np.ndarray, seed: np.ndarray) -> Solution:
-        """As `solve`, for poses [n 7] in the frame in which an arm's first joint turns: arms that stand anywhere, in one call."""
+        """As `solve`, for poses [n 7] in the frame in which an arm's first joint turns, wherever each stands."""
         joint_pos = self._nearest(tool_pose, seed)
         reached = np.linalg.inv(self.base[0]) @ tool_matrix(self.robot, 0, joint_pos)
         return Solution(joint_pos, *_pose_errors(reached, tool_pose))
@@ -129,9 +129,7 @@ class ArmSolver:
             return np.concatenate([self._nearest(target[part], seed[part]) for part in parts])
         size = 1 << max(0, len(target) - 1).bit_length()
         if size not in self._problems:
-            self._problems[size] = _Problems(
-                self.robot, self.model, self.tool, size, self.iterations, self.posture_weight
-            )
+            self._problems[size] = _Problems(self.robot, self.model, self.tool, size, self.iterations, self.posture_weight)
         return np.clip(self._problems[size].solve(target, seed), self.lower, self.upper)
 
     def _errors(self, arm: np.ndarray, tool_pose: np.ndarray, joint_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,9 @@
-"""Registry of robots: five bimanual ones, each a URDF with our own geometry and one `RobotSpec`; and procedural bodies by number.
+"""Registry of robots: five bimanual ones, each a URDF with our own geometry and one `RobotSpec`; and bodies by number.
 
-`body:17` names a procedural body, `body:0-63` a range of them (docs/bodies.md); their keys are `body_17`. To add a robot, write a file with `SPEC = RobotSpec(...)` here and add its line to `ROBOTS`; outside the repository write it
-anywhere importable and name it `module:SPEC` wherever a robot is asked for, or name the path of a URDF or of a RoboTwin
-embodiment (docs/add_a_robot.md).
+`body:17` names a procedural body, `body:0-63` a range of them (docs/bodies.md); their keys are `body_17`. To add a robot, write
+a file with `SPEC = RobotSpec(...)` here and add its line to `ROBOTS`; outside the repository write it anywhere importable and
+name it `module:SPEC` wherever a robot is asked for, or name the path of a URDF or of a RoboTwin embodiment
+(docs/add_a_robot.md).
 """
 
 from pathlib import Path

@@ -4,14 +4,19 @@ Reads  the designs of candidates, in numeric order
 Writes the catalog: for every body the number of its candidate, base poses and homes, so that loading one searches for nothing
 
 A candidate that fails the check is skipped: from some place both of its arms must follow the plans of eight tasks and two seeds
-each (`trials.trial_plans`), within the limits and speeds of its joints. Numbers that are known keep their bodies: a longer catalog begins
-like a shorter one. Bodies are written as they are found; the command goes on from there unless it is told to begin anew.
+each (`trials.trial_plans`), within the limits and speeds of its joints. Numbers that are known keep their bodies: a longer
+catalog begins like a shorter one. Bodies are written as they are found; the command goes on from there unless it is told to
+begin anew.
 
-Command: python -m xew.sim_warp.robots.bodies [--count 96 --anew --workers 2 --out FILE]
+With --digest it prints SHA-256 digests of the URDF and meshes of each body of the catalog, and of all: two machines that print
+the same make the same bodies.
+
+Command: python -m xew.sim_warp.robots.bodies [--count 104 --anew --workers 2 --out FILE | --digest]
 """
 
+import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import count as count_from
 from itertools import islice, product
@@ -24,14 +29,16 @@ from tqdm import tqdm
 
 from xew.config import ConfigError, user_errors
 from xew.files import replacing
+from xew.protocol import body_key
 from xew.sim_warp.devices.workers import Workers, quiet_warp
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.geometry.poses import Pose
 from xew.sim_warp.robots.procedural.bodies import CATALOG, Entry, catalog_text, read_catalog, unplaced_body
 from xew.sim_warp.robots.procedural.design import BodyDesign, design_body
+from xew.sim_warp.robots.procedural.urdf_files import body_files
 from xew.sim_warp.robots.user.placement import YAW_90, move_apart, move_to, place
 
-BODY_COUNT = 96
+BODY_COUNT = 104
 """Number of bodies in the packaged catalog."""
 LEAST_SHARE = 1.0
 """Least share of the trial plans that a body follows."""
@@ -83,6 +90,18 @@ def find_bodies(known: tuple[Entry, ...], count: int, workers: int) -> Iterator[
                     found += isinstance(result[1], Entry)
 
 
+def digest_lines(entries: Sequence[Entry]) -> Iterator[str]:
+    """A line a body with the digest of its files, then one with that of all."""
+    together = hashlib.sha256()
+    for number, entry in enumerate(entries):
+        digest = hashlib.sha256()
+        for name, content in sorted(body_files(design_body(entry.candidate)).items()):
+            digest.update(name.encode() + b"\0" + hashlib.sha256(content).digest())
+        together.update(digest.digest())
+        yield f"{body_key(number)} {digest.hexdigest()}"
+    yield f"all {together.hexdigest()}"
+
+
 def _rounded(pose: Pose) -> Pose:
     x, y, z, qx, qy, qz, qw = (round(float(value), 7) for value in pose)
     return x, y, z, qx, qy, qz, qw
@@ -99,12 +118,18 @@ class Args:
     workers: int = os.cpu_count() or 1
     out: Path = CATALOG
     """File of the catalog."""
+    digest: bool = False
+    """Print digests of the bodies of the file instead."""
 
 
 @user_errors
 def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
+    if args.digest:
+        for line in digest_lines(read_catalog(args.out)):
+            print(line)
+        return
     entries = list(read_catalog(args.out)) if args.out.is_file() and not args.anew else []
     skipped = 0
     with tqdm(total=args.count, initial=len(entries), desc="bodies", unit="body") as bar:

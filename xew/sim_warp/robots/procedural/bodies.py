@@ -10,7 +10,7 @@ All but what the catalog holds is a function of the number.
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -87,7 +87,9 @@ def read_catalog(path: Path = CATALOG) -> tuple[Entry, ...]:
             for entry in entries
         )
     except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
-        raise ConfigError(f"{path} is no catalog of bodies ({error}); write it by `python -m xew.sim_warp.robots.bodies`.") from error
+        raise ConfigError(
+            f"{path} is no catalog of bodies ({error}); write it by `python -m xew.sim_warp.robots.bodies`."
+        ) from error
 
 
 def catalog_text(entries: Sequence[Entry]) -> str:
@@ -100,10 +102,9 @@ def placed_body(entry: Entry, key: str, title: str) -> RobotSpec:
     """The robot of an entry."""
     robot = unplaced_body(design_body(entry.candidate), key, title)
     left, right = (
-        Arm(**{**vars(arm), "root_pose": root, "home": home})
-        for arm, root, home in zip(robot.arms, entry.root_pose, entry.home, strict=True)
+        replace(arm, root_pose=root, home=home) for arm, root, home in zip(robot.arms, entry.root_pose, entry.home, strict=True)
     )
-    return RobotSpec(**{**vars(robot), "arms": (left, right)})
+    return replace(robot, arms=(left, right))
 
 
 def unplaced_body(body: BodyDesign, key: str, title: str) -> RobotSpec:

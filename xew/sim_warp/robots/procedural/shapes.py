@@ -48,7 +48,9 @@ def base_shape(design: BodyDesign) -> LinkShape:
         parts += [("second", post), ("housing", plate)]
     if design.mount == "tilted":
         drop = wide * np.sin(abs(design.lean)) + 0.03
-        level = rounded_box((-1.3 * wide, -1.3 * wide, -drop - 0.012), (1.3 * wide, 1.3 * wide, -drop), 0.003, (0, -design.lean, 0))
+        level = rounded_box(
+            (-1.3 * wide, -1.3 * wide, -drop - 0.012), (1.3 * wide, 1.3 * wide, -drop), 0.003, (0, -design.lean, 0)
+        )
         parts.append(("second", hull(rounded_box((-wide, -wide, -0.02), (wide, wide, -0.01), 0.003), level)))
     parts.append(("body", rounded_box((-wide, -wide, -0.01), (wide, wide, 0.018), 0.005)))
     box = Box((-wide, -wide, -max(design.column, 0.01)), (wide, wide, height))

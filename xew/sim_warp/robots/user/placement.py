@@ -89,9 +89,7 @@ def check_plans(robot: RobotSpec) -> Placed:
     return Placed(robot, tuple(commands.problem for commands in joint_commands(robot, list(trial_plans()))))
 
 
-def place_at(
-    robot: RobotSpec, candidates: Sequence[RobotSpec], near: tuple[np.ndarray | None, np.ndarray | None]
-) -> Placed:
+def place_at(robot: RobotSpec, candidates: Sequence[RobotSpec], near: tuple[np.ndarray | None, np.ndarray | None]) -> Placed:
     """As `place`, for a robot whose user says where it stands; an error names a place that would do.
 
     Args:

@@ -107,32 +107,32 @@ class Trials:
             seeds: number of postures from which the search begins.
             most: number of postures that are kept.
         """
-        rows, reached = self._search_homes(near, seeds)
-        rows = rows[reached]
+        rows, position, rotation = self._search_homes(near, seeds)
+        rows = rows[_are_home(position, rotation)]
         return self._choose(rows[self._is_clear(rows)], near, most)
 
     def find_miss(self, near: tuple[np.ndarray | None, np.ndarray | None], seeds: int) -> str:
-        """Why the first candidate that is tried has no home, in words that follow a colon."""
-        rows, reached = self._search_homes(near, seeds)
+        """Why the candidates have no home, in words that follow a colon."""
+        rows, position, rotation = self._search_homes(near, seeds)
         for arm in (0, 1):
-            if not reached[rows.arm == arm].any():
-                nearest = int(np.argmin(np.where(rows.arm == arm, self._off[0] + 0.25 * self._off[1], np.inf)))
-                off = f"{1000 * self._off[0][nearest]:.0f} mm and {np.degrees(self._off[1][nearest]):.0f} deg off"
+            mine = rows.arm == arm
+            if not _are_home(position[mine], rotation[mine]).any():
+                nearest = int(np.argmin(np.where(mine, position + 0.25 * rotation, np.inf)))
+                off = f"{1000 * position[nearest]:.0f} mm and {np.degrees(rotation[nearest]):.0f} deg off"
                 return f"the nearest of the {('left', 'right')[arm]} arm is {off}"
         return "a link would stand in the table or on the other arm's side"
 
     def _search_homes(
         self, near: tuple[np.ndarray | None, np.ndarray | None], seeds: int
-    ) -> tuple[Postures, np.ndarray]:
-        """Postures from all starts of both arms of all candidates, and which of them [e] bring the tool home."""
+    ) -> tuple[Postures, np.ndarray, np.ndarray]:
+        """Postures from all starts of both arms of all candidates, and how far from home [e] m and rad they leave the tool."""
         starts = [_start_postures(self.candidates[0], wanted, seeds) for wanted in near]
         pairs = np.array(list(product(range(len(self.candidates)), (0, 1))))
         rows = Postures(pairs[:, 0], pairs[:, 1], np.zeros((len(pairs), starts[0].shape[1])))
         pose = np.stack([_tool_pose(HOME[arm]) for arm in rows.arm])[:, None].repeat(seeds, 1)
         joint_pos, position, rotation = self.solve(rows, pose, np.stack([starts[arm] for arm in rows.arm]))
-        self._off = position.ravel(), rotation.ravel()
         every = Postures(rows.candidate.repeat(seeds), rows.arm.repeat(seeds), joint_pos.reshape(-1, joint_pos.shape[-1]))
-        return every, (self._off[0] < POSITION_TOLERANCE) & (self._off[1] < ROTATION_TOLERANCE)
+        return every, position.ravel(), rotation.ravel()
 
     def _choose(self, rows: Postures, near: tuple[np.ndarray | None, np.ndarray | None], most: int) -> Postures:
         """The postures of each arm that differ by more than 0.1 rad, with room to the limits where there are such."""
@@ -229,8 +229,13 @@ def _straight(start: Tool, end: Tool, shares: np.ndarray) -> np.ndarray:
     return np.concatenate([start.position + shares[:, None] * (end.position - start.position), turn(shares).as_quat()], 1)
 
 
+def _are_home(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """[e] bool for errors [e] m and rad."""
+    return (position < POSITION_TOLERANCE) & (rotation < ROTATION_TOLERANCE)
+
+
 def _tool_pose(at: Tool) -> np.ndarray:
-    """[7]"""
+    """[7] position and quaternion of a tool."""
     return np.concatenate([at.position, at.rotation.as_quat()])
 
 
