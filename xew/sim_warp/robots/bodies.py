@@ -4,7 +4,7 @@ Reads  the designs of candidates, in numeric order
 Writes the catalog: for every body the number of its candidate, base poses and homes, so that loading one searches for nothing
 
 A candidate that fails the check is skipped: from some place both of its arms must follow the plans of eight tasks and two seeds
-each (`trials.trial_plans`), within the limits and speeds of its joints. Numbers that are known keep their bodies: a longer
+each (`trials.trial_plans`), within the limits and speeds of its joints, and at home each arm stays on its side. Numbers that are known keep their bodies: a longer
 catalog begins like a shorter one. Bodies are written as they are found; the command goes on from there unless it is told to
 begin anew.
 
@@ -32,7 +32,10 @@ from xew.files import replacing
 from xew.protocol import body_key
 from xew.sim_warp.devices.workers import Workers, quiet_warp
 from xew.sim_warp.embodiment.spec import RobotSpec
-from xew.sim_warp.geometry.poses import Pose
+from xew.sim_warp.embodiment.urdf import load_urdf
+from xew.sim_warp.geometry.poses import Pose, matrix_from_pose
+from xew.sim_warp.kinematics.forward import link_poses
+from xew.sim_warp.rendering.streams import home_action
 from xew.sim_warp.robots.procedural.bodies import CATALOG, Entry, catalog_text, read_catalog, unplaced_body
 from xew.sim_warp.robots.procedural.design import BodyDesign, design_body
 from xew.sim_warp.robots.procedural.urdf_files import body_files
@@ -42,6 +45,8 @@ BODY_COUNT = 104
 """Number of bodies in the packaged catalog."""
 LEAST_SHARE = 1.0
 """Least share of the trial plans that a body follows."""
+LEAST_GAP = 0.002
+"""Least distance of an arm at home from the plane between both [m]."""
 GAPS, BASE_Y = (0.6, 0.45, 0.75), (-0.45, -0.55, -0.65)
 BASE_Z = {"upright": (0.75, 0.55), "tilted": (0.75, 0.6), "frame": (0.75, 0.95)}
 """Places that are tried [m]: distances between the bases, and where they stand, by the kind of mount."""
@@ -66,8 +71,21 @@ def try_candidate(number: int) -> tuple[int, Entry | str]:
     if placed.share < LEAST_SHARE:
         problem = next(problem for problem in placed.problems if problem is not None)
         return number, f"follows {placed.share:.0%} of the plans ({problem})"
+    if (gap := gap_between_arms(placed.robot)) < LEAST_GAP:
+        return number, f"its arms come within {1000 * gap:.0f} mm of the middle between them at home"
     left, right = placed.robot.arms
     return number, Entry(number, (_rounded(left.root_pose), _rounded(right.root_pose)), (left.home, right.home))
+
+
+def gap_between_arms(robot: RobotSpec) -> float:
+    """Least distance of a link from the plane between the two arms, at home [m]; negative where one is on the other's side."""
+    urdf, row = load_urdf(robot.urdf), home_action(robot)[None]
+    gaps = []
+    for side, frames in zip((-1, 1), link_poses(robot, row), strict=True):
+        for name, link in urdf.links.items():
+            pose = matrix_from_pose(frames[name])[0]
+            gaps += [] if link.visual is None else [side * (link.visual.vertices @ pose[0, :3] + pose[0, 3])]
+    return float(min(gap.min() for gap in gaps))
 
 
 def find_bodies(known: tuple[Entry, ...], count: int, workers: int) -> Iterator[tuple[int, Entry | str]]:

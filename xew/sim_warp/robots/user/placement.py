@@ -95,7 +95,7 @@ def place_at(robot: RobotSpec, candidates: Sequence[RobotSpec], near: tuple[np.n
     Args:
         robot: at the place that the user names.
         candidates: the robot as it is, or with its bases apart by the distances that may be tried.
-        near: as for `place`.
+        near: posture [d] rad that each arm would like to be near, or None.
     """
     try:
         return place(candidates, near)

@@ -112,7 +112,7 @@ class Trials:
         return self._choose(rows[self._is_clear(rows)], near, most)
 
     def find_miss(self, near: tuple[np.ndarray | None, np.ndarray | None], seeds: int) -> str:
-        """Why the candidates have no home, in words that follow a colon."""
+        """Why the candidates have no home, in words that follow a colon; `near` are postures [d] rad as in `find_homes`."""
         rows, position, rotation = self._search_homes(near, seeds)
         for arm in (0, 1):
             mine = rows.arm == arm
