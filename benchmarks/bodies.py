@@ -193,7 +193,7 @@ def plot_distances(kinematic: np.ndarray, appearance: np.ndarray, kinds: dict[st
     axes.set_ylabel("appearance distance")
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=0)
-    axes.legend(frameon=False, loc="upper right")
+    figure.legend(frameon=False, loc="outside upper center", ncols=3)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
 

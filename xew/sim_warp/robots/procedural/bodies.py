@@ -161,5 +161,5 @@ def content_version() -> str:
     """Digest of all that decides a body's bytes and arrays: the code that makes and reads them, and the libraries it calls."""
     digest = hashlib.sha256(f"{np.__version__} {scipy.__version__} {trimesh.__version__}".encode())
     for module in (design, shapes, urdf_files, solids, mesh_files, meshes, prepared, urdf):
-        digest.update(Path(module.__file__).read_bytes())
+        digest.update(Path(str(module.__file__)).read_bytes())
     return digest.hexdigest()[:12]

@@ -242,10 +242,10 @@ def _read_place(path: Path, robot: RobotSpec) -> RobotSpec | None:
     try:
         kept = json.loads(path.read_text(encoding="utf-8"))
         left, right = (
-            replace(arm, **{name: tuple(values) for name, values in found.items()})
+            replace(arm, root_pose=tuple(found["root_pose"]), home=tuple(found["home"]), tool_pose=tuple(found["tool_pose"]))
             for arm, found in zip(robot.arms, kept, strict=True)
         )
-    except (OSError, ValueError, TypeError, AttributeError):
+    except (OSError, ValueError, TypeError, KeyError):
         return None
     return replace(robot, arms=(left, right))
 
