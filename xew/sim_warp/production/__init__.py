@@ -4,4 +4,4 @@
 renders and writes them, and `rerender` makes what is on disk again. What is written is complete or absent.
 """
 
-__all__ = ["cells", "episodes", "expert", "outcome", "produce", "rerender"]
+__all__ = ["cells", "episodes", "outcome", "produce", "rerender"]

@@ -4,9 +4,9 @@ Reads  the designs of candidates, in numeric order
 Writes the catalog: for every body the number of its candidate, base poses and homes, so that loading one searches for nothing
 
 A candidate that fails the check is skipped: from some place both of its arms must follow the plans of eight tasks and two seeds
-each (`trials.trial_plans`), within the limits and speeds of its joints, and at home each arm stays on its side. Numbers that are known keep their bodies: a longer
-catalog begins like a shorter one. Bodies are written as they are found; the command goes on from there unless it is told to
-begin anew.
+each (`trials.trial_plans`), within the limits and speeds of its joints, and at home each arm stays on its side. Numbers that
+are known keep their bodies: a longer catalog begins like a shorter one. Bodies are written as they are found; the command goes
+on from there unless it is told to begin anew.
 
 With --digest it prints SHA-256 digests of the URDF and meshes of each body of the catalog, and of all: two machines that print
 the same make the same bodies.
