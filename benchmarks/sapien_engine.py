@@ -33,10 +33,10 @@ from xew.sim_warp import stage
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
 from xew.sim_warp.geometry.meshes import Mesh
 from xew.sim_warp.kinematics import joint_positions
+from xew.sim_warp.kinematics.expert import joint_commands
 from xew.sim_warp.physics import Motion, simulate
 from xew.sim_warp.physics.template import PAD_FRICTION
 from xew.sim_warp.physics.worlds import STEPS_PER_FRAME, TIME_STEP, World
-from xew.sim_warp.production.expert import joint_commands
 from xew.sim_warp.rendering.bodies import robot_bodies, robot_pose
 from xew.sim_warp.rendering.observe import scene_things
 from xew.sim_warp.rendering.render import Body, Frames, Renderer

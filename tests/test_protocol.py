@@ -6,22 +6,31 @@ import pytest
 
 from xew.model.conditions import ACTIONS, CONDITIONS
 from xew.protocol import (
+    DISTANCE,
+    FIXED,
     FORGETTING_ROBOT,
     HELD_OUT_ROBOTS,
     LOEO,
     PAPER_PARTS,
     PARTS,
     ROBOT_NAMES,
+    SCALING,
     SEEN_ROBOTS,
     SHOTS,
     SPLITS,
     TASK_COUNT,
+    TRAINING_BODIES,
+    UNSEEN_BODIES,
+    VALIDATION,
+    VALIDATION_BODIES,
     VARIANTS,
     Variant,
     expected_counts,
     reference,
+    split_counts,
     training_counts,
 )
+from xew.sim_warp.robots.procedural.bodies import read_catalog
 from xew.sim_warp.tasks import TASKS
 
 
@@ -82,7 +91,29 @@ def test_the_model_knows_every_action_conditioning_and_split() -> None:
     for variant in VARIANTS.values():
         assert variant.action in ACTIONS and variant.embodiment in CONDITIONS and variant.split in SPLITS
         assert variant.start is None or variant.start in VARIANTS.values()
-    assert set(SPLITS) == {"fixed", *(f"loeo_{robot}" for robot in LOEO)}
+    loeo = {f"loeo_{robot}" for robot in LOEO}
+    assert set(SPLITS) == {"fixed", "distance", "validation", *loeo, *SCALING}
+
+
+def test_splits_with_bodies_count_what_they_should() -> None:
+    """K = 4, 16, 64 bodies, with the three robots and without; Panda, PiPER and 32 bodies to be tested on."""
+    trained = {key: len(split.train_robots) for key, split in SCALING.items()}
+    assert sorted(trained.values()) == [3, 4, 7, 16, 19, 64, 67]
+    for split in SCALING.values():
+        assert len(split.held_out_robots) == 34 and set(HELD_OUT_ROBOTS) < set(split.held_out_robots)
+        assert split_counts(split) == (1250 * len(split.train_robots), 34 * 500)
+    assert split_counts(FIXED) == (3750, 1000)
+    assert split_counts(DISTANCE) == (3750, 64 * 500) and split_counts(VALIDATION, tasks=2, test_seeds=1)[1] == 16
+    assert split_counts(SCALING["scaling_bodies_16"], tasks=6, train_seeds=10)[0] == 960
+
+
+def test_no_body_has_two_roles() -> None:
+    roles = (TRAINING_BODIES, UNSEEN_BODIES, VALIDATION_BODIES)
+    assert sum(map(len, roles)) == len(set().union(*roles)) == len(read_catalog())
+    for split in SPLITS.values():
+        assert set(split.train_robots).isdisjoint(split.held_out_robots)
+    smaller = SPLITS["scaling_bodies_4"].train_robots
+    assert SPLITS["scaling_bodies_16"].train_robots[:4] == smaller, "more bodies are those before and others"
 
 
 def test_a_smaller_study_counts_what_it_has() -> None:

@@ -3,6 +3,8 @@
 It follows the paper's section 3 and its appendix. Every room may read this file, which imports nothing of ours.
 """
 
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 ROBOT_NAMES = ("aloha_agilex", "arx_x5", "ur5_wsg", "franka_panda", "piper")
@@ -10,6 +12,10 @@ ROBOT_NAMES = ("aloha_agilex", "arx_x5", "ur5_wsg", "franka_panda", "piper")
 SEEN_ROBOTS = ("aloha_agilex", "arx_x5", "ur5_wsg")
 HELD_OUT_ROBOTS = ("franka_panda", "piper")
 """Roles in the fixed split: three robots train, two are held out and reported apart, never averaged."""
+
+BODY_NAME = re.compile(r"body[:_](\d+)")
+BODY_RANGE = re.compile(r"body:(\d+)-(\d+)")
+"""Forms of the names of one procedural body and of several in a row, as users write them."""
 
 ACTION_DIM = 16
 """Length of a command: left arm 7 joints [rad], left gripper, right arm 7 joints [rad], right gripper. Grippers go from 0,
@@ -39,6 +45,25 @@ TEST_SEED_START = 1_000_000
 """First test seed. Training seeds count up from 0 and never reach it."""
 
 
+def body_key(number: int) -> str:
+    """The key of a procedural body in folders, headers and score tables: no colon, which Windows does not allow in a path."""
+    return f"body_{number}"
+
+
+def expand_robots(names: Iterable[str]) -> tuple[str, ...]:
+    """Robots as keys: `body:17` becomes `body_17` and `body:0-63` all of `body_0` to `body_63`; others stay as they are."""
+    keys: list[str] = []
+    for name in names:
+        if several := BODY_RANGE.fullmatch(name):
+            first, last = int(several[1]), int(several[2])
+            keys += [body_key(number) for number in range(first, last + 1)] or [name]
+        elif one := BODY_NAME.fullmatch(name):
+            keys.append(body_key(int(one[1])))
+        else:
+            keys.append(name)
+    return tuple(keys)
+
+
 @dataclass(frozen=True)
 class Split:
     """Robots that a model trains on, and robots that it must render unseen."""
@@ -51,7 +76,32 @@ FIXED = Split(SEEN_ROBOTS, HELD_OUT_ROBOTS)
 """Split of most tables: three robots train, two are held out."""
 LOEO = {held_out: Split(tuple(r for r in ROBOT_NAMES if r != held_out), (held_out,)) for held_out in ROBOT_NAMES}
 """Leave-one-embodiment-out (LOEO): five folds, each named by the robot that it holds out."""
-SPLITS = {"fixed": FIXED} | {f"loeo_{robot}": split for robot, split in LOEO.items()}
+
+TRAINING_BODIES = expand_robots(["body:0-63"])
+"""Procedural bodies that models may train on, in the order in which a scaling protocol takes them."""
+UNSEEN_BODIES = expand_robots(["body:64-95"])
+"""Bodies that no model trains on; test episodes of theirs are graded."""
+VALIDATION_BODIES = expand_robots(["body:96-103"])
+"""Bodies by which choices are made, so that neither held-out robots nor test bodies have a part in them."""
+BODY_SCALES = (4, 16, 64)
+"""Numbers of bodies (K) that the scaling protocol trains on."""
+_TESTED = (*HELD_OUT_ROBOTS, *UNSEEN_BODIES)
+SCALING = {
+    "scaling_seen": Split(SEEN_ROBOTS, _TESTED),
+    **{f"scaling_bodies_{count}": Split(TRAINING_BODIES[:count], _TESTED) for count in BODY_SCALES},
+    **{f"scaling_seen_bodies_{count}": Split((*SEEN_ROBOTS, *TRAINING_BODIES[:count]), _TESTED) for count in BODY_SCALES},
+}
+"""The scaling protocol: the three robots, K bodies, or both; all are tested on Panda, PiPER and 32 unseen bodies."""
+DISTANCE = Split(SEEN_ROBOTS, TRAINING_BODIES)
+"""The distance protocol: one model of the three robots, tested on 64 bodies, error against distance."""
+VALIDATION = Split(SEEN_ROBOTS, VALIDATION_BODIES)
+"""The fixed split's training robots, with the bodies by which choices are made in place of the held-out robots."""
+SPLITS = (
+    {"fixed": FIXED}
+    | {f"loeo_{robot}": split for robot, split in LOEO.items()}
+    | SCALING
+    | {"distance": DISTANCE, "validation": VALIDATION}
+)
 """All splits by key."""
 
 SHOTS = (1, 2, 3)
@@ -184,6 +234,16 @@ def training_counts(
     if variant.target is not None:
         return {variant.target: tasks * variant.shots} if variant.target in robots else {}
     return {robot: tasks * train_seeds for robot in SPLITS[variant.split].train_robots if robot in robots}
+
+
+def split_counts(
+    split: Split,
+    tasks: int = TASK_COUNT,
+    train_seeds: int = TRAIN_SEEDS_PER_TASK,
+    test_seeds: int = TEST_SEEDS_PER_TASK,
+) -> tuple[int, int]:
+    """Numbers of training episodes of a split and of test episodes of its held-out robots: 1,250 and 500 a robot."""
+    return len(split.train_robots) * tasks * train_seeds, len(split.held_out_robots) * tasks * test_seeds
 
 
 def seed_split(seed: int) -> str:

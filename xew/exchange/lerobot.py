@@ -32,6 +32,7 @@ from tqdm import tqdm
 from xew.config import user_errors
 from xew.dataset import read_dataset
 from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, States, complete_folder, read_states, read_video
+from xew.protocol import expand_robots
 
 VERSION = "v3.0"
 RATE = Fraction(50, 3)
@@ -113,14 +114,14 @@ def export(args: Args) -> tuple[int, list[str]]:
 
 
 def _select_episodes(args: Args) -> list[tuple[Path, Record]]:
-    dataset = read_dataset(args.data)
+    dataset, robots = read_dataset(args.data), expand_robots(args.robots)
     for flag, asked, known in (
-        ("--robots", args.robots, {record.robot for _, record in dataset.accepted}),
+        ("--robots", robots, {record.robot for _, record in dataset.accepted}),
         ("--tasks", args.tasks, {record.task for _, record in dataset.accepted}),
     ):
         if missing := sorted(set(asked) - known):
             raise EpisodeError(f"{flag} {', '.join(missing)}: not in {args.data}; it has {', '.join(sorted(known))}.")
-    found = dataset.select(robots=args.robots or None, tasks=args.tasks or None, split=args.split)
+    found = dataset.select(robots=robots or None, tasks=args.tasks or None, split=args.split)
     if not found:
         raise EpisodeError(f"{args.data} has no episode of these robots, tasks and seeds; name fewer.")
     return found

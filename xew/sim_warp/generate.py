@@ -27,7 +27,7 @@ from tqdm import tqdm
 from xew.config import user_errors
 from xew.dataset import find_records
 from xew.episode import EpisodeError, Record, episode_folder, remove_left_overs
-from xew.protocol import TEST_SEED_START, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK
+from xew.protocol import TEST_SEED_START, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expand_robots
 from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
@@ -48,7 +48,7 @@ class Args:
     tasks: tuple[str, ...] = tuple(TASKS)
     """Keys of the registry, or module:NAME."""
     robots: tuple[str, ...] = tuple(ROBOTS)
-    """Keys of the registry, module:NAME, or paths of your own (docs/add_a_robot.md)."""
+    """Keys of the registry, bodies (body:17, body:0-63), module:NAME, or paths of your own (docs/add_a_robot.md)."""
     robot: Path | None = None
     """Path of a robot of your own, then the only one: a URDF, a folder with a robot.yaml, or a RoboTwin embodiment folder."""
     train_seeds: int = TRAIN_SEEDS_PER_TASK
@@ -192,7 +192,7 @@ def _check(args: Args) -> None:
     """Check names, numbers and the folder before any work. Raises ConfigError or EpisodeError."""
     for task in args.tasks:
         get_task(task)
-    for robot in args.robots:
+    for robot in expand_robots(args.robots):
         if not is_path(robot):
             get_robot(robot, args.out)
     if not args.tasks or not args.robots or min(args.train_seeds, args.test_seeds) < 0 or args.batch < 1:

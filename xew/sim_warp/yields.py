@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from xew.config import user_errors
 from xew.episode import EpisodeError, Record
+from xew.protocol import expand_robots
 from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
 from xew.sim_warp.production.episodes import header
@@ -42,7 +43,7 @@ class Args:
     tasks: tuple[str, ...] = tuple(TASKS)
     """Keys of the registry, or module:NAME."""
     robots: tuple[str, ...] = tuple(ROBOTS)
-    """Keys of the registry, module:NAME, or paths of your own (docs/add_a_robot.md)."""
+    """Keys of the registry, bodies (body:17, body:0-63), module:NAME, or paths of your own (docs/add_a_robot.md)."""
     seeds: int = 20
     """Number of seeds of each task, all of which count."""
     first_seed: int = 0
@@ -63,7 +64,7 @@ def attempt_seeds(args: Args) -> Iterator[list[Record]]:
         ConfigError: an unknown task, robot or device.
         EpisodeError: nothing to try.
     """
-    tasks, robots = dict.fromkeys(args.tasks), tuple(dict.fromkeys(args.robots))
+    tasks, robots = dict.fromkeys(args.tasks), tuple(dict.fromkeys(expand_robots(args.robots)))
     for name in tasks:
         get_task(name)
     for name in robots:

@@ -10,6 +10,7 @@ from tests.sim_warp.small import at_home
 from xew.config import ConfigError
 from xew.protocol import ARMS, FRAME_RATE
 from xew.sim_warp.embodiment.spec import RobotSpec
+from xew.sim_warp.kinematics.expert import joint_commands
 from xew.sim_warp.physics import gpu as physics_gpu
 from xew.sim_warp.physics import simulate
 from xew.sim_warp.physics.template import FREE_SLOTS
@@ -30,7 +31,6 @@ from xew.sim_warp.physics.worlds import (
 )
 from xew.sim_warp.plan import HOME, LEFT, RIGHT, Timeline
 from xew.sim_warp.production.cells import Cell, Job, plan_cells
-from xew.sim_warp.production.expert import joint_commands
 from xew.sim_warp.production.outcome import DEEPEST_IN_TABLE
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.scene import Scene, scene_rng

@@ -9,10 +9,10 @@ from tests.sim_warp.small import at_home
 from xew.episode import FAILURES
 from xew.protocol import FRAME_RATE
 from xew.sim_warp import objects
+from xew.sim_warp.kinematics.expert import Commands
 from xew.sim_warp.physics import Motion
 from xew.sim_warp.plan import LEFT, RIGHT, Hold, Timeline, ToolPath
 from xew.sim_warp.production.cells import Cell, measured_tools
-from xew.sim_warp.production.expert import Commands
 from xew.sim_warp.production.outcome import DEEPEST_IN_ARM, DEEPEST_IN_TABLE, moment
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.scene import Scene, SceneObject, upright

@@ -3,7 +3,7 @@
 import os
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from xew.sim_warp.plan import HOME
 from xew.sim_warp.production.rerender import render_again
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import RobotSpec, adopt_robots, get_robot, load_robot, load_urdf
+from xew.sim_warp.robots.user import own
 from xew.sim_warp.robots.user.own import FOLDERS
 
 PLACED: dict[str, Any] = {"root_pose": [0, -0.37, 0.75, 0, 0, 0.5**0.5, 0.5**0.5]}
@@ -33,6 +34,14 @@ PLACED: dict[str, Any] = {"root_pose": [0, -0.37, 0.75, 0, 0, 0.5**0.5, 0.5**0.5
 @pytest.fixture(autouse=True)
 def no_listed_folders(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(FOLDERS, raising=False)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A cache folder that knows no places yet: what an earlier session found proves nothing."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +108,19 @@ def test_a_bare_urdf_shows_its_hands_and_finds_its_place(tmp_path: Path) -> None
     assert left.tool_link == "link6" and left.tool_pose[:3] == pytest.approx((0.13, 0, 0), abs=1e-6), "15 mm behind the tips"
     assert left.finger_closed == (0, 0) and left.finger_open == (0.04, 0.04)
     assert left.root_pose[0] == -right.root_pose[0] < 0 and at_home(robot).max() < 2e-3
+
+
+def test_a_place_is_searched_for_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process, here another copy of the same files, takes what was found; other files or drafts search again."""
+    searched: list[str] = []
+    find = own._find_place
+    monkeypatch.setattr(own, "_find_place", lambda draft, robot, near: searched.append(robot.key) or find(draft, robot, near))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    first = load_robot(write_urdf(tmp_path / "one"))
+    again = load_robot(write_urdf(tmp_path / "two"))
+    assert searched == ["small"] and again.arms == first.arms and again.urdf.parent.name == "two"
+    longer = write_urdf(tmp_path / "three", {'xyz="-0.264 0 0"': 'xyz="-0.274 0 0"'})
+    assert load_robot(longer).arms != first.arms and len(searched) == 2
 
 
 def test_a_robot_yaml_decides_what_it_names(tmp_path: Path) -> None:
@@ -278,7 +300,7 @@ BAD_CONFIGS: list[tuple[dict[str, Any], str]] = [
     ({"gripper_name": [{"base": "grip_a", "mimic": []}]}, "expected a base joint and one mimic of"),
     ({"gripper_name": [{"base": "grip_c", "mimic": [["grip_b", 1, 0]]}]}, "small.urdf has no joint grip_c; it has arm1"),
     ({"robot_pose": [[0, 0, 0]]}, "robot_pose is [[0, 0, 0]]; expected lists of x y z and a quaternion w x y z"),
-    ({"robot_pose": [[0, -3, 0.75, 0.707, 0, 0, 0.707]]}, "cannot bring its tool home"),
+    ({"robot_pose": [[0, -3, 0.75, 0.707, 0, 0, 0.707]]}, "cannot bring its tools home"),
     ({"ee_joints": ["nowhere"]}, "has no link or joint nowhere; name the one that carries the tool"),
     ({"arm_joints_name": [["arm1", "arm2"]]}, "have 2 and 2 joints; expected equal arms of six or seven"),
     ({"homestate": [[0, 0]]}, "a home has 2 joints, the arm 6"),

@@ -8,6 +8,7 @@ from xew.config import ConfigError, suggestion
 from xew.dataset import Dataset, Episode, read_dataset
 from xew.episode import EpisodeError
 from xew.model.settings.parts import EpisodeChoice
+from xew.protocol import expand_robots
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,7 @@ def replay_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
 
 def _select_training(dataset: Dataset, robots: Sequence[str], *, need_all: bool) -> list[Episode]:
     """Episodes of training seeds of some robots. Raises ConfigError if a robot has none (one of all, unless all are needed)."""
+    robots = expand_robots(robots)
     chosen = dataset.select(robots=robots, split="train")
     missing = [robot for robot in robots if robot not in {record.robot for _, record in chosen}]
     if missing and (need_all or not chosen):
@@ -85,7 +87,7 @@ def sample_episodes(dataset: Dataset, choice: EpisodeChoice) -> dict[str, Episod
 
     In an adapted run the robots adapted to are the target, and seen are those of the run that it started from.
     """
-    split, targets = choice.split, choice.adapt.robots
+    split, targets = choice.split, expand_robots(choice.adapt.robots)
     roles = dict.fromkeys(split.train_robots, "seen") | dict.fromkeys(split.held_out_robots, "unseen")
     roles |= dict.fromkeys(targets, "target")
     found = dataset.select(robots=tuple(roles), split="test") or training_episodes(dataset, choice)
@@ -96,7 +98,7 @@ def sample_episodes(dataset: Dataset, choice: EpisodeChoice) -> dict[str, Episod
 def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None) -> list[Episode]:
     """Accepted episodes of a seed family and of the given robots, or of all. Raises ConfigError if there is none."""
     dataset = read_dataset(data)
-    known = dataset.robots
+    known, robots = dataset.robots, expand_robots(robots or ()) or None
     for robot in robots or ():
         if robot not in known:
             raise ConfigError(f"unknown robot {robot!r};{suggestion(robot, known)} {data} has: {', '.join(known)}.")

@@ -3,4 +3,4 @@
 Read from files once, checked, and never changed; which robots exist is the business of `xew.sim_warp.robots`.
 """
 
-__all__ = ["mesh_files", "spec", "urdf"]
+__all__ = ["mesh_files", "prepared", "spec", "urdf"]

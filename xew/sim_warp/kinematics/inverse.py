@@ -32,6 +32,9 @@ ANCHOR_STRIDE = 8
 """Number of frames from one pose of a path that is solved after the one before to the next; those between are solved at once.
 """
 
+LARGEST_BATCH = 1024
+"""Largest number of poses that a CPU solves in a call: more gain nothing there, and a batch is filled up to a power of two."""
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -48,20 +51,24 @@ class Solution:
 class ArmSolver:
     """Inverse kinematics of one robot's arms; made once, called for every frame or path."""
 
-    def __init__(self, robot: RobotSpec, device: str | None = None, iterations: int = 24) -> None:
+    def __init__(
+        self, robot: RobotSpec, device: str | None = None, iterations: int = 24, posture_weight: float = POSTURE_WEIGHT
+    ) -> None:
         """Prepare a solver.
 
         Args:
             robot: whose arms.
             device: Warp's name of the device; its default if left out.
             iterations: Levenberg-Marquardt steps a call.
+            posture_weight: weight of a seven-joint arm's pull toward the mean of its homes; 0 where there are no homes yet.
 
         Raises:
             ConfigError: the arms are not alike.
         """
         self.robot = robot
         self.iterations = iterations
-        self.base = np.stack([_base(robot, arm) for arm in robot.arms])
+        self.posture_weight = posture_weight if robot.arm_joint_count == JOINT_COUNT else 0.0
+        self.base = arm_bases(robot)
         self.model, self.tool = _arm_model(robot, device)
         self.lower, self.upper = np.array(robot.joint_lower), np.array(robot.joint_upper)
         self._problems: dict[int, _Problems] = {}
@@ -80,6 +87,12 @@ class ArmSolver:
         arm = np.broadcast_to(arm, len(tool_pose))
         joint_pos = self._nearest(self._in_base(arm, tool_pose), seed)
         return Solution(joint_pos, *self._errors(arm, tool_pose, joint_pos))
+
+    def solve_in_base(self, tool_pose: np.ndarray, seed: np.ndarray) -> Solution:
+        """As `solve`, for poses [n 7] in the frame in which an arm's first joint turns, wherever each stands."""
+        joint_pos = self._nearest(tool_pose, seed)
+        reached = np.linalg.inv(self.base[0]) @ tool_matrix(self.robot, 0, joint_pos)
+        return Solution(joint_pos, *_pose_errors(reached, tool_pose))
 
     def solve_path(self, arm: int | np.ndarray, tool_pose: np.ndarray, start: np.ndarray) -> Solution:
         """Joint positions along paths of the tool, each frame near the one before it.
@@ -111,18 +124,26 @@ class ArmSolver:
 
     def _nearest(self, target: np.ndarray, seed: np.ndarray) -> np.ndarray:
         """[n d] joint positions for poses [n 7] in the arms' bases, found from seeds [n d]."""
+        if len(target) > LARGEST_BATCH and not self.model.device.is_cuda:
+            parts = [slice(first, first + LARGEST_BATCH) for first in range(0, len(target), LARGEST_BATCH)]
+            return np.concatenate([self._nearest(target[part], seed[part]) for part in parts])
         size = 1 << max(0, len(target) - 1).bit_length()
         if size not in self._problems:
-            self._problems[size] = _Problems(self.robot, self.model, self.tool, size, self.iterations)
+            self._problems[size] = _Problems(self.robot, self.model, self.tool, size, self.iterations, self.posture_weight)
         return np.clip(self._problems[size].solve(target, seed), self.lower, self.upper)
 
     def _errors(self, arm: np.ndarray, tool_pose: np.ndarray, joint_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         reached = np.empty((len(arm), 4, 4))
         for side in np.unique(arm):
             reached[arm == side] = tool_matrix(self.robot, side, joint_pos[arm == side])
-        position = np.linalg.norm(reached[:, :3, 3] - tool_pose[:, :3], axis=-1)
-        rotation = (Rotation.from_matrix(reached[:, :3, :3]).inv() * Rotation.from_quat(tool_pose[:, 3:])).magnitude()
-        return position, rotation
+        return _pose_errors(reached, tool_pose)
+
+
+def _pose_errors(reached: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances [n] m and angles [n] rad between tool frames [n 4 4] and poses [n 7]."""
+    position = np.linalg.norm(reached[:, :3, 3] - wanted[:, :3], axis=-1)
+    rotation = (Rotation.from_matrix(reached[:, :3, :3]).inv() * Rotation.from_quat(wanted[:, 3:])).magnitude()
+    return position, rotation
 
 
 def inverse_kinematics(
@@ -143,7 +164,7 @@ def inverse_kinematics(
     return solution.joint_pos, solution.position_error, solution.rotation_error
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=128)
 def arm_solver(robot: RobotSpec) -> ArmSolver:
     """The process's solver of a robot, made at first use."""
     return ArmSolver(robot)
@@ -169,9 +190,9 @@ def _segments(robot: RobotSpec, arm: Arm) -> list[np.ndarray]:
     return [*segments, frame @ matrix_from_pose(arm.tool_pose)]
 
 
-def _base(robot: RobotSpec, arm: Arm) -> np.ndarray:
-    """[4 4] world pose of the frame in which the arm's first joint turns."""
-    return matrix_from_pose(arm.root_pose) @ _segments(robot, arm)[0]
+def arm_bases(robot: RobotSpec) -> np.ndarray:
+    """[2 4 4] world poses of the frames in which the first joints of both arms turn."""
+    return np.stack([matrix_from_pose(arm.root_pose) @ _segments(robot, arm)[0] for arm in robot.arms])
 
 
 def _arm_model(robot: RobotSpec, device: str | None) -> tuple[newton.Model, np.ndarray]:
@@ -202,7 +223,9 @@ def _arm_model(robot: RobotSpec, device: str | None) -> tuple[newton.Model, np.n
 class _Problems:
     """A fixed number of problems of one arm model, with their buffers and, on a GPU, their captured graph."""
 
-    def __init__(self, robot: RobotSpec, model: newton.Model, tool: np.ndarray, size: int, iterations: int) -> None:
+    def __init__(
+        self, robot: RobotSpec, model: newton.Model, tool: np.ndarray, size: int, iterations: int, posture_weight: float
+    ) -> None:
         device = model.device
         link = robot.arm_joint_count - 1
         home = np.mean([arm.home for arm in robot.arms], 0).tolist() + [0.0] * (JOINT_COUNT - robot.arm_joint_count)
@@ -212,7 +235,7 @@ class _Problems:
         self.joint_pos = wp.zeros((size, JOINT_COUNT), dtype=wp.float32, device=device)
         self.iterations = iterations
         self.posture = newton.ik.IKObjectiveJointLimit(posture, posture)
-        self.posture_weight = POSTURE_WEIGHT if robot.arm_joint_count == JOINT_COUNT else 0.0
+        self.posture_weight = posture_weight
         objectives = [
             newton.ik.IKObjectivePosition(link, wp.vec3(*tool[:3]), self.positions, weight=POSITION_WEIGHT),
             newton.ik.IKObjectiveRotation(link, wp.quat(*tool[3:]), self.rotations),

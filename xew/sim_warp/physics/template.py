@@ -83,7 +83,7 @@ class RigidGroup:
     """Name and points [k 3] m of each convex piece, frame of the joint."""
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=512)
 def arm_groups(path: Path, arm: Arm) -> tuple[list[RigidGroup], list[RigidGroup]]:
     """The rigid groups of an arm's revolute joints, base outwards, and those of its two fingers."""
     urdf, moving = load_urdf(path), [*arm.joints, *arm.fingers]

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from xew.sim_warp.kinematics.expert import Commands, joint_commands
 from xew.sim_warp.kinematics.forward import tool_poses
 from xew.sim_warp.physics import Motion, World, simulate
 from xew.sim_warp.plan import ToolPath
-from xew.sim_warp.production.expert import Commands, joint_commands
 from xew.sim_warp.production.outcome import find_failure
 from xew.sim_warp.rendering.observe import Recording, scene_recording
 from xew.sim_warp.robots import RobotSpec, get_robot

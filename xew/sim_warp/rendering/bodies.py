@@ -55,7 +55,7 @@ def body_names(spec: RobotSpec) -> list[tuple[int, str]]:
     return list(_visible_links(spec))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=256)
 def _visible_links(spec: RobotSpec) -> tuple[tuple[int, str], ...]:
     urdf = load_urdf(spec.urdf)
     copies = 1 if spec.one_urdf_holds_both_arms else 2

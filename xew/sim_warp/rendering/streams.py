@@ -180,6 +180,13 @@ def nine_views(robot: str | RobotSpec) -> np.ndarray:
     return np.concatenate([default_renderer().render(bodies, pose, camera, ground=False).rgb for camera in cameras])
 
 
+def side_view(robot: str | RobotSpec, azimuth: float) -> np.ndarray:
+    """The robot at home from one azimuth [deg], as in `nine_views` but as near as this view allows: [h w 3] uint8."""
+    robot = get_robot(robot)
+    bodies, pose = robot_bodies(robot), robot_pose(robot, home_action(robot)[None])
+    return default_renderer().render(bodies, pose, _fit_cameras(bodies, pose, [azimuth])[0], ground=False).rgb[0]
+
+
 def articulation_clip(robot: str | RobotSpec) -> np.ndarray:
     """A clip of the robot, seen from the front, that sweeps every joint and both grippers (`articulation_action`): [17 h w 3]
     uint8."""

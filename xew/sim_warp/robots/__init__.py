@@ -1,8 +1,9 @@
-"""Registry of robots: five bimanual ones, each a URDF with our own geometry and one `RobotSpec`.
+"""Registry of robots: five bimanual ones, each a URDF with our own geometry and one `RobotSpec`; and bodies by number.
 
-To add one, write a file with `SPEC = RobotSpec(...)` here and add its line to `ROBOTS`; outside the repository write it
-anywhere importable and name it `module:SPEC` wherever a robot is asked for, or name the path of a URDF or of a RoboTwin
-embodiment (docs/add_a_robot.md).
+`body:17` names a procedural body, `body:0-63` a range of them (docs/bodies.md); their keys are `body_17`. To add a robot, write
+a file with `SPEC = RobotSpec(...)` here and add its line to `ROBOTS`; outside the repository write it anywhere importable and
+name it `module:SPEC` wherever a robot is asked for, or name the path of a URDF or of a RoboTwin embodiment
+(docs/add_a_robot.md).
 """
 
 from pathlib import Path
@@ -11,6 +12,7 @@ from xew.config import ConfigError, pick
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, UrdfError, load_urdf
 from xew.sim_warp.robots import aloha_agilex, arx_x5, franka_panda, piper, ur5_wsg
+from xew.sim_warp.robots.procedural.bodies import body_number, load_body
 from xew.sim_warp.robots.user.own import FOLDERS, adopt_robots, is_path, keep_robot, kept_robot, load_robot
 
 __all__ = [
@@ -37,7 +39,7 @@ ROBOTS: dict[str, RobotSpec] = {
 
 
 def get_robot(name: str | RobotSpec, data: Path | None = None) -> RobotSpec:
-    """The robot of a registry key, of an import path `module:NAME`, at a path, or kept beside data.
+    """The robot of a registry key, of an import path `module:NAME`, at a path, kept beside data, or a body by its number.
 
     Args:
         name: of the robot; a robot itself is returned as it is.
@@ -48,6 +50,8 @@ def get_robot(name: str | RobotSpec, data: Path | None = None) -> RobotSpec:
     """
     if isinstance(name, RobotSpec):
         return name
+    if (number := body_number(name)) is not None:
+        return load_body(number)
     if name not in ROBOTS and is_path(name):
         return load_robot(name)
     try:

@@ -11,6 +11,7 @@ import numpy as np
 import tyro
 
 from xew.config import user_errors
+from xew.protocol import expand_robots
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.kinematics.inverse import ArmSolver
 from xew.sim_warp.kinematics.reachability import GRASP_TILT, WORK_X, WORK_Y, WORK_Z, radial_yaw, reaches
@@ -63,14 +64,14 @@ class Args:
     """Print which tool poses robots reach, as Markdown."""
 
     robots: tuple[str, ...] = tuple(ROBOTS)
-    """Registry keys, import paths module:NAME or paths."""
+    """Registry keys, bodies (body:17, body:0-63), import paths module:NAME or paths."""
 
 
 @user_errors
 def main() -> None:
     quiet_warp()
     args = tyro.cli(Args)
-    print(format_tables([get_robot(name) for name in args.robots]))
+    print(format_tables([get_robot(name) for name in expand_robots(args.robots)]))
 
 
 if __name__ == "__main__":

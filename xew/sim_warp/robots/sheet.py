@@ -2,6 +2,7 @@
 
     python -m xew.sim_warp.robots.sheet --out docs/img
     python -m xew.sim_warp.robots.sheet --robots piper --references references
+    python -m xew.sim_warp.robots.sheet --robots body:0-63 --grid docs/img/bodies.png
 
 Reference renders do not depend on a task: for every robot <references>/<key>/ holds front.png (the canonical front view),
 view_000.png to view_320.png (nine azimuths in degrees), clip.mkv (17 frames that sweep every joint, lossless) with clip.png
@@ -18,6 +19,7 @@ import tyro
 
 from xew.config import user_errors
 from xew.episode import EpisodeError, write_video
+from xew.protocol import expand_robots
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
 from xew.sim_warp.rendering.bodies import robot_bodies, robot_pose
@@ -30,8 +32,14 @@ from xew.sim_warp.rendering.streams import (
     nine_views,
     ray_map,
     reference_image,
+    side_view,
 )
 from xew.sim_warp.robots import ROBOTS, get_robot
+
+GRID_COLUMNS, GRID_WIDTH, GRID_HEIGHT = 8, 240, 180
+"""Numbers of robots in a row of a grid, and of pixels of each."""
+GRID_AZIMUTH = 25.0
+"""Azimuth from which a grid shows its robots [deg]: nearly from the front, a little towards the robot's left hand."""
 
 
 def sheet(views: np.ndarray) -> np.ndarray:
@@ -54,6 +62,27 @@ def overview(views: dict[str, np.ndarray], head: dict[str, np.ndarray]) -> np.nd
         cv2.putText(row, get_robot(key).title, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (20, 20, 20), 1, cv2.LINE_AA)
         rows.append(row)
     return np.vstack(rows)
+
+
+def grid(keys: tuple[str, ...]) -> np.ndarray:
+    """Robots at home side by side with their titles, eight in a row, [h w 3] uint8."""
+    tiles = []
+    for key in keys:
+        image = cv2.resize(side_view(key, GRID_AZIMUTH), (GRID_WIDTH, GRID_HEIGHT), interpolation=cv2.INTER_AREA)
+        cv2.putText(image, get_robot(key).title, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (20, 20, 20), 1, cv2.LINE_AA)
+        tiles.append(image)
+    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % GRID_COLUMNS)
+    return np.vstack([np.hstack(tiles[row : row + GRID_COLUMNS]) for row in range(0, len(tiles), GRID_COLUMNS)])
+
+
+def write_grid(keys: tuple[str, ...], path: Path) -> None:
+    """Draw `grid` as a PNG. Raises EpisodeError if it cannot be written."""
+    picture = grid(keys)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise EpisodeError(f"cannot write to {path.parent}: {error.strerror}. Choose another file with --grid.") from error
+    save(path, picture)
 
 
 def head_view(key: str, renderer: Renderer) -> np.ndarray:
@@ -111,19 +140,26 @@ class Args:
     out: Path = Path("docs/img")
     """Folder for robot_<key>.png and robots.png."""
     robots: tuple[str, ...] = tuple(ROBOTS)
-    """Registry keys, import paths module:NAME or paths."""
+    """Registry keys, bodies (body:17, body:0-63), import paths module:NAME or paths."""
     references: Path | None = None
     """Folder for reference renders, a folder a robot; then no sheets are drawn."""
+    grid: Path | None = None
+    """PNG file for one view of each robot, eight in a row; then no sheets are drawn."""
 
 
 @user_errors
 def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
-    if args.references is None:
-        print(*write_sheets(args.robots, args.out), sep="\n")
+    robots = expand_robots(args.robots)
+    if args.grid is not None:
+        write_grid(robots, args.grid)
+        print(args.grid)
         return
-    for key in args.robots:
+    if args.references is None:
+        print(*write_sheets(robots, args.out), sep="\n")
+        return
+    for key in robots:
         write_references(key, args.references)
         print(args.references / get_robot(key).key)
 

@@ -8,10 +8,12 @@ reaches of .6 to .95 m); colors are those of real arms and beyond.
 import colorsys
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 Vector = tuple[float, float, float]
+Option = TypeVar("Option")
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 STYLES = ("tube", "shell", "box", "frame")
@@ -19,7 +21,7 @@ STYLES = ("tube", "shell", "box", "frame")
 FINGERS = ("paddle", "bar", "jaw", "wedge")
 """Shapes of fingers behind their pads."""
 MOUNTS = ("upright", "tilted", "frame")
-"""Kinds of base: a foot, a foot that leans back, a column that is part of the base."""
+"""Kinds of base: a foot, a wedge on which the base leans forward or back, a column that is part of the base."""
 COLORS = {
     "white": (228, 229, 231),
     "light": (186, 189, 194),
@@ -94,6 +96,8 @@ class BodyDesign:
     """Kind of its base, of MOUNTS."""
     column: float
     """Height of the base's column [m]; 0 but for the mount `frame`."""
+    lean: float
+    """Lean of the base towards the table [rad]; 0 but for the mount `tilted`."""
     look: Look
     hand: HandDesign
 
@@ -104,12 +108,19 @@ def design_body(number: int) -> BodyDesign:
     Args:
         number: from 0.
     """
-    rng = np.random.Generator(np.random.Philox(key=[number, 0x626F6479]))
+    rng = _stream(number, "arm")
     family = _choose(rng, tuple(FAMILIES))
     joints, flange = FAMILIES[family](rng)
     mount = _choose(rng, MOUNTS)
     column = _length(rng, 0.18, 0.35) if mount == "frame" else 0.0
-    return BodyDesign(number, family, joints, flange, mount, column, _look(rng, len(joints)), _hand(rng))
+    lean = _rounded(rng.uniform(0.15, 0.5) * _choose(rng, (1, 1, -0.6))) if mount == "tilted" else 0.0
+    look, hand = _look(_stream(number, "look"), len(joints)), _hand(_stream(number, "hand"))
+    return BodyDesign(number, family, joints, flange, mount, column, lean, look, hand)
+
+
+def _stream(number: int, part: str) -> np.random.Generator:
+    """Random numbers for one part of a body, so that a change of one part changes no other."""
+    return np.random.Generator(np.random.Philox(key=[number, int.from_bytes(part.encode(), "big")]))
 
 
 # --- Arms. Zero positions: upper arm up, forearm and hand ahead.
@@ -230,8 +241,8 @@ def _hand(rng: np.random.Generator) -> HandDesign:
     return HandDesign(palm, _length(rng, 0.06, 0.09), stroke, _choose(rng, FINGERS))
 
 
-def _choose(rng: np.random.Generator, names: tuple[str, ...]) -> str:
-    return names[int(rng.integers(len(names)))]
+def _choose(rng: np.random.Generator, options: tuple[Option, ...]) -> Option:
+    return options[int(rng.integers(len(options)))]
 
 
 def _length(rng: np.random.Generator, low: float, high: float) -> float:

@@ -38,7 +38,7 @@ class LinkShape:
 
 
 def base_shape(design: BodyDesign) -> LinkShape:
-    """The foot, the column of a frame, and the pedestal below the first joint."""
+    """The foot, the column of a frame or the wedge below a base that leans, and the pedestal below the first joint."""
     radius, height = design.look.radii[0], design.joints[0].origin[2]
     wide = 1.5 * radius
     parts: list[Part] = [("housing", cylinder((0, 0, 0), (0, 0, height), 1.15 * radius, radius))]
@@ -46,6 +46,12 @@ def base_shape(design: BodyDesign) -> LinkShape:
         post = rounded_box((-0.6 * wide, -0.6 * wide, -design.column), (0.6 * wide, 0.6 * wide, -0.01), 0.004)
         plate = rounded_box((-1.6 * wide, -1.2 * wide, -design.column), (0.9 * wide, 1.2 * wide, 0.015 - design.column), 0.003)
         parts += [("second", post), ("housing", plate)]
+    if design.mount == "tilted":
+        drop = wide * np.sin(abs(design.lean)) + 0.03
+        level = rounded_box(
+            (-1.3 * wide, -1.3 * wide, -drop - 0.012), (1.3 * wide, 1.3 * wide, -drop), 0.003, (0, -design.lean, 0)
+        )
+        parts.append(("second", hull(rounded_box((-wide, -wide, -0.02), (wide, wide, -0.01), 0.003), level)))
     parts.append(("body", rounded_box((-wide, -wide, -0.01), (wide, wide, 0.018), 0.005)))
     box = Box((-wide, -wide, -max(design.column, 0.01)), (wide, wide, height))
     return LinkShape(parts, (box,))

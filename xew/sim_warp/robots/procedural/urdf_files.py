@@ -20,7 +20,7 @@ EFFORT, FINGER_EFFORT, FINGER_SPEED = 60.0, 20.0, 0.3
 
 def body_files(design: BodyDesign) -> dict[str, bytes]:
     """URDF and meshes of a design by their path below the body's folder."""
-    root = ElementTree.Element("robot", name=f"body_{design.number:04d}")
+    root = ElementTree.Element("robot", name=f"candidate_{design.number}")
     look = design.look
     colors = {"body": look.body, "second": look.second, "housing": look.housing, "accent": look.accent, "rubber": RUBBER}
     for name, color in colors.items():

@@ -3,4 +3,4 @@
 They are kept beside the data that were made with them, so that a data set can always be read again.
 """
 
-__all__ = ["draft", "infer", "own", "placement"]
+__all__ = ["draft", "infer", "own", "placement", "trials"]

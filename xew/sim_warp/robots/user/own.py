@@ -7,7 +7,9 @@ Episodes name their robot by its key. Whoever reads them finds the robot in the 
 `XEW_ROBOTS` lists (as PATH does).
 """
 
+import contextlib
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -23,7 +25,8 @@ from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError
 from xew.episode import complete_folder
-from xew.protocol import ROBOT_NAMES
+from xew.files import cache_folder, replacing
+from xew.protocol import BODY_NAME, ROBOT_NAMES, expand_robots
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
 from xew.sim_warp.robots.user.draft import OWN, ArmDraft, RobotDraft, find_description, read_draft
@@ -42,6 +45,8 @@ FOLDERS = "XEW_ROBOTS"
 KEPT = "robots"
 """Name of the folder of a data set that holds its robots."""
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+SEARCH_CODE = ("robots/user", "kinematics", "tasks", ".")
+"""Folders of the room whose code decides where a robot is placed; a change in one makes the search begin anew."""
 STROKE_TOLERANCE = 1e-3
 """Largest difference between the strokes of the two fingers of a hand, which move together [m]."""
 
@@ -71,12 +76,12 @@ def _load(description: Path, modified: int) -> RobotSpec:
 
 
 def robot_key(description: Path) -> str:
-    """A name for folders: that of a URDF file, else of the folder; `_own` sets it apart from the project's robots."""
+    """A name for folders: that of a URDF file, else of the folder; `_own` sets it apart from robots and bodies of ours."""
     name = description.stem if description.suffix == ".urdf" else description.parent.name
     key = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_-")
     if not key:
         raise ConfigError(f"{description}: the name {name!r} gives no key for the robot; give the folder a name of letters.")
-    return f"{key}_own" if key in ROBOT_NAMES else key
+    return f"{key}_own" if key in ROBOT_NAMES or BODY_NAME.fullmatch(key) else key
 
 
 # --- What a draft leaves open.
@@ -197,22 +202,59 @@ def _complete_limits(
 
 def _settle(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
     """The robot with bases and homes, which are found where the draft leaves them open."""
-    from xew.sim_warp.robots.user import placement
-
     left, right = _fill_right_arm(draft.arms)
     if left.root_pose is not None and left.home is not None and right.home is not None:
         return robot
-    bases = robot.arms[0].root_pose, robot.arms[1].root_pose
     near = (_posture(left, robot, source), _posture(right, robot, source))
+    path = cache_folder("places") / f"{_place_digest(draft, robot)}.json"
+    if (known := _read_place(path, robot)) is not None:
+        return known
+    placed = _find_place(draft, robot, near)
+    _keep_place(placed, path)
+    return placed
 
-    def settle(robot: RobotSpec) -> RobotSpec:
-        if left.root_pose is None:
-            return placement.find_place(robot, near)
-        if not robot.one_urdf_holds_both_arms and bases[0][0] == bases[1][0]:
-            return placement.find_distance(robot, near, draft.distance)
-        return placement.find_homes(robot, near)
 
-    return settle(robot) if left.tool_pose else placement.try_turned_tools(robot, settle)
+def _find_place(draft: RobotDraft, robot: RobotSpec, near: tuple[np.ndarray | None, np.ndarray | None]) -> RobotSpec:
+    """The robot with bases and homes, searched for near postures [d] rad."""
+    from xew.sim_warp.robots.user import placement
+
+    left = draft.arms[0]
+    turn = list if left.tool_pose else placement.with_turned_tools
+    if left.root_pose is None:
+        return placement.place(turn(placement.standard_places(robot)), near).robot
+    if not robot.one_urdf_holds_both_arms and robot.arms[0].root_pose[0] == robot.arms[1].root_pose[0]:
+        gaps = placement.DISTANCES if draft.distance is None else (draft.distance,)
+        return placement.place_at(robot, turn(placement.move_apart(robot, gap) for gap in gaps), near).robot
+    return placement.place_at(robot, turn([robot]), near).robot
+
+
+def _place_digest(draft: RobotDraft, robot: RobotSpec) -> str:
+    """SHA-256 over all that a place depends on: the draft, the files of the URDF, and the code that searches."""
+    digest = hashlib.sha256(repr((draft, replace(robot, urdf=Path()))).encode())
+    code = sorted(file for folder in SEARCH_CODE for file in (Path(__file__).parents[2] / folder).glob("*.py"))
+    for file in [*load_urdf(robot.urdf).files, *code]:
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def _read_place(path: Path, robot: RobotSpec) -> RobotSpec | None:
+    """The robot with the bases, homes and tool frames that were found before; None if there are none."""
+    try:
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        left, right = (
+            replace(arm, root_pose=tuple(found["root_pose"]), home=tuple(found["home"]), tool_pose=tuple(found["tool_pose"]))
+            for arm, found in zip(robot.arms, kept, strict=True)
+        )
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+    return replace(robot, arms=(left, right))
+
+
+def _keep_place(robot: RobotSpec, path: Path) -> None:
+    """Keep what was found, where the cache folder can be written."""
+    found = [{name: getattr(arm, name) for name in ("root_pose", "home", "tool_pose")} for arm in robot.arms]
+    with contextlib.suppress(OSError), replacing(path) as temporary:
+        temporary.write_text(json.dumps(found), encoding="utf-8")
 
 
 def _posture(arm: ArmDraft, robot: RobotSpec, source: str) -> np.ndarray | None:
@@ -227,12 +269,13 @@ def _posture(arm: ArmDraft, robot: RobotSpec, source: str) -> np.ndarray | None:
 
 
 def adopt_robots(names: Sequence[str], data: Path) -> tuple[str, ...]:
-    """Robots as jobs name them: paths become keys, and what lies there is kept in `<data>/robots/<key>`.
+    """Robots as jobs name them: paths become keys, and what lies there is kept in `<data>/robots/<key>`; `body:0-7` becomes the
+    keys of eight bodies.
 
     Raises:
         ConfigError: a robot cannot be used, or the data set holds another of that key.
     """
-    return tuple(_adopt(Path(name), data) if is_path(name) else name for name in names)
+    return tuple(_adopt(Path(name), data) if is_path(name) else name for name in expand_robots(names))
 
 
 def kept_robot(key: str, data: Path | None = None) -> RobotSpec | None:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from xew.protocol import ACTION_DIM, ARMS, FRAME_RATE
+from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.kinematics.inverse import arm_solver
 from xew.sim_warp.plan import LEFT, RIGHT, ToolPath
-from xew.sim_warp.robots import RobotSpec
 
 POSITION_TOLERANCE = 0.003
 """Largest distance between commanded and planned tool [m]."""

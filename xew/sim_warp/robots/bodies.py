@@ -1,0 +1,167 @@
+"""The command that finds out which procedural bodies work, and where they stand: the catalog behind `body:17`.
+
+Reads  the designs of candidates, in numeric order
+Writes the catalog: for every body the number of its candidate, base poses and homes, so that loading one searches for nothing
+
+A candidate that fails the check is skipped: from some place both of its arms must follow the plans of eight tasks and two seeds
+each (`trials.trial_plans`), within the limits and speeds of its joints, and at home each arm stays on its side. Numbers that
+are known keep their bodies: a longer catalog begins like a shorter one. Bodies are written as they are found; the command goes
+on from there unless it is told to begin anew.
+
+With --digest it prints SHA-256 digests of the URDF and meshes of each body of the catalog, and of all: two machines that print
+the same make the same bodies.
+
+Command: python -m xew.sim_warp.robots.bodies [--count 104 --anew --workers 2 --out FILE | --digest]
+"""
+
+import hashlib
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import count as count_from
+from itertools import islice, product
+from pathlib import Path
+
+import numpy as np
+import tyro
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from xew.config import ConfigError, user_errors
+from xew.files import replacing
+from xew.protocol import body_key
+from xew.sim_warp.devices.workers import Workers, quiet_warp
+from xew.sim_warp.embodiment.spec import RobotSpec
+from xew.sim_warp.embodiment.urdf import load_urdf
+from xew.sim_warp.geometry.poses import Pose, matrix_from_pose
+from xew.sim_warp.kinematics.forward import link_poses
+from xew.sim_warp.rendering.streams import home_action
+from xew.sim_warp.robots.procedural.bodies import CATALOG, Entry, catalog_text, read_catalog, unplaced_body
+from xew.sim_warp.robots.procedural.design import BodyDesign, design_body
+from xew.sim_warp.robots.procedural.urdf_files import body_files
+from xew.sim_warp.robots.user.placement import YAW_90, move_apart, move_to, place
+
+BODY_COUNT = 104
+"""Number of bodies in the packaged catalog."""
+LEAST_SHARE = 1.0
+"""Least share of the trial plans that a body follows."""
+LEAST_GAP = 0.002
+"""Least distance of an arm at home from the plane between both [m]."""
+GAPS, BASE_Y = (0.6, 0.45, 0.75), (-0.45, -0.55, -0.65)
+BASE_Z = {"upright": (0.75, 0.55), "tilted": (0.75, 0.6), "frame": (0.75, 0.95)}
+"""Places that are tried [m]: distances between the bases, and where they stand, by the kind of mount."""
+
+
+def body_places(design: BodyDesign, robot: RobotSpec) -> list[RobotSpec]:
+    """A body at every place that is tried."""
+    rotation = (Rotation.from_quat(YAW_90) * Rotation.from_euler("y", design.lean)).as_quat(canonical=True)
+    turn = np.round(rotation, 7).tolist()
+    places = product(GAPS, BASE_Y, BASE_Z[design.mount])
+    return [move_apart(move_to(robot, (0.0, y, z, *turn)), gap) for gap, y, z in places]
+
+
+def try_candidate(number: int) -> tuple[int, Entry | str]:
+    """Look for a place for a candidate; what the catalog holds of it, or why it is skipped."""
+    design = design_body(number)
+    robot = unplaced_body(design, f"candidate_{number}", f"Candidate {number}")
+    try:
+        placed = place(body_places(design, robot))
+    except ConfigError as error:
+        return number, str(error).partition(": ")[2]
+    if placed.share < LEAST_SHARE:
+        problem = next(problem for problem in placed.problems if problem is not None)
+        return number, f"follows {placed.share:.0%} of the plans ({problem})"
+    if (gap := gap_between_arms(placed.robot)) < LEAST_GAP:
+        return number, f"its arms come within {1000 * gap:.0f} mm of the middle between them at home"
+    left, right = placed.robot.arms
+    return number, Entry(number, (_rounded(left.root_pose), _rounded(right.root_pose)), (left.home, right.home))
+
+
+def gap_between_arms(robot: RobotSpec) -> float:
+    """Least distance of a link from the plane between the two arms, at home [m]; negative where one is on the other's side."""
+    urdf, row = load_urdf(robot.urdf), home_action(robot)[None]
+    gaps = []
+    for side, frames in zip((-1, 1), link_poses(robot, row), strict=True):
+        for name, link in urdf.links.items():
+            pose = matrix_from_pose(frames[name])[0]
+            gaps += [] if link.visual is None else [side * (link.visual.vertices @ pose[0, :3] + pose[0, 3])]
+    return float(min(gap.min() for gap in gaps))
+
+
+def find_bodies(known: tuple[Entry, ...], count: int, workers: int) -> Iterator[tuple[int, Entry | str]]:
+    """Candidates after the known ones in numeric order, until `count` bodies are known; skipped ones with the reason."""
+    found, numbers = len(known), count_from(known[-1].candidate + 1 if known else 0)
+    if found >= count:
+        return
+    if workers == 1:
+        for number in numbers:
+            yield (result := try_candidate(number))
+            found += isinstance(result[1], Entry)
+            if found == count:
+                return
+    with Workers(workers) as pool:
+        while found < count:
+            batch = list(islice(numbers, 2 * workers))
+            for result in sorted(pool.run(try_candidate, batch), key=lambda result: result[0]):
+                if found < count:
+                    yield result
+                    found += isinstance(result[1], Entry)
+
+
+def digest_lines(entries: Sequence[Entry]) -> Iterator[str]:
+    """A line a body with the digest of its files, then one with that of all."""
+    together = hashlib.sha256()
+    for number, entry in enumerate(entries):
+        digest = hashlib.sha256()
+        for name, content in sorted(body_files(design_body(entry.candidate)).items()):
+            digest.update(name.encode() + b"\0" + hashlib.sha256(content).digest())
+        together.update(digest.digest())
+        yield f"{body_key(number)} {digest.hexdigest()}"
+    yield f"all {together.hexdigest()}"
+
+
+def _rounded(pose: Pose) -> Pose:
+    x, y, z, qx, qy, qz, qw = (round(float(value), 7) for value in pose)
+    return x, y, z, qx, qy, qz, qw
+
+
+@dataclass(frozen=True)
+class Args:
+    """Find procedural bodies that work."""
+
+    count: int = BODY_COUNT
+    """Number of bodies in the catalog."""
+    anew: bool = False
+    """Forget the bodies that the file knows."""
+    workers: int = os.cpu_count() or 1
+    out: Path = CATALOG
+    """File of the catalog."""
+    digest: bool = False
+    """Print digests of the bodies of the file instead."""
+
+
+@user_errors
+def main() -> None:
+    quiet_warp()
+    args = tyro.cli(Args, description=__doc__)
+    if args.digest:
+        for line in digest_lines(read_catalog(args.out)):
+            print(line)
+        return
+    entries = list(read_catalog(args.out)) if args.out.is_file() and not args.anew else []
+    skipped = 0
+    with tqdm(total=args.count, initial=len(entries), desc="bodies", unit="body") as bar:
+        for number, result in find_bodies(tuple(entries), args.count, args.workers):
+            if isinstance(result, str):
+                skipped += 1
+                bar.write(f"candidate {number} is skipped: {result}")
+                continue
+            entries.append(result)
+            with replacing(args.out) as path:
+                path.write_text(catalog_text(entries), encoding="utf-8", newline="\n")
+            bar.update()
+    print(f"{args.out}: {len(entries)} bodies; {skipped} candidates were skipped")
+
+
+if __name__ == "__main__":
+    main()

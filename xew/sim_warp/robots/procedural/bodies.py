@@ -1,0 +1,165 @@
+"""Bodies by their number: `body:17` is a candidate of the catalog with its place and homes.
+
+Reads  catalog.json, which `python -m xew.sim_warp.robots.bodies` writes: the candidates that pass its check, in order
+Writes URDFs and meshes of bodies that are asked for, once, to the user's cache folder, under a digest of the code that makes
+       them; a `RobotSpec` names the URDF there
+
+All but what the catalog holds is a function of the number.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import scipy
+import trimesh
+
+from xew.config import ConfigError
+from xew.episode import complete_folder
+from xew.files import cache_folder
+from xew.protocol import BODY_NAME, body_key
+from xew.sim_warp.embodiment import mesh_files, prepared, urdf
+from xew.sim_warp.embodiment.spec import Arm, RobotSpec
+from xew.sim_warp.embodiment.urdf import prepare
+from xew.sim_warp.geometry import meshes
+from xew.sim_warp.geometry.poses import Pose
+from xew.sim_warp.robots.procedural import design, shapes, urdf_files
+from xew.sim_warp.robots.procedural.design import SPEED, BodyDesign, design_body
+from xew.sim_warp.robots.procedural.shapes import tool_offset
+from xew.sim_warp.robots.procedural.urdf_files import URDF, body_files
+from xew.sim_warp.robots.shapes import solids
+
+CATALOG = Path(__file__).parent / "catalog.json"
+AT_ORIGIN: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the catalog holds of a body; left arm first."""
+
+    candidate: int
+    """Number of the design."""
+    root_pose: tuple[Pose, Pose]
+    home: tuple[tuple[float, ...], tuple[float, ...]]
+    """Joint positions at rest [rad]."""
+
+
+def body_number(name: str) -> int | None:
+    """The number of a body by its name, body:17 or body_17; None for other names."""
+    found = BODY_NAME.fullmatch(name)
+    return int(found[1]) if found else None
+
+
+@cache
+def load_body(number: int) -> RobotSpec:
+    """A procedural body.
+
+    Args:
+        number: from 0 to one less than the catalog has entries.
+
+    Raises:
+        ConfigError: there is no body of that number, or the user's cache folder cannot be written.
+    """
+    entries = read_catalog()
+    if number >= len(entries):
+        raise ConfigError(
+            f"there is no body:{number}; expected body:0 to body:{len(entries) - 1}. `python -m xew.sim_warp.robots.bodies "
+            f"--count {number + 1}` extends the catalog."
+        )
+    return placed_body(entries[number], body_key(number), f"Body {number}")
+
+
+@cache
+def read_catalog(path: Path = CATALOG) -> tuple[Entry, ...]:
+    """The entries of a catalog, by number. Raises ConfigError if it cannot be read."""
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))["bodies"]
+        return tuple(
+            Entry(
+                entry["candidate"],
+                (tuple(entry["root_pose"][0]), tuple(entry["root_pose"][1])),
+                (tuple(entry["home"][0]), tuple(entry["home"][1])),
+            )
+            for entry in entries
+        )
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
+        raise ConfigError(
+            f"{path} is no catalog of bodies ({error}); write it by `python -m xew.sim_warp.robots.bodies`."
+        ) from error
+
+
+def catalog_text(entries: Sequence[Entry]) -> str:
+    """The content of a catalog, a line an entry."""
+    lines = ",\n".join(json.dumps(asdict(entry)) for entry in entries)
+    return f'{{"bodies": [\n{lines}\n]}}\n'
+
+
+def placed_body(entry: Entry, key: str, title: str) -> RobotSpec:
+    """The robot of an entry."""
+    robot = unplaced_body(design_body(entry.candidate), key, title)
+    left, right = (
+        replace(arm, root_pose=root, home=home) for arm, root, home in zip(robot.arms, entry.root_pose, entry.home, strict=True)
+    )
+    return replace(robot, arms=(left, right))
+
+
+def unplaced_body(body: BodyDesign, key: str, title: str) -> RobotSpec:
+    """The robot of a design at the world's origin, with all joints at 0; its files are written if they are not there yet."""
+    x, y, z = body.flange
+    count, stroke = len(body.joints), body.hand.stroke
+    arm = Arm(
+        root_pose=AT_ORIGIN,
+        joints=tuple(f"joint{index + 1}" for index in range(count)),
+        home=(0.0,) * count,
+        tool_link=f"link{count}",
+        tool_pose=(round(x + tool_offset(body.hand), 6), y, z, 0.0, 0.0, 0.0, 1.0),
+        fingers=("left_finger_joint", "right_finger_joint"),
+        finger_closed=(0.0, 0.0),
+        finger_open=(stroke, stroke),
+    )
+    return RobotSpec(
+        key=key,
+        title=title,
+        label=title,
+        urdf=keep_files(body),
+        arms=(arm, arm),
+        joint_lower=tuple(joint.lower for joint in body.joints),
+        joint_upper=tuple(joint.upper for joint in body.joints),
+        joint_velocity=SPEED[:count],
+    )
+
+
+def keep_files(body: BodyDesign) -> Path:
+    """The URDF of a design in the user's cache folder, written with its meshes if it is not there yet.
+
+    Raises:
+        ConfigError: the folder cannot be written.
+    """
+    folder = cache_folder("bodies") / content_version() / f"candidate_{body.number}"
+    path = folder / URDF
+    if path.is_file():
+        return path
+    try:
+        with complete_folder(folder) as temporary:
+            for name, content in body_files(body).items():
+                (temporary / name).parent.mkdir(exist_ok=True)
+                (temporary / name).write_bytes(content)
+            prepare(temporary / URDF)
+    except OSError as error:
+        if path.is_file():  # another process was faster
+            return path
+        raise ConfigError(f"cannot write {folder}: {error.strerror}. Name another cache folder by XDG_CACHE_HOME.") from error
+    return path
+
+
+@cache
+def content_version() -> str:
+    """Digest of all that decides a body's bytes and arrays: the code that makes and reads them, and the libraries it calls."""
+    digest = hashlib.sha256(f"{np.__version__} {scipy.__version__} {trimesh.__version__}".encode())
+    for module in (design, shapes, urdf_files, solids, mesh_files, meshes, prepared, urdf):
+        digest.update(Path(str(module.__file__)).read_bytes())
+    return digest.hexdigest()[:12]
