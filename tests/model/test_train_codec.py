@@ -25,7 +25,6 @@ from xew.model.codec_training.report import choose_robots
 from xew.model.codec_training.sampling import Batch, Batches, Schedule
 from xew.model.codec_training.settings import (
     CodecTrainSettings,
-    expand_robots,
     load_codec_experiment,
     select_episodes,
     training_episodes,
@@ -38,7 +37,7 @@ from xew.model.episodes.choice import training_episodes as model_episodes
 from xew.model.experiment import load_experiment
 from xew.model.training.loop import STOPPED
 from xew.model.video.frames import to_model_size
-from xew.protocol import HELD_OUT_ROBOTS, SEEN_ROBOTS
+from xew.protocol import HELD_OUT_ROBOTS, SEEN_ROBOTS, expand_robots
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 
@@ -281,10 +280,6 @@ def test_only_training_robots_and_seeds_are_seen(world: Path) -> None:
     assert len(chosen) == 3 < len(find_accepted(world / "data"))
     with pytest.raises(ConfigError, match="has no training episode with videos of body_0, body_1; it has aloha_agilex"):
         training_episodes(dataset, expand_robots(["body:0-1"]))
-
-
-def test_bodies_are_named_by_ranges() -> None:
-    assert expand_robots(["ur5_wsg", "body:7", "body:0-2"]) == ("ur5_wsg", "body_7", "body_0", "body_1", "body_2")
 
 
 # Samples.

@@ -1,6 +1,5 @@
 """What the configs of `train_codec` hold, and the checks of it."""
 
-import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,10 +11,8 @@ from xew.model.codec_training.kinds import KINDS, Kind
 from xew.model.codec_training.pictures import ALIGNED, UNALIGNED, Cut
 from xew.model.settings.checks import check_least
 from xew.model.settings.settings import Clip
-from xew.protocol import SPLITS, seed_split
+from xew.protocol import SPLITS, expand_robots, seed_split
 
-SEVERAL_BODIES = re.compile(r"(\w+):(\d+)(?:-(\d+))?")
-"""Name of one procedural body, or of a range of them: body:17, body:0-63."""
 Seeds = Literal["train", "test"]
 SMALLEST_SIDE = 32
 """Least side [pixels] of a picture that LPIPS takes."""
@@ -219,19 +216,6 @@ def check_streams(streams: dict[str, float]) -> None:
             raise ConfigError(f"streams: {name} has the share {share:g}; it must be at least 0.")
     if not any(streams.values()):
         raise ConfigError(f"streams names none with a share over 0; name some of {', '.join(known)}.")
-
-
-def expand_robots(names: Sequence[str]) -> tuple[str, ...]:
-    """Keys of robots by their names: body:17 is body_17, body:0-63 are 64 of them, and others stay as they are."""
-    keys: list[str] = []
-    for name in names:
-        found = SEVERAL_BODIES.fullmatch(name)
-        if found is None:
-            keys.append(name)
-            continue
-        first, last = int(found[2]), int(found[3] or found[2])
-        keys += [f"{found[1]}_{number}" for number in range(first, last + 1)]
-    return tuple(keys)
 
 
 def select_episodes(dataset: Dataset, robots: Collection[str], seeds: Seeds) -> list[Episode]:
