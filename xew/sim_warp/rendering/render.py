@@ -55,9 +55,9 @@ def _nothing() -> np.ndarray:
 class Frames:
     """Images of one world. What was not asked for has no elements."""
 
-    rgb: np.ndarray
+    rgb: np.ndarray = field(default_factory=_nothing)
     """[t h w 3] uint8, sRGB, anti-aliased."""
-    robot_mask: np.ndarray
+    robot_mask: np.ndarray = field(default_factory=_nothing)
     """[t h w] bool, whether the first thing that the ray through the pixel's center meets is the robot."""
     depth: np.ndarray = field(default_factory=_nothing)
     """[t h w] float32 depth along the optical axis at the pixel's center [m], 0 where nothing is."""
@@ -142,10 +142,29 @@ class Renderer:
         with PARSING:  # threads take turns at the device, whose buffers and modules are shared; the latter are parsed
             return _split_by_world(self._render_worlds(worlds, camera, ground, wanted), worlds)
 
+    def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Look up the points of worlds with the stage about them, without making any image.
+
+        Returns:
+            For each world `Frames.point_body` [t k] and `Frames.point_depth` [t k] of its points, as `render_batch` gives them.
+
+        Raises:
+            ValueError: poses or points do not fit, or are not finite, or a world has no points.
+        """
+        for world in worlds:
+            check_world(world)
+            if world.points is None or not world.points.shape[1]:
+                raise ValueError("a world has no points to look up; give World.points [t k 3].")
+        if not worlds:
+            return []
+        with PARSING:
+            frames = _split_by_world(self._render_worlds(worlds, camera, True, frozenset(), images=False), worlds)
+        return [(seen.point_body, seen.point_depth) for seen in frames]
+
     def _render_worlds(
-        self, worlds: Sequence[World], camera: Camera, ground: bool, wanted: frozenset[str]
+        self, worlds: Sequence[World], camera: Camera, ground: bool, wanted: frozenset[str], images: bool = True
     ) -> dict[str, np.ndarray]:
-        """Images of all frames of all worlds on the host, by the names of `Frames`."""
+        """Images of all frames of all worlds on the host, by the names of `Frames`; without images the points alone."""
         kinds, kind = distinct_worlds(worlds)
         table, pose = pack_frames(worlds, kind)
         call = _Call(
@@ -154,8 +173,9 @@ class Renderer:
             camera=camera,
             view=_camera_view(camera),
             stage=self._stage(camera, ground),
-            shadows=len(stage.LIGHTS) if ground else 0,
+            shadows=len(stage.LIGHTS) if ground and images else 0,
             wanted=wanted,
+            images=images,
         )
         pixel = _nearest_pixel(camera, pack_points(worlds))
         chunks = [slice(i, i + self._frames_per_chunk) for i in range(0, len(table.world), self._frames_per_chunk)]
@@ -187,7 +207,7 @@ class Renderer:
         """Images of some frames on the device, by the names of `Frames`."""
         chunk = _Chunk(self.device, call.geometry, frames)
         drawn = self._draw(call, chunk)
-        images = {"rgb": self._shade(call, chunk, drawn)} | self._measure(call, chunk, drawn)
+        images = {"rgb": self._shade(call, chunk, drawn)} | self._measure(call, chunk, drawn) if call.images else {}
         if pixel.shape[1]:
             images |= self._probe(call, chunk, drawn, pixel)
         return images
@@ -320,6 +340,7 @@ class _Call:
     stage: shading.LitStage
     shadows: int = 0
     wanted: frozenset[str] = frozenset()
+    images: bool = True
 
 
 class _Chunk:
