@@ -1,3 +1,3 @@
-"""Perturbations: videos that are wrong in a known way, to measure estimators and metrics by."""
+"""Videos that are wrong in a known way, to measure estimators and metrics by."""
 
-__all__ = ["perturbations"]
+__all__ = ["matrix", "perturbations", "predictors"]

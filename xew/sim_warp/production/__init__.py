@@ -1,8 +1,8 @@
 """Seeds to episodes in batches, in the order in which a seed goes through the files.
 
 `produce` takes jobs; `cells` plans (with `expert`) and simulates them, `outcome` says why one does not count, `episodes`
-renders and writes them, `rerender` makes what is on disk again, and `surfaces` follows points on it. What is written is complete
-or absent.
+renders and writes them, `rerender` makes what is on disk again, and `surfaces` follows points on it. What is written is
+complete or absent.
 """
 
 __all__ = ["cells", "episodes", "expert", "outcome", "produce", "rerender", "surfaces"]

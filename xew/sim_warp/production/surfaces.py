@@ -12,7 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from xew.config import ConfigError
 from xew.episode import Record, data_folder, read_record, read_states
+from xew.sim_warp.geometry.camera import Camera
 from xew.sim_warp.rendering.observe import scene_recording
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import default_renderer
@@ -55,19 +57,24 @@ def read_surfaces(folder: Path, renderer: Renderer | None = None) -> SurfaceTrac
 
     Returns:
         The tracks; None where the shapes are not known: the episode was imported, or is not of the scene that its task now
-        makes of its seed.
+        makes of its seed, or there is no such task or robot here.
 
     Raises:
-        EpisodeError: a file is missing or damaged. ConfigError: there is no such robot or task.
+        EpisodeError: a file is missing or damaged.
     """
     record = read_record(folder)
-    scene = None if record.source else _find_scene(record)
+    try:
+        scene = None if record.source else _find_scene(record)
+        robot = get_robot(record.robot, data_folder(folder))
+    except ConfigError:  # of a task or robot that is not known here
+        scene = None
     if scene is None:
         return None
     states = read_states(folder)
-    robot = get_robot(record.robot, data_folder(folder))
     recording = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
-    return track_surfaces([recording], [scene_names(scene)], renderer or default_renderer())[0]
+    height, width = states.robot_mask.shape[1:]
+    camera = Camera(states.intrinsics, states.extrinsics, width, height)
+    return track_surfaces([recording], [scene_names(scene)], renderer or default_renderer(), camera)[0]
 
 
 def _find_scene(record: Record) -> Scene | None:

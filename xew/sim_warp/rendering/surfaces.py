@@ -4,8 +4,8 @@ Reads  `Recording`s: a robot, its measured joints, and things with their measure
 Writes `SurfaceTracks`: pixels and visibility of points on the robot's moving links, on objects and on hinged lids
 
 A point is fixed to its body, so that its path follows from the states. It is seen where the renderer's own buffer shows its
-body at its pixel, at its depth: what hides it may be the robot, an object, the table, or its own body. Of many points sampled on each
-body, few are kept: as many as it takes to see some of them in every frame in which the body is seen.
+body at its pixel, at its depth: what hides it may be the robot, an object, the table, or its own body. Of many points sampled
+on each body, few are kept: as many as it takes to see some of them in every frame in which the body is seen.
 """
 
 from collections.abc import Sequence
