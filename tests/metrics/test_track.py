@@ -232,7 +232,7 @@ def test_strict_position_accuracy_is_tap_vids() -> None:
     prediction = np.stack([away, np.zeros(6, np.float32)], axis=-1)[None]
     expected = np.mean([1, 4 / 5, 3 / 5, 2 / 5, 1 / 5, 0])
     assert pck_strict(prediction, target, np.ones((1, 6), bool), TAPVID_SIDE) == pytest.approx(expected, abs=1e-6)
-    assert failure_distance() == pytest.approx(LOST) and SIDE == pytest.approx(np.sqrt(320 * 240))
+    assert failure_distance() == pytest.approx(LOST) and pytest.approx(np.sqrt(320 * 240)) == SIDE
     assert (TOLERANCES, FAILURE) == ((1, 2, 4, 8, 16), 50)
 
 

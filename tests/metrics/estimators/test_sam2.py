@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.torch_ops import make_torchvision_importable
 from tests.synthetic import write_synthetic_data
+from tests.torch_ops import make_torchvision_importable
 from xew.config import ConfigError
 from xew.episode import episode_folder, read_states, read_video
 from xew.metrics import mask_iou

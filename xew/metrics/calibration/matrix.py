@@ -110,5 +110,5 @@ def to_markdown(table: pd.DataFrame) -> str:
     for name in map(str, table.index):
         values = ["-" if np.isnan(value) else f"{value:.3g}" for value in table.loc[name]]
         pairs = "; ".join(f"{a}, {b}" for a, b in wrong[name])
-        lines.append([f"`{name}`", ", ".join(METRICS[name].suites), *values, pairs])
+        lines.append([name, ", ".join(METRICS[name].suites), *values, pairs])
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
