@@ -78,6 +78,8 @@ class Args:
     """Its weights, where it has some."""
     predictors: bool = False
     """Grade predictors made on purpose, in place of both tables."""
+    metrics: tuple[str, ...] = tuple(METRICS)
+    """Names of the metrics of the predictors' table."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ def grade_matrix(episodes: Sequence[Episode], args: Args, estimators: Estimators
     text = ""
     for folder, record in tqdm(choose(episodes, args), desc="predictors", unit="episode", disable=None):
         other = find_another(episodes, record, "robot")
-        rows += grade_predictors(folder, record, other, estimators.masker, estimators.tracker)
+        rows += grade_predictors(folder, record, other, estimators.masker, estimators.tracker, args.metrics)
         table = pd.DataFrame(rows)
         text = to_markdown(matrix(table)) + "\n"
         write(args.out, text, {"predictors": table}, "predictors.md")

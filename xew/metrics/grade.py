@@ -15,6 +15,7 @@ import numpy as np
 from xew.metrics import METRICS, contact_f1
 from xew.metrics.backends import Masker, Tracker
 from xew.metrics.estimators.contact import predicted_contact
+from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.metric import ACCELERATOR_CHUNK, Metric
 from xew.metrics.perceptual import SMALLEST_SIDE, union_box
 from xew.metrics.truth import Points, Surfaces, Truth, is_inside
@@ -85,13 +86,20 @@ class Comparison:
 
     @cached_property
     def found_on_surfaces(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where the tracker finds the points on the robot [t k 2] and on objects [t p 2], all in one pass; NaN where lost."""
+        """Where the tracker finds the points on the robot [t k 2] and on objects [t p 2], all in one pass; NaN where lost.
+
+        A place that does not have the color of the point's body is none, so that an object is not found by what is round it.
+        """
         both = (self.surfaces.robot, self.surfaces.objects)
         points, visible = (np.concatenate([getattr(some, name) for some in both], axis=1) for name in ("pixels", "visible"))
         seen = visible.any(axis=0)
         found = np.full_like(points, np.nan)
         if seen.any():
-            found[:, seen] = self.tracker(self.seen, self.truth.rgb, np.nan_to_num(points[:, seen]), visible[:, seen])
+            known = np.nan_to_num(points[:, seen]), visible[:, seen]
+            found[:, seen] = self.tracker(self.seen, self.truth.rgb, *known)
+            if self.surfaces.shown is not None:
+                body = np.concatenate([some.body for some in both if some.body is not None])[seen]
+                found[:, seen] = confirm_tracks(found[:, seen], self.seen, self.truth.rgb, *known, self.surfaces.shown, body)
         count = both[0].pixels.shape[1]
         return found[:, :count], found[:, count:]
 

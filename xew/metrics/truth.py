@@ -44,6 +44,8 @@ class Points:
     """[t k 2] float32 pixels; NaN behind the camera."""
     visible: np.ndarray
     """[t k] bool."""
+    body: np.ndarray | None = None
+    """[k] int, index of the body that each point lies on, as in `Surfaces.shown`; None where bodies are not known."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,8 @@ class Surfaces:
 
     robot: Points
     objects: Points
+    shown: np.ndarray | None
+    """[t h w] int16, index of the body that a pixel shows, -1 for any other; None where the shapes are not known."""
     known: bool
     """False where the episode's shapes are not known, as of an imported one: the points are then links' and objects'
     origins."""
@@ -108,6 +112,7 @@ def read_truth(folder: Path, frames: int, compared: Collection[str]) -> Truth:
         surfaces = _find_surfaces(folder, frames) or Surfaces(
             Points(states.keypoints[:frames], states.keypoint_visible[:frames]),
             _of_moving(states.object_pose[..., :3], Points(objects, visible), frames),
+            shown=None,
             known=False,
         )
     return Truth(
@@ -134,9 +139,10 @@ def _find_surfaces(folder: Path, frames: int) -> Surfaces | None:
     of_robot = tracks.is_robot[tracks.body]
     moves = (tracks.displacement[:frames].max(axis=0) > MOVED)[tracks.body]
     robot, objects = (
-        Points(tracks.pixels[:frames, some], tracks.visible[:frames, some]) for some in (of_robot, ~of_robot & moves)
+        Points(tracks.pixels[:frames, some], tracks.visible[:frames, some], tracks.body[some])
+        for some in (of_robot, ~of_robot & moves)
     )
-    return Surfaces(robot, objects, known=True)
+    return Surfaces(robot, objects, tracks.shown[:frames], known=True)
 
 
 def _of_moving(places: np.ndarray, points: Points, frames: int) -> Points:

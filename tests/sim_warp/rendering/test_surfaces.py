@@ -53,6 +53,15 @@ def test_points_go_with_their_body(tracks: SurfaceTracks) -> None:
     assert not tracks.is_robot[index]
 
 
+def test_pixels_tell_whose_they_are(tracks: SurfaceTracks) -> None:
+    """The pixel of every point that is seen shows its body."""
+    for t in range(FRAMES):
+        seen = tracks.visible[t]
+        x, y = np.round(tracks.pixels[t, seen]).astype(int).T
+        np.testing.assert_array_equal(tracks.shown[t, y, x], tracks.body[seen])
+    assert (tracks.shown[0] == -1).mean() > 0.3 and tracks.shown.max() < len(tracks.names)
+
+
 def test_another_object_hides_them(tracks: SurfaceTracks) -> None:
     assert not tracks.visible[2, of(tracks, "cube")].any()
     assert tracks.visible[2, of(tracks, "screen")].sum() >= 8
@@ -82,9 +91,11 @@ def test_looking_up_is_what_rendering_says(renderer: Renderer) -> None:
     points = np.array([[[0.0, 0.0, 0.82], [0.3, 0.2, TABLE_TOP], [5.0, 0.0, 0.8]]])
     world = World([CUBE], np.float32([[[0.0, 0.0, 0.78, *TURN]]]), points)
     frames = renderer.render_batch([world])[0]
-    (body, depth), *_ = renderer.probe_batch([world])
-    np.testing.assert_array_equal(body, frames.point_body)
-    np.testing.assert_array_equal(depth, frames.point_depth)
+    (found,) = renderer.probe_batch([world])
+    np.testing.assert_array_equal(found.point_body, frames.point_body)
+    np.testing.assert_array_equal(found.point_depth, frames.point_depth)
+    np.testing.assert_array_equal(found.robot_mask, frames.robot_mask)
+    assert found.rgb.size == 0 and found.body.shape == frames.robot_mask.shape
     assert renderer.probe_batch([]) == []
     with pytest.raises(ValueError, match="no points"):
         renderer.probe_batch([World([CUBE], world.pose)])

@@ -15,7 +15,7 @@ import pandas as pd
 from xew.episode import Record, read_video
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker
-from xew.metrics.calibration.predictors import PREDICTORS, Material, predict, render_objects, soften
+from xew.metrics.calibration.predictors import PREDICTORS, Material, predict, render_objects
 from xew.metrics.grade import Comparison, grade, input_kind
 from xew.metrics.truth import Truth, read_truth
 
@@ -56,16 +56,22 @@ def grade_predictors(
     truth = read_truth(folder, record.frame_count, {input_kind(name) for name in metrics})
     still, erased = (None, None) if objects is None else objects(folder)
     material = Material(truth.rgb, None if other is None else _cut(read_video(other / "rgb.mkv"), truth), still, erased)
+    key = {"task": record.task, "seed": record.seed, "robot": record.robot}
+    return [key | row for row in grade_material(material, truth, masker, tracker, metrics)]
+
+
+def grade_material(
+    material: Material, truth: Truth, masker: Masker, tracker: Tracker, metrics: Sequence[str] = tuple(METRICS)
+) -> list[Row]:
+    """Rows (case metric value) of all predictors that can be made of the material; the truth is graded as by `evaluate`."""
     rows: list[Row] = []
     for case in PREDICTORS:
         video = predict(case, material)
         if video is None:
             continue
-        shown = soften(video) if case == "truth" else None
-        exact = material.truth if case == "truth" else video
-        values = grade(Comparison(exact, truth, masker, tracker, shown=shown), metrics).values
-        key = {"task": record.task, "seed": record.seed, "robot": record.robot, "case": case}
-        rows += [key | {"metric": name, "value": value} for name, value in values.items()]
+        graded, shown = (truth.rgb, video) if case == "truth" else (video, None)
+        values = grade(Comparison(graded, truth, masker, tracker, shown=shown), metrics).values
+        rows += [{"case": case, "metric": name, "value": value} for name, value in values.items()]
     return rows
 
 
@@ -98,9 +104,12 @@ def order_violations(table: pd.DataFrame) -> dict[str, list[tuple[str, str]]]:
 
 
 def expected_order(objects: bool) -> list[tuple[str, str]]:
-    """Pairs of predictors, the better one first: those of following steps, and of metrics of objects the further pairs."""
+    """Pairs of predictors, the better one first: those of following steps, and of metrics of objects the further pairs.
+
+    Of metrics of objects the other robot is left out: it moves them as the first one does.
+    """
     pairs = [(a, b) for better, worse in itertools.pairwise(STEPS) for a in better for b in worse]
-    return pairs + (list(FURTHER) if objects else [])
+    return [pair for pair in pairs if "other robot" not in pair] + list(FURTHER) if objects else pairs
 
 
 def to_markdown(table: pd.DataFrame) -> str:

@@ -17,8 +17,9 @@ from xew.metrics.calibration.perturbations import render_perturbation
 from xew.metrics.grading.jobs import SOFTNESS
 from xew.metrics.truth import MOVED
 
-QUALITY = 28
-"""Quantizer (CRF) of the H.264 video that stands for a codec; 23 is x264's default, more is worse."""
+QUALITY = 34
+"""Quantizer (CRF) of the H.264 video that stands for a codec; 23 is x264's default, more is worse. At 28 a video is nearer to
+the truth than the softened truth is."""
 LATE = (2, 8)
 """Numbers of frames by which the late predictors lag."""
 NOISE_SEED = 0
@@ -125,7 +126,7 @@ def erase_objects(states: States) -> States:
 
 
 def render_objects(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """`Material.still` and `Material.erased` of a simulated episode. Raises EpisodeError where its states are not known."""
+    """`Material.still` and `Material.erased` [t h w 3] of an episode. Raises EpisodeError where its states are unknown."""
     states = read_states(folder)
     still, erased = (render_perturbation(folder, change(states)).rgb for change in (hold_objects, erase_objects))
     return still, erased

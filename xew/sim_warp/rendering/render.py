@@ -142,11 +142,11 @@ class Renderer:
         with PARSING:  # threads take turns at the device, whose buffers and modules are shared; the latter are parsed
             return _split_by_world(self._render_worlds(worlds, camera, ground, wanted), worlds)
 
-    def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Look up the points of worlds with the stage about them, without making any image.
+    def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA) -> list[Frames]:
+        """Look up the points of worlds with the stage about them, and which body each pixel shows, without any colors.
 
         Returns:
-            For each world `Frames.point_body` [t k] and `Frames.point_depth` [t k] of its points, as `render_batch` gives them.
+            For each world its frames as `render_batch` gives them, of which `rgb` and what is optional but `body` are empty.
 
         Raises:
             ValueError: poses or points do not fit, or are not finite, or a world has no points.
@@ -158,13 +158,13 @@ class Renderer:
         if not worlds:
             return []
         with PARSING:
-            frames = _split_by_world(self._render_worlds(worlds, camera, True, frozenset(), images=False), worlds)
-        return [(seen.point_body, seen.point_depth) for seen in frames]
+            images = self._render_worlds(worlds, camera, True, frozenset({"body"}), colors=False)
+            return _split_by_world(images, worlds)
 
     def _render_worlds(
-        self, worlds: Sequence[World], camera: Camera, ground: bool, wanted: frozenset[str], images: bool = True
+        self, worlds: Sequence[World], camera: Camera, ground: bool, wanted: frozenset[str], colors: bool = True
     ) -> dict[str, np.ndarray]:
-        """Images of all frames of all worlds on the host, by the names of `Frames`; without images the points alone."""
+        """Images of all frames of all worlds on the host, by the names of `Frames`; colors, with shadows, if asked for."""
         kinds, kind = distinct_worlds(worlds)
         table, pose = pack_frames(worlds, kind)
         call = _Call(
@@ -173,9 +173,9 @@ class Renderer:
             camera=camera,
             view=_camera_view(camera),
             stage=self._stage(camera, ground),
-            shadows=len(stage.LIGHTS) if ground and images else 0,
+            shadows=len(stage.LIGHTS) if ground and colors else 0,
             wanted=wanted,
-            images=images,
+            colors=colors,
         )
         pixel = _nearest_pixel(camera, pack_points(worlds))
         chunks = [slice(i, i + self._frames_per_chunk) for i in range(0, len(table.world), self._frames_per_chunk)]
@@ -207,7 +207,8 @@ class Renderer:
         """Images of some frames on the device, by the names of `Frames`."""
         chunk = _Chunk(self.device, call.geometry, frames)
         drawn = self._draw(call, chunk)
-        images = {"rgb": self._shade(call, chunk, drawn)} | self._measure(call, chunk, drawn) if call.images else {}
+        images = {"rgb": self._shade(call, chunk, drawn)} if call.colors else {}
+        images |= self._measure(call, chunk, drawn)
         if pixel.shape[1]:
             images |= self._probe(call, chunk, drawn, pixel)
         return images
@@ -340,7 +341,7 @@ class _Call:
     stage: shading.LitStage
     shadows: int = 0
     wanted: frozenset[str] = frozenset()
-    images: bool = True
+    colors: bool = True
 
 
 class _Chunk:

@@ -21,7 +21,7 @@ from xew.sim_warp.geometry.poses import matrix_from_pose
 from xew.sim_warp.geometry.surface_points import sample_surface
 from xew.sim_warp.rendering.bodies import SIDES, body_names, robot_bodies, robot_pose
 from xew.sim_warp.rendering.observe import Recording
-from xew.sim_warp.rendering.render import Renderer, World
+from xew.sim_warp.rendering.render import Frames, Renderer, World
 
 LINK_CANDIDATES, THING_CANDIDATES = 64, 256
 """Numbers of points that are sampled on each link that an arm or a gripper moves, and on each object and hinged lid: of what a
@@ -44,6 +44,8 @@ class SurfaceTracks:
     """[t p] bool."""
     body: np.ndarray
     """[p] int32, index of the body that a point lies on."""
+    shown: np.ndarray
+    """[t h w] int16, index of the body that a pixel shows, -1 for any other."""
     names: tuple[str, ...]
     """Names of the b bodies: side and link of a robot, name of an object, and name and lid of what has a hinge."""
     is_robot: np.ndarray
@@ -117,15 +119,15 @@ def _tracks(
     recording: Recording,
     thing_names: Sequence[str],
     where: tuple[np.ndarray, np.ndarray, np.ndarray],
-    shown: tuple[np.ndarray, np.ndarray],
+    shown: Frames,
     camera: Camera,
 ) -> SurfaceTracks:
-    """Tracks from the candidates' places and normals [t p 3] and bodies [p], and from what their pixels show [t p]."""
+    """Tracks from the candidates' places and normals [t p 3] and bodies [p], and from what the camera sees."""
     world, normal, body = where
     pixels, depth = project(camera, world)
     to_camera = camera.position - world
     facing = np.einsum("tpi,tpi->tp", normal, to_camera) > LEAST_FACING * np.linalg.norm(to_camera, axis=-1)
-    visible = (shown[0] == body) & facing & (depth > 0) & (np.abs(shown[1] - depth) < DEPTH_MARGIN)
+    visible = (shown.point_body == body) & facing & (depth > 0) & (np.abs(shown.point_depth - depth) < DEPTH_MARGIN)
     links = _link_names(recording.robot)
     bodies = np.unique(body)
     kept = [
@@ -134,10 +136,13 @@ def _tracks(
     ]
     far = [_motion(world[:, body == b]) for b in bodies]
     points = np.concatenate(kept)
+    number = np.full(len(links) + len(thing_names) + 1, -1, np.int16)  # the last is that of body -1
+    number[bodies] = np.arange(len(bodies))
     return SurfaceTracks(
         pixels=pixels[:, points].astype(np.float32),
         visible=visible[:, points],
         body=np.repeat(np.arange(len(bodies), dtype=np.int32), [len(some) for some in kept]),
+        shown=number[shown.body],
         names=tuple([*links, *thing_names][b] for b in bodies),
         is_robot=bodies < len(links),
         displacement=np.stack([of_body[0] for of_body in far], axis=1),
