@@ -221,7 +221,7 @@ def ndtw_strict(prediction: Tracks, target: Tracks, valid: Valid, side: float | 
 
 
 def failure_distance(side: float | jax.Array = SIDE) -> float | jax.Array:
-    """The error [pixels] of a lost point in an image whose area is that of a square of this side [pixels]; scalars [] both."""
+    """The error [...] [pixels] of a lost point in an image with the area of a square of this side [...] [pixels]."""
     return FAILURE / TAPVID_SIDE * side
 
 

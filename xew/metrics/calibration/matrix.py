@@ -117,7 +117,7 @@ def to_markdown(table: pd.DataFrame) -> str:
     wrong = order_violations(table)
     lines = [["metric", "suites", *map(str, table.columns), "not in order"], ["---"] * (len(table.columns) + 3)]
     for name in map(str, table.index):
-        values = ["-" if np.isnan(value) else f"{value:.3g}" for value in table.loc[name]]
+        values = ["-" if np.isnan(value) else f"{value:.3g}" for value in table.loc[name].to_numpy(float)]
         pairs = "; ".join(f"{a}, {b}" for a, b in wrong[name])
         lines.append([name, ", ".join(METRICS[name].suites), *values, pairs])
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
