@@ -28,6 +28,7 @@ SLOW = (
     "tests/analysis/test_study.py::test_cells_run_as_tasks_on_a_ray_cluster",
     "tests/analysis/test_study.py::test_steps_run_as_tasks_on_a_ray_cluster",
     "tests/legacy/",
+    "tests/metrics/calibration/",
     "tests/metrics/estimators/test_sam2.py",
     "tests/metrics/grading/test_resume.py",
     "tests/metrics/test_calibrate.py",

@@ -35,7 +35,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 LAZILY = {
     ("model", "sim_warp"): ("conditions", "latents", "cache", "episodes", "video"),
     ("model", "metrics"): ("codec_training", "codecs.ceiling"),
-    ("metrics", "sim_warp"): ("calibrate", "calibration"),
+    ("metrics", "sim_warp"): ("calibrate", "calibration", "truth"),
 }
 """Modules and packages of the first room that may import the second, and inside functions alone: the room loads without it."""
 FORBIDDEN = {
@@ -352,8 +352,10 @@ def test_the_registry_of_metrics_is_complete() -> None:
 
 def test_an_entry_of_the_registry_of_metrics_agrees_with_its_function() -> None:
     metrics = importlib.import_module("xew.metrics")
-    others: dict[str, list[str]] = {"video": [], "mask": [], "region": ["target_mask"], "track": ["valid"]}
-    assert set(others) == set(importlib.import_module("xew.metrics.metric").INPUTS)
+    kinds = importlib.import_module("xew.metrics.metric")
+    masked = {kind: ["target_mask"] for kind in ("region", "robot")}
+    others: dict[str, list[str]] = {"video": [], "mask": [], "track": ["valid"]} | masked
+    assert set(others) == set(kinds.INPUTS)
     for name, metric in metrics.METRICS.items():
         exported = metric.function.__name__
         assert getattr(metrics, exported) is metric.function and exported in metrics.__all__, name
@@ -362,5 +364,7 @@ def test_an_entry_of_the_registry_of_metrics_agrees_with_its_function() -> None:
             assert list(inspect.signature(function).parameters)[: len(taken)] == taken, name
         assert (metric.curve is None) == (metric.inputs == "track"), name
         assert metric.range[0] < metric.range[1] and metric.dimension and metric.reference, name
+        assert metric.suites and set(metric.suites) <= set(kinds.SUITES) and metric.points in kinds.POINTS, name
+        assert metric.by_image == ("side" in inspect.signature(metric.function).parameters), name
     titles = [metric.title or name for name, metric in metrics.METRICS.items()]
     assert len(set(titles)) == len(titles)

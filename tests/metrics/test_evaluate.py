@@ -20,6 +20,7 @@ from xew.metrics.estimators.contact import predicted_contact, touching_distance
 from xew.metrics.evaluate import Args, main
 from xew.metrics.grade import Comparison
 from xew.metrics.grade import grade as grade_one
+from xew.metrics.track import failure_distance
 from xew.metrics.truth import _find_visible, read_truth
 from xew.projection import project
 from xew.protocol import BASELINES, OTHER_ROBOT
@@ -109,12 +110,13 @@ def test_all_four_dimensions_with_baselines_by_default(rollouts: Path, data: Pat
     assert {info["dimension"] for info in described.values()} == {"visual", "morphology", "kinematics", "objects"}
     for robot in ROBOTS:
         for name, info in described.items():
-            if name in ("coverage", "object_coverage", "trajectory_error"):  # all is found; the disc hardly moves in a frame
+            # all is found; the disc hardly moves in a frame
+            if name.removesuffix("_strict") in ("coverage", "object_coverage", "trajectory_error"):
                 continue
             frozen, model, perfect = (value(scores, m, robot, name) for m in ("copy_first_frame", "late", "ground_truth"))
             sign = 1 if info["higher_is_better"] else -1
             assert sign * frozen < sign * model < sign * perfect, (robot, name)
-        for name, best in (("ssim", 1), ("lpips", 0), ("region_lpips", 0)):
+        for name, best in (("ssim", 1), ("lpips", 0), ("region_lpips", 0), ("robot_lpips", 0)):
             assert value(scores, "ground_truth", robot, name) == best
         assert value(scores, "ground_truth", robot, "mask_iou") > 0.95
     exact = scores[scores["model"] == "ground_truth"]["exact_frames"]
@@ -140,6 +142,52 @@ def test_tracks_are_compared_with_what_the_episode_holds(rollouts: Path, data: P
         rows = scores[(scores["robot"] == robot) & (scores["metric"] == "trajectory_error")]
         assert rows.empty, "an object that is never found has no error"
         assert value(scores, "late", robot, "object_coverage") == 0
+        for model in ("late", "ground_truth"):
+            assert value(scores, model, robot, "object_coverage_strict") == 0
+            assert value(scores, model, robot, "trajectory_error_strict") == pytest.approx(failure_distance(), rel=1e-5)
+            assert value(scores, model, robot, "coverage_strict") == 1, "of all points on surfaces the last is the object's"
+
+
+def test_a_gray_video_is_worst_in_the_strict_suite_and_missing_in_the_papers(data: Path, tmp_path: Path) -> None:
+    """The estimators find nothing in it, which the paper's errors leave out."""
+    for robot in ROBOTS:
+        target = truth(data, robot)
+        gray = np.concatenate([target[:1], np.full_like(target[1:], 128)])
+        write_rollout(tmp_path / "rollouts", TASK, SEED, robot, gray, {"model": "gray", "condition": "none"})
+    names = tuple(name for name in METRICS if METRICS[name].inputs == "track")
+    scores = grade(tmp_path / "rollouts", data, metrics=names, baselines=True)
+    gray = scores[scores["model"] == "gray"]
+    assert not {"keypoint_error", "ndtw", "trajectory_error"} & set(gray["metric"])
+    for name in (name for name in names if METRICS[name].suites == ("strict",)):
+        worst = {"keypoint_error_strict": failure_distance(), "trajectory_error_strict": failure_distance(), "ndtw_strict": 0.5}
+        for robot in ROBOTS:
+            assert value(scores, "gray", robot, name) == pytest.approx(worst.get(name, 0), rel=1e-5)
+
+
+def test_suites_are_chosen_and_named_in_the_table(rollouts: Path, data: Path, capsys: pytest.CaptureFixture) -> None:
+    names = ("psnr", "pck", "pck_strict")
+    for suite, chosen in ((("paper",), ["psnr", "pck"]), (("strict",), ["psnr", "pck_strict"]), (Args.suite, list(names))):
+        scores = grade(rollouts, data, metrics=names, suite=suite, tracks=f"{__name__}:EXACT", overwrite=True)
+        assert list(scores.attrs["metrics"]) == chosen and set(scores["metric"]) == set(chosen)
+        assert ("shapes of 2 of 2 episodes are not known" in capsys.readouterr().out) == ("pck_strict" in chosen)
+    suites = {name: info["suites"] for name, info in scores.attrs["metrics"].items()}
+    assert suites == {"psnr": ["paper", "strict"], "pck": ["paper"], "pck_strict": ["strict"]}
+
+
+def test_only_what_moves_counts_among_objects(data: Path, tmp_path: Path) -> None:
+    """A disc that stays where it is gives strict metrics of objects nothing to grade, for any prediction."""
+    folder = episode_folder(data, TASK, SEED, "piper")
+    read = read_truth(folder, FRAMES, ("object_points",))
+    assert read.surfaces is not None and not read.surfaces.known and read.surfaces.objects.visible.shape == (FRAMES, 1)
+    states = read_states(folder)
+    still = replace(states, object_pose=np.repeat(states.object_pose[:1], FRAMES, axis=0))
+    write_episode(tmp_path, read_record(folder), still, read.rgb, read_video(folder / "robot.mkv"))
+    read = read_truth(episode_folder(tmp_path, TASK, SEED, "piper"), FRAMES, ("object_points",))
+    assert read.surfaces is not None and read.surfaces.objects.visible.shape == (FRAMES, 0)
+    grades = grade_one(Comparison(late(read.rgb), read, estimate_masks, exact), ("trajectory_error_strict", "pck_strict"))
+    assert np.isnan(grades.values["trajectory_error_strict"]) and grades.values["pck_strict"] == 1
+    with pytest.raises(ValueError, match="no points on surfaces; ask read_truth"):
+        grade_one(Comparison(read.rgb, replace(read, surfaces=None), estimate_masks, exact), ("pck_strict",))
 
 
 def test_contact_is_a_diagnostic_and_no_part_of_the_suite(rollouts: Path, data: Path) -> None:
@@ -400,6 +448,7 @@ def test_missing_episodes_trees_and_metrics_are_named(
         ({"metrics": ("psrn",)}, "did you mean 'psnr'"),
         ({"dimensions": ("kinematic",)}, "did you mean 'kinematics'"),
         ({"dimensions": ("objects",)}, "no metric of psnr, ssim, mask_iou"),
+        ({"suite": ("stric",)}, "did you mean 'strict'"),
         ({"masks": "sam3"}, "did you mean 'sam2'"),
         ({"masks": "sam2"}, "--masks-checkpoint"),
         ({"tracks_checkpoint": tmp_path / "none.pth"}, "does not exist"),

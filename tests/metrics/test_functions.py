@@ -53,7 +53,10 @@ def test_shuffled_frames_have_shuffled_scores(name: str) -> None:
     np.testing.assert_allclose(shuffled, metric.curve(*arrays)[order], **CLOSE)
 
 
-@pytest.mark.parametrize("name", ["pck", "pck_05", "keypoint_error", "coverage", "trajectory_error"])
+ORDERLESS = ["pck", "pck_05", "pck_strict", "keypoint_error", "keypoint_error_strict", "coverage", "trajectory_error"]
+
+
+@pytest.mark.parametrize("name", ORDERLESS)
 def test_the_order_of_frames_does_not_matter_to_means_over_points(name: str) -> None:
     arrays, order = inputs("track"), np.array([2, 0, 1])
     shuffled = METRICS[name].function(*(array[order] for array in arrays))

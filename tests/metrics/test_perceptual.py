@@ -9,11 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from xew.metrics import lpips, lpips_features, lpips_from_features, region_lpips, region_lpips_frames
+from xew.metrics import (
+    lpips,
+    lpips_features,
+    lpips_from_features,
+    region_lpips,
+    region_lpips_frames,
+    robot_lpips,
+    robot_lpips_frames,
+)
 from xew.metrics.networks import alexnet
 from xew.metrics.networks.alexnet import ADMITTED, _package_file, read_alexnet
 from xew.metrics.networks.pickles import read_arrays
-from xew.metrics.perceptual import SMALLEST_SIDE, union_box
+from xew.metrics.perceptual import SMALLEST_SIDE, _covered_share, _receptive_fields, _weights, union_box
 
 rng = np.random.default_rng(3)
 
@@ -131,6 +139,59 @@ def test_a_region_without_room_for_the_network_is_an_error() -> None:
         mask[area] = True
         with pytest.raises(ValueError, match="at least 31"):
             region_lpips(video, video, mask)
+
+
+def test_receptive_fields_are_those_of_the_network() -> None:
+    """Changing a pixel changes the units whose field holds it, at most. The sides are AlexNet's known ones."""
+    fields = _receptive_fields(_weights())
+    assert [side for side, _, _ in fields] == [11, 51, 99, 131, 163]
+    video = np.full((1, 96, 128, 3), 100, np.uint8)
+    changed = video.copy()
+    changed[0, 40, 70] = 255
+    layers = zip(lpips_features(video).layers, lpips_features(changed).layers, fields, strict=True)
+    mask = (video != changed).any(axis=-1)
+    for before, after, field in layers:
+        differs = np.abs(np.asarray(before - after)).max(axis=-1)[0] > 1e-6
+        reached = np.asarray(_covered_share(jnp.asarray(mask), field, before.shape[1:3]))[0] > 0
+        assert differs.any() and not (differs & ~reached).any()
+
+
+def test_covered_shares_equal_counting() -> None:
+    mask = rng.random((2, 33, 47)) < 0.3
+    for side, step, first in ((11, 4, -2), (51, 8, -18)):
+        found = np.asarray(_covered_share(jnp.asarray(mask), (side, step, first), (4, 5)))
+        for row, column in np.ndindex(4, 5):
+            low = [step * index + first for index in (row, column)]
+            part = mask[:, max(low[0], 0) : low[0] + side, max(low[1], 0) : low[1] + side]
+            np.testing.assert_allclose(found[:, row, column], part.mean(axis=(1, 2)), rtol=1e-6)
+
+
+def test_lpips_of_a_robot_all_over_the_frame_is_lpips() -> None:
+    prediction, target = noise(2), noise(2)
+    whole = np.ones((2, 40, 56), bool)
+    np.testing.assert_allclose(robot_lpips_frames(prediction, target, whole), lpips(prediction, target), atol=1e-6)
+
+
+def test_lpips_of_the_robot_sees_what_is_wrong_near_the_robot() -> None:
+    """The same fault costs more where the robot is, much more than in LPIPS of the frame; far from it hardly anything."""
+    target = noise(1, 64, 256)
+    mask = np.zeros((1, 64, 256), bool)
+    mask[:, 16:48, 8:40] = True
+    near, far = target.copy(), target.copy()
+    near[:, 16:48, 8:40] = 128
+    far[:, 16:48, 216:248] = 128
+    at_robot, elsewhere = (float(robot_lpips(video, target, mask)) for video in (near, far))
+    assert at_robot > 2 * float(np.mean(lpips(near, target))) and elsewhere < 0.05 * at_robot
+    assert float(np.mean(lpips(far, target))) == pytest.approx(float(np.mean(lpips(near, target))), rel=0.5)
+
+
+def test_frames_without_the_robot_have_no_value_whatever_is_predicted() -> None:
+    target, mask = noise(2), np.zeros((2, 40, 56), bool)
+    mask[1, 5:20, 5:20] = True
+    for prediction in (noise(2), target):
+        frames = np.asarray(robot_lpips_frames(prediction, target, mask))
+        assert np.isnan(frames[0]) and frames[1] == pytest.approx(float(robot_lpips(prediction, target, mask)))
+    assert robot_lpips(target, target, mask) == 0 and np.isnan(robot_lpips(noise(2), target, np.zeros_like(mask)))
 
 
 def test_as_a_loss_its_gradient_is_finite() -> None:

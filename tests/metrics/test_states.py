@@ -42,7 +42,7 @@ def inputs(kind: str) -> tuple[np.ndarray, ...]:
         return prediction, target, rng.random((FRAMES, 3)) < 0.8
     prediction, target = video(), video()
     prediction[:1] = target[:1]
-    return (prediction, target, masks()) if kind == "region" else (prediction, target)
+    return (prediction, target, masks()) if kind in ("region", "robot") else (prediction, target)
 
 
 def options(name: str, arrays: Sequence[np.ndarray]) -> dict:
@@ -61,7 +61,9 @@ def bits(tree: object) -> list[bytes]:
     return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree)]
 
 
-@pytest.mark.parametrize("name", ["psnr", "ssim", "lpips", "region_lpips", "boundary_f1", "pck", "trajectory_error"])
+@pytest.mark.parametrize(
+    "name", ["psnr", "ssim", "lpips", "region_lpips", "robot_lpips", "boundary_f1", "pck", "trajectory_error"]
+)
 def test_no_split_and_no_order_changes_a_bit(name: str) -> None:
     arrays = inputs(METRICS[name].inputs)
     more = options(name, arrays)

@@ -5,7 +5,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from xew.metrics import contact_f1, coverage, keypoint_error, ndtw, pck, pck_05, trajectory_error
+from xew.metrics import (
+    contact_f1,
+    coverage,
+    keypoint_error,
+    keypoint_error_strict,
+    ndtw,
+    ndtw_strict,
+    pck,
+    pck_05,
+    pck_strict,
+    trajectory_error,
+    trajectory_error_strict,
+)
+from xew.metrics.track import FAILURE, SIDE, TAPVID_SIDE, TOLERANCES, failure_distance
 
 rng = np.random.default_rng(2)
 
@@ -181,3 +194,78 @@ def test_shapes_and_types_are_checked() -> None:
         ndtw(prediction, target, valid[1:])
     with pytest.raises(TypeError, match="bool"):
         keypoint_error(prediction, target, valid.astype(np.float32))
+
+
+STRICT = (pck_strict, keypoint_error_strict, trajectory_error_strict, ndtw_strict)
+LOST = 50 / 256 * np.sqrt(320 * 240)
+"""Error of a lost point in an image of 320x240 [pixels]."""
+
+
+def losing(share: float, spread: float = 6) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    prediction, target, valid = tracks(t=12, k=5, spread=spread)
+    valid[0] = True
+    prediction[rng.random(valid.shape) < share] = np.nan
+    return prediction, target, valid
+
+
+def strict_distance(prediction: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """[t k] with plain NumPy: the distance, at most LOST, and LOST where there is none."""
+    return np.fmin(np.linalg.norm(prediction - target, axis=-1), LOST)
+
+
+@pytest.mark.parametrize("spread", [3, 60])
+def test_strict_errors_equal_their_definitions(spread: float) -> None:
+    prediction, target, valid = losing(0.3, spread)
+    distance = strict_distance(prediction, target)
+    expected = distance[valid].mean()
+    assert keypoint_error_strict(prediction, target, valid) == pytest.approx(expected, rel=1e-5)
+    assert trajectory_error_strict(prediction, target, valid) == pytest.approx(expected, rel=1e-5)
+    found = np.isfinite(prediction).all(axis=-1)
+    near = [np.mean((distance < d / 256 * np.sqrt(320 * 240)) & found, where=valid) for d in (1, 2, 4, 8, 16)]
+    assert pck_strict(prediction, target, valid) == pytest.approx(np.mean(near), abs=1e-6)
+
+
+def test_strict_position_accuracy_is_tap_vids() -> None:
+    """In an image of 256x256 tolerances are 1, 2, 4, 8 and 16 pixels, and one exactly at a tolerance is not within it."""
+    target = np.zeros((1, 6, 2), np.float32)
+    away = np.float32([0.5, 1, 3, 7.9, 15, 17])
+    prediction = np.stack([away, np.zeros(6, np.float32)], axis=-1)[None]
+    expected = np.mean([1, 4 / 5, 3 / 5, 2 / 5, 1 / 5, 0])
+    assert pck_strict(prediction, target, np.ones((1, 6), bool), TAPVID_SIDE) == pytest.approx(expected, abs=1e-6)
+    assert failure_distance() == pytest.approx(LOST) and pytest.approx(np.sqrt(320 * 240)) == SIDE
+    assert (TOLERANCES, FAILURE) == ((1, 2, 4, 8, 16), 50)
+
+
+@pytest.mark.parametrize("share", [0, 0.3])
+def test_strict_warping_equals_the_whole_table(share: float) -> None:
+    prediction, target, valid = losing(share, spread=30)
+    values = []
+    for i in range(target.shape[1]):
+        places, seen = prediction[valid[:, i], i], target[valid[:, i], i]
+        cost = np.fmin(np.linalg.norm(places[:, None] - seen[None], axis=-1), LOST)
+        table = np.full((len(seen) + 1,) * 2, np.inf)
+        table[0, 0] = 0
+        for a, b in np.ndindex(cost.shape):
+            table[a + 1, b + 1] = cost[a, b] + min(table[a, b], table[a, b + 1], table[a + 1, b])
+        values.append(table[-1, -1] / (2 * len(seen) * LOST))
+    assert ndtw_strict(prediction, target, valid) == pytest.approx(np.mean(values), rel=1e-5)
+
+
+def test_no_prediction_has_no_strict_score_and_losing_all_is_worst() -> None:
+    _, target, valid = losing(0)
+    lost = np.full_like(target, np.nan)
+    scores = [float(metric(lost, target, valid)) for metric in STRICT]
+    assert scores == [0, pytest.approx(LOST), pytest.approx(LOST), pytest.approx(0.5)]
+    far = target + np.float32([4e4, 0])
+    assert [float(metric(far, target, valid)) for metric in STRICT] == scores
+    assert all(np.isnan(metric(target, target, np.zeros_like(valid))) for metric in STRICT), "a truth with nothing to grade"
+
+
+def test_losing_a_point_never_pays() -> None:
+    """Whatever the error of a point that was found, a prediction that loses it is no better."""
+    prediction, target, valid = losing(0, spread=40)
+    for t, i in np.argwhere(valid)[::7]:
+        worse = prediction.copy()
+        worse[t, i] = np.nan
+        for metric, sign in zip(STRICT, (1, -1, -1, -1), strict=True):
+            assert sign * metric(worse, target, valid) <= sign * metric(prediction, target, valid) + 1e-6

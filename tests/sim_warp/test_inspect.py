@@ -1,5 +1,6 @@
 """The command that looks into data: yields, hashes, rendering again, pictures."""
 
+import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -28,6 +29,7 @@ from xew.sim_warp.inspect import (
 )
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import produce
+from xew.sim_warp.production.surfaces import count_visible, read_surfaces
 from xew.sim_warp.rendering.render import Renderer
 
 ROBOTS = ("franka_panda", SLOW)
@@ -194,3 +196,28 @@ def test_nothing_there_is_told_with_the_way_to_make_it(made: Path, data: Path, t
     assert code == 2 and "Choose another folder with --pictures." in told
     code, _, told = inspect(made, "--grid", tmp_path / "file" / "grid.png")
     assert code == 2 and "Choose another folder with --grid." in told
+
+
+def test_visibility_is_counted_by_task_and_robot(data: Path, inspect: Inspect) -> None:
+    """The block of the small task never moves; so only the robot's points are asked for."""
+    code, out, _ = inspect(data, "--visibility")
+    rows = [line for line in out.splitlines() if line.startswith(f"| `{TASK}`")]
+    assert code == 0 and len(rows) == len(ROBOTS) and all("| nothing moves | 100% |" in row for row in rows)
+
+
+def test_a_scene_that_its_task_makes_no_more_has_no_known_shapes(data: Path) -> None:
+    folder = next(folder for folder, record in read_headers(data)[0] if record.success)
+    tracks = read_surfaces(folder)
+    assert tracks is not None and "block" in tracks.names
+    few = replace(tracks, visible=tracks.visible & (np.arange(len(tracks.body)) < 3))
+    assert count_visible(few).robot.max() <= 3 < count_visible(tracks).robot.min() and not count_visible(tracks).things
+    moved = replace(tracks, displacement=tracks.displacement + 1, step=tracks.step + 1)
+    assert set(count_visible(moved).things) == {"block"} and (count_visible(moved).things["block"] >= 4).all()
+    for change in ({"scene_hash": "another"}, {"source": "elsewhere"}, {"task": "no_such_task"}):
+        edit_header(folder, **change)
+        assert read_surfaces(folder) is None
+
+
+def edit_header(folder: Path, **changes: str) -> None:
+    path = folder / "episode.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))

@@ -2,13 +2,16 @@
 
 Reads  a data set; for the second table its episodes are rendered anew, with robot and objects moved wrongly
 Writes <out>/calibration.md (both tables), references.parquet and wrong.parquet (a row for each episode, case and metric),
-       frames.parquet (the second by frame)
+       frames.parquet (the second by frame); or, with --predictors, predictors.md and predictors.parquet
 
 References: every metric on the true video itself, on what a codec leaves of it, and on videos that are wrong altogether.
 Wrong motions: where the true mask and the true points of the video are known, so that what a metric makes of the estimators'
 masks and points stands beside what it makes of the true ones.
+Predictors: videos made on purpose, from the true one to a gray one, and whether every metric puts them in order
+(docs/metrics.md).
 
     python -m xew.metrics.calibrate --data data --codec runs/fixed --out calibration
+    python -m xew.metrics.calibrate --data data --predictors --out calibration
 """
 
 import importlib
@@ -29,6 +32,7 @@ from xew.dataset import find_accepted
 from xew.episode import EpisodeError, Record, read_video
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
+from xew.metrics.calibration.matrix import grade_predictors, matrix, to_markdown
 from xew.metrics.calibration.perturbations import Perturbation, render_perturbations
 from xew.metrics.grade import Comparison, Grades, grade, input_kind
 from xew.metrics.truth import NEEDS, Truth, read_truth
@@ -72,6 +76,10 @@ class Args:
     """Estimator of keypoints and objects: a name of xew.metrics.backends.TRACKERS, or module:NAME."""
     tracks_checkpoint: Path | None = None
     """Its weights, where it has some."""
+    predictors: bool = False
+    """Grade predictors made on purpose, in place of both tables."""
+    metrics: tuple[str, ...] = tuple(METRICS)
+    """Names of the metrics of the predictors' table."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +100,9 @@ def main(args: Args) -> None:
     estimators = Estimators(open_masker(args.masks, args.masks_checkpoint), open_tracker(args.tracks, args.tracks_checkpoint))
     through_codec = None if args.codec is None else open_codec(args.codec, args.codec_opener)
     episodes = find_accepted(args.data)
+    if args.predictors:
+        print(grade_matrix(episodes, args, estimators))
+        return
     tables = {name: pd.DataFrame() for name in ("references", "wrong", "frames")}
     text = ""
     for episode in tqdm(choose(episodes, args), desc="calibrate", unit="episode", disable=None):
@@ -100,6 +111,19 @@ def main(args: Args) -> None:
         text = report(**tables)
         write(args.out, text, tables)  # each time, so that a run that is stopped has told something
     print(text)
+
+
+def grade_matrix(episodes: Sequence[Episode], args: Args, estimators: Estimators) -> str:
+    """Grade the predictors on the chosen episodes, write rows and table, and return the table in Markdown."""
+    rows: list[Row] = []
+    text = ""
+    for folder, record in tqdm(choose(episodes, args), desc="predictors", unit="episode", disable=None):
+        other = find_another(episodes, record, "robot")
+        rows += grade_predictors(folder, record, other, estimators.masker, estimators.tracker, args.metrics)
+        table = pd.DataFrame(rows)
+        text = to_markdown(matrix(table)) + "\n"
+        write(args.out, text, {"predictors": table}, "predictors.md")
+    return text
 
 
 def calibrate(
@@ -293,13 +317,13 @@ def _markdown(table: pd.DataFrame) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
-def write(out: Path, text: str, tables: dict[str, pd.DataFrame]) -> None:
-    """Raises EpisodeError if the folder cannot be written."""
+def write(out: Path, text: str, tables: dict[str, pd.DataFrame], name: str = "calibration.md") -> None:
+    """Write a text of this name and tables. Raises EpisodeError if the folder cannot be written."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        (out / "calibration.md").write_text(text)
-        for name, table in tables.items():
-            table.to_parquet(out / f"{name}.parquet", index=False)
+        (out / name).write_text(text)
+        for key, table in tables.items():
+            table.to_parquet(out / f"{key}.parquet", index=False)
     except OSError as error:
         raise EpisodeError(f"cannot write the tables to {out}: {error}; choose another --out.") from error
 

@@ -46,12 +46,13 @@ from xew.metrics.grading.scores import (
 )
 from xew.metrics.grading.summary import summarize, to_markdown
 from xew.metrics.grading.workers import Bench, make_opener, open_nothing, worker_count
+from xew.metrics.metric import SUITES
 from xew.metrics.truth import Truth, read_truth
 from xew.protocol import HELD_OUT_ROBOTS
 from xew.rollout import RolloutError
 from xew.threads import map_in_order
 
-PROTOCOL = 3
+PROTOCOL = 4
 """Version of the grading: it goes up when any score would change, and scores of another version are graded anew."""
 DIMENSIONS = tuple(dict.fromkeys(metric.dimension for metric in METRICS.values()))
 
@@ -70,6 +71,8 @@ class Args:
     """Names of xew.metrics.METRICS."""
     dimensions: tuple[str, ...] = DIMENSIONS
     """Dimensions whose metrics are graded."""
+    suite: tuple[str, ...] = tuple(SUITES)
+    """Suites whose metrics are graded: paper, strict, or both."""
     masks: str = "default"
     """Estimator of robot masks in a prediction: a name of xew.metrics.backends.MASKERS, or module:NAME."""
     masks_checkpoint: Path | None = None
@@ -156,13 +159,25 @@ def _write_summary(args: Args, rows: pd.DataFrame) -> str:
 
 def choose_metrics(args: Args) -> tuple[str, ...]:
     """Names of the metrics to grade, in the registry's order. Raises ConfigError for an unknown name, or if none is left."""
-    for kind, names, known in (("metric", args.metrics, tuple(METRICS)), ("dimension", args.dimensions, DIMENSIONS)):
+    wanted = {
+        "metric": (args.metrics, tuple(METRICS)),
+        "dimension": (args.dimensions, DIMENSIONS),
+        "suite": (args.suite, tuple(SUITES)),
+    }
+    for kind, (names, known) in wanted.items():
         for name in names:
             if name not in known:
                 raise ConfigError(f"unknown {kind} {name!r};{suggestion(name, known)} known: {', '.join(known)}.")
-    chosen = tuple(name for name in METRICS if name in args.metrics and METRICS[name].dimension in args.dimensions)
+    chosen = tuple(
+        name
+        for name, metric in METRICS.items()
+        if name in args.metrics and metric.dimension in args.dimensions and set(metric.suites) & set(args.suite)
+    )
     if not chosen:
-        raise ConfigError(f"no metric of {', '.join(args.metrics)} is of the dimensions {', '.join(args.dimensions)}.")
+        raise ConfigError(
+            f"no metric of {', '.join(args.metrics)} is of the dimensions {', '.join(args.dimensions)} and the suites "
+            f"{', '.join(args.suite)}."
+        )
     return chosen
 
 
@@ -201,7 +216,7 @@ def open_bench(args: Args, metrics: Sequence[str]) -> Bench:
     tracker: Callable[[jax.Device], Tracker] = open_nothing
     if "mask" in kinds:
         masker = make_opener(args.masks, MASKERS, open_masker, args.masks_checkpoint)
-    if kinds & {"keypoints", "objects", "contact"}:
+    if kinds & {"keypoints", "objects", "robot_points", "object_points", "contact"}:
         tracker = make_opener(args.tracks, TRACKERS, open_tracker, args.tracks_checkpoint)
     return Bench(masker, tracker, itertools.cycle(jax.local_devices()))
 
@@ -219,22 +234,36 @@ def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: Cell
     if len(todo) < len(jobs):
         print(f"{len(jobs) - len(todo)} of {len(jobs)} are graded already in {store.folder}")
     bench = open_bench(args, metrics)
+    without_shapes: set[Path] = set()
     groups = [list(group) for _, group in itertools.groupby(todo, key=lambda pair: (pair[0].episode, pair[0].cell.frames))]
     errors: list[str] = []
     stop = threading.Event()
     with tqdm(total=len(jobs), initial=len(jobs) - len(todo), desc="evaluate", unit="video", disable=None) as bar:
-        work = functools.partial(_grade_group, args=args, bench=bench, store=store, stop=stop)
+        work = functools.partial(_grade_group, args=args, bench=bench, store=store, stop=stop, without_shapes=without_shapes)
         results = map_in_order(work, groups, worker_count(args.workers), stop)
         for group, problems in zip(groups, results, strict=True):
             errors += problems
             bar.update(len(group))
+    if without_shapes:
+        print(
+            f"the shapes of {len(without_shapes)} of {len(groups)} episodes are not known (imported, or of another version of "
+            f"their task, such as {min(without_shapes)}): their strict metrics of points are of links' and objects' origins"
+        )
     return errors
 
 
 def _grade_group(
-    group: list[tuple[Job, tuple[str, ...]]], args: Args, bench: Bench, store: CellStore, stop: threading.Event
+    group: list[tuple[Job, tuple[str, ...]]],
+    args: Args,
+    bench: Bench,
+    store: CellStore,
+    stop: threading.Event,
+    without_shapes: set[Path],
 ) -> list[str]:
-    """Grade jobs of one episode, which is read once; return what went wrong, or raise it as `grade_all` does."""
+    """Grade jobs of one episode, which is read once; return what went wrong, or raise it as `grade_all` does.
+
+    An episode whose shapes were needed and are not known is added to `without_shapes`.
+    """
     errors: list[str] = []
     truth: Truth | None = None
     for job, metrics in group:
@@ -243,6 +272,8 @@ def _grade_group(
         try:
             needed = {input_kind(name) for _, names in group for name in names}
             truth = truth or read_truth(job.episode, job.cell.frames, needed)
+            if truth.surfaces is not None and not truth.surfaces.known:
+                without_shapes.add(job.episode)
             store.write(job.cell, _grade_job(job, truth, metrics, args, bench))
         except (EpisodeError, ValueError) as error:
             message = str(error) if str(job.place) in str(error) else f"{job.place}: {error}"

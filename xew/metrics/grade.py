@@ -4,8 +4,10 @@ Frames and points go through the compiler in blocks of one size, so that a few p
 """
 
 import functools
+import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import cached_property
 
 import jax
 import numpy as np
@@ -13,9 +15,10 @@ import numpy as np
 from xew.metrics import METRICS, contact_f1
 from xew.metrics.backends import Masker, Tracker
 from xew.metrics.estimators.contact import predicted_contact
+from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.metric import ACCELERATOR_CHUNK, Metric
 from xew.metrics.perceptual import SMALLEST_SIDE, union_box
-from xew.metrics.truth import Truth, is_inside
+from xew.metrics.truth import Points, Surfaces, Truth, is_inside
 
 FRAME_BLOCK = 16
 """Number of frames graded at once on a CPU; on a GPU it is `ACCELERATOR_CHUNK`."""
@@ -45,6 +48,8 @@ def input_kind(name: str) -> str:
     metric = METRICS[name]
     if metric.inputs != "track":
         return metric.inputs
+    if metric.points == "surfaces":
+        return "object_points" if metric.dimension == "objects" else "robot_points"
     return "objects" if metric.dimension == "objects" else "keypoints"
 
 
@@ -67,6 +72,37 @@ class Comparison:
         """Video [t h w 3] uint8 that the estimators see."""
         return self.prediction if self.shown is None else self.shown
 
+    @property
+    def side(self) -> float:
+        """Square root of the image's area [pixels]."""
+        return math.sqrt(self.prediction.shape[1] * self.prediction.shape[2])
+
+    @cached_property
+    def surfaces(self) -> Surfaces:
+        """Points on the truth's surfaces. Raises ValueError where the truth was read without them."""
+        if self.truth.surfaces is None:
+            raise ValueError("the truth has no points on surfaces; ask read_truth for 'robot_points' and 'object_points'.")
+        return self.truth.surfaces
+
+    @cached_property
+    def found_on_surfaces(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where the tracker finds the points on the robot [t k 2] and on objects [t p 2], all in one pass; NaN where lost.
+
+        A place that does not have the color of the point's body is none, so that an object is not found by what is round it.
+        """
+        both = (self.surfaces.robot, self.surfaces.objects)
+        points, visible = (np.concatenate([getattr(some, name) for some in both], axis=1) for name in ("pixels", "visible"))
+        seen = visible.any(axis=0)
+        found = np.full_like(points, np.nan)
+        if seen.any():
+            known = np.nan_to_num(points[:, seen]), visible[:, seen]
+            found[:, seen] = self.tracker(self.seen, self.truth.rgb, *known)
+            if self.surfaces.shown is not None:
+                body = np.concatenate([some.body for some in both if some.body is not None])[seen]
+                found[:, seen] = confirm_tracks(found[:, seen], self.seen, self.truth.rgb, *known, self.surfaces.shown, body)
+        count = both[0].pixels.shape[1]
+        return found[:, :count], found[:, count:]
+
 
 def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
     """Scores of one predicted video by the metrics and diagnostics of these names."""
@@ -80,13 +116,13 @@ def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
         elif name in DIAGNOSTICS:
             values[name] = float(DIAGNOSTICS[name](*arrays))
         elif METRICS[name].inputs == "track":
-            values[name], curve = _grade_tracks(name, arrays)
+            values[name], curve = _grade_tracks(name, arrays, comparison.side)
             curves |= {} if curve is None else {name: curve}
         else:
             whole = OF_WHOLE_FRAMES.get(name)
             known = curves.get(whole) if whole and _touches_all_borders(arrays[-1][0]) else None
             curves[name] = _curve(name, arrays) if known is None else known
-            values[name] = float(np.mean(curves[name], dtype=np.float64))
+            values[name] = _mean_of_known(curves[name])
     prediction, target = _video(comparison)
     return Grades(values, curves, int(np.all(prediction == target, axis=(1, 2, 3)).sum()))
 
@@ -111,12 +147,38 @@ def _region(c: Comparison) -> Arrays | None:
     return *_video(c), np.broadcast_to(covered, c.truth.mask[c.first :].shape)
 
 
+def _robot(c: Comparison) -> Arrays | None:
+    """The two videos and the robot's true masks, frame by frame; None where no frame shows the robot."""
+    mask = c.truth.mask[c.first :]
+    if not mask.any() or min(mask.shape[1:]) < SMALLEST_SIDE:
+        return None
+    return *_video(c), mask
+
+
 def _keypoints(c: Comparison) -> Arrays | None:
     return _tracks(c, c.truth.keypoints, c.truth.keypoint_visible)
 
 
 def _objects(c: Comparison) -> Arrays | None:
     return _tracks(c, c.truth.objects, c.truth.object_visible)
+
+
+def _robot_points(c: Comparison) -> Arrays | None:
+    return _found_points(c, c.surfaces.robot, 0)
+
+
+def _object_points(c: Comparison) -> Arrays | None:
+    return _found_points(c, c.surfaces.objects, 1)
+
+
+def _found_points(c: Comparison, points: Points, which: int) -> Arrays | None:
+    """Tracked points, true points and visibility of those that are ever seen; None where none is, whatever the prediction."""
+    if not points.visible[c.first :].any():
+        return None
+    seen = points.visible[c.first :].any(axis=0)
+    found = c.found_on_surfaces[which][c.first :, seen]
+    pixels, visible = (array[c.first :, seen] for array in (np.nan_to_num(points.pixels), points.visible))
+    return found.astype(np.float32), pixels, visible
 
 
 def _contact(c: Comparison) -> Arrays | None:
@@ -140,8 +202,11 @@ INPUTS: dict[str, Callable[[Comparison], Arrays | None]] = {
     "video": _video,
     "mask": _mask,
     "region": _region,
+    "robot": _robot,
     "keypoints": _keypoints,
     "objects": _objects,
+    "robot_points": _robot_points,
+    "object_points": _object_points,
     "contact": _contact,
 }
 """Arrays that the functions of metrics take, by `input_kind`; None where the truth has nothing to compare."""
@@ -162,17 +227,23 @@ def _touches_all_borders(mask: np.ndarray) -> bool:
     return bool(mask[[0, -1]].any(axis=1).all() and mask[:, [0, -1]].any(axis=0).all())
 
 
-def _grade_tracks(name: str, arrays: Arrays) -> tuple[float, np.ndarray | None]:
+def _grade_tracks(name: str, arrays: Arrays, side: float) -> tuple[float, np.ndarray | None]:
     """A score and its curve. What is filled up is not valid, which no metric of tracks looks at."""
+    metric = METRICS[name]
     padded = [_fill(_fill(array, 0, FRAME_BLOCK, 0), 1, POINT_BLOCK, 0) for array in arrays]
-    value = float(METRICS[name].function(*padded))
-    return value, None if METRICS[name].whole else np.asarray(_frame_by_frame(METRICS[name])(*padded))[: len(arrays[0])]
+    options = {"side": np.float32(side)} if metric.by_image else {}
+    value = float(metric.function(*padded, **options))
+    return value, None if metric.whole else np.asarray(_frame_by_frame(metric)(padded, options))[: len(arrays[0])]
 
 
 @functools.cache
 def _frame_by_frame(metric: Metric) -> Callable[..., jax.Array]:
-    """A metric of tracks of each frame alone, [t], NaN where it has nothing to compare."""
-    return jax.jit(jax.vmap(lambda *frame: metric.function(*(array[None] for array in frame))))
+    """A metric of tracks of each frame alone, [t], NaN where it has nothing to compare; of arrays and of its options."""
+
+    def of_frames(arrays: list[jax.Array], options: dict[str, jax.Array]) -> jax.Array:
+        return jax.vmap(lambda *frame: metric.function(*(array[None] for array in frame), **options))(*arrays)
+
+    return jax.jit(of_frames)
 
 
 def _curve(name: str, arrays: Arrays) -> np.ndarray:
@@ -185,6 +256,12 @@ def _curve(name: str, arrays: Arrays) -> np.ndarray:
     size = len(padded[0]) if METRICS[name].whole else block
     blocks = [curve(*(array[i : i + size] for array in padded)) for i in range(0, len(padded[0]), size)]
     return np.concatenate(jax.device_get(blocks))[:count].astype(np.float32)
+
+
+def _mean_of_known(curve: np.ndarray) -> float:
+    """Mean of the values of a curve [t] that are not NaN; NaN where there is none."""
+    known = curve[~np.isnan(curve)]
+    return float(np.mean(known, dtype=np.float64)) if len(known) else math.nan
 
 
 def _fill(array: np.ndarray, axis: int, block: int, value: str | int) -> np.ndarray:

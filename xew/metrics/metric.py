@@ -31,11 +31,18 @@ Scalar: TypeAlias = Float32[jax.Array, ""]
 P = ParamSpec("P")
 R = TypeVar("R")
 
-INPUTS = ("video", "mask", "region", "track")
-"""Kinds of what a metric compares. video: two [t h w 3]. mask: two [t h w]. region: two videos and the target's mask.
-track: two [t k 2], valid [t k]."""
+INPUTS = ("video", "mask", "region", "robot", "track")
+"""Kinds of what a metric compares. video: two [t h w 3]. mask: two [t h w]. region: two videos and the union over time of the
+target's masks. robot: two videos and the target's masks frame by frame. track: two [t k 2], valid [t k]."""
 ESTIMATED_INPUTS = ("mask", "track")
 """Inputs that have to be estimated in a prediction."""
+SUITES = {
+    "paper": "the paper's definitions, so that its tables can be set beside ours",
+    "strict": "what is lost is an error, points lie on surfaces, and one tolerance holds for all robots",
+}
+"""Suites of metrics by name, each with what it promises."""
+POINTS = ("origins", "surfaces")
+"""Kinds of points that tracks follow: origins of links and objects, or points on surfaces of links and of what moves."""
 
 ACCELERATOR_CHUNK = 64
 """Number of frames computed at once on a GPU or TPU; one is fastest on a CPU, where a frame's intermediates then stay in its
@@ -72,6 +79,12 @@ class Metric:
     metric of tracks, whether a frame has no value of its own (nDTW)."""
     parts: Callable[..., tuple[jax.Array, jax.Array]] | None = None
     """Function of the same inputs to the values that the metric is the mean of, and which of them count."""
+    suites: tuple[str, ...] = tuple(SUITES)
+    """Suites that it belongs to, keys of `SUITES`."""
+    points: str = "origins"
+    """Points that a metric of tracks compares, one of `POINTS`."""
+    by_image: bool = False
+    """Whether its functions take the option `side`, the square root of the image's area [pixels]."""
     state: Mergeable | None = None
     """Mergeable states; left out, they are the mean of `parts`, or else of the values by frame."""
 

@@ -108,6 +108,34 @@ def region_lpips_frames(
     return _box_distance(_weights(), prediction, target, box, chunk)
 
 
+@check_first(check_region)
+def robot_lpips(prediction: Video, target: Video, target_mask: Masks, *, chunk: int | None = None) -> Scalar:
+    """LPIPS of what shows the robot, mean over the frames in which the target shows it; lower is better.
+
+    LPIPS is a mean over each layer's map of distances. Here the mean is weighted, frame by frame, by the share of a unit's
+    receptive field that the robot covers in the target: a unit counts if the robot, grown by the receptive field, reaches it,
+    and the more the more robot it sees. A mask of whole frames gives LPIPS.
+
+    Args:
+        prediction, target: [t h w 3] RGB, uint8, or floating in [0, 1]; sides of at least 31 pixels.
+        target_mask: [t h w] bool, the robot in the target.
+        chunk: as in `lpips`.
+
+    Returns:
+        Scalar float32; NaN where no frame shows the robot.
+
+    Raises:
+        ValueError: shapes differ or a side is under 31 pixels.
+    """
+    return jnp.nanmean(robot_lpips_frames(prediction, target, target_mask, chunk=chunk))
+
+
+@check_first(check_region)
+def robot_lpips_frames(prediction: Video, target: Video, target_mask: Masks, *, chunk: int | None = None) -> ByFrame:
+    """`robot_lpips` before the mean, [t] float32, NaN where no pixel is the robot; of videos [t h w 3], masks [t h w] bool."""
+    return _weighted_distance(_weights(), prediction, target, jnp.asarray(target_mask), chunk)
+
+
 def check_target(target: Any, target_mask: Any = None) -> None:
     """Raise ValueError or TypeError unless a video is [t h w 3] and large enough, and its mask None or bool [t h w]."""
     check_videos(target, target, SMALLEST_SIDE)
@@ -215,6 +243,59 @@ def _box_distance(weights: Weights, prediction: jax.Array, target: jax.Array, bo
 
 
 @functools.partial(jax.jit, static_argnames="chunk")
+def _weighted_distance(
+    weights: Weights, prediction: jax.Array, target: jax.Array, mask: jax.Array, chunk: int | None
+) -> jax.Array:
+    """LPIPS [t] of whole frames, weighted by the share of the mask in each receptive field; NaN where there is no mask."""
+    box = _whole_box(target)
+
+    def distances(frames: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        features = _features(weights, _input(jnp.concatenate(frames[:2]), box), *box[2:])
+        count, total = len(frames[0]), jnp.zeros(len(frames[0]), jnp.float32)
+        for i, ((x, _, _), field_of_unit) in enumerate(zip(features, _receptive_fields(weights), strict=True)):
+            unit = _unit(x)
+            share = _covered_share(frames[2], field_of_unit, unit.shape[1:3])
+            weighted = jnp.sum(share * _layer_map(weights[f"head{i}"], unit[:count], unit[count:]), axis=(1, 2))
+            weight = jnp.sum(share, axis=(1, 2))
+            total = total + jnp.where(weight > 0, weighted / jnp.where(weight > 0, weight, 1), 0)
+        return total
+
+    def of_frames(frames: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        equal = jnp.all(frames[0] == frames[1], axis=(1, 2, 3))
+        none = jnp.zeros(len(equal), jnp.float32)
+        found = lax.cond(jnp.all(equal), lambda _: none, distances, frames)
+        return jnp.where(jnp.any(frames[2], axis=(1, 2)), jnp.where(equal, 0, found), jnp.nan)
+
+    return map_chunks(of_frames, (prediction, target, mask), chunk)
+
+
+def _receptive_fields(weights: Weights) -> list[tuple[int, int, int]]:
+    """Side, step and first pixel of the receptive fields of each layer's units, along either axis of the image [pixels]."""
+    fields, side, step, first = [], 1, 1, 0
+    for i, (stride, padding, pool_first) in enumerate(CONVOLUTIONS):
+        if pool_first:
+            side, step = side + 2 * step, 2 * step
+        first -= padding * step
+        side, step = side + (weights[f"conv{i}_kernel"].shape[0] - 1) * step, stride * step
+        fields.append((side, step, first))
+    return fields
+
+
+def _covered_share(mask: jax.Array, receptive_field: tuple[int, int, int], shape: tuple[int, ...]) -> jax.Array:
+    """Share of the mask [n h w] in the receptive field of each unit of a layer [n *shape], of what lies in the image."""
+    side, step, first = receptive_field
+    covered, area = mask.astype(jnp.float32), np.ones((1, 1, 1), np.float32)
+    for axis, units in zip((1, 2), shape, strict=True):
+        low = step * np.arange(units) + first
+        start, end = (np.clip(edge, 0, mask.shape[axis]) for edge in (low, low + side))
+        # Sums over windows as differences of a running sum: of whole numbers, exact in float32.
+        running = jnp.pad(jnp.cumsum(covered, axis=axis), [(1, 0) if i == axis else (0, 0) for i in range(3)])
+        covered = jnp.take(running, end, axis=axis) - jnp.take(running, start, axis=axis)
+        area = area * np.expand_dims((end - start).astype(np.float32), (0, 3 - axis))
+    return covered / area
+
+
+@functools.partial(jax.jit, static_argnames="chunk")
 def _box_features(weights: Weights, video: jax.Array, box: Box, chunk: int | None) -> tuple[jax.Array, ...]:
     """Unit vectors of the five layers [t h w d] of a video's box."""
 
@@ -277,9 +358,13 @@ def _sum_of_layers(weights: Weights, layers: list[tuple[jax.Array, jax.Array, ja
 
 
 def _layer_distance(head: jax.Array, x: jax.Array, y: jax.Array, height: jax.Array, width: jax.Array) -> jax.Array:
-    """Squared difference of unit vectors [n h w d], weighted by the head [d], mean over the valid part: [n]."""
-    weighted = jnp.einsum("nhwd,d->nhw", jnp.square(x - y), head, precision=lax.Precision.HIGHEST)
-    return jnp.sum(jnp.sum(weighted, axis=2), axis=1) / (height * width).astype(jnp.float32)
+    """`_layer_map` of unit vectors [n h w d], mean over the valid part: [n]."""
+    return jnp.sum(jnp.sum(_layer_map(head, x, y), axis=2), axis=1) / (height * width).astype(jnp.float32)
+
+
+def _layer_map(head: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+    """Squared difference of unit vectors [n h w d], weighted by the head [d]: [n h w]."""
+    return jnp.einsum("nhwd,d->nhw", jnp.square(x - y), head, precision=lax.Precision.HIGHEST)
 
 
 def _unit(x: jax.Array) -> jax.Array:

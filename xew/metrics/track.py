@@ -1,10 +1,13 @@
 """Robot kinematics and object dynamics by tracked points in the image plane.
 
 Tracks are float [t k 2] pixels (x right, y down), validity bool [t k]: the point is visible in the target. A prediction
-that lost a point holds NaN there: a miss for PCK, left out of the errors, so look at coverage beside them.
+that lost a point holds NaN there. In the paper's definitions it is a miss for PCK and left out of the errors, so look at
+coverage beside them. In the strict ones, whose names end so, it is an error like the largest that any point can have, and one
+tolerance holds for all robots.
 """
 
 import functools
+import math
 from typing import TypeAlias
 
 import jax
@@ -16,6 +19,16 @@ from xew.metrics.mergeable.sums import Mean, Mergeable, empty_mean, mean_of, mer
 from xew.metrics.metric import AnyArray, ByFrame, Contacts, Scalar, Tracks, Valid, check_contacts, check_first, check_tracks
 
 PointValues: TypeAlias = Float32[jax.Array, "t k"]
+
+TAPVID_SIDE = 256.0
+"""Side [pixels] of the square images that TAP-Vid's tolerances are stated for."""
+TOLERANCES = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""Tolerances [pixels of TAPVID_SIDE] that `pck_strict` is the mean of, TAP-Vid's (C. Doersch et al., NeurIPS 2022)."""
+FAILURE = 50.0
+"""Distance [pixels of TAPVID_SIDE] from which on a point counts as lost: the failure of PointOdyssey's survival rate
+(Y. Zheng et al., ICCV 2023), which CoTracker's evaluation uses too."""
+SIDE = math.sqrt(320 * 240)
+"""Side [pixels] of the square with the area of an episode's image."""
 
 
 @jax.jit
@@ -144,6 +157,76 @@ def ndtw(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
 
 @jax.jit
 @check_first(check_tracks)
+def pck_strict(prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE) -> Scalar:
+    """Share in [0, 1] of the valid points nearer than a tolerance of the image, mean over `TOLERANCES`; higher is better.
+
+    TAP-Vid's average position accuracy: points that are visible in the target count whether or not the prediction has them.
+
+    Args:
+        prediction, target: [t k 2] pixels. valid: [t k] bool.
+        side: square root of the image's area [pixels].
+
+    Returns:
+        Scalar float32; NaN where no point is valid.
+    """
+    return _masked_mean(*strict_hits(prediction, target, valid, side))
+
+
+@jax.jit
+@check_first(check_tracks)
+def keypoint_error_strict(prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE) -> Scalar:
+    """Mean distance [pixels] over the valid points; a lost point has the distance of failure, and none has more.
+
+    Args:
+        prediction, target: [t k 2] pixels. valid: [t k] bool.
+        side: square root of the image's area [pixels].
+
+    Returns:
+        Scalar float32 from 0 to `failure_distance(side)`; NaN where no point is valid.
+    """
+    return _masked_mean(*strict_distances(prediction, target, valid, side))
+
+
+@jax.jit
+@check_first(check_tracks)
+def trajectory_error_strict(prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE) -> Scalar:
+    """`keypoint_error_strict` of points on objects: mean over frames and points, none is left out; lower is better.
+
+    Args:
+        prediction, target: [t k 2] pixels. valid: [t k] bool.
+        side: square root of the image's area [pixels].
+
+    Returns:
+        Scalar float32 from 0 to `failure_distance(side)`; NaN where no point is valid.
+    """
+    return keypoint_error_strict(prediction, target, valid, side)
+
+
+@jax.jit
+@check_first(check_tracks)
+def ndtw_strict(prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE) -> Scalar:
+    """Dynamic time warping of each point's path over its valid frames, mean over points; lower is better, 0 is best.
+
+    Classic DTW, whose cost is that of `keypoint_error_strict`, so that a frame in which the point is lost costs most wherever
+    it is warped to; divided by the sum of both lengths and by the distance of failure. A point that is always lost has 0.5.
+
+    Args:
+        prediction, target: [t k 2] pixels. valid: [t k] bool.
+        side: square root of the image's area [pixels].
+
+    Returns:
+        Scalar float32 in [0, 0.5]; NaN where no point is valid.
+    """
+    return _masked_mean(*strict_warpings(prediction, target, valid, side))
+
+
+def failure_distance(side: float | jax.Array = SIDE) -> float | jax.Array:
+    """The error [...] [pixels] of a lost point in an image with the area of a square of this side [...] [pixels]."""
+    return FAILURE / TAPVID_SIDE * side
+
+
+@jax.jit
+@check_first(check_tracks)
 def hits(prediction: Tracks, target: Tracks, valid: Valid, alpha: float | jax.Array = 0.1) -> tuple[PointValues, Valid]:
     """What `pck` of tracks [t k 2] is the mean of: [t k] float32, 1 where one is near enough, and [t k] bool, which count."""
     diagonal = box_diagonal(target, valid)
@@ -178,6 +261,37 @@ def warpings(prediction: Tracks, target: Tracks, valid: Valid) -> tuple[Float32[
     return cost / jnp.where(counts, 2 * length.astype(jnp.float32) * scale, 1), counts
 
 
+@jax.jit
+@check_first(check_tracks)
+def strict_hits(prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE) -> tuple[PointValues, Valid]:
+    """What `pck_strict` of tracks [t k 2] is the mean of: [t k] float32, share of the tolerances kept, and [t k] bool."""
+    tolerances = jnp.asarray(TOLERANCES, jnp.float32) / TAPVID_SIDE * side
+    near = _distance(prediction, target)[..., None] < tolerances.reshape(1, 1, -1)
+    return jnp.mean(near.astype(jnp.float32), axis=-1), jnp.asarray(valid)
+
+
+@jax.jit
+@check_first(check_tracks)
+def strict_distances(
+    prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE
+) -> tuple[PointValues, Valid]:
+    """What strict errors of tracks [t k 2] are means of: [t k] float32 pixels, never above failure, and [t k] bool."""
+    failure = jnp.asarray(failure_distance(side), jnp.float32)
+    return jnp.minimum(_distance(prediction, target), failure), jnp.asarray(valid)
+
+
+@jax.jit
+@check_first(check_tracks)
+def strict_warpings(
+    prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE
+) -> tuple[Float32[jax.Array, " k"], Bool[jax.Array, " k"]]:
+    """What `ndtw_strict` of tracks [t k 2] is the mean of: [k] float32, and [k] bool, which count."""
+    failure = jnp.asarray(failure_distance(side), jnp.float32)
+    length = jnp.sum(valid, axis=0)
+    cost = jax.vmap(functools.partial(_path_cost, most=failure), in_axes=1)(prediction, target, valid)
+    return cost / (2 * jnp.maximum(length, 1).astype(jnp.float32) * failure), length > 0
+
+
 def box_diagonal(points: Tracks, valid: Valid) -> ByFrame:
     """[t] float32, diagonal [pixels] of the bounding box of each frame's valid points; 0 where there is none.
 
@@ -190,8 +304,8 @@ def box_diagonal(points: Tracks, valid: Valid) -> ByFrame:
     return _norm(extent)
 
 
-def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray) -> jax.Array:
-    """DTW cost of two paths [t 2] over the tracked frames.
+def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray, most: float | jax.Array = math.inf) -> jax.Array:
+    """DTW cost of two paths [t 2] over the tracked frames; a step costs at most `most`, and so much where a place is lost.
 
     Tracked frames come first, in order, so that the cost of the paths is the cell (n - 1, n - 1) of the whole table,
     which no later frame touches. The table is filled by anti-diagonals, whose cells do not depend on each other.
@@ -199,13 +313,15 @@ def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray) -> jax
     order = jnp.argsort(~tracked, stable=True)
     keep = tracked[order][:, None]
     a, b = jnp.where(keep, prediction[order], 0), jnp.where(keep, target[order], 0)
+    found = _is_found(a)
+    a = jnp.where(found[:, None], a, 0)
     t = len(a)
     rows = jnp.arange(t)
 
     def fill(last_two: tuple[jax.Array, jax.Array], d: jax.Array) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
         before, last = last_two
         columns = d - rows
-        cost = _norm(a - b[jnp.clip(columns, 0, t - 1)])
+        cost = jnp.where(found, jnp.minimum(_norm(a - b[jnp.clip(columns, 0, t - 1)]), most), most)
         up, diagonal = (jnp.concatenate([jnp.full(1, jnp.inf, jnp.float32), cells[:-1]]) for cells in (last, before))
         best = jnp.minimum(jnp.minimum(up, last), diagonal)
         cells = cost + jnp.where(d == 0, 0, best)

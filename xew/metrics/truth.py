@@ -16,8 +16,11 @@ NEEDS = {
     "video": (),
     "mask": ("robot_mask",),
     "region": ("robot_mask",),
+    "robot": ("robot_mask",),
     "keypoints": ("keypoints", "keypoint_visible"),
     "objects": ("object_pose", "extrinsics", "intrinsics"),
+    "robot_points": ("keypoints", "keypoint_visible"),
+    "object_points": ("object_pose", "extrinsics", "intrinsics"),
     "contact": ("object_pose", "tool_pose", "contact", "extrinsics", "intrinsics"),
 }
 """Arrays of an episode that each kind of comparison rests on; imported episodes may not know some."""
@@ -29,6 +32,33 @@ PATCH = 2
 OTHER_COLOR = 40
 """Least difference [levels of a channel] that is another color. A shadow on a bright object may be one too: then its frames
 are left out, which costs little."""
+MOVED = 0.01
+"""Distance from its first place [m] from which on an object has moved, so that points on it count."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points whose paths in the image are known."""
+
+    pixels: np.ndarray
+    """[t k 2] float32 pixels; NaN behind the camera."""
+    visible: np.ndarray
+    """[t k] bool."""
+    body: np.ndarray | None = None
+    """[k] int, index of the body that each point lies on, as in `Surfaces.shown`; None where bodies are not known."""
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Points on the surfaces of the robot's moving links, and of the objects and lids that move."""
+
+    robot: Points
+    objects: Points
+    shown: np.ndarray | None
+    """[t h w] int16, index of the body that a pixel shows, -1 for any other; None where the shapes are not known."""
+    known: bool
+    """False where the episode's shapes are not known, as of an imported one: the points are then links' and objects'
+    origins."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +82,8 @@ class Truth:
     """[t 2 2] float32 pixels, the tool frames of the left and right arm, projected; NaN behind the camera."""
     contact: np.ndarray
     """[t 2 o] bool, does any finger of the left, right arm touch the object."""
+    surfaces: Surfaces | None = None
+    """Points on surfaces; None where they were not asked for."""
 
 
 def read_truth(folder: Path, frames: int, compared: Collection[str]) -> Truth:
@@ -74,16 +106,49 @@ def read_truth(folder: Path, frames: int, compared: Collection[str]) -> Truth:
         project(pose[..., :3], states.intrinsics, states.extrinsics)[0].astype(np.float32)
         for pose in (states.object_pose, states.tool_pose)
     )
+    visible = _find_visible(objects, rgb, states.robot_mask)
+    surfaces = None
+    if {"robot_points", "object_points"} & set(compared):
+        surfaces = _find_surfaces(folder, frames) or Surfaces(
+            Points(states.keypoints[:frames], states.keypoint_visible[:frames]),
+            _of_moving(states.object_pose[..., :3], Points(objects, visible), frames),
+            shown=None,
+            known=False,
+        )
     return Truth(
         rgb=rgb[:frames],
         mask=states.robot_mask[:frames],
         keypoints=states.keypoints[:frames],
         keypoint_visible=states.keypoint_visible[:frames],
         objects=objects[:frames],
-        object_visible=_find_visible(objects, rgb, states.robot_mask)[:frames],
+        object_visible=visible[:frames],
         hands=hands[:frames],
         contact=states.contact[:frames],
+        surfaces=surfaces,
     )
+
+
+def _find_surfaces(folder: Path, frames: int) -> Surfaces | None:
+    """Points on surfaces in an episode's first frames; None where its shapes are not known."""
+    # Only here: the metrics load without Warp.
+    from xew.sim_warp.production.surfaces import read_surfaces
+
+    tracks = read_surfaces(folder)
+    if tracks is None:
+        return None
+    of_robot = tracks.is_robot[tracks.body]
+    moves = (tracks.displacement[:frames].max(axis=0) > MOVED)[tracks.body]
+    robot, objects = (
+        Points(tracks.pixels[:frames, some], tracks.visible[:frames, some], tracks.body[some])
+        for some in (of_robot, ~of_robot & moves)
+    )
+    return Surfaces(robot, objects, tracks.shown[:frames], known=True)
+
+
+def _of_moving(places: np.ndarray, points: Points, frames: int) -> Points:
+    """The first frames of the points [t o] of objects that move, told by their origins' places [t o 3] m."""
+    moves = np.linalg.norm(places[:frames] - places[:1], axis=-1).max(axis=0, initial=0) > MOVED
+    return Points(points.pixels[:frames, moves], points.visible[:frames, moves])
 
 
 def _find_visible(points: np.ndarray, rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:

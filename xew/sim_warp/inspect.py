@@ -4,7 +4,8 @@ Reads  <data>/<task>/<seed>/<robot>/
 Writes a table to the terminal and, where asked, pictures: a sheet a task (start, middle and end of every robot) and a strip
        an episode (eight frames of the scene over eight of the robot alone); or a grid of all tasks and robots
 
-Command: python -m xew.sim_warp.inspect data [--verify] [--rerender 5] [--render] [--pictures sheets] [--grid grid.png]
+Command: python -m xew.sim_warp.inspect data [--verify] [--visibility] [--rerender 5] [--render] [--pictures sheets]
+         [--grid grid.png]
 """
 
 import math
@@ -26,6 +27,7 @@ from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, read_record, read_s
 from xew.sim_warp.devices.workers import Workers, quiet_warp
 from xew.sim_warp.generate import yield_table
 from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
+from xew.sim_warp.production.surfaces import visibility_table
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS
 
@@ -50,6 +52,8 @@ class Args:
     data: Annotated[Path, tyro.conf.Positional]
     verify: bool = False
     """Read everything and compare with the recorded hashes, and the motions with what is plausible."""
+    visibility: bool = False
+    """Print in how many frames the camera sees enough points on the surfaces of each robot and of what moves."""
     rerender: int = 0
     """Number of episodes to render again from their states and compare with the recorded hashes."""
     render: bool = False
@@ -76,8 +80,10 @@ def main() -> None:
         damaged += verify([folder for folder, _ in pictured])
     if damaged:
         raise EpisodeError("\n".join([*damaged, f"{len(damaged)} damaged."]))
-    if not pictured and (args.rerender or args.render or args.pictures or args.grid):
+    if not pictured and (args.visibility or args.rerender or args.render or args.pictures or args.grid):
         raise EpisodeError(f"no seed under {args.data} is accepted, so there is nothing to render or draw.")
+    if args.visibility:
+        print(visibility_table([folder for folder, _ in pictured]))
     if args.rerender:
         rerender([folder for folder, _ in pictured], args.rerender)
     if args.render:

@@ -1,6 +1,7 @@
 """Who finds the robot, its points and its motion in a video that has no ground truth.
 
-Two estimators need no weights; the others open local checkpoints of other projects.
+Two estimators need no weights, and `presence` confirms what any of them found; the others open local checkpoints of other
+projects.
 """
 
-__all__ = ["adapters", "contact", "cotracker", "flow", "masks", "sam2", "similarity", "tapir", "tracks"]
+__all__ = ["adapters", "contact", "cotracker", "flow", "masks", "presence", "sam2", "similarity", "tapir", "tracks"]

@@ -235,7 +235,7 @@ def describe(settings: dict[str, Any], metrics: tuple[str, ...]) -> dict[str, An
         metric = METRICS[name]
         low, high = (bound if math.isfinite(bound) else None for bound in metric.range)
         fields = {key: getattr(metric, key) for key in ("dimension", "unit", "higher_is_better", "reference")}
-        fields |= {"low": low, "high": high}
+        fields |= {"low": low, "high": high, "suites": list(metric.suites)}
         described[name] = fields | {"title": metric.title or name, "estimated": metric.estimated, "reported": metric.reported}
     return settings | {"metrics": described, "versions": {"xew": xew.__version__, "jax": jax.__version__}}
 

@@ -3,4 +3,4 @@
 Arrays in meters and radians in, arrays out; nothing here knows robots, tasks or a device.
 """
 
-__all__ = ["camera", "meshes", "poses"]
+__all__ = ["camera", "meshes", "poses", "surface_points"]

@@ -1,7 +1,7 @@
 """Posed bodies to images: what the head camera sees of recorded states, and what follows from commands alone.
 
-Every image is a pure, bit-repeatable function of its inputs. Call `observe` for recorded states and `streams` for commands;
-`render` draws any posed bodies for both, by the kernels, of what `bodies` and `packing` give it.
+Every image is a pure, bit-repeatable function of its inputs. Call `observe` and `surfaces` for recorded states and `streams`
+for commands; `render` draws any posed bodies for all three, by the kernels, of what `bodies` and `packing` give it.
 """
 
-__all__ = ["bodies", "observe", "packing", "raster_kernels", "render", "shading_kernels", "streams"]
+__all__ = ["bodies", "observe", "packing", "raster_kernels", "render", "shading_kernels", "streams", "surfaces"]

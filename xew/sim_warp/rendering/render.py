@@ -55,9 +55,9 @@ def _nothing() -> np.ndarray:
 class Frames:
     """Images of one world. What was not asked for has no elements."""
 
-    rgb: np.ndarray
+    rgb: np.ndarray = field(default_factory=_nothing)
     """[t h w 3] uint8, sRGB, anti-aliased."""
-    robot_mask: np.ndarray
+    robot_mask: np.ndarray = field(default_factory=_nothing)
     """[t h w] bool, whether the first thing that the ray through the pixel's center meets is the robot."""
     depth: np.ndarray = field(default_factory=_nothing)
     """[t h w] float32 depth along the optical axis at the pixel's center [m], 0 where nothing is."""
@@ -142,10 +142,29 @@ class Renderer:
         with PARSING:  # threads take turns at the device, whose buffers and modules are shared; the latter are parsed
             return _split_by_world(self._render_worlds(worlds, camera, ground, wanted), worlds)
 
+    def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA) -> list[Frames]:
+        """Look up the points of worlds with the stage about them, and which body each pixel shows, without any colors.
+
+        Returns:
+            For each world its frames as `render_batch` gives them, of which `rgb` and what is optional but `body` are empty.
+
+        Raises:
+            ValueError: poses or points do not fit, or are not finite, or a world has no points.
+        """
+        for world in worlds:
+            check_world(world)
+            if world.points is None or not world.points.shape[1]:
+                raise ValueError("a world has no points to look up; give World.points [t k 3].")
+        if not worlds:
+            return []
+        with PARSING:
+            images = self._render_worlds(worlds, camera, True, frozenset({"body"}), colors=False)
+            return _split_by_world(images, worlds)
+
     def _render_worlds(
-        self, worlds: Sequence[World], camera: Camera, ground: bool, wanted: frozenset[str]
+        self, worlds: Sequence[World], camera: Camera, ground: bool, wanted: frozenset[str], colors: bool = True
     ) -> dict[str, np.ndarray]:
-        """Images of all frames of all worlds on the host, by the names of `Frames`."""
+        """Images of all frames of all worlds on the host, by the names of `Frames`; colors, with shadows, if asked for."""
         kinds, kind = distinct_worlds(worlds)
         table, pose = pack_frames(worlds, kind)
         call = _Call(
@@ -154,8 +173,9 @@ class Renderer:
             camera=camera,
             view=_camera_view(camera),
             stage=self._stage(camera, ground),
-            shadows=len(stage.LIGHTS) if ground else 0,
+            shadows=len(stage.LIGHTS) if ground and colors else 0,
             wanted=wanted,
+            colors=colors,
         )
         pixel = _nearest_pixel(camera, pack_points(worlds))
         chunks = [slice(i, i + self._frames_per_chunk) for i in range(0, len(table.world), self._frames_per_chunk)]
@@ -187,7 +207,8 @@ class Renderer:
         """Images of some frames on the device, by the names of `Frames`."""
         chunk = _Chunk(self.device, call.geometry, frames)
         drawn = self._draw(call, chunk)
-        images = {"rgb": self._shade(call, chunk, drawn)} | self._measure(call, chunk, drawn)
+        images = {"rgb": self._shade(call, chunk, drawn)} if call.colors else {}
+        images |= self._measure(call, chunk, drawn)
         if pixel.shape[1]:
             images |= self._probe(call, chunk, drawn, pixel)
         return images
@@ -320,6 +341,7 @@ class _Call:
     stage: shading.LitStage
     shadows: int = 0
     wanted: frozenset[str] = frozenset()
+    colors: bool = True
 
 
 class _Chunk:

@@ -1,0 +1,146 @@
+"""Predictors made on purpose: they are wrong as they say, and the strict metrics put them in the right order."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.synthetic import write_synthetic_data
+from xew.episode import States, read_states
+from xew.metrics import METRICS
+from xew.metrics.backends import open_masker, open_tracker
+from xew.metrics.calibration.matrix import expected_order, grade_material, matrix, order_violations, to_markdown
+from xew.metrics.calibration.predictors import BELOW, PREDICTORS, Material, erase_objects, hold_objects, predict, soften
+from xew.metrics.truth import MOVED, Points, Surfaces, Truth
+
+FRAMES, HEIGHT, WIDTH = 41, 96, 128
+ORDERED = ("keypoint_error_strict", "trajectory_error_strict")
+CHEAP = (*ORDERED, "pck_strict", "coverage_strict", "object_coverage_strict", "psnr")
+"""Metrics that the test grades; those of masks and networks take longer."""
+ROBOT, THING = (34, 26), (15, 13)
+"""Width and height [pixels] of the robot, a rectangle, and of the thing that moves, one too."""
+rng = np.random.default_rng(11)
+
+
+def texture(width: int, height: int, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
+    """[height width 3] uint8 spots of about three pixels, between two colors."""
+    spots = np.repeat(np.repeat(rng.random((height // 3 + 1, width // 3 + 1, 1)), 3, axis=0), 3, axis=1)[:height, :width]
+    return (np.array(low) + spots * (np.array(high) - low)).astype(np.uint8)
+
+
+GROUND = texture(WIDTH, HEIGHT, (150, 160, 150), (200, 200, 190))
+LOOKS = {"robot": texture(*ROBOT, (10, 10, 60), (60, 60, 160))}
+LOOKS["other"] = np.concatenate([LOOKS["robot"][:, :12], texture(22, 26, (90, 60, 10), (160, 130, 40))], axis=1)
+THING_LOOKS = texture(*THING, (180, 10, 10), (250, 110, 60))
+
+
+def paths() -> tuple[np.ndarray, np.ndarray]:
+    """Upper left corners [t 2] int of the robot, which goes to and fro, and of the thing, which goes to the right and stays."""
+    t = np.arange(FRAMES)
+    robot = np.stack([8 + 1.2 * t, 12 + 6 * np.sin(t / 6)], axis=-1).astype(int)
+    return robot, np.stack([20 + 1.5 * np.clip(t - 6, 0, 30), np.full(FRAMES, 66)], axis=-1).astype(int)
+
+
+def draw(robot: str = "robot", thing: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """A video [t h w 3] and whose each pixel is [t h w]: 0 the robot's, 1 the thing's, which is gone where it is negative."""
+    corners, moving = paths()
+    video, shown = np.repeat(GROUND[None], FRAMES, axis=0), np.full((FRAMES, HEIGHT, WIDTH), -1, np.int16)
+    for t in range(FRAMES):
+        bodies = ((1, THING_LOOKS, (moving if thing is None else thing)[t]), (0, LOOKS[robot], corners[t]))
+        for body, looks, (x, y) in bodies:
+            if x >= 0:
+                video[t, y : y + looks.shape[0], x : x + looks.shape[1]] = looks
+                shown[t, y : y + looks.shape[0], x : x + looks.shape[1]] = body
+    return video, shown
+
+
+def points(corners: np.ndarray, size: tuple[int, int], body: int) -> Points:
+    """Nine points of a rectangle, always seen."""
+    grid = np.stack(np.meshgrid(*(np.linspace(0.15, 0.85, 3) * (side - 1) for side in size)), axis=-1).reshape(-1, 2)
+    pixels = (corners[:, None] + grid).astype(np.float32)
+    return Points(pixels, np.ones(pixels.shape[:2], bool), np.full(len(grid), body))
+
+
+@pytest.fixture(scope="module")
+def rows() -> pd.DataFrame:
+    """All predictors of a rectangle that goes about and of a thing that moves by 45 pixels, by the default estimators."""
+    corners, moving = paths()
+    rgb, shown = draw()
+    robot, thing = points(corners, ROBOT, 0), points(moving, THING, 1)
+    contact = np.zeros((FRAMES, 2, 1), bool)
+    surfaces = Surfaces(robot, thing, shown, known=True)
+    middles = thing.pixels[:, 4:5], thing.visible[:, :1]
+    truth = Truth(rgb, shown == 0, robot.pixels, robot.visible, *middles, robot.pixels[:, :2], contact, surfaces)
+    at_rest = np.repeat(moving[:1], FRAMES, axis=0)
+    gone = np.where((moving != moving[0]).any(axis=-1)[:, None], -1, moving)
+    material = Material(rgb, draw("other")[0], draw(thing=at_rest)[0], draw(thing=gone)[0])
+    found = grade_material(material, truth, open_masker("default"), open_tracker("default"), CHEAP)
+    return pd.DataFrame([{"task": "t", "seed": 0, "robot": "r"} | row for row in found])
+
+
+@pytest.fixture(scope="module")
+def states(tmp_path_factory: pytest.TempPathFactory) -> States:
+    root = tmp_path_factory.mktemp("data")
+    (folder,) = write_synthetic_data(root, seeds=(1_000_000,), robots=("piper",), frames=17)
+    return read_states(folder)
+
+
+def test_every_predictor_has_every_strict_score(rows: pd.DataFrame) -> None:
+    strict = rows[rows["metric"].map(lambda name: "strict" in METRICS[name].suites)]
+    assert strict["value"].notna().all() and set(strict["case"]) == set(PREDICTORS)
+
+
+@pytest.mark.parametrize("name", ORDERED)
+def test_strict_metrics_put_predictors_in_order(name: str, rows: pd.DataFrame) -> None:
+    table = matrix(rows)
+    assert order_violations(table)[name] == [], table.loc[name].to_dict()
+
+
+def test_erasing_an_object_is_worse_than_leaving_it_where_it_was(rows: pd.DataFrame) -> None:
+    table = matrix(rows)
+    assert table.loc["trajectory_error_strict", "object erased"] > table.loc["trajectory_error_strict", "object at rest"] > 5
+    assert table.loc["psnr", "2 frames late"] > table.loc["psnr", "gray"]
+
+
+def test_a_wrong_order_is_named() -> None:
+    table = pd.DataFrame({"truth": [0.9, 1.0], "codec": [0.8, 2.0], "gray": [0.85, np.nan]}, ["ssim", "keypoint_error"])
+    wrong = order_violations(table)
+    assert wrong == {"ssim": [], "keypoint_error": []}, "steps that do not follow one another are not compared"
+    swapped = table.rename(columns={"truth": "codec", "codec": "truth"})
+    assert order_violations(swapped)["ssim"] == order_violations(swapped)["keypoint_error"] == [("truth", "codec")]
+    missing = table.rename(columns={"codec": "frozen"})
+    assert order_violations(missing)["keypoint_error"] == [("frozen", "gray")], "no score is no order"
+    assert ("object at rest", "object erased") in expected_order(objects=True)
+    text = to_markdown(missing)
+    assert "| keypoint_error | paper | 1 | 2 | - | frozen, gray |" in text
+
+
+def test_predictors_are_what_they_are_called() -> None:
+    rng = np.random.default_rng(4)
+    coarse = np.repeat(np.repeat(rng.integers(0, 256, (12, 4, 6, 3), dtype=np.uint8), 16, axis=1), 16, axis=2)
+    material = Material(soften(coarse, 2), other_robot=255 - coarse)
+    videos = {name: predict(name, material) for name in PREDICTORS}
+    assert videos["object at rest"] is None and videos["object erased"] is None
+    truth = material.truth
+    for name, video in videos.items():
+        if video is not None:
+            assert video.shape == truth.shape and video.dtype == np.uint8, name
+            np.testing.assert_array_equal(video[0], truth[0], err_msg="the given frame")
+    np.testing.assert_array_equal(videos["2 frames late"][3:], truth[1:-2])
+    np.testing.assert_array_equal(videos["frozen"], np.repeat(truth[:1], 12, axis=0))
+    assert sorted(frame.tobytes() for frame in videos["shuffled"]) == sorted(frame.tobytes() for frame in truth)
+    assert (videos["shuffled"] != truth).any()
+    np.testing.assert_array_equal(videos["mirrored"][1:, :, 0], truth[1:, :, -1])
+    off = {name: np.abs(videos[name][1:].astype(int) - truth[1:]).mean() for name in ("truth", "codec", "blur", "noise")}
+    assert 0 < off["truth"] < off["blur"] and 0 < off["codec"] < 0.3 * off["noise"]
+
+
+def test_objects_are_held_or_taken_away_from_where_they_begin_to_move(states: States) -> None:
+    held, gone = hold_objects(states), erase_objects(states)
+    assert (held.object_pose == states.object_pose[0]).all() and (held.joint_pos == states.joint_pos).all()
+    moved = np.linalg.norm(states.object_pose[..., :3] - states.object_pose[:1, :, :3], axis=-1) > MOVED
+    assert moved.any() and not moved[0].any()
+    assert ((gone.object_pose[..., 2] == BELOW) == np.logical_or.accumulate(moved, axis=0)).all()
+    hinged = replace(states, object_joint=np.linspace(0, 1, states.frame_count, dtype=np.float32)[:, None])
+    assert (erase_objects(hinged).object_pose[1:, 0, 2] == BELOW).all()

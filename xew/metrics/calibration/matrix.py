@@ -1,0 +1,123 @@
+"""The matrix of predictors made on purpose: what every metric says of each, and whether it puts them in the right order.
+
+Reads  episodes of a data set
+Writes rows (task seed robot case metric value), and Markdown tables of them
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from xew.episode import Record, read_video
+from xew.metrics import METRICS
+from xew.metrics.backends import Masker, Tracker
+from xew.metrics.calibration.predictors import PREDICTORS, Material, predict, render_objects
+from xew.metrics.grade import Comparison, grade, input_kind
+from xew.metrics.truth import Truth, read_truth
+
+STEPS: tuple[tuple[str, ...], ...] = (
+    ("truth",),
+    ("codec",),
+    ("2 frames late",),
+    ("8 frames late",),
+    ("other robot", "frozen", "shuffled"),
+    ("gray",),
+)
+"""Predictors from right to wrong; those of one step are not compared with each other."""
+FURTHER = (("object at rest", "object erased"),)
+"""Further pairs, the better one first, for metrics of objects."""
+
+Episode = tuple[Path, Record]
+Row = dict[str, Any]
+
+
+def grade_predictors(
+    folder: Path,
+    record: Record,
+    other: Path | None,
+    masker: Masker,
+    tracker: Tracker,
+    metrics: Sequence[str] = tuple(METRICS),
+    objects: Callable[[Path], tuple[np.ndarray, np.ndarray]] | None = render_objects,
+) -> list[Row]:
+    """Rows of one episode: the value of each metric for each predictor, NaN where it has none.
+
+    Args:
+        folder, record: the episode.
+        other: the folder of the same seed with another robot, if there is one.
+        masker, tracker: estimators.
+        metrics: names of METRICS.
+        objects: function of the folder to the videos with objects at rest and erased, None to leave them out.
+    """
+    truth = read_truth(folder, record.frame_count, {input_kind(name) for name in metrics})
+    still, erased = (None, None) if objects is None else objects(folder)
+    material = Material(truth.rgb, None if other is None else _cut(read_video(other / "rgb.mkv"), truth), still, erased)
+    key = {"task": record.task, "seed": record.seed, "robot": record.robot}
+    return [key | row for row in grade_material(material, truth, masker, tracker, metrics)]
+
+
+def grade_material(
+    material: Material, truth: Truth, masker: Masker, tracker: Tracker, metrics: Sequence[str] = tuple(METRICS)
+) -> list[Row]:
+    """Rows (case metric value) of all predictors that can be made of the material; the truth is graded as by `evaluate`."""
+    rows: list[Row] = []
+    for case in PREDICTORS:
+        video = predict(case, material)
+        if video is None:
+            continue
+        graded, shown = (truth.rgb, video) if case == "truth" else (video, None)
+        values = grade(Comparison(graded, truth, masker, tracker, shown=shown), metrics).values
+        rows += [{"case": case, "metric": name, "value": value} for name, value in values.items()]
+    return rows
+
+
+def _cut(video: np.ndarray, truth: Truth) -> np.ndarray:
+    """A video [t h w 3] with as many frames as the truth, the last repeated."""
+    return video[np.minimum(np.arange(len(truth.rgb)), len(video) - 1)]
+
+
+def matrix(rows: pd.DataFrame) -> pd.DataFrame:
+    """Mean value of each metric (rows) for each predictor (columns), both in their own order."""
+    table = rows.groupby(["metric", "case"])["value"].mean().unstack()
+    cases = [case for case in PREDICTORS if case in table.columns]
+    return table.loc[[name for name in METRICS if name in table.index], cases]
+
+
+def order_violations(table: pd.DataFrame) -> dict[str, list[tuple[str, str]]]:
+    """Pairs of predictors that a metric does not put in order, the one that should be better first, by metric.
+
+    Args:
+        table: values by metric (rows) and predictor (columns), as `matrix` gives them.
+    """
+    found = {}
+    for name in table.index:
+        metric = METRICS[str(name)]
+        sign = 1 if metric.higher_is_better else -1
+        value = sign * table.loc[name]
+        pairs = expected_order(metric.dimension == "objects")
+        found[str(name)] = [(a, b) for a, b in pairs if {a, b} <= set(table.columns) and not value[a] > value[b]]
+    return found
+
+
+def expected_order(objects: bool) -> list[tuple[str, str]]:
+    """Pairs of predictors, the better one first: those of following steps, and of metrics of objects the further pairs.
+
+    Of metrics of objects the other robot is left out: it moves them as the first one does.
+    """
+    pairs = [(a, b) for better, worse in itertools.pairwise(STEPS) for a in better for b in worse]
+    return [pair for pair in pairs if "other robot" not in pair] + list(FURTHER) if objects else pairs
+
+
+def to_markdown(table: pd.DataFrame) -> str:
+    """The matrix, and beside each metric its suites and the pairs that it does not put in order."""
+    wrong = order_violations(table)
+    lines = [["metric", "suites", *map(str, table.columns), "not in order"], ["---"] * (len(table.columns) + 3)]
+    for name in map(str, table.index):
+        values = ["-" if np.isnan(value) else f"{value:.3g}" for value in table.loc[name].to_numpy(float)]
+        pairs = "; ".join(f"{a}, {b}" for a, b in wrong[name])
+        lines.append([name, ", ".join(METRICS[name].suites), *values, pairs])
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)

@@ -1,0 +1,123 @@
+"""Points on surfaces of episodes on disk, and how many of them the camera sees.
+
+Reads  <data>/<task>/<seed>/<robot>/
+Writes nothing: the points follow from recorded states and from the shapes of the robot and of the task's objects, so that
+       episodes of earlier versions have them too
+"""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from xew.config import ConfigError
+from xew.episode import Record, data_folder, read_record, read_states
+from xew.sim_warp.geometry.camera import Camera
+from xew.sim_warp.rendering.observe import scene_recording
+from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.rendering.streams import default_renderer
+from xew.sim_warp.rendering.surfaces import SurfaceTracks, track_surfaces
+from xew.sim_warp.robots import get_robot
+from xew.sim_warp.scene import Scene, scene_hash, scene_rng
+from xew.sim_warp.tasks import get_task
+
+MOVED = 0.01
+"""Distance from its first place [m] from which on a body has moved."""
+MOVING = 0.001
+"""Distance from one frame to the next [m] from which on a body is moving."""
+NEEDED_OF_ROBOT, NEEDED_OF_THING = 8, 4
+"""Numbers of visible points of a robot, and of an object that moves, that the visibility table asks for."""
+ROBOT_SHARE, THING_SHARE = 0.95, 0.90
+"""Shares of frames, and of an object's moving frames, in which there should be so many."""
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """How well an episode's surfaces are seen."""
+
+    robot: np.ndarray
+    """[t] int, visible points of the robot."""
+    things: dict[str, np.ndarray]
+    """Numbers of visible points [m] int in the m moving frames of each thing that moves, by name."""
+
+
+def scene_names(scene: Scene) -> tuple[str, ...]:
+    """Names of the bodies of `rendering.observe.scene_things`: the objects, then the lids of those that have a hinge."""
+    return *scene.names, *(f"{thing.name} lid" for thing in scene.objects if thing.hinge is not None)
+
+
+def read_surfaces(folder: Path, renderer: Renderer | None = None) -> SurfaceTracks | None:
+    """Points on the surfaces of an accepted episode.
+
+    Args:
+        folder: of the episode.
+        renderer: whose buffer says what is seen; by default the process's own.
+
+    Returns:
+        The tracks; None where the shapes are not known: the episode was imported, or is not of the scene that its task now
+        makes of its seed, or there is no such task or robot here.
+
+    Raises:
+        EpisodeError: a file is missing or damaged.
+    """
+    record = read_record(folder)
+    try:
+        scene = None if record.source else _find_scene(record)
+        robot = get_robot(record.robot, data_folder(folder))
+    except ConfigError:  # of a task or robot that is not known here
+        scene = None
+    if scene is None:
+        return None
+    states = read_states(folder)
+    recording = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
+    height, width = states.robot_mask.shape[1:]
+    camera = Camera(states.intrinsics, states.extrinsics, width, height)
+    return track_surfaces([recording], [scene_names(scene)], renderer or default_renderer(), camera)[0]
+
+
+def _find_scene(record: Record) -> Scene | None:
+    """The scene of an episode; None where its task makes another of its seed now."""
+    scene = get_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
+    return scene if scene.names == record.object_names and scene_hash(scene) == record.scene_hash else None
+
+
+def count_visible(tracks: SurfaceTracks) -> Visibility:
+    """Visible points of the robot by frame, and of each thing that moves by moving frame."""
+    counts = np.stack([tracks.visible[:, tracks.body == b].sum(axis=1) for b in range(len(tracks.names))], axis=1)
+    things = np.flatnonzero(~tracks.is_robot & (tracks.displacement.max(axis=0) > MOVED))
+    moving = tracks.step > MOVING
+    return Visibility(counts[:, tracks.is_robot].sum(axis=1), {tracks.names[b]: counts[moving[:, b], b] for b in things})
+
+
+def visibility_table(folders: Sequence[Path]) -> str:
+    """A Markdown table: for each task and robot, in how many frames enough points are seen. Raises as `read_surfaces`."""
+    found: dict[tuple[str, str], list[Visibility]] = defaultdict(list)
+    for folder in folders:
+        tracks = read_surfaces(folder)
+        if tracks is not None:
+            record = read_record(folder)
+            found[record.task, record.robot].append(count_visible(tracks))
+    lines = [
+        f"| task | robot | visible points of the robot | frames with {NEEDED_OF_ROBOT} | worst thing that moves | "
+        f"its moving frames with {NEEDED_OF_THING} | |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    lines += [_row(*key, several) for key, several in sorted(found.items())]
+    return "\n".join(lines)
+
+
+def _row(task: str, robot: str, several: Sequence[Visibility]) -> str:
+    """The row of a task and robot; of the things that move, the one that is seen least."""
+    of_robot = np.concatenate([one.robot for one in several])
+    robot_share = float(np.mean(of_robot >= NEEDED_OF_ROBOT))
+    shares = [
+        (float(np.mean(counts >= NEEDED_OF_THING)) if len(counts) else 1.0, name)
+        for one in several
+        for name, counts in one.things.items()
+    ]
+    share, name = min(shares, default=(1.0, "nothing moves"))
+    short = "" if robot_share >= ROBOT_SHARE and share >= THING_SHARE else "below the aim"
+    cells = (f"`{task}`", f"`{robot}`", f"{of_robot.mean():.1f}", f"{robot_share:.0%}", name, f"{share:.0%}", short)
+    return f"| {' | '.join(cells)} |"
