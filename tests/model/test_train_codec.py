@@ -475,3 +475,15 @@ def test_the_shipped_codec_learns_from_bodies_alone() -> None:
     assert experiment.train_robots == tuple(f"body_{number}" for number in range(64))
     assert set(experiment.streams) == {*pictures_module.ALIGNED, *pictures_module.UNALIGNED}
     assert not experiment.report.test_seeds
+
+
+def test_missing_lpips_is_told_before_anything_is_decoded(
+    world: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing() -> None:
+        raise FileNotFoundError("LPIPS needs its weights")
+
+    monkeypatch.setattr("xew.metrics.networks.alexnet.read_alexnet", missing)
+    said = fails(train_codec.main, [str(world / "codec.yaml"), "--out", str(world / "mistaken")], capsys)
+    assert said.count("\n") == 1 and "LPIPS needs its weights" in said
+    assert not (world / "mistaken").exists()

@@ -37,6 +37,7 @@ from xew.model.codec_training.settings import (
     training_episodes,
 )
 from xew.model.codec_training.step import init_codec_state, make_codec_step, summarize
+from xew.model.codecs.ceiling import check_lpips
 from xew.model.codecs.codec import to_pictures, to_signed
 from xew.model.runs.checkpoint import TrainState, restore_state
 from xew.model.runs.folder import check_one_of, claim_run
@@ -80,6 +81,7 @@ def train_codec(experiment: CodecExperiment, *, resume: bool = False, overwrite:
     Returns:
         Whether the end was reached.
     """
+    check_lpips()
     settings = experiment.train
     dataset = read_dataset(experiment.data)
     episodes = training_episodes(dataset, experiment.train_robots)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import UInt8
 
+from xew.config import ConfigError
 from xew.model.codecs.codec import Codec
 from xew.model.video.frames import to_camera_size, to_model_size
 
@@ -34,6 +35,16 @@ class Ceiling:
 
     def __str__(self) -> str:
         return f"PSNR {self.psnr:.2f} dB, LPIPS {self.lpips:.4f} at camera size over {self.clips} clips"
+
+
+def check_lpips() -> None:
+    """Raise ConfigError unless the weights of LPIPS are installed, before long work that needs them at its end."""
+    from xew.metrics.networks.alexnet import read_alexnet
+
+    try:
+        read_alexnet()
+    except FileNotFoundError as error:
+        raise ConfigError(str(error)) from error
 
 
 def measure_ceiling(
