@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from xew.command_line import find_path, parse_command
 from xew.compilation import keep_compiled_programs
-from xew.config import CONVERTER, ConfigError, user_errors
+from xew.config import CONVERTER, ConfigError, parse, user_errors
 from xew.dataset import Episode, read_dataset
 from xew.episode import Record, episode_folder
 from xew.files import checkpoint_time
@@ -154,9 +154,18 @@ def is_done(out: Path, episode: Episode, header: dict[str, Any]) -> bool:
     _, record = episode
     folder = episode_folder(out, record.task, record.seed, record.robot)
     try:
-        return json.loads((folder / "rollout.json").read_text()) == header and (folder / "rgb.mkv").exists()
-    except (OSError, ValueError):
+        return _read_header(folder) == header and (folder / "rgb.mkv").exists()
+    except (OSError, ValueError, ConfigError):
         return False
+
+
+def _read_header(folder: Path) -> dict[str, Any]:
+    """A rollout's header; settings that came after it was written have their defaults."""
+    path = folder / "rollout.json"
+    header: dict[str, Any] = json.loads(path.read_text())
+    if "config" in header:
+        header["config"] = CONVERTER.unstructure(parse(Experiment, header["config"], str(path)))
+    return header
 
 
 def group_by_length(pending: Sequence[Item], size: int) -> Iterator[list[Item]]:

@@ -19,11 +19,15 @@ def log(folder: Path, begin: int, values: dict[int, float]) -> None:
 
 
 def curves(folder: Path) -> tuple[list[tuple[int, float]], list[tuple[int, float]]]:
-    """(step, value) of metrics.jsonl and of TensorBoard."""
+    """(step, value) of metrics.jsonl and of TensorBoard.
+
+    TensorBoard reads files by name, which has the second and a number that a process counts up: of files of one second the
+    tenth comes before the ninth, so that its events are put in order here.
+    """
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     accumulator = EventAccumulator(str(folder))
     accumulator.Reload()
-    return [(line["step"], line[NAME]) for line in lines], [(e.step, e.value) for e in accumulator.Scalars(NAME)]
+    return [(line["step"], line[NAME]) for line in lines], sorted((e.step, e.value) for e in accumulator.Scalars(NAME))
 
 
 def test_a_run_that_goes_on_continues_both_curves(tmp_path: Path) -> None:
