@@ -59,20 +59,20 @@ def pasted_render(folder: Path, truth: Truth) -> np.ndarray:
 
 def other_robot(folder: Path, truth: Truth) -> np.ndarray:
     """The true episode of the next robot by name in the same scene: uint8 [t h w 3]."""
-    other = find_other_robot(folder, len(truth.rgb))
+    other = find_other_robot(folder)
     assert other is not None, "BASELINES asks before"
     return read_video(other / "rgb.mkv")[: len(truth.rgb)]
 
 
-def find_other_robot(folder: Path, frames: int) -> Path | None:
-    """The folder of the next robot by name, in a circle, whose episode of the same scene has its video and enough frames."""
+def find_other_robot(folder: Path) -> Path | None:
+    """The folder of the next robot by name, in a circle, whose episode of the same scene has its video and is no shorter."""
     record = read_record(folder)
     names = sorted(path.name for path in folder.parent.iterdir() if (path / "episode.json").exists())
     place = names.index(folder.name)
     for name in names[place + 1 :] + names[:place]:
         other = folder.parent / name
         found = read_record(other)
-        if found.success and found.videos and found.frame_count >= frames and found.scene_hash == record.scene_hash:
+        if found.success and found.videos and found.frame_count >= record.frame_count and found.scene_hash == record.scene_hash:
             return other
     return None
 
@@ -82,7 +82,7 @@ def _render_digest(folder: Path, record: Record) -> str | None:
 
 
 def _other_digest(folder: Path, record: Record) -> str | None:
-    other = find_other_robot(folder, record.frame_count)
+    other = find_other_robot(folder)
     return None if other is None else read_record(other).hashes["rgb"]
 
 
