@@ -76,14 +76,10 @@ class Kind(Protocol):
         """Options that tell `latents` and `train` to use the weights in a folder."""
 
 
-@dataclass(frozen=True)
-class ConvKind:
-    """The autoencoder of groups of four frames."""
+class OfSize:
+    """What both kinds read off their size."""
 
-    file: ClassVar[str] = "autoencoder"
-
-    name: str
-    size: AutoencoderSize
+    size: Any
 
     @property
     def spatial_factor(self) -> int:
@@ -92,6 +88,16 @@ class ConvKind:
     @property
     def channels(self) -> int:
         return self.size.channels
+
+
+@dataclass(frozen=True)
+class ConvKind(OfSize):
+    """The autoencoder of groups of four frames."""
+
+    file: ClassVar[str] = "autoencoder"
+
+    name: str
+    size: AutoencoderSize
 
     @classmethod
     def of_size(cls, name: str) -> "ConvKind":
@@ -128,21 +134,13 @@ class ConvKind:
 
 
 @dataclass(frozen=True)
-class VaeKind:
+class VaeKind(OfSize):
     """The video autoencoder of Wan2.2's kind; latents are drawn from what the encoder gives."""
 
     file: ClassVar[str] = "vae"
 
     name: str
     size: VaeSize
-
-    @property
-    def spatial_factor(self) -> int:
-        return self.size.spatial_factor
-
-    @property
-    def channels(self) -> int:
-        return self.size.channels
 
     @classmethod
     def of_size(cls, name: str) -> "VaeKind":
