@@ -48,7 +48,7 @@ def check_lpips() -> None:
 
 
 def measure_ceiling(
-    codec: Codec, videos: Iterable[UInt8[np.ndarray, "t h w 3"]], frames: int, height: int, width: int
+    codec: Codec, videos: Iterable[UInt8[np.ndarray, "_ h w 3"]], frames: int, height: int, width: int
 ) -> Ceiling:
     """Grade what is left of the first `frames` frames of each video after encoding and decoding.
 

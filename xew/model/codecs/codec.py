@@ -286,7 +286,7 @@ class PatchCodec(BatchCodec):
 
     @classmethod
     def fit(
-        cls, clips: list[UInt8[np.ndarray, "t h w 3"]], spatial_factor: int, channels: int, whitening: float = 0.5
+        cls, clips: list[UInt8[np.ndarray, "_ h w 3"]], spatial_factor: int, channels: int, whitening: float = 0.5
     ) -> "PatchCodec":
         """Fit on clips; deterministic.
 
