@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.metrics.quick import QUICK
 from tests.synthetic import write_synthetic_data
 from xew.analysis.reports import charts
 from xew.dataset import find_accepted
@@ -15,7 +16,7 @@ from xew.metrics.evaluate import Args, main
 from xew.protocol import seed_split
 from xew.rollout import write_rollout
 
-TASKS, SEEDS, FRAMES = ("place_empty_cup", "open_laptop"), (0, 1_000_000, 1_000_001, 1_000_002), 9
+TASKS, SEEDS, FRAMES = ("place_empty_cup", "open_laptop"), (0, 1_000_000, 1_000_001, 1_000_002), 6
 ROBOTS = ("aloha_agilex", "franka_panda", "piper")
 
 
@@ -44,5 +45,5 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
             late = read_video(folder / "rgb.mkv")[np.maximum(np.arange(FRAMES) - 1, 0)]
             header = {"model": "late", "condition": "by one <frame>"}
             write_rollout(made.rollouts, record.task, record.seed, record.robot, late, header)
-    main(Args((made.rollouts,), made.data, made.scores, ("psnr", "lpips", "mask_iou"), baselines=True))
+    main(Args((made.rollouts,), made.data, made.scores, ("psnr", "lpips", "mask_iou"), masks=QUICK))
     return made

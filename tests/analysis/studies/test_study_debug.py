@@ -1,4 +1,4 @@
-"""The debug study from nothing to a report by its real commands, then a part of it killed again and again.
+"""The debug study from nothing to a report by its real commands, then once more from its data, killed again and again.
 
 The task is the tests' own of twelve simulated frames, and of the 18 models five are made, something of every part.
 """
@@ -32,14 +32,13 @@ MADE = (
 )
 """Something of each table."""
 ADAPTED = "few_shot-piper-1"
-PART = (ADAPTED, "--parts", "few_shot", "forgetting")
-"""What is killed: a training, an adaptation from it, and all that they need and lead to."""
+"""An adaptation from one of the others."""
 KILLS = 3
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where the studies of this file lie, and what they share."""
+    """Where a study of this file lies, and what it shares with others."""
 
     root: Path
     environment: dict[str, str]
@@ -48,14 +47,15 @@ class Place:
     def study(self) -> Path:
         return self.root / "study"
 
-    def command(self, *variants: str) -> list[str]:
-        """Of a study of these variants (and of more choices after them)."""
+    @property
+    def command(self) -> list[str]:
+        """The command of the study."""
         files = [str(CONFIG), "--experiment", str(ROOT / "configs" / "debug.yaml")]
-        return [sys.executable, "-m", "xew.analysis.study", *files, "--out", "study", "--tasks", TASK, "--variants", *variants]
+        return [sys.executable, "-m", "xew.analysis.study", *files, "--out", "study", "--tasks", TASK, "--variants", *MADE]
 
-    def run(self, *variants: str) -> str:
+    def run(self) -> str:
         """What the study's command prints; it must end well."""
-        done = subprocess.run(self.command(*variants), cwd=self.root, env=self.environment, capture_output=True, text=True)
+        done = subprocess.run(self.command, cwd=self.root, env=self.environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
@@ -70,16 +70,16 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
 
 
 @pytest.fixture(scope="module")
-def told(place: Place) -> str:
+def printed(place: Place) -> str:
     """The whole study, from nothing."""
-    return place.run(*MADE)
+    return place.run()
 
 
 def rows_of(study: Path) -> pd.DataFrame:
     return pd.read_parquet(study / "scores.parquet")
 
 
-def test_from_nothing_to_a_report(place: Place, told: str) -> None:
+def test_from_nothing_to_a_report(place: Place, printed: str) -> None:
     table = rows_of(place.study)
     planned = table.attrs["study"]
     assert set(table["variant"]) == {"", *planned["variants"]}
@@ -91,44 +91,41 @@ def test_from_nothing_to_a_report(place: Place, told: str) -> None:
     assert set(table.loc[table["variant"] == "", "model"]) == set(BASELINES)
     assert table["value"].notna().all()
     assert (place.study / "report" / "index.html").stat().st_size > 10_000
-    assert f"report: {Path('study', 'report', 'index.html')}" in told
+    assert f"report: {Path('study', 'report', 'index.html')}" in printed
 
 
-def test_done_is_done(place: Place, told: str) -> None:
+def test_done_is_done(place: Place, printed: str) -> None:
     before = {path: path.stat().st_mtime_ns for path in place.study.rglob("*") if path.is_file() and "state" not in path.parts}
-    again = place.run(*MADE)
+    again = place.run()
     after = {path: path.stat().st_mtime_ns for path in before}
     changed = {path.name for path in before if before[path] != after[path]}
     assert changed <= {"study.yaml", "status.txt", ".lock"}
     assert "[0/" not in again.partition("about")[2], again
 
 
-def test_an_adaptation_started_from_its_variant(place: Place, told: str) -> None:
+def test_an_adaptation_started_from_its_variant(place: Place, printed: str) -> None:
     start = json.loads((place.study / "runs" / ADAPTED / "start.json").read_text())
     assert Path(start["run"]).name == VARIANTS[ADAPTED].start.name  # type: ignore[union-attr]
 
 
-def test_killed_anywhere_it_ends_in_the_same_report(place: Place, told: str) -> None:
-    """A part of the study without a break, then again from nothing but data, killed as it goes: the same bytes at the end."""
-    place.run(*PART)
-    straight = place.root / "straight"
-    place.study.rename(straight)
-    place.study.mkdir()
-    shutil.copytree(straight / "data", place.study / "data")
+def test_killed_anywhere_it_ends_in_the_same_report(place: Place, printed: str) -> None:
+    """The study again from nothing but data and compiled programs, killed as it goes: the same bytes at the end."""
+    killed = Place(place.root / "killed", place.environment)
+    shutil.copytree(place.study / "data", killed.study / "data")
     moments = random.Random(int(time.time()))
     for number in range(KILLS):
-        seconds = moments.uniform(3, 10)
+        seconds = moments.uniform(3, 15)
         print(f"kill {number} after {seconds:.2f} s")
-        process = subprocess.Popen(place.command(*PART), cwd=place.root, env=place.environment, stdout=subprocess.PIPE)
+        process = subprocess.Popen(killed.command, cwd=killed.root, env=killed.environment, stdout=subprocess.PIPE)
         try:
             process.communicate(timeout=seconds)
             break
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()
-    place.run(*PART)
-    same_files(straight / "report", place.study / "report")
-    pd.testing.assert_frame_equal(rows_of(straight), rows_of(place.study))
+    killed.run()
+    same_files(place.study / "report", killed.study / "report")
+    pd.testing.assert_frame_equal(rows_of(place.study), rows_of(killed.study))
 
 
 def same_files(straight: Path, killed: Path) -> None:

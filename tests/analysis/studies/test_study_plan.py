@@ -1,6 +1,7 @@
 """Studies before they start: configs, variants, the graph, keys, costs."""
 
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from xew.analysis.studies.cost import (
     format_duration,
 )
 from xew.analysis.studies.ledger import Ledger
+from xew.analysis.studies.machines import ThisMachine
 from xew.analysis.studies.plan import Step, plan, sort_steps, source_digest, step_key
 from xew.config import ConfigError
 from xew.protocol import PAPER_PARTS, PARTS, VARIANTS
@@ -147,6 +149,23 @@ def test_trainings_may_be_launched_on_other_machines(study: Study) -> None:
     step = plan(launched)["train/fixed-joints-none"]
     assert step.launcher == ("srun", "--nodes=2") and "--distributed" in step.command
     assert plan(launched)["rollout/fixed-joints-none"].launcher == plan(study)["train/fixed-joints-none"].launcher == ()
+
+
+def test_steps_of_a_kind_have_an_environment_of_their_own(
+    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = plan(replace(study, step_environment={"train": {"XLA_FLAGS": "--quick"}}))
+    assert {step.kind for step in steps.values() if step.environment} == {"train"}
+    monkeypatch.setenv("OTHER", "0")
+    machine = ThisMachine((), 1, {"OTHER": "1"})
+    compares = "import os; raise SystemExit(os.environ['XLA_FLAGS'] + os.environ['OTHER'] != '--quick1')"
+    step = replace(steps["train/fixed-joints-none"], launcher=(sys.executable, "-c", compares))
+    machine.start(step, (), tmp_path / "step.log")
+    assert machine.wait() == [("train/fixed-joints-none", 0)]
+    config = tmp_path / "study.yaml"
+    config.write_text(DEBUG.read_text().replace("  train: &quick", "  training: &quick"))
+    with pytest.raises(ConfigError, match=r"unknown kind of step in step_environment 'training'; did you mean 'train'"):
+        load_study(config)
 
 
 def test_systems_and_remedies_have_their_settings() -> None:

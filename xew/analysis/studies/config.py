@@ -27,6 +27,9 @@ from xew.protocol import (
 )
 from xew.sim_warp.tasks import get_task
 
+KINDS = ("generate", "latents", "train", "adapt", "rollout", "evaluate", "distances", "analyse")
+"""Kinds of steps, in the order of the work."""
+
 Settings = dict[str, Any]
 """A part of an experiment's config, nested as in its file."""
 
@@ -142,6 +145,8 @@ class Study:
     """Further arguments of `xew.analysis.distance`, which runs where the part loeo is planned."""
     environment: dict[str, str] = field(default_factory=dict)
     """Environment variables set for every step."""
+    step_environment: dict[str, dict[str, str]] = field(default_factory=dict)
+    """Environment variables set beside them for the steps of one kind, such as XLA_FLAGS for `train`."""
     data: Path | None = None
     """Folder of the episodes; <out>/data where left out. What is missing in it is made."""
     machine: Machine = Machine()
@@ -226,6 +231,7 @@ def _check_names(study: Study, path: Path) -> None:
         ("number of shots", shots, known_shots),
         ("task", study.tasks, study.tasks),  # known: checked above, and may be outside tasks
         ("training seed", tuple(map(str, study.training_seeds)), tuple(map(str, study.training_seeds))),
+        ("kind of step in step_environment", tuple(study.step_environment), KINDS),
     ):
         for name in names:
             if name not in known:

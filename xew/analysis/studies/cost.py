@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from xew.analysis.studies.config import Settings, Study, build_experiment
+from xew.analysis.studies.config import KINDS, Settings, Study, build_experiment
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import usable_gpus
-from xew.analysis.studies.plan import KINDS, Step, sort_steps
+from xew.analysis.studies.plan import Step, sort_steps
 from xew.protocol import Variant
 
 

@@ -102,7 +102,7 @@ class ThisMachine:
     def start(self, step: Step, command: tuple[str, ...], log: Path) -> None:
         slots = tuple(self._free.pop(0) for _ in range(self._count_slots(step)))
         own = {"CUDA_VISIBLE_DEVICES": ",".join(slots)} if self.gpus else {}
-        process = start_step(command, log, self.environment | own, launcher=step.launcher)
+        process = start_step(command, log, {**self.environment, **step.environment, **own}, launcher=step.launcher)
         self._running[step.name] = _Running(process, slots)
 
     def wait(self) -> list[tuple[str, int]]:
@@ -151,7 +151,8 @@ class RayCluster:
         # A machine that is lost is made up for elsewhere: the same command goes on from what is on disk.
         options: dict[str, Any] = {"num_cpus": 1, "num_gpus": step.gpus if self._gpus else 0, "max_retries": 2}
         task = self._ray.remote(_run_on_ray).options(**options)
-        reference = task.remote(command, str(log.absolute()), self.environment, step.launcher, str(Path.cwd()))
+        environment = {**self.environment, **step.environment}
+        reference = task.remote(command, str(log.absolute()), environment, step.launcher, str(Path.cwd()))
         self._running[reference] = step.name
 
     def wait(self) -> list[tuple[str, int]]:

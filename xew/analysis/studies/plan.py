@@ -9,7 +9,7 @@ import hashlib
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -21,9 +21,6 @@ import xew
 from xew.analysis.studies.config import Settings, Study, build_experiment, run_folder
 from xew.episode import SCHEMA_VERSION
 from xew.protocol import Variant
-
-KINDS = ("generate", "latents", "train", "adapt", "rollout", "evaluate", "distances", "analyse")
-"""Kinds of steps, in the order of the work."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +43,8 @@ class Step:
     """Number of GPUs that it takes at once."""
     launcher: tuple[str, ...] = ()
     """Program and arguments that start the command, if any."""
+    environment: Mapping[str, str] = field(default_factory=dict)
+    """Environment variables of its kind."""
 
     @property
     def name(self) -> str:
@@ -69,7 +68,7 @@ def plan(study: Study) -> dict[str, Step]:
     if "loeo" in study.parts:
         steps.append(_plan_distances(study))
     steps.append(_plan_analyse(study, tuple(step.name for step in steps if step.kind in ("evaluate", "distances"))))
-    return {step.name: step for step in steps}
+    return {step.name: replace(step, environment=study.step_environment.get(step.kind, {})) for step in steps}
 
 
 def sort_steps(steps: Mapping[str, Step]) -> list[Step]:
