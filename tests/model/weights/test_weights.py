@@ -129,7 +129,9 @@ def test_an_abstract_module_becomes_real(arrays: Arrays, tmp_path: Path) -> None
     module, real = nnx.eval_shape(lambda: Leaves(nnx.Rngs(0))), Leaves(nnx.Rngs(1))
     for target in (module, real):
         fill(target, read_tensors(tmp_path / "in.safetensors"), LAYOUT)
-    jax.tree.map(np.testing.assert_array_equal, nnx.state(module, nnx.Param), nnx.state(real, nnx.Param))
+    (filled, of_real) = (nnx.state(each, nnx.Param) for each in (module, real))
+    assert jax.tree.leaves(filled)
+    jax.tree.map(np.testing.assert_array_equal, filled, of_real)
 
 
 # Files.
