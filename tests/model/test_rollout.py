@@ -18,7 +18,7 @@ from xew.dataset import Episode, read_dataset
 from xew.episode import EpisodeError, read_video
 from xew.model import latents, rollout
 from xew.model.cache.codecs import load_codec
-from xew.model.codecs.codec import encode_pictures
+from xew.model.codecs.contract import encode_pictures
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment, create_model, load_experiment
 from xew.model.network.dit_layouts import save_dit

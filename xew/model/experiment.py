@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from xew.command_line import parse_command
 from xew.config import load, pick
-from xew.model.codecs.codec import CodecSettings, latent_frames
+from xew.model.codecs.contract import CodecSettings, latent_frames
 from xew.model.codecs.vae import VAES
 from xew.model.conditions import Condition
 from xew.model.devices.sharding import MeshSettings

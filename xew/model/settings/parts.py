@@ -8,7 +8,7 @@ import numpy as np
 import optax
 
 from xew.config import pick
-from xew.model.codecs.codec import CodecSettings
+from xew.model.codecs.contract import CodecSettings
 from xew.model.codecs.vae import VaeSize
 from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition, list_conditions
 from xew.model.network.dit import STREAMS, token_grid

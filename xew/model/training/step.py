@@ -19,7 +19,7 @@ from flax import nnx
 from jax import Array
 from jax.sharding import Mesh
 
-from xew.model.codecs.codec import Codec
+from xew.model.codecs.contract import Codec
 from xew.model.devices.sharding import gather_parameters, place_shapes
 from xew.model.diffusion.flow_matching import ReplaceReference, TrainingPair, put_first, sample_losses, training_pair
 from xew.model.network.dit import cast_params
