@@ -72,7 +72,7 @@ def test_the_same_bytes_alone_among_others_and_in_groups(
 ) -> None:
     others = [Job("grab_roller", 1, ("piper",)), *reversed(JOBS)]
     monkeypatch.setattr(produce_module, "FRAMES_AT_ONCE", 1)  # every seed is a group of its own
-    monkeypatch.setattr(produce_module, "plan_cells", shortened(produce_module.plan_cells))
+    monkeypatch.setattr(produce_module, "plan_cells", shorten_plans(produce_module.plan_cells))
     produce(others, tmp_path / "among", renderer, robots=WITH_SLOW)
     for job in JOBS:
         produce([job], tmp_path / "alone", renderer, robots=WITH_SLOW)
@@ -82,8 +82,8 @@ def test_the_same_bytes_alone_among_others_and_in_groups(
             assert record_of(tmp_path / "alone", job.seed, robot) == expected
 
 
-def shortened(plan_cells: object) -> object:
-    """Only the first frames of a real task: company for the others, not an episode."""
+def shorten_plans(plan_cells: object) -> object:
+    """Planning of which only the first frames are kept: company for the others, no whole episode."""
 
     def first_frames(jobs: list[Job], robots: Mapping[str, RobotSpec]) -> list[list[Cell]]:
         return [[cut(cell) for cell in cells] for cells in plan_cells(jobs, robots)]  # type: ignore[operator]

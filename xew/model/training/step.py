@@ -2,6 +2,7 @@
 
 Reads  `TrainState`, `Batch`
 Writes the next `TrainState`, `StepResult`
+The optimizer is made in settings/optimizer.py, the noise in diffusion/flow_matching.py.
 
 The parameters are float32. The linear layers' are rounded to the network's dtype once a step, before they are gathered
 along `fsdp`, so that the traffic and the gradients have that dtype too; the numbers are the same as if every layer
