@@ -102,7 +102,7 @@ class Passes:
         return drawn
 
     def shade(self, call: Call, chunk: Chunk, drawn: Drawn) -> wp.array:
-        """Colors of a chunk's frames."""
+        """Colors [t h w 3] uint8 of a chunk's frames."""
         height, width = call.camera.height, call.camera.width
         posed = [call.geometry.arrays, chunk.world, chunk.pose, call.pose, call.view]
         seen = [drawn.vertex, drawn.key, drawn.shadow_map, drawn.shadow_tile]
@@ -116,7 +116,7 @@ class Passes:
         return rgb
 
     def measure(self, call: Call, chunk: Chunk, drawn: Drawn) -> dict[str, wp.array]:
-        """Mask, bodies, depth and optical flow of a chunk's frames, as far as wanted."""
+        """Masks of a chunk's frames and, as far as wanted, bodies, depth [m] (all [t h w]) and optical flow [t h w 2] px."""
         shape = (chunk.count, call.camera.height, call.camera.width)
         posed = [call.geometry.arrays, chunk.world, chunk.pose, chunk.next_pose, call.pose, call.view]
         images = {"robot_mask": self._empty(shape, wp.bool)}
@@ -131,7 +131,7 @@ class Passes:
         return {name: image for name, image in images.items() if image.size}
 
     def probe(self, call: Call, chunk: Chunk, drawn: Drawn, pixel: np.ndarray) -> dict[str, wp.array]:
-        """What is seen at pixels [t k 2] x y of a chunk's frames."""
+        """Body [t k] and depth [t k] m that are seen at pixels [t k 2] x y of a chunk's frames."""
         shape = pixel.shape[:2]
         images = {"point_body": self._empty(shape, int), "point_depth": self._empty(shape, float)}
         self._launch(
