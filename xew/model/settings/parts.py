@@ -83,6 +83,7 @@ class EpisodeChoice:
 
     split: Split
     adapt: AdaptSettings = field(default_factory=AdaptSettings)
+    """Adaptation, with every robot by its own key."""
     replay: tuple[str, ...] = ()
     """Robots whose training episodes are replayed, in an adaptation with replay."""
     samples: bool = False
