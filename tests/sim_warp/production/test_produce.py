@@ -1,7 +1,7 @@
 """From jobs to episodes: the same bytes every time and in any company, paired over robots, conditions from commands only."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +25,13 @@ from xew.episode import (
 from xew.sim_warp.physics import Motion, World, simulate
 from xew.sim_warp.production import cells as cells_module
 from xew.sim_warp.production import produce as produce_module
+from xew.sim_warp.production import surfaces as surfaces_module
 from xew.sim_warp.production.cells import Cell, Job
 from xew.sim_warp.production.episodes import fill_instruction
+from xew.sim_warp.production.kept_tracks import load_tracks, save_tracks, tracks_key, tracks_path
 from xew.sim_warp.production.produce import produce
 from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
+from xew.sim_warp.production.surfaces import read_surfaces
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import command_streams_batch
 from xew.sim_warp.robots import RobotSpec
@@ -216,6 +219,45 @@ def test_streams_follow_from_the_recorded_commands(data: Path, renderer: Rendere
     folder, record = find_accepted(data)[0]
     (streams,) = command_streams_batch([(WITH_SLOW[record.robot], read_states(folder).action)], renderer=renderer)
     assert array_hash(streams.render) == record.hashes["robot"]
+
+
+def test_points_on_surfaces_are_rendered_once(
+    data: Path, renderer: Renderer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, record = find_accepted(data)[0]
+    first = read_surfaces(folder, renderer, tmp_path)
+    assert first is not None and first.visible.any()
+    with monkeypatch.context() as patch:
+        patch.setattr(surfaces_module, "track_surfaces", None)  # would be called to render
+        again = read_surfaces(folder, renderer, tmp_path)
+    assert again is not None and again.names == first.names
+    for field in fields(first):
+        assert np.array_equal(getattr(again, field.name), getattr(first, field.name), equal_nan=field.name == "pixels")
+    kept = tracks_path(tmp_path, record)
+    kept.write_bytes(kept.read_bytes()[:-40])
+    mended = read_surfaces(folder, renderer, tmp_path)
+    assert mended is not None and np.array_equal(mended.shown, first.shown), "a damaged file is made anew"
+    kept.unlink()
+    kept.mkdir()
+    assert read_surfaces(folder, renderer, tmp_path) is not None, "what cannot be kept is not missed"
+
+
+def test_kept_points_are_of_one_robot_scene_motion_and_camera(data: Path, tmp_path: Path) -> None:
+    folder, record = find_accepted(data)[0]
+    robot, states = WITH_SLOW[record.robot], read_states(folder)
+    key = tracks_key(robot, record.scene_hash, states)
+    assert key == tracks_key(robot, record.scene_hash, read_states(folder))
+    others = [
+        tracks_key(WITH_SLOW["arx_x5"], record.scene_hash, states),
+        tracks_key(robot, "another", states),
+        tracks_key(robot, record.scene_hash, replace(states, joint_pos=states.joint_pos + np.float32(0.1))),
+        tracks_key(robot, record.scene_hash, replace(states, extrinsics=2 * states.extrinsics)),
+    ]
+    assert len({key, *others}) == 5
+    tracks = read_surfaces(folder)
+    assert tracks is not None
+    save_tracks(tmp_path / "tracks.npz", key, tracks)
+    assert load_tracks(tmp_path / "tracks.npz", key) is not None and load_tracks(tmp_path / "tracks.npz", others[0]) is None
 
 
 def test_measured_states_are_not_the_commands(data: Path) -> None:
