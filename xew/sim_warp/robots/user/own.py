@@ -35,8 +35,9 @@ FOLDERS = "XEW_ROBOTS"
 """Name of the environment variable that lists folders of robots, separated as in PATH."""
 KEPT = "robots"
 """Name of the folder of a data set that holds its robots."""
-SEARCH_CODE = ("robots/user", "kinematics", "tasks", ".")
-"""Folders of the room whose code decides where a robot is placed; a change in one makes the search begin anew."""
+SEARCH_CODE = ("robots/user", "kinematics", "tasks", "assets", "embodiment", "geometry")
+"""Packages of the room whose code, with the files at its root, decides where a robot is placed; a change in one makes the search
+begin anew."""
 
 
 def is_path(name: str) -> bool:
@@ -125,8 +126,9 @@ def _find_place(draft: RobotDraft, robot: RobotSpec, near: tuple[np.ndarray | No
 def _place_digest(draft: RobotDraft, robot: RobotSpec) -> str:
     """SHA-256 over all that a place depends on: the draft, the files of the URDF, and the code that searches."""
     digest = hashlib.sha256(repr((draft, replace(robot, urdf=Path()))).encode())
-    code = sorted(file for folder in SEARCH_CODE for file in (Path(__file__).parents[2] / folder).glob("*.py"))
-    for file in [*load_urdf(robot.urdf).files, *code]:
+    room = Path(__file__).parents[2]
+    code = {*room.glob("*.py"), *(file for folder in SEARCH_CODE for file in (room / folder).rglob("*.py"))}
+    for file in [*load_urdf(robot.urdf).files, *sorted(code)]:
         digest.update(hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
 
