@@ -36,8 +36,8 @@ FOLDERS = "XEW_ROBOTS"
 KEPT = "robots"
 """Name of the folder of a data set that holds its robots."""
 SEARCH_CODE = ("robots/user", "kinematics", "tasks", "assets", "embodiment", "geometry")
-"""Packages of the room whose code, with the files at its root, decides where a robot is placed; a change in one makes the search
-begin anew."""
+"""Packages of the room whose code, with the files at its root, decides where a robot is placed: a change of it makes the
+search begin anew."""
 
 
 def is_path(name: str) -> bool:
