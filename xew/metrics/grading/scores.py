@@ -75,7 +75,7 @@ class Cell:
 
 
 class CellStore:
-    """Graded videos, a file each, complete or not there: whoever is stopped goes on from what stands.
+    """Graded videos, a file each, complete or not there: a grading that was stopped goes on from what is there.
 
     Args:
         folder: of the videos of models.

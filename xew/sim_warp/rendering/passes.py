@@ -29,12 +29,17 @@ class Call:
 
     geometry: PackedGeometry
     pose: wp.array
+    """[P] wp.transform, poses of the bodies of all frames, world."""
     camera: Camera
     view: raster.View
+    """The camera as the kernels take it."""
     stage: shading.LitStage
     shadows: int = 0
+    """Number of lights whose shadow maps are drawn."""
     wanted: frozenset[str] = frozenset()
+    """Names of the optional images of `render.Frames` that are made."""
     colors: bool = True
+    """Whether colors are made."""
 
 
 class Chunk:
@@ -54,10 +59,15 @@ class Drawn:
     """What `Passes.draw` leaves for the kernels after it, as they describe it in raster_kernels.py."""
 
     vertex: wp.array
+    """[n v] vertices in the camera's view."""
     shadow_vertex: wp.array
+    """[n l v] vertices in the lights' views."""
     key: wp.array
+    """[n s h w] nearest triangle of each sample."""
     shadow_map: wp.array
+    """[n l m m] nearest depth of each texel."""
     shadow_tile: wp.array
+    """[n l q q] nearest depth of each tile."""
 
 
 class Passes:
