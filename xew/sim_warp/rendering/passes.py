@@ -59,15 +59,15 @@ class Drawn:
     """What `Passes.draw` leaves for the kernels after it, as they describe it in raster_kernels.py."""
 
     vertex: wp.array
-    """[n v] vertices in the camera's view."""
+    """[n v] wp.vec3, m, camera's frame."""
     shadow_vertex: wp.array
-    """[n l v] vertices in the lights' views."""
+    """[n l v] wp.vec3, x y [texels] and nearness on each shadow map."""
     key: wp.array
-    """[n s h w] nearest triangle of each sample."""
+    """[n s h w] uint64, nearness and triangle of each sample."""
     shadow_map: wp.array
-    """[n l m m] nearest depth of each texel."""
+    """[n l m m] uint32, nearness of the nearest caster at each texel."""
     shadow_tile: wp.array
-    """[n l q q] nearest depth of each tile."""
+    """[n l q q] uint32, largest nearness in and round each tile."""
 
 
 class Passes:
