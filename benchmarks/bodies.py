@@ -159,7 +159,7 @@ def compare_distances(args: Distances) -> int:
     names = (*ROBOT_NAMES, *(body_key(number) for number in range(args.bodies)))
     robots = {name: get_robot(name) for name in names}
     kinematic = measure(robots, range(args.draws), workers=1).kinematic.mean(axis=0)
-    appearance = appearance_matrix([nine_views(name) for name in tqdm(names, desc="views")])
+    appearance = appearance_matrix([nine_views(robot) for robot in tqdm(robots.values(), desc="views")])
     first, second = np.triu_indices(len(names), 1)
     five = len(ROBOT_NAMES)
     kinds = {

@@ -92,7 +92,10 @@ def test_a_snippet_runs(snippet: str, tmp_path: Path, monkeypatch: pytest.Monkey
     target = np.random.default_rng(0).integers(0, 256, (2, 48, 64, 3), np.uint8)
     mask = target[..., 0] > 128
     names |= {"prediction": target[::-1], "target": target, "predicted_mask": ~mask, "target_mask": mask}
+    given = set(names)
     exec(compile(snippet, "a snippet of the docs", "exec"), names)
+    shown = set(names) - given - {"__builtins__"}
+    assert shown and all(names[name] is not None for name in shown), "a snippet imports or makes something"
 
 
 def normalize(command: str) -> str:

@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from multiprocessing.connection import Connection
 
@@ -46,4 +47,7 @@ def is_gone(process: int) -> bool:
 
 
 def test_the_first_process_has_no_parent_to_leave_with() -> None:
-    leave_with_parent(lambda: os._exit(1))
+    assert multiprocessing.parent_process() is None
+    before, left = threading.enumerate(), []
+    leave_with_parent(lambda: left.append(True))
+    assert threading.enumerate() == before and not left, "nothing watches for a parent that there is not"

@@ -42,11 +42,12 @@ def read(folder: Path) -> np.ndarray:
     return read_rollout_video(read_rollout(folder), RATE)
 
 
-def fails(folder: Path, *words: str) -> None:
+def refusal(folder: Path) -> str:
+    """The error of reading a folder's rollout, which names the folder."""
     with pytest.raises(RolloutError) as error:
         read(folder)
-    for word in (str(folder), *words):
-        assert word in str(error.value)
+    assert str(folder) in str(error.value)
+    return str(error.value)
 
 
 def test_what_we_write_is_read_exactly_and_opencvs_too(folder: Path) -> None:
@@ -66,7 +67,8 @@ def test_a_file_that_is_cut_off_is_no_video(folder: Path, name: str, share: floa
     whole = (folder / name).read_bytes()
     assert read(folder).shape == VIDEO.shape
     (folder / name).write_bytes(whole[: int(share * len(whole))])
-    fails(folder, name, "make this rollout again")
+    message = refusal(folder)
+    assert name in message and "make this rollout again" in message
 
 
 def test_bits_that_are_lost_are_not_painted_over(folder: Path) -> None:
@@ -74,7 +76,7 @@ def test_bits_that_are_lost_are_not_painted_over(folder: Path) -> None:
     content = bytearray((folder / "rgb.mp4").read_bytes())
     content[len(content) // 2 : len(content) // 2 + 40] = bytes(40)
     (folder / "rgb.mp4").write_bytes(content)
-    fails(folder, "make this rollout again")
+    assert "make this rollout again" in refusal(folder)
 
 
 @pytest.mark.parametrize(
@@ -86,7 +88,7 @@ def test_only_rgb_of_8_bits_is_read(folder: Path, pixels: str, codec: str, word:
     if word is None:  # alpha that hides nothing
         assert read(folder).shape == VIDEO.shape
     else:
-        fails(folder, word)
+        assert word in refusal(folder)
 
 
 def test_alpha_that_hides_something_is_an_error(folder: Path) -> None:
@@ -96,7 +98,7 @@ def test_alpha_that_hides_something_is_an_error(folder: Path) -> None:
         half = np.full((*VIDEO.shape[1:3], 1), 128, np.uint8)
         container.mux(stream.encode(av.VideoFrame.from_ndarray(np.concatenate([VIDEO[0], half], -1), format="rgba")))
         container.mux(stream.encode())
-    fails(folder, "alpha")
+    assert "alpha" in refusal(folder)
 
 
 def test_a_changing_rate_is_an_error_and_rounding_is_none(folder: Path) -> None:
@@ -104,10 +106,11 @@ def test_a_changing_rate_is_an_error_and_rounding_is_none(folder: Path) -> None:
     assert read(folder).shape == VIDEO.shape
     for times in (lambda i: 60 * i + 30 * (i % 2), lambda i: 60 * i + (60 if i > 5 else 0)):
         write(folder / "rgb.mkv", times=times)
-        fails(folder, "variable frame rate", "--allow rate")
+        message = refusal(folder)
+        assert "variable frame rate" in message and "--allow rate" in message
         assert len(read_rollout_video(read_rollout(folder))) == FRAMES
     write(folder / "rgb.mkv", times=lambda i: 40 * i)
-    fails(folder, "25.00 frames a second, its episode 16.67")
+    assert "25.00 frames a second, its episode 16.67" in refusal(folder)
 
 
 def png(folder: Path, number: int, image: np.ndarray) -> Path:
@@ -122,12 +125,15 @@ def test_pngs_are_in_the_order_of_their_numbers_and_are_whole(folder: Path) -> N
     assert (read(folder) == VIDEO).all()
     path = folder / "7.png"
     path.write_bytes(path.read_bytes()[:-30])
-    fails(folder, "7.png", "cut off")
+    message = refusal(folder)
+    assert "7.png" in message and "cut off" in message
     path.write_bytes(b"")
-    fails(folder, "7.png", "no readable PNG")
+    message = refusal(folder)
+    assert "7.png" in message and "no readable PNG" in message
     path.unlink()
     path.mkdir()
-    fails(folder, "7.png", "cannot be read")
+    message = refusal(folder)
+    assert "7.png" in message and "cannot be read" in message
     path.rmdir()
     for image, word in (
         (VIDEO[0][..., 0], "gray"),
@@ -136,7 +142,8 @@ def test_pngs_are_in_the_order_of_their_numbers_and_are_whole(folder: Path) -> N
         (VIDEO[0][:-1], "sizes must be one"),
     ):
         png(folder, 7, image)
-        fails(folder, "7.png", word)
+        message = refusal(folder)
+        assert "7.png" in message and word in message
 
 
 @pytest.mark.parametrize(
@@ -156,25 +163,30 @@ def test_pngs_are_in_the_order_of_their_numbers_and_are_whole(folder: Path) -> N
 )
 def test_an_array_that_is_no_video_is_named_as_what_it_is(folder: Path, arrays: dict, word: str) -> None:
     np.savez(folder / "rgb.npz", **arrays)
-    fails(folder, "rgb.npz", word)
+    message = refusal(folder)
+    assert "rgb.npz" in message and word in message
 
 
 def test_links_out_of_the_tree_are_not_followed(folder: Path, tmp_path: Path) -> None:
     write_video(tmp_path / "secret.mkv", VIDEO)
     (folder / "rgb.mkv").symlink_to(tmp_path / "secret.mkv")
-    fails(folder, "secret.mkv", "out of the tree")
+    message = refusal(folder)
+    assert "secret.mkv" in message and "out of the tree" in message
     (folder / "rgb.mkv").unlink()
     write_video(folder / "rgb.mkv", VIDEO)
     (folder / "rollout.json").symlink_to(tmp_path / "elsewhere.json")
     (tmp_path / "elsewhere.json").write_text("{}")
-    fails(folder, "elsewhere.json", "out of the tree")
+    message = refusal(folder)
+    assert "elsewhere.json" in message and "out of the tree" in message
     (folder / "rollout.json").unlink()
     (folder / "rollout.json").symlink_to("rollout.json")
-    fails(folder, "rollout.json", "leads nowhere")
+    message = refusal(folder)
+    assert "rollout.json" in message and "leads nowhere" in message
     (folder / "rollout.json").unlink()
     folder.rename(tmp_path / "moved")
     folder.symlink_to(tmp_path / "moved")
-    fails(folder, "moved", "out of the tree")
+    message = refusal(folder)
+    assert "moved" in message and "out of the tree" in message
     linked = tmp_path / "linked"
     folder.unlink()
     (tmp_path / "moved").rename(folder)
@@ -187,7 +199,8 @@ def test_links_out_of_the_tree_are_not_followed(folder: Path, tmp_path: Path) ->
 def test_a_name_is_a_name(folder: Path, key: str, name: object) -> None:
     np.savez(folder / "rgb.npz", VIDEO)
     (folder / "rollout.json").write_text(json.dumps({key: name}))
-    fails(folder, "rollout.json", key)
+    message = refusal(folder)
+    assert "rollout.json" in message and key in message
 
 
 def test_names_with_a_slash_are_fine(folder: Path) -> None:

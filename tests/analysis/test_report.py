@@ -12,7 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from tests.analysis.conftest import FRAMES, Study
-from tests.analysis.reports.browser import assert_readable, needs_chromium
+from tests.analysis.reports.browser import find_faults, needs_chromium
 from xew.analysis.report import Args, main
 from xew.analysis.reports import pictures
 from xew.analysis.reports.study_charts import run_chart
@@ -79,7 +79,7 @@ def test_the_page_is_well_formed_and_needs_no_network(report: Path) -> None:
 
 @needs_chromium
 def test_a_browser_shows_it_on_a_phone_and_a_desk_in_light_and_dark(report: Path) -> None:
-    assert_readable(report / "index.html", images=3 * 2 + 1, charts=3 * 2)
+    assert find_faults(report / "index.html", images=3 * 2 + 1, charts=3 * 2) == []
 
 
 def test_curves_go_from_frame_to_frame_though_the_first_episode_begins_late() -> None:

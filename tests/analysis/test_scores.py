@@ -80,7 +80,7 @@ def written(path: Path, rows: pd.DataFrame, **attributes: object) -> Path:
     return path
 
 
-def changed(rows: pd.DataFrame, place: int, **values: object) -> pd.DataFrame:
+def alter(rows: pd.DataFrame, place: int, **values: object) -> pd.DataFrame:
     rows = rows.copy()
     for column, value in values.items():
         rows.loc[place, column] = value
@@ -88,14 +88,14 @@ def changed(rows: pd.DataFrame, place: int, **values: object) -> pd.DataFrame:
 
 
 WRONG = {
-    "the value is NaN, 1 rows: flow open_laptop 1000000 ur5_wsg pck": lambda r: changed(r, 1, value=float("nan")),
+    "the value is NaN, 1 rows: flow open_laptop 1000000 ur5_wsg pck": lambda r: alter(r, 1, value=float("nan")),
     "outside of the metric's range, 2 rows: flow open_laptop 1000000 ur5_wsg lpips; flow open_laptop 1000000 ur5_wsg pck": (
-        lambda r: changed(changed(r, 0, value=-0.1), 1, value=1.1)
+        lambda r: alter(alter(r, 0, value=-0.1), 1, value=1.1)
     ),
-    "the robot is unknown, 1 rows: flow open_laptop 1000000 my_robot lpips": lambda r: changed(r, 0, robot="my_robot"),
+    "the robot is unknown, 1 rows: flow open_laptop 1000000 my_robot lpips": lambda r: alter(r, 0, robot="my_robot"),
     "more than once, 2 rows: flow open_laptop 1000000 ur5_wsg lpips": lambda r: pd.concat([r, r.iloc[:1]], ignore_index=True),
-    "the metric is not described, 1 rows: flow open_laptop 1000000 ur5_wsg fid": lambda r: changed(r, 0, metric="fid"),
-    "over different numbers of frames, 6 rows: flow open_laptop 1000000 ur5_wsg lpips": lambda r: changed(r, 0, frames=8),
+    "the metric is not described, 1 rows: flow open_laptop 1000000 ur5_wsg fid": lambda r: alter(r, 0, metric="fid"),
+    "over different numbers of frames, 6 rows: flow open_laptop 1000000 ur5_wsg lpips": lambda r: alter(r, 0, frames=8),
 }
 
 
@@ -113,7 +113,7 @@ def test_nobody_is_told_to_delete_a_folder(tmp_path: Path) -> None:
 
 
 def test_all_that_is_wrong_is_named_at_once(tmp_path: Path) -> None:
-    rows = changed(changed(graded(), 0, robot="my_robot"), 5, value=float("nan"))
+    rows = alter(alter(graded(), 0, robot="my_robot"), 5, value=float("nan"))
     with pytest.raises(ConfigError) as error:
         read_scores(written(tmp_path / "s.parquet", rows))
     assert "unknown, 1 rows" in str(error.value) and "NaN, 1 rows: flow lift_pot" in str(error.value)

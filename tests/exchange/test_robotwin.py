@@ -200,7 +200,7 @@ def truncated(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
-def changed(name: str, value: object) -> Callable[[Path], None]:
+def rewrite(name: str, value: object) -> Callable[[Path], None]:
     """Replace a data set, or remove it where the value is None."""
 
     def change(path: Path) -> None:
@@ -220,21 +220,21 @@ HEAD = "observation/head_camera"
     [
         (truncated, "cannot be read as HDF5"),
         (lambda path: path.write_text("not HDF5"), "cannot be read as HDF5"),
-        (changed("joint_action/left_arm", None), r"has no joint_action/left_arm \(at its top: endpose, joint_action, obs"),
-        (changed(f"{HEAD}/rgb", None), f"has no {HEAD}/rgb"),
-        (changed("joint_action", None), "has no joint_action/left_arm"),
-        (changed("joint_action/left_arm", np.zeros((made.FRAMES, 5))), "the arms have 5 and 6 joints; expected six or seven"),
-        (changed("joint_action/left_arm", np.zeros(made.FRAMES)), r"left_arm is float64 of shape \(5,\); expected numbers"),
-        (changed("joint_action/left_arm", np.full((made.FRAMES, 6), np.nan)), "left_arm holds numbers that are not finite"),
-        (changed("joint_action/left_gripper", np.zeros(3)), "have 5, 5, 3, 5, 5, 5 frames; expected as many of each"),
-        (changed("endpose/left_endpose", np.zeros((made.FRAMES, 7))), "quaternions that are not of length 1"),
-        (changed("endpose/left_endpose", np.zeros((made.FRAMES, 6))), "the end poses have another shape"),
-        (changed(f"{HEAD}/rgb", np.array([b"jpeg"] * made.FRAMES)), "frame 0, cannot be decoded; expected a JPEG"),
-        (changed(f"{HEAD}/rgb", np.array([b"jpeg"])), "has 1 pictures; expected one for each of 5 frames"),
-        (changed(f"{HEAD}/intrinsic_cv", np.eye(4)), "intrinsic_cv has shape"),
-        (changed(f"{HEAD}/extrinsic_cv", np.eye(4)), "extrinsic_cv looks away from the table"),
-        (changed(f"{HEAD}/extrinsic_cv", np.zeros((3, 4))), "extrinsic_cv holds no rotation"),
-        (changed(f"{HEAD}/extrinsic_cv", np.arange(60.0).reshape(5, 3, 4)), "changes during the episode"),
+        (rewrite("joint_action/left_arm", None), r"has no joint_action/left_arm \(at its top: endpose, joint_action, obs"),
+        (rewrite(f"{HEAD}/rgb", None), f"has no {HEAD}/rgb"),
+        (rewrite("joint_action", None), "has no joint_action/left_arm"),
+        (rewrite("joint_action/left_arm", np.zeros((made.FRAMES, 5))), "the arms have 5 and 6 joints; expected six or seven"),
+        (rewrite("joint_action/left_arm", np.zeros(made.FRAMES)), r"left_arm is float64 of shape \(5,\); expected numbers"),
+        (rewrite("joint_action/left_arm", np.full((made.FRAMES, 6), np.nan)), "left_arm holds numbers that are not finite"),
+        (rewrite("joint_action/left_gripper", np.zeros(3)), "have 5, 5, 3, 5, 5, 5 frames; expected as many of each"),
+        (rewrite("endpose/left_endpose", np.zeros((made.FRAMES, 7))), "quaternions that are not of length 1"),
+        (rewrite("endpose/left_endpose", np.zeros((made.FRAMES, 6))), "the end poses have another shape"),
+        (rewrite(f"{HEAD}/rgb", np.array([b"jpeg"] * made.FRAMES)), "frame 0, cannot be decoded; expected a JPEG"),
+        (rewrite(f"{HEAD}/rgb", np.array([b"jpeg"])), "has 1 pictures; expected one for each of 5 frames"),
+        (rewrite(f"{HEAD}/intrinsic_cv", np.eye(4)), "intrinsic_cv has shape"),
+        (rewrite(f"{HEAD}/extrinsic_cv", np.eye(4)), "extrinsic_cv looks away from the table"),
+        (rewrite(f"{HEAD}/extrinsic_cv", np.zeros((3, 4))), "extrinsic_cv holds no rotation"),
+        (rewrite(f"{HEAD}/extrinsic_cv", np.arange(60.0).reshape(5, 3, 4)), "changes during the episode"),
     ],
 )  # fmt: skip
 def test_a_bad_file_ends_in_one_line(damage: Callable[[Path], None], told: str, tmp_path: Path) -> None:

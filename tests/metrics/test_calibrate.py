@@ -66,6 +66,18 @@ def test_wrong_renderings_are_wrong_as_they_say(simulated: Path) -> None:
     assert 1 < off[0] < off[1]
 
 
+def test_a_truth_that_was_kept_is_the_same_without_rendering(
+    simulated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = read_truth(simulated, 12, ("robot_points",), tmp_path)
+    monkeypatch.setattr("xew.sim_warp.production.surfaces.track_surfaces", None)  # would be called to render
+    again = read_truth(simulated, 12, ("robot_points",), tmp_path)
+    assert first.surfaces is not None and first.surfaces.known and again.surfaces is not None
+    for one, other in ((first.surfaces.robot, again.surfaces.robot), (first.surfaces.objects, again.surfaces.objects)):
+        np.testing.assert_array_equal(one.pixels, other.pixels)
+        np.testing.assert_array_equal(one.visible, other.visible)
+
+
 def test_motions_leave_what_they_do_not_touch(data: Path) -> None:
     states = read_states(find_accepted(data)[0][0])
     biased = MOTIONS["joints off by 0.12 rad"](states)

@@ -21,7 +21,7 @@ from xew.metrics.evaluate import Args, main
 from xew.metrics.grade import Comparison
 from xew.metrics.grade import grade as grade_one
 from xew.metrics.track import failure_distance
-from xew.metrics.truth import _find_visible, read_truth
+from xew.metrics.truth import Truth, _find_visible, read_truth
 from xew.projection import project
 from xew.protocol import BASELINES, OTHER_ROBOT
 from xew.rollout import write_rollout
@@ -96,6 +96,18 @@ def test_every_score_is_the_mean_of_the_functions_without_the_given_frame(rollou
         assert value(scores, "late", robot, "mask_iou") == pytest.approx(expected, rel=1e-5)
     assert set(scores["frames"]) == {ASKED}
     assert scores.attrs["estimators"] == {"masks": "default", "tracks": "default"} and scores.attrs["frame_zero"] == "given"
+
+
+def test_points_on_surfaces_are_kept_beside_the_data(rollouts: Path, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folders = []
+
+    def read(folder: Path, frames: int, compared: set[str], keep: Path) -> Truth:
+        folders.append(keep)
+        return read_truth(folder, frames, compared)
+
+    monkeypatch.setattr("xew.metrics.evaluate.read_truth", read)
+    grade(rollouts, data, metrics=("psnr",))
+    assert folders == [data.with_name(f"{data.name}-surfaces")] * len(ROBOTS)
 
 
 def test_all_four_dimensions_with_baselines_by_default(rollouts: Path, data: Path) -> None:

@@ -144,6 +144,13 @@ def test_shipped_configs_load_and_survive_saving(path: Path, tmp_path: Path) -> 
     assert load_experiment(tmp_path / "saved.yaml") == experiment
 
 
+def test_bodies_to_adapt_to_are_named_one_by_one_and_not_replayed(tmp_path: Path) -> None:
+    config.save(load_experiment(MODEL_CONFIGS[0], ["--split", "scaling_bodies_4"]), tmp_path / "config.yaml")
+    adaptation = ["--adapt.start_from", str(tmp_path), "--adapt.robots", "body:1-2", "--adapt.replay", "0.5"]
+    choice = load_experiment(MODEL_CONFIGS[0], adaptation).choice
+    assert choice.adapt.robots == ("body_1", "body_2") and choice.replay == ("body_0", "body_3")
+
+
 def test_what_lies_beside_the_data_does_so_wherever_one_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "data" / "task").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "data" / "task")
@@ -157,6 +164,8 @@ def test_what_lies_beside_the_data_does_so_wherever_one_stands(tmp_path: Path, m
     ("overrides", "said"),
     [
         (["--clip.frames", "16"], r"clip.frames is 16; it must be 4 k \+ 1 .* for example 17"),
+        (["--train.steps", "-1"], "train.steps is -1; it must be at least 0"),
+        (["--train.ema-decay", "1"], "train.ema_decay is 1; it must be under 1"),
         (["--clip.width", "100"], "both sides must be multiples of"),
         (["--model.size", "debgu"], "unknown model size 'debgu'; did you mean 'debug'"),
         (["--model.embodiment", "render"], "unknown embodiment 'render'; did you mean 'robot_render'"),

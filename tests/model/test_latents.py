@@ -13,7 +13,7 @@ from xew.episode import EpisodeError, read_record, write_video
 from xew.model import latents
 from xew.model.cache.clips import needed_pixels
 from xew.model.cache.encode import encode_many
-from xew.model.codecs.codec import PatchCodec
+from xew.model.codecs.patches import PatchCodec
 from xew.model.conditions import Command
 from xew.model.experiment import load_experiment
 from xew.model.video.pixels import stored_pixels

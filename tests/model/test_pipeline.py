@@ -64,7 +64,7 @@ def lines(run: Path, name: str) -> list[float]:
     return [line[name] for line in logged if name in line]
 
 
-def fails(command: Callable[[list[str]], None], arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+def refusal(command: Callable[[list[str]], None], arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """What a command says when it exits with code 2."""
     with pytest.raises(SystemExit) as stop:
         command(arguments)
@@ -108,17 +108,17 @@ def test_run_folder_holds_what_a_rerun_needs(run: Path, experiment: Experiment) 
 
 
 def test_existing_run_is_not_touched_unasked(world: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = fails(train.main, [str(world / "config.yaml")], capsys)
+    said = refusal(train.main, [str(world / "config.yaml")], capsys)
     assert "--resume" in said and "--overwrite" in said
-    said = fails(train.main, [str(world / "config.yaml"), "--resume", "--train.learning-rate", "0.5"], capsys)
+    said = refusal(train.main, [str(world / "config.yaml"), "--resume", "--train.learning-rate", "0.5"], capsys)
     assert "train.learning_rate was 0.001, is 0.5" in said
     assert len(lines(run, "train/loss")) == 4
 
 
 def test_missing_data_and_latents_name_the_command(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = str(world / "config.yaml")
-    assert "python -m xew.sim_warp.generate" in fails(train.main, [config, "--data", str(tmp_path / "none")], capsys)
-    said = fails(train.main, [config, "--cache", str(tmp_path / "none"), "--out", str(tmp_path / "run")], capsys)
+    assert "python -m xew.sim_warp.generate" in refusal(train.main, [config, "--data", str(tmp_path / "none")], capsys)
+    said = refusal(train.main, [config, "--cache", str(tmp_path / "none"), "--out", str(tmp_path / "run")], capsys)
     assert "python -m xew.model.latents" in said
     assert not (tmp_path / "run").exists()
 
@@ -127,7 +127,7 @@ def test_other_data_makes_the_cache_stale(world: Path, tmp_path: Path, capsys: p
     """The same cells, recorded differently: nothing of the old cache is taken for them."""
     synthetic.write_synthetic_data(tmp_path / "data", seeds=(0, 1_000_000), frames=FRAMES + 1)
     shutil.copytree(world / "data-latents", tmp_path / "data-latents")
-    said = fails(
+    said = refusal(
         train.main, [str(world / "config.yaml"), "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")], capsys
     )
     assert "no codec fitted on" in said and "python -m xew.model.latents" in said
@@ -141,9 +141,9 @@ def test_stale_stream_is_an_error(
     victim = next((tmp_path / "cache").glob("*/*/arx_x5/rgb-*.safetensors"))
     victim.rename(victim.with_name("rgb-000000000000.safetensors"))
     config = [str(world / "config.yaml"), "--cache", str(tmp_path / "cache"), "--out", str(tmp_path / "run")]
-    assert "was encoded from other data" in fails(train.main, config, capsys)
+    assert "was encoded from other data" in refusal(train.main, config, capsys)
     victim.write_bytes(b"cut off")
-    assert f"{victim} is damaged" in fails(train.main, config, capsys)
+    assert f"{victim} is damaged" in refusal(train.main, config, capsys)
 
 
 def test_training_sees_training_robots_and_seeds_only(experiment: Experiment) -> None:
@@ -225,6 +225,6 @@ def test_rollouts_resume_and_do_not_depend_on_the_batch(run: Path, world: Path, 
 
 
 def test_rollout_mistakes(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "did you mean 'piper'" in fails(rollout.main, [str(run), "--robots", "pipr"], capsys)
-    assert "holds no run" in fails(rollout.main, [str(tmp_path)], capsys)
-    assert "xew.sim_warp.generate" in fails(rollout.main, [str(run), "--data", str(tmp_path)], capsys)
+    assert "did you mean 'piper'" in refusal(rollout.main, [str(run), "--robots", "pipr"], capsys)
+    assert "holds no run" in refusal(rollout.main, [str(tmp_path)], capsys)
+    assert "xew.sim_warp.generate" in refusal(rollout.main, [str(run), "--data", str(tmp_path)], capsys)

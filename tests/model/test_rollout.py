@@ -18,7 +18,7 @@ from xew.dataset import Episode, read_dataset
 from xew.episode import EpisodeError, read_video
 from xew.model import latents, rollout
 from xew.model.cache.codecs import load_codec
-from xew.model.codecs.codec import encode_pictures
+from xew.model.codecs.contract import encode_pictures
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment, create_model, load_experiment
 from xew.model.network.dit_layouts import save_dit
@@ -224,7 +224,7 @@ def test_published_weights_are_rolled_out_untrained(published: Path, tmp_path: P
     assert find_rollouts(tmp_path)[0].video[0].stat().st_mtime_ns != touched
 
 
-def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+def refusal(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     with pytest.raises(SystemExit) as stop:
         rollout.main(arguments)
     assert stop.value.code == 2
@@ -234,16 +234,16 @@ def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 def test_mistakes_end_in_one_clear_error(
     world: Path, published: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "names no model.weights" in fails([str(world / "config.yaml")], capsys)
-    assert "did you mean 'piper'" in fails([str(published), "--robots", "pipr"], capsys)
-    assert "did you mean 'unipc'" in fails([str(published), "--rollout.sampler", "unipcc"], capsys)
-    assert "did you mean 'flowwam'" in fails([str(published), "--rollout.grid", "flowam"], capsys)
-    assert "xew.sim_warp.generate" in fails([str(published), "--data", str(tmp_path)], capsys)
-    assert "rollout.steps is 0; it must be at least 1" in fails([str(published), "--rollout.steps", "0"], capsys)
+    assert "names no model.weights" in refusal([str(world / "config.yaml")], capsys)
+    assert "did you mean 'piper'" in refusal([str(published), "--robots", "pipr"], capsys)
+    assert "did you mean 'unipc'" in refusal([str(published), "--rollout.sampler", "unipcc"], capsys)
+    assert "did you mean 'flowwam'" in refusal([str(published), "--rollout.grid", "flowam"], capsys)
+    assert "xew.sim_warp.generate" in refusal([str(published), "--data", str(tmp_path)], capsys)
+    assert "rollout.steps is 0; it must be at least 1" in refusal([str(published), "--rollout.steps", "0"], capsys)
 
 
 def test_rollouts_never_take_the_place_of_episodes(world: Path, published: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "rollouts would replace them" in fails([str(published), "--out", str(world / "data")], capsys)
+    assert "rollouts would replace them" in refusal([str(published), "--out", str(world / "data")], capsys)
     assert choose_tests(world / "data")
 
 
@@ -259,8 +259,8 @@ def test_a_run_allows_rollout_overrides_only(world: Path, tmp_path: Path, capsys
     run = str(tmp_path / "run")
     train.main([str(world / "config.yaml"), "--out", run, "--train.sample-every", "0"])
     capsys.readouterr()
-    assert "--model.action" in fails([run, "--model.action", "none"], capsys)
-    assert "has no checkpoint of step 9" in fails([run, "--checkpoint", "9"], capsys)
+    assert "--model.action" in refusal([run, "--model.action", "none"], capsys)
+    assert "has no checkpoint of step 9" in refusal([run, "--checkpoint", "9"], capsys)
     out = tmp_path / "out"
     rollout.main([run, "--checkpoint", "1", "--out", str(out), "--robots", "piper", "--rollout.steps", "3"])
     header = json.loads(next(out.glob("*/*/*/rollout.json")).read_text())
@@ -274,7 +274,7 @@ def test_a_run_allows_rollout_overrides_only(world: Path, tmp_path: Path, capsys
     assert "1 rollouts new" in capsys.readouterr().out, "the same config trained anew makes other rollouts"
     for file in (tmp_path / "run" / "codec").iterdir():
         file.unlink()
-    assert "lacks its codec" in fails([run], capsys)
+    assert "lacks its codec" in refusal([run], capsys)
 
 
 def test_a_failed_write_is_told(world: Path, tmp_path: Path) -> None:

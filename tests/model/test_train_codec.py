@@ -30,8 +30,9 @@ from xew.model.codec_training.settings import (
     training_episodes,
 )
 from xew.model.codec_training.step import augment, codec_losses, unpack_regions
+from xew.model.codecs.autoencoders import ConvAutoencoderCodec, WanVaeCodec
 from xew.model.codecs.ceiling import reconstruct
-from xew.model.codecs.codec import CodecSettings, ConvAutoencoderCodec, WanVaeCodec
+from xew.model.codecs.contract import CodecSettings
 from xew.model.codecs.conv_autoencoder import AUTOENCODERS
 from xew.model.episodes.choice import training_episodes as model_episodes
 from xew.model.experiment import load_experiment

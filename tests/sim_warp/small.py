@@ -40,6 +40,8 @@ def success(scene: Scene, now: Moment) -> bool:
 
 CLOSE = Task("close", "close both hands", sample, plan, success)
 SLOW_PIPER = replace(ROBOTS["piper"], joint_velocity=(0.02,) * 6)
+WITH_SLOW = ROBOTS | {SLOW: SLOW_PIPER}
+"""Robots of the registry and the slow one, by the names that jobs give."""
 
 
 def at_home(robot: RobotSpec, frames: int) -> np.ndarray:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.sim_warp.small import SLOW, TASK
+from tests.sim_warp.small import SLOW, TASK, WITH_SLOW
 from xew.config import ConfigError
 from xew.dataset import find_accepted, find_records
 from xew.episode import EpisodeError, Record, episode_folder, verify_episode, write_episode
@@ -22,6 +22,7 @@ from xew.sim_warp.generate import Args, Family, generate, main, yield_table
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import produce
 from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.robots import RobotSpec
 
 ROOT = Path(__file__).parents[2]
 ROBOTS = ("franka_panda", SLOW)
@@ -70,7 +71,7 @@ def test_what_was_rejected_is_on_record_with_its_reason(undisturbed: Path) -> No
 
 def test_neither_workers_nor_batches_change_a_byte(undisturbed: Path, tmp_path: Path) -> None:
     jobs = [Job(TASK, seed, ROBOTS) for seed in (4, 1, TEST_SEED_START)]
-    produce(jobs, tmp_path, Renderer("cpu"))
+    produce(jobs, tmp_path, Renderer("cpu"), robots=WITH_SLOW)
     found, expected = contents(tmp_path), contents(undisturbed)
     assert len(found) == 6 and all(expected[name] == cell for name, cell in found.items())
 
@@ -81,6 +82,18 @@ def test_what_is_there_is_not_made_again(undisturbed: Path, monkeypatch: pytest.
 
     monkeypatch.setattr(command.Workers, "run", none)
     assert [family.accepted for family in generate(arguments(undisturbed))] == [3, 1]
+
+
+def test_each_robot_is_found_once(undisturbed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+
+    def find(name: str, data: Path) -> RobotSpec:
+        found.append(name)
+        return WITH_SLOW[name]
+
+    monkeypatch.setattr(command, "get_robot", find)
+    assert [family.robots for family in generate(arguments(undisturbed))] == [ROBOTS, ROBOTS]
+    assert found == list(ROBOTS)
 
 
 def test_what_is_deleted_is_made_again(undisturbed: Path, tmp_path: Path) -> None:

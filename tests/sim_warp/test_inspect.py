@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.sim_warp.small import SLOW, TASK
+from tests.sim_warp.small import SLOW, TASK, WITH_SLOW
 from xew.episode import States, episode_folder, read_record, read_states, read_video, write_episode
 from xew.sim_warp.inspect import (
     GAP,
@@ -40,7 +40,7 @@ Inspect = Callable[..., tuple[int, str, str]]
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One accepted seed and one rejected."""
     out = tmp_path_factory.mktemp("data")
-    produce([Job(TASK, seed, ROBOTS) for seed in (0, 1)], out, Renderer("cpu"))
+    produce([Job(TASK, seed, ROBOTS) for seed in (0, 1)], out, Renderer("cpu"), robots=WITH_SLOW)
     return out
 
 
@@ -82,7 +82,7 @@ def test_sound_data_is_verified_and_rendered_again(made: Path, inspect: Inspect)
 
 def test_videos_that_were_left_out_are_made_on_demand(made: Path, tmp_path: Path, inspect: Inspect) -> None:
     data = tmp_path / "states"
-    produce([Job(TASK, 0, ROBOTS)], data, Renderer("cpu"), videos=False)
+    produce([Job(TASK, 0, ROBOTS)], data, Renderer("cpu"), videos=False, robots=WITH_SLOW)
     folders = [episode_folder(data, TASK, 0, robot) for robot in ROBOTS]
     assert not any((folder / "rgb.mkv").exists() for folder in folders)
     code, _, told = inspect(data, "--pictures", tmp_path / "sheets")

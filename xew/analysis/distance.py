@@ -9,7 +9,7 @@ standard error over views) and the figure that the paper prints.
 """
 
 import importlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -96,16 +96,14 @@ def main(args: Args) -> None:
     if args.seeds < 1:
         raise ConfigError(f"--seeds is {args.seeds}; expected 1 or more.")
     distance = _import_image_distance(args.perceptual) if args.looks and args.perceptual else None
-    names = (*ROBOT_NAMES, *args.robot)
-    robots = find_robots(names)
+    robots = find_robots((*ROBOT_NAMES, *args.robot))
     features = measure(robots, range(args.seeds), workers=args.workers)
     axes = {"kinematic": Axis(features.robots, features.kinematic.mean(axis=0), features.kinematic)}
     for other in OTHER_FRAMES:
         draws = measure(robots, range(args.seeds), other, args.workers).kinematic
         axes[other] = Axis(features.robots, draws.mean(axis=0), draws)
     if args.looks:
-        whole = {key: name for (key, robot), name in zip(robots.items(), names, strict=True) if isinstance(robot, RobotSpec)}
-        axes |= _measure_looks(whole, distance)
+        axes |= _measure_looks([robot for robot in robots.values() if isinstance(robot, RobotSpec)], distance)
     floor = chamfer_floor(robots, range(min(args.seeds, FLOOR_SEEDS)))
     pairs, singles = distance_frame(axes), robot_frame(features, axes, floor)
     for title, axis in axes.items():
@@ -135,11 +133,11 @@ def find_robots(names: Iterable[str]) -> dict[str, RobotSpec | Urdf]:
     return found
 
 
-def _measure_looks(names: Mapping[str, str], distance: ImageDistance | None) -> dict[str, Axis]:
-    """Distances of appearance between robots, given as key and the name that finds the robot."""
+def _measure_looks(specs: Sequence[RobotSpec], distance: ImageDistance | None) -> dict[str, Axis]:
+    """Distances of appearance between robots."""
     from xew.sim_warp.rendering.streams import VIEW_COUNT, nine_views  # loads Warp, which no other part of the analysis needs
 
-    renders, robots = [nine_views(name) for name in names.values()], tuple(names)
+    renders, robots = [nine_views(robot) for robot in specs], tuple(robot.key for robot in specs)
     without_one = [appearance_matrix([np.delete(views, i, axis=0) for views in renders]) for i in range(VIEW_COUNT)]
     jackknife = (VIEW_COUNT - 1) / np.sqrt(VIEW_COUNT)
     axes = {"appearance": Axis(robots, appearance_matrix(renders), np.array(without_one), jackknife)}

@@ -40,6 +40,7 @@ from xew.metrics.grading.scores import (
     check_out,
     describe,
     path_beside,
+    surfaces_folder,
     write_diagnostics,
     write_tables,
     write_whole,
@@ -271,7 +272,7 @@ def _grade_group(
             break
         try:
             needed = {input_kind(name) for _, names in group for name in names}
-            truth = truth or read_truth(job.episode, job.cell.frames, needed)
+            truth = truth or read_truth(job.episode, job.cell.frames, needed, surfaces_folder(args.data, args.out))
             if truth.surfaces is not None and not truth.surfaces.known:
                 without_shapes.add(job.episode)
             store.write(job.cell, _grade_job(job, truth, metrics, args, bench))

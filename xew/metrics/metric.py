@@ -1,4 +1,8 @@
-"""What a metric is, and what all metrics share: checks on arrays, and frames by the chunk."""
+"""What a metric is, and what all metrics share: checks on arrays, and frames by the chunk.
+
+A metric compares one of INPUTS, which grade.py makes of a prediction and of the ground truth (truth.py). To add a metric of
+those, only its function and its entry in METRICS are written.
+"""
 
 import functools
 import inspect

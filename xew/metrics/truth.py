@@ -86,13 +86,14 @@ class Truth:
     """Points on surfaces; None where they were not asked for."""
 
 
-def read_truth(folder: Path, frames: int, compared: Collection[str]) -> Truth:
+def read_truth(folder: Path, frames: int, compared: Collection[str], keep: Path | None = None) -> Truth:
     """The first frames of an episode.
 
     Args:
         folder: of the episode.
         frames: how many are asked for.
         compared: keys of NEEDS; an array that none of them rests on may be unknown.
+        keep: folder that keeps points on surfaces, so that they are rendered once; None renders them anew.
 
     Raises:
         EpisodeError: a file is missing or damaged, files contradict each other, or the episode does not know what is compared.
@@ -109,7 +110,7 @@ def read_truth(folder: Path, frames: int, compared: Collection[str]) -> Truth:
     visible = _find_visible(objects, rgb, states.robot_mask)
     surfaces = None
     if {"robot_points", "object_points"} & set(compared):
-        surfaces = _find_surfaces(folder, frames) or Surfaces(
+        surfaces = _find_surfaces(folder, frames, keep) or Surfaces(
             Points(states.keypoints[:frames], states.keypoint_visible[:frames]),
             _of_moving(states.object_pose[..., :3], Points(objects, visible), frames),
             shown=None,
@@ -128,12 +129,12 @@ def read_truth(folder: Path, frames: int, compared: Collection[str]) -> Truth:
     )
 
 
-def _find_surfaces(folder: Path, frames: int) -> Surfaces | None:
+def _find_surfaces(folder: Path, frames: int, keep: Path | None) -> Surfaces | None:
     """Points on surfaces in an episode's first frames; None where its shapes are not known."""
     # Only here: the metrics load without Warp.
     from xew.sim_warp.production.surfaces import read_surfaces
 
-    tracks = read_surfaces(folder)
+    tracks = read_surfaces(folder, keep=keep)
     if tracks is None:
         return None
     of_robot = tracks.is_robot[tracks.body]

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from xew.command_line import parse_command
 from xew.config import load, pick
-from xew.model.codecs.codec import CodecSettings, latent_frames
+from xew.model.codecs.contract import CodecSettings, latent_frames
 from xew.model.codecs.vae import VAES
 from xew.model.conditions import Condition
 from xew.model.devices.sharding import MeshSettings
@@ -28,7 +28,7 @@ from xew.model.settings.optimizer import make_optimizer
 from xew.model.settings.parts import ClipInputs, Encoding, EpisodeChoice, Instructions, Learning, pick_conditions
 from xew.model.settings.settings import AdaptSettings, Clip, ModelSettings, RolloutSettings, TrainSettings
 from xew.model.text.instructions import TEXT_ENCODERS, VOCABULARY, TextEncoder, TextSource
-from xew.protocol import ACTION_DIM, SPLITS, Split
+from xew.protocol import ACTION_DIM, SPLITS, Split, expand_robots
 
 F = TypeVar("F")
 
@@ -101,11 +101,11 @@ class Experiment:
     @property
     def choice(self) -> EpisodeChoice:
         """Which episodes are read. Raises ConfigError if the run that is replayed has gone."""
-        start, replay = self.adapt.start_from, tuple[str, ...]()
-        if start is not None and self.adapt.replay:
-            source = load_experiment(start / "config.yaml").robots.train_robots
-            replay = tuple(robot for robot in source if robot not in self.adapt.robots)
-        return EpisodeChoice(self.robots, self.adapt, replay, samples=self.train.sample_every > 0)
+        adapt, replay = replace(self.adapt, robots=expand_robots(self.adapt.robots)), tuple[str, ...]()
+        if adapt.start_from is not None and adapt.replay:
+            source = load_experiment(adapt.start_from / "config.yaml").robots.train_robots
+            replay = tuple(robot for robot in source if robot not in adapt.robots)
+        return EpisodeChoice(self.robots, adapt, replay, samples=self.train.sample_every > 0)
 
     @property
     def learning(self) -> Learning:

@@ -31,7 +31,8 @@ from xew.episode import Record, episode_folder
 from xew.files import checkpoint_time
 from xew.model.cache.codecs import load_codec
 from xew.model.cache.scales import Scale, load_run_scales
-from xew.model.codecs.codec import Codec, codec_class
+from xew.model.codecs.codec import codec_class
+from xew.model.codecs.contract import Codec
 from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
 from xew.model.episodes.choice import select_episodes, training_episodes
 from xew.model.experiment import Experiment, parse_experiment

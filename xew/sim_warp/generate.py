@@ -13,7 +13,7 @@ Command: python -m xew.sim_warp.generate --batch 256 [--tasks … --robots … -
 import itertools
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -33,7 +33,7 @@ from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import produce
 from xew.sim_warp.rendering.render import Renderer
-from xew.sim_warp.robots import ROBOTS, adopt_robots, get_robot, is_path
+from xew.sim_warp.robots import ROBOTS, RobotSpec, adopt_robots, get_robot, is_path
 from xew.sim_warp.tasks import TASKS, get_task
 
 TRIES_PER_SEED = 3
@@ -127,11 +127,11 @@ Made = tuple[list[Record], float]
 
 
 @contextmanager
-def start_workers(args: Args) -> Iterator[Callable[[Sequence[Job]], Iterator[Made]]]:
+def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Callable[[Sequence[Job]], Iterator[Made]]]:
     """Start worker processes; what is given runs jobs in them, one at a time on a CPU, in large batches on a GPU."""
     device = find_device(args.device)
-    size = max(1, args.batch // len(args.robots)) if device.is_cuda else 1
-    make = partial(_make, out=args.out, device=device.alias, batch=args.batch, videos=not args.states_only)
+    size = max(1, args.batch // len(robots)) if device.is_cuda else 1
+    make = partial(_make, robots=robots, out=args.out, device=device.alias, batch=args.batch, videos=not args.states_only)
     with Workers(args.workers or worker_count(device), first_alone=not has_kernels(device)) as workers:
 
         def run(jobs: Sequence[Job]) -> Iterator[Made]:
@@ -148,10 +148,10 @@ def _renderer(device: str) -> Renderer:
     return Renderer(device)
 
 
-def _make(jobs: Sequence[Job], out: Path, device: str, batch: int, videos: bool) -> list[Made]:
+def _make(jobs: Sequence[Job], robots: Mapping[str, RobotSpec], out: Path, device: str, batch: int, videos: bool) -> list[Made]:
     """Make some jobs in a worker process."""
     begin = time.perf_counter()
-    seeds = produce(jobs, out, _renderer(device), batch, videos)
+    seeds = produce(jobs, out, _renderer(device), batch, videos, robots)
     seconds = (time.perf_counter() - begin) / len(jobs)
     return [(records, seconds) for records in seeds]
 
@@ -161,11 +161,10 @@ def generate(args: Args) -> list[Family]:
     if args.robot:
         args = replace(args, robots=(str(args.robot.absolute()),))
     _check(args)
-    args = replace(args, robots=adopt_robots(args.robots, args.out))
-    robots = tuple(dict.fromkeys(args.robots))
+    robots = _find_robots(args.robots, args.out)
     manifest = Manifest() if args.search else read_manifest(args.manifest)
     families = [
-        Family(task, first, wanted, robots, manifest.failing(task, robots))
+        Family(task, first, wanted, tuple(robots), manifest.failing(task, tuple(robots)))
         for task in dict.fromkeys(args.tasks)
         for first, wanted in ((0, args.train_seeds), (TEST_SEED_START, args.test_seeds))
     ]
@@ -174,7 +173,7 @@ def generate(args: Args) -> list[Family]:
     frames: Counter[str] = Counter()
     total = sum(family.wanted for family in families)
     bar = tqdm(total=total, initial=sum(f.accepted for f in families), desc="accepted seeds", unit="seed")
-    with bar, start_workers(args) as make:
+    with bar, start_workers(args, robots) as make:
         while jobs := {(family.task, job.seed): (family, job) for family in families for job in family.next_jobs()}:
             for records, seconds in make([job for _, job in jobs.values()]):
                 family, _ = jobs[records[0].task, records[0].seed]
@@ -189,24 +188,38 @@ def generate(args: Args) -> list[Family]:
 
 
 def _check(args: Args) -> None:
-    """Check names, numbers and the folder before any work. Raises ConfigError or EpisodeError."""
+    """Check tasks and numbers before any work. Raises ConfigError or EpisodeError."""
     for task in args.tasks:
         get_task(task)
-    for robot in expand_robots(args.robots):
-        if not is_path(robot):
-            get_robot(robot, args.out)
     if not args.tasks or not args.robots or min(args.train_seeds, args.test_seeds) < 0 or args.batch < 1:
         raise EpisodeError(
             f"nothing to make of {len(args.tasks)} tasks, {len(args.robots)} robots, {args.train_seeds} training and "
             f"{args.test_seeds} test seeds in batches of {args.batch}; name tasks and robots, seeds from 0 and batches from 1."
         )
+
+
+def _find_robots(asked: Sequence[str], out: Path) -> dict[str, RobotSpec]:
+    """Robots by the names under which episodes know them, each found once; those at paths are kept beside the data.
+
+    Raises:
+        ConfigError: there is no such robot, or it cannot be used; then nothing has been written.
+        EpisodeError: the folder cannot be written to.
+    """
+    names = expand_robots(asked)
+    known = {name: get_robot(name, out) for name in names if not is_path(name)}
+    _prepare_folder(out)
+    return {key: known.get(name) or get_robot(key, out) for name, key in zip(names, adopt_robots(names, out), strict=True)}
+
+
+def _prepare_folder(out: Path) -> None:
+    """Make the folder, without what a stopped run left half-written. Raises EpisodeError where it cannot be written to."""
     try:
-        args.out.mkdir(parents=True, exist_ok=True)
-        remove_left_overs(args.out)
-        (args.out / ".writable").touch()
-        (args.out / ".writable").unlink()
+        out.mkdir(parents=True, exist_ok=True)
+        remove_left_overs(out)
+        (out / ".writable").touch()
+        (out / ".writable").unlink()
     except OSError as error:
-        raise EpisodeError(f"cannot write to {args.out}: {error.strerror}. Choose another folder with --out.") from error
+        raise EpisodeError(f"cannot write to {out}: {error.strerror}. Choose another folder with --out.") from error
 
 
 def _read_existing(families: list[Family], args: Args) -> None:

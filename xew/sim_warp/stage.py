@@ -1,7 +1,7 @@
 """The stage: table, wall, ground and lights, which never move, as plain data for scenes, physics and renderer.
 
 Sizes and lights are RoboTwin 2.0's (`demo_clean`); meters, world frame.
-To change the place where everything happens, change these constants.
+To change the place where everything happens, change these constants; to add a light, one line in LIGHTS.
 """
 
 from dataclasses import dataclass

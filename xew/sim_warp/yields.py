@@ -11,7 +11,7 @@ Command: python -m xew.sim_warp.yields [--tasks … --robots … --seeds 20 --fi
 import importlib
 import inspect
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -28,7 +28,7 @@ from xew.protocol import expand_robots
 from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
 from xew.sim_warp.production.episodes import header
-from xew.sim_warp.robots import ROBOTS, get_robot
+from xew.sim_warp.robots import ROBOTS, RobotSpec, get_robot
 from xew.sim_warp.tasks import TASKS, Task, get_task
 
 PARAGRAPHS = ("Task", "Randomization", "Success", "After")
@@ -64,12 +64,10 @@ def attempt_seeds(args: Args) -> Iterator[list[Record]]:
         ConfigError: an unknown task, robot or device.
         EpisodeError: nothing to try.
     """
-    tasks, robots = dict.fromkeys(args.tasks), tuple(dict.fromkeys(expand_robots(args.robots)))
+    tasks, robots = dict.fromkeys(args.tasks), {name: get_robot(name) for name in expand_robots(args.robots)}
     for name in tasks:
         get_task(name)
-    for name in robots:
-        get_robot(name)
-    jobs = [Job(task, args.first_seed + index, robots) for task in tasks for index in range(args.seeds)]
+    jobs = [Job(task, args.first_seed + index, tuple(robots)) for task in tasks for index in range(args.seeds)]
     if not jobs or not robots or args.first_seed < 0:
         raise EpisodeError(
             f"nothing to try of {len(tasks)} tasks, {len(robots)} robots and {args.seeds} seeds from {args.first_seed}; name "
@@ -78,15 +76,15 @@ def attempt_seeds(args: Args) -> Iterator[list[Record]]:
     device = find_device(args.device)
     size = max(1, args.batch // len(robots)) if device.is_cuda else 1
     batches = [jobs[start : start + size] for start in range(0, len(jobs), size)]
-    attempt = partial(attempt_batch, device=device.alias, batch=args.batch)
+    attempt = partial(attempt_batch, device=device.alias, batch=args.batch, robots=robots)
     with Workers(args.workers or worker_count(device), first_alone=not has_kernels(device)) as workers:
         for seeds in workers.run(attempt, batches):
             yield from seeds
 
 
-def attempt_batch(jobs: Sequence[Job], device: str, batch: int) -> list[list[Record]]:
+def attempt_batch(jobs: Sequence[Job], device: str, batch: int, robots: Mapping[str, RobotSpec] = ROBOTS) -> list[list[Record]]:
     """Plan and simulate some seeds; the headers that their episodes would have, without hashes."""
-    seeds = simulate_cells(plan_cells(jobs), device, batch)
+    seeds = simulate_cells(plan_cells(jobs, robots), device, batch)
     return [[header(cell, wp.get_device(device)) for cell in cells] for cells in seeds]
 
 

@@ -36,7 +36,7 @@ COLUMNS_AT_ONCE = 128
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean over episodes, or a number computed of several, and what it could as well have been."""
+    """A mean over episodes, or a number computed of several means, with its value in every bootstrap draw."""
 
     values: np.ndarray
     """[1 + n + k] float64: the number itself, its value in each of n draws (NaN in a draw without any episode), and its value

@@ -24,7 +24,7 @@ TAIL = 0.01
 
 
 class Drawn:
-    """What a number was in bootstrap draws, for its intervals and p-values.
+    """The values of a number in bootstrap draws, for its intervals and p-values.
 
     Args:
         values: [1 + n + k] float64: the number, n draws, and k values without one training each. Draws that are not finite

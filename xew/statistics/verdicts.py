@@ -14,7 +14,7 @@ BETTER, WORSE, UNRESOLVED = "better", "worse", "unresolved"
 
 
 def verdict(difference: float, ends: tuple[float, float], floor: float, higher_is_better: bool) -> str:
-    """Of a mean paired difference: is what was subtracted from better or worse than what was subtracted?
+    """Whether the first of two models is better or worse than the second, by the mean of their paired differences.
 
     Unresolved is what the interval does not tell from 0, what lies within the noise floor, and what has no interval or floor.
 

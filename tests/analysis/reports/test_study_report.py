@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.analysis.reports.browser import assert_readable, needs_chromium
+from tests.analysis.reports.browser import find_faults, needs_chromium
 from tests.analysis.synthetic_study import TASKS, paper_axes, write_study
 from tests.analysis.test_report import Page, refers_outside
 from tests.synthetic import write_synthetic_data
@@ -103,7 +103,7 @@ def test_the_page_is_well_formed_and_needs_no_network(folder: Path) -> None:
 @needs_chromium
 def test_a_browser_shows_it_on_a_phone_and_a_desk_in_light_and_dark(folder: Path) -> None:
     text = (folder / "report" / "index.html").read_text()
-    assert_readable(folder / "report" / "index.html", images=2, charts=text.count("<svg"))
+    assert find_faults(folder / "report" / "index.html", images=2, charts=text.count("<svg")) == []
 
 
 def test_the_finding_comes_first(folder: Path) -> None:
@@ -342,7 +342,7 @@ def test_all_distances_fit_a_desk(tmp_path: Path) -> None:
     main(Args(tmp_path / "scores.parquet", out=tmp_path / "report", distances=tmp_path))
     text = (tmp_path / "report" / "index.html").read_text()
     assert "Correlation of our own distances" in text
-    assert_readable(tmp_path / "report" / "index.html", images=0, charts=text.count("<svg"))
+    assert find_faults(tmp_path / "report" / "index.html", images=0, charts=text.count("<svg")) == []
 
 
 def test_wrong_inputs_name_what_to_do(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

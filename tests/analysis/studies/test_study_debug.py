@@ -124,14 +124,13 @@ def test_killed_anywhere_it_ends_in_the_same_report(place: Place, printed: str) 
             process.kill()
             process.communicate()
     killed.run()
-    same_files(place.study / "report", killed.study / "report")
+    assert different_files(place.study / "report", killed.study / "report") == []
     pd.testing.assert_frame_equal(rows_of(place.study), rows_of(killed.study))
 
 
-def same_files(straight: Path, killed: Path) -> None:
-    """Raises where two folders hold other files, or other bytes."""
-    files = {path.relative_to(straight) for path in straight.rglob("*") if path.is_file()}
-    assert files == {path.relative_to(killed) for path in killed.rglob("*") if path.is_file()}
-    assert files
-    different = [str(file) for file in sorted(files) if not filecmp.cmp(straight / file, killed / file, shallow=False)]
-    assert not different
+def different_files(straight: Path, killed: Path) -> list[str]:
+    """Names of files that only one of two folders holds, or whose bytes differ."""
+    first, second = ({path.relative_to(top) for path in top.rglob("*") if path.is_file()} for top in (straight, killed))
+    assert first, f"{straight} is empty"
+    shared = {file for file in first & second if not filecmp.cmp(straight / file, killed / file, shallow=False)}
+    return sorted(map(str, (first ^ second) | shared))

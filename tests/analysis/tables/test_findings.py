@@ -32,12 +32,12 @@ def scores(tmp_path_factory: pytest.TempPathFactory) -> Scores:
     return read_scores(write_study(tmp_path_factory.mktemp("findings") / "scores.parquet", spread=0.01))
 
 
-def asked(rows: pd.DataFrame, name: str, metrics: tuple[MetricInfo, ...]) -> Finding:
+def ask_one(rows: pd.DataFrame, name: str, metrics: tuple[MetricInfo, ...]) -> Finding:
     claim = next(claim for claim in CLAIMS if claim.name == name)
     return ask(StudyGrades(rows, metrics, paper_axes(read_paper())), [claim])[0]
 
 
-def changed(rows: pd.DataFrame, variant: str, metric: str, factor: float, robot: str | None = None) -> pd.DataFrame:
+def scale_scores(rows: pd.DataFrame, variant: str, metric: str, factor: float, robot: str | None = None) -> pd.DataFrame:
     """The same scores with one variant better or worse."""
     chosen = (rows["variant"] == variant) & (rows["metric"] == metric) & ((rows["robot"] == robot) if robot else True)
     return rows.assign(value=rows["value"].where(~chosen, rows["value"] * factor))
@@ -81,7 +81,7 @@ def test_the_gap_is_that_of_folds_on_the_same_robot(scores: Scores) -> None:
     rows = scores.rows
     hard = (rows["robot"] == "piper") & (rows["metric"] == "lpips") & (rows["variant"] != "")
     harder = rows.assign(value=rows["value"].where(~hard, rows["value"] * 3))
-    before, after = (asked(table, "gap", scores.metrics) for table in (rows, harder))
+    before, after = (ask_one(table, "gap", scores.metrics) for table in (rows, harder))
     assert before.answer == after.answer == "holds"
     assert [a.value for a in after.comparisons] == pytest.approx([a.value for a in before.comparisons])
     means = rows[(rows["robot"] == "piper") & (rows["metric"] == "lpips")].groupby("variant")["value"].mean()
@@ -89,10 +89,10 @@ def test_the_gap_is_that_of_folds_on_the_same_robot(scores: Scores) -> None:
     unseen = folds[[name for name in folds.index if name.startswith("loeo_piper")]].iloc[0]
     saw = (folds.sum() - unseen) / 4
     assert before.comparisons[1].value == pytest.approx((unseen - saw) / saw)
-    systems = [asked(table, "all systems degrade", scores.metrics) for table in (rows, harder)]
+    systems = [ask_one(table, "all systems degrade", scores.metrics) for table in (rows, harder)]
     assert [a.value for a in systems[1].comparisons] == pytest.approx([a.value for a in systems[0].comparisons])
     without = rows[~rows["variant"].str.startswith("loeo_")]
-    found = asked(without, "gap", scores.metrics)
+    found = ask_one(without, "gap", scores.metrics)
     assert found.answer == "unresolved" and all("no model that saw this one" in a.numbers for a in found.comparisons)
 
 
@@ -106,7 +106,7 @@ def test_saturation_is_an_equivalence(scores: Scores) -> None:
     for name, factor, spread in (("alike", 1.002, 0.004), ("noisy", 1.0, 0.2), ("harm", 1.2, 0.01)):
         noise = 1 + spread * rng.normal(size=len(same))
         value = np.clip(same["value"] * np.where(same["metric"] == "lpips", factor, 1) * noise, 0, 100)
-        answers[name] = asked(pd.concat([rest, same.assign(value=value)]), "views saturate", scores.metrics).answer
+        answers[name] = ask_one(pd.concat([rest, same.assign(value=value)]), "views saturate", scores.metrics).answer
     assert answers == {"alike": "holds", "noisy": "unresolved", "harm": "fails"}
 
 
@@ -117,12 +117,14 @@ def test_an_exact_p_decides_claims_about_five_robots(scores: Scores) -> None:
     straight = scores.rows["robot"].map(axis) * (1 + 0.01 * np.random.default_rng(0).normal(size=len(scores.rows)))
     rows = scores.rows.assign(value=scores.rows["value"].where(~chosen, straight))
     assert (
-        asked(rows, "looks predict", scores.metrics).answer == asked(rows, "looks are stable", scores.metrics).answer == "holds"
+        ask_one(rows, "looks predict", scores.metrics).answer
+        == ask_one(rows, "looks are stable", scores.metrics).answer
+        == "holds"
     )
     turned = rows.assign(value=rows["value"].where(~chosen, 0.3 - straight))
     assert (
-        asked(turned, "looks predict", scores.metrics).answer
-        == asked(turned, "looks are stable", scores.metrics).answer
+        ask_one(turned, "looks predict", scores.metrics).answer
+        == ask_one(turned, "looks are stable", scores.metrics).answer
         == "fails"
     )
     claims = [claim for claim in CLAIMS if claim.name == "looks are stable"]
@@ -137,7 +139,7 @@ def test_comparisons_and_claims_are_corrected_as_families(scores: Scores) -> Non
             assert (one.answer == "holds") == (one.p_holds <= 0.05) and (one.answer == "fails") == (one.p_fails <= 0.05)
         if finding.in_family not in ("unresolved", "not measured"):
             assert finding.in_family == finding.answer, "the answer among all is never bolder than that of the claim alone"
-    many = asked(scores.rows, "mask keeps outlines", scores.metrics)
+    many = ask_one(scores.rows, "mask keeps outlines", scores.metrics)
     alone = Reader(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper())))
     plain = [c.p_values(0.95)[0] for c in many.claim.comparisons(alone)]
     assert [a.p_holds for a in many.comparisons] == pytest.approx(list(holm(plain)))
@@ -145,15 +147,15 @@ def test_comparisons_and_claims_are_corrected_as_families(scores: Scores) -> Non
 
 def test_a_claim_fails_where_the_scores_say_the_opposite(scores: Scores) -> None:
     rows, flow = scores.rows, "fixed-optical_flow-none"
-    assert asked(rows, "flow looks best", scores.metrics).answer == "holds"
-    worse = changed(rows, flow, "lpips", 3.0, "piper")
-    found = asked(worse, "flow looks best", scores.metrics)
+    assert ask_one(rows, "flow looks best", scores.metrics).answer == "holds"
+    worse = scale_scores(rows, flow, "lpips", 3.0, "piper")
+    found = ask_one(worse, "flow looks best", scores.metrics)
     assert found.answer == "fails" and {a.answer for a in found.comparisons if "Franka" in a.label} == {"holds"}
     fold = "loeo_franka_panda-optical_flow-nine_views"
-    assert asked(changed(rows, fold, "lpips", 0.1, "franka_panda"), "gap", scores.metrics).answer == "fails"
-    calm = changed(rows, "few_shot-franka_panda-1", "lpips", 0.55, "ur5_wsg")
-    assert asked(calm, "forgetting", scores.metrics).answer == "fails"
-    assert asked(calm, "catastrophic forgetting", scores.metrics).answer == "fails"
+    assert ask_one(scale_scores(rows, fold, "lpips", 0.1, "franka_panda"), "gap", scores.metrics).answer == "fails"
+    calm = scale_scores(rows, "few_shot-franka_panda-1", "lpips", 0.55, "ur5_wsg")
+    assert ask_one(calm, "forgetting", scores.metrics).answer == "fails"
+    assert ask_one(calm, "catastrophic forgetting", scores.metrics).answer == "fails"
 
 
 def test_a_difference_inside_the_noise_floor_is_not_resolved(scores: Scores) -> None:
@@ -163,12 +165,12 @@ def test_a_difference_inside_the_noise_floor_is_not_resolved(scores: Scores) -> 
     near = close.assign(variant=mask, condition=mask, value=close["value"] + 0.02)
     keep = ~((rows["variant"] == mask) & (rows["metric"] == "mask_iou") & (rows["robot"] == "piper"))
     with_near = pd.concat([rows[keep], near])
-    found = asked(with_near, "mask keeps outlines", scores.metrics)
+    found = ask_one(with_near, "mask keeps outlines", scores.metrics)
     answer = next(a for a in found.comparisons if a.label == "over optical flow, Piper Mask IoU")
     assert answer.low > 0 and answer.answer == "unresolved" and "noise floor of 0.03" in answer.numbers
     truth = (with_near["model"] == "ground_truth") & (with_near["metric"] == "mask_iou")
     exact = with_near.assign(value=with_near["value"].where(~truth, 1.0))
-    found = asked(exact, "mask keeps outlines", scores.metrics)
+    found = ask_one(exact, "mask keeps outlines", scores.metrics)
     assert next(a for a in found.comparisons if a.label == answer.label).answer == "holds"
 
 
@@ -176,23 +178,23 @@ def test_a_share_of_a_gap_that_is_not_there_is_no_answer(scores: Scores) -> None
     """Where both steps lead the wrong way, their ratio looks like a long way gone."""
     worse = scores.rows
     for row, factor in (("fixed-ray_map-none", 3.0), ("fixed-optical_flow-none", 6.0)):
-        worse = changed(worse, row, "lpips", factor)
+        worse = scale_scores(worse, row, "lpips", factor)
     for robot in HELD_OUT_ROBOTS:
         for shots in SHOTS:
-            worse = changed(worse, f"few_shot-{robot}-{shots}", "lpips", 4.0 + 0.1 * shots, robot)
-        worse = changed(worse, "fixed-optical_flow-none", "region_lpips", 0.02, robot)
-        worse = changed(worse, "fixed-optical_flow-robot_render", "region_lpips", 0.2, robot)
+            worse = scale_scores(worse, f"few_shot-{robot}-{shots}", "lpips", 4.0 + 0.1 * shots, robot)
+        worse = scale_scores(worse, "fixed-optical_flow-none", "region_lpips", 0.02, robot)
+        worse = scale_scores(worse, "fixed-optical_flow-robot_render", "region_lpips", 0.2, robot)
     for name in ("rays recover", "returns diminish", "only alignment closes the gap"):
-        found = asked(worse, name, scores.metrics)
+        found = ask_one(worse, name, scores.metrics)
         assert found.answer == "unresolved" and all("no gap to close" in a.numbers for a in found.comparisons), name
 
 
 def test_a_render_that_gains_nothing_does_not_gain_more_than_views_that_harm(scores: Scores) -> None:
     worse = scores.rows
     for robot in HELD_OUT_ROBOTS:
-        worse = changed(worse, "fixed-optical_flow-nine_views", "region_lpips", 3.0, robot)
-        worse = changed(worse, "fixed-optical_flow-robot_render", "region_lpips", 4.0, robot)
-    found = asked(worse, "render gains most", scores.metrics)
+        worse = scale_scores(worse, "fixed-optical_flow-nine_views", "region_lpips", 3.0, robot)
+        worse = scale_scores(worse, "fixed-optical_flow-robot_render", "region_lpips", 4.0, robot)
+    found = ask_one(worse, "render gains most", scores.metrics)
     assert found.answer == "fails"
     assert {a.answer for a in found.comparisons if "Region" in a.label and a.label.endswith(": render")} == {"fails"}
 
@@ -200,18 +202,18 @@ def test_a_render_that_gains_nothing_does_not_gain_more_than_views_that_harm(sco
 def test_few_scenes_resolve_nothing(tmp_path: Path) -> None:
     few = read_scores(write_study(tmp_path / "scores.parquet", tasks=TASKS[:1], seeds=5))
     enough = read_scores(write_study(tmp_path / "more.parquet", tasks=TASKS[:1], seeds=6))
-    assert asked(few.rows, "gap", few.metrics).answer == "unresolved"
-    assert "fewer than 6 scenes" in asked(few.rows, "gap", few.metrics).comparisons[0].numbers
-    assert asked(enough.rows, "gap", enough.metrics).answer == "holds"
+    assert ask_one(few.rows, "gap", few.metrics).answer == "unresolved"
+    assert "fewer than 6 scenes" in ask_one(few.rows, "gap", few.metrics).comparisons[0].numbers
+    assert ask_one(enough.rows, "gap", enough.metrics).answer == "holds"
 
 
 def test_what_was_not_run_is_named_and_not_judged(scores: Scores) -> None:
     rows = scores.rows[scores.rows["variant"] != "fixed-optical_flow-robot_render"]
-    found = asked(rows, "render gains most", scores.metrics)
+    found = ask_one(rows, "render gains most", scores.metrics)
     assert found.answer == "not measured" and "robot render" in found.missing and not found.comparisons
     without = rows[rows["metric"] != "lpips"]
     infos = tuple(metric for metric in scores.metrics if metric.name != "lpips")
-    assert asked(without, "gap", infos).answer == "not measured"
+    assert ask_one(without, "gap", infos).answer == "not measured"
 
 
 def test_cells_that_one_row_lacks_count_for_none(scores: Scores) -> None:
@@ -220,8 +222,8 @@ def test_cells_that_one_row_lacks_count_for_none(scores: Scores) -> None:
     hard = (rows["task"] == TASKS[0]) & (rows["metric"] == "lpips")
     rows.loc[hard, "value"] = np.minimum(rows.loc[hard, "value"] * 20, 5.0)
     lacking = rows[~(hard & (rows["variant"] == "fixed-joints-none"))]
-    full = asked(rows[rows["task"] != TASKS[0]], "pixels beat joints", scores.metrics)
-    found = asked(lacking, "pixels beat joints", scores.metrics)
+    full = ask_one(rows[rows["task"] != TASKS[0]], "pixels beat joints", scores.metrics)
+    found = ask_one(lacking, "pixels beat joints", scores.metrics)
     assert [a.value for a in found.comparisons] == pytest.approx([a.value for a in full.comparisons])
 
 

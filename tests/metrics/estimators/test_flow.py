@@ -26,7 +26,7 @@ def moving_robot() -> tuple[np.ndarray, np.ndarray]:
     action = np.tile(home_action(robot), (4, 1))
     for sign, (joints, _) in zip((1, -1), ARMS, strict=True):
         action[:, joints.start : joints.start + robot.arm_joint_count] += sign * STEP * np.arange(4)[:, None]
-    streams = command_streams("piper", action)
+    streams = command_streams(robot, action)
     return streams.render, streams.optical_flow[:-1]
 
 

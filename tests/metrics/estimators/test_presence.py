@@ -18,7 +18,7 @@ def draw(red: tuple[int, int] | None, dark: tuple[int, int] = (5, 5)) -> np.ndar
     return image
 
 
-def shown(red: tuple[int, int], dark: tuple[int, int] = (5, 5)) -> np.ndarray:
+def draw_bodies(red: tuple[int, int], dark: tuple[int, int] = (5, 5)) -> np.ndarray:
     """[60 80] int16, 0 the red body, 1 the dark one, -1 the ground."""
     whose = np.full(GROUND.shape[:2], -1, np.int16)
     for number, place in ((1, dark), (0, red)):
@@ -30,7 +30,7 @@ def keeps(prediction: np.ndarray, found: tuple[float, float], true: tuple[int, i
     """Is a place that a tracker found for the red body in a frame kept?"""
     points = np.float32([[true]])
     places = np.float32([[found]])
-    seen, whose = np.ones((1, 1), bool), shown(true)[None]
+    seen, whose = np.ones((1, 1), bool), draw_bodies(true)[None]
     confirmed = confirm_tracks(places, prediction[None], draw(true)[None], points, seen, whose, np.zeros(1, np.int32))
     assert np.isnan(confirmed).all() or (confirmed == places).all()
     return bool(np.isfinite(confirmed).all())
@@ -51,7 +51,7 @@ def test_another_body_is_not_it() -> None:
     truth = draw((40, 30), dark=(60, 45))
     truth[43:48, 56:65] = RED  # of the same color, and it stands there in the truth too
     prediction = np.where((np.arange(80) < 50)[None, :, None], GROUND, truth)
-    whose = shown((40, 30), dark=(60, 45))[None]
+    whose = draw_bodies((40, 30), dark=(60, 45))[None]
     arguments = prediction[None], truth[None], np.float32([[[40, 30]]]), np.ones((1, 1), bool), whose, np.zeros(1, np.int32)
     assert np.isnan(confirm_tracks(np.float32([[[60, 45]]]), *arguments)).all()
 
@@ -60,5 +60,5 @@ def test_what_was_lost_stays_lost_and_hidden_points_are_left_alone() -> None:
     found = np.float32([[[np.nan, np.nan], [3, 3]]])
     points, seen = np.float32([[[40, 30], [40, 30]]]), np.array([[True, False]])
     frame = draw((40, 30))[None]
-    confirmed = confirm_tracks(found, frame, frame, points, seen, shown((40, 30))[None], np.zeros(2, np.int32))
+    confirmed = confirm_tracks(found, frame, frame, points, seen, draw_bodies((40, 30))[None], np.zeros(2, np.int32))
     np.testing.assert_array_equal(confirmed, found)

@@ -92,7 +92,7 @@ def authors_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def found(masker: Masker, video: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def masks(masker: Masker, video: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """The masks that a masker gives."""
     frames, mask = video
     return masker(frames, frames, mask)
@@ -105,23 +105,23 @@ def masker(request: pytest.FixtureRequest) -> Masker:
     return open_masker("sam2", path) if path.is_dir() else open_sam2(path, side=SIDE)
 
 
-def test_masks_spread_from_the_largest_true_mask(found: np.ndarray, video: tuple[np.ndarray, np.ndarray]) -> None:
+def test_masks_spread_from_the_largest_true_mask(masks: np.ndarray, video: tuple[np.ndarray, np.ndarray]) -> None:
     _, mask = video
-    assert found.shape == mask.shape and found.dtype == bool
-    np.testing.assert_array_equal(found[PROMPTED], mask[PROMPTED])
-    others = np.delete(found, PROMPTED, axis=0)
+    assert masks.shape == mask.shape and masks.dtype == bool
+    np.testing.assert_array_equal(masks[PROMPTED], mask[PROMPTED])
+    others = np.delete(masks, PROMPTED, axis=0)
     assert others.any() and not others.all(), "random weights ought to find something, and not everything"
 
 
-def test_both_directions_start_afresh(masker: Masker, found: np.ndarray, video: tuple[np.ndarray, np.ndarray]) -> None:
+def test_both_directions_start_afresh(masker: Masker, masks: np.ndarray, video: tuple[np.ndarray, np.ndarray]) -> None:
     """What comes before the prompted frame changes nothing after it, and the other way round."""
     frames, mask = video
     first, last = frames.copy(), frames.copy()
     first[:PROMPTED], last[PROMPTED + 1 :] = 255 - first[:PROMPTED], 255 - last[PROMPTED + 1 :]
     for changed, same, other in ((first, slice(PROMPTED, None), 0), (last, slice(PROMPTED + 1), -1)):
         again = masker(changed, frames, mask)
-        np.testing.assert_array_equal(again[same], found[same])
-        assert (again[other] != found[other]).any()
+        np.testing.assert_array_equal(again[same], masks[same])
+        assert (again[other] != masks[other]).any()
 
 
 def test_without_a_robot_there_is_nothing_to_follow(masker: Masker, video: tuple[np.ndarray, np.ndarray]) -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from xew.metrics import psnr
 from xew.model.codecs.ceiling import choose_evenly, measure_ceiling
-from xew.model.codecs.codec import PatchCodec
+from xew.model.codecs.patches import PatchCodec
 from xew.model.video.frames import to_camera_size, to_model_size
 
 

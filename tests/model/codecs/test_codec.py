@@ -10,18 +10,9 @@ from flax import nnx
 
 from xew.config import ConfigError
 from xew.metrics import psnr
-from xew.model.codecs.codec import (
-    CodecSettings,
-    PatchCodec,
-    WanVaeCodec,
-    cut_patches,
-    decode_to_pictures,
-    encode_pictures,
-    join_patches,
-    latent_frames,
-    to_pictures,
-    to_signed,
-)
+from xew.model.codecs.autoencoders import WanVaeCodec
+from xew.model.codecs.contract import CodecSettings, decode_to_pictures, encode_pictures, latent_frames, to_pictures, to_signed
+from xew.model.codecs.patches import PatchCodec, cut_patches, join_patches
 from xew.model.codecs.vae import VAES, abstract_vae
 from xew.model.codecs.vae_layouts import save_vae
 from xew.model.video.frames import to_camera_size, to_model_size
@@ -197,7 +188,7 @@ def test_saved_autoencoder_is_the_same(vae_codec: WanVaeCodec, tmp_path: Path) -
     loaded = WanVaeCodec.load(tmp_path)
     assert loaded.hash == vae_codec.hash and loaded.size == vae_codec.size and loaded.chunk == 2
     np.testing.assert_array_equal(loaded.encode(smooth_clip(9)), vae_codec.encode(smooth_clip(9)))
-    other = loaded.vae
+    other = loaded.autoencoder
     other.latents_mean.set_value(jax.numpy.zeros(48))
     assert WanVaeCodec.from_vae(other).hash != vae_codec.hash
     assert WanVaeCodec.from_weights(tmp_path, VAES["tiny"], "bfloat16").hash != vae_codec.hash

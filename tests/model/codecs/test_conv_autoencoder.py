@@ -11,8 +11,9 @@ from safetensors.numpy import load_file, save_file
 
 from tests.model.codecs.test_codec import smooth_clip
 from xew.config import ConfigError
-from xew.model.codecs import codec as codecs
-from xew.model.codecs.codec import CodecSettings, ConvAutoencoderCodec, encode_pictures
+from xew.model.codecs import autoencoders
+from xew.model.codecs.autoencoders import ConvAutoencoderCodec
+from xew.model.codecs.contract import CodecSettings, encode_pictures
 from xew.model.codecs.conv_autoencoder import (
     AUTOENCODERS,
     AutoencoderSize,
@@ -44,7 +45,7 @@ def settings(weights: Path | None, channels: int = 48) -> CodecSettings:
 def test_the_shipped_size_fits_into_20_megabytes() -> None:
     """Two bytes a number, and a little for names and norms."""
     assert 9.0e6 < count_parameters(AUTOENCODERS["base"]) <= 9.7e6
-    assert (AUTOENCODERS["base"].spatial_factor, AUTOENCODERS["base"].channels) == codecs.PACKAGED_SHAPE
+    assert (AUTOENCODERS["base"].spatial_factor, AUTOENCODERS["base"].channels) == autoencoders.PACKAGED_SHAPE
 
 
 def test_shapes_and_types(codec: ConvAutoencoderCodec) -> None:
@@ -128,7 +129,7 @@ def test_a_block_begins_as_its_shortcut() -> None:
 
 
 def test_missing_weights_are_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(codecs, "PACKAGED_WEIGHTS", tmp_path / "nothing.safetensors")
+    monkeypatch.setattr(autoencoders, "PACKAGED_WEIGHTS", tmp_path / "nothing.safetensors")
     with pytest.raises(ConfigError, match=r"train one by `python -m xew\.model\.train_codec"):
         ConvAutoencoderCodec.prepare(settings(None), list)
     with pytest.raises(ConfigError, match="there are no weights at"):
@@ -138,7 +139,7 @@ def test_missing_weights_are_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 
 
 def test_packaged_weights_are_found(monkeypatch: pytest.MonkeyPatch, weights: Path, codec: ConvAutoencoderCodec) -> None:
-    monkeypatch.setattr(codecs, "PACKAGED_WEIGHTS", weights)
+    monkeypatch.setattr(autoencoders, "PACKAGED_WEIGHTS", weights)
     assert ConvAutoencoderCodec.prepare(settings(None), list).hash == codec.hash
 
 

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from tests.model.codecs.test_codec import smooth_clip
-from xew.model.codecs.codec import CODECS, Codec, ConvAutoencoderCodec, PatchCodec, decode_to_pictures
+from xew.model.codecs.autoencoders import ConvAutoencoderCodec
+from xew.model.codecs.codec import CODECS
+from xew.model.codecs.contract import Codec, decode_to_pictures
 from xew.model.codecs.conv_autoencoder import AUTOENCODERS, ConvAutoencoder
+from xew.model.codecs.patches import PatchCodec
 from xew.model.diffusion.flow_matching import put_first
 from xew.model.training.step import estimate_clean, sample_pairs
 

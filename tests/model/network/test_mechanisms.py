@@ -38,7 +38,7 @@ SIGMA = jnp.array([0.3, 0.9], jnp.float32)
 LATENTS, TEXT = normal(2, *SHAPE), normal(3, 2, 8, 16)
 
 
-def told(streams: tuple[str, ...]) -> dict[str, jax.Array]:
+def make_conditions(streams: tuple[str, ...]) -> dict[str, jax.Array]:
     """Noise in the shape of what each stream or mechanism is told."""
     history = len(EARLIER) if "history" in streams else 0
     shapes = {name: SHAPE for name in streams} | {"history": (2, history, *SHAPE[2:]), "joints": (2, 3, 16)}
@@ -65,7 +65,7 @@ KINDS += [("none", embodiment, False) for embodiment in CONDITIONS if embodiment
 def test_every_condition_fits_is_used_and_can_be_learned(action: str, embodiment: str, history: bool) -> None:
     """All of ACTIONS and CONDITIONS: shapes, finite gradients, and a change of any condition changes the velocity."""
     streams = streams_of(action, embodiment, history)
-    model, conditions = model_of(streams), told(streams)
+    model, conditions = model_of(streams), make_conditions(streams)
     graph, params = nnx.split(model, nnx.Param)
 
     def loss(params: nnx.State, conditions: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -108,7 +108,7 @@ def test_new_parts_that_can_start_at_zero_do() -> None:
     model, plain = (WorldModel(MODELS["tiny"], CHANNELS, streams, rngs=nnx.Rngs(0)) for streams in (names, ()))
     for network in (model, plain):  # the head starts at zero too
         network.head.head.kernel.set_value(normal(5, *network.head.head.kernel.shape))
-    conditions = told(names)
+    conditions = make_conditions(names)
     expected = plain(LATENTS, {}, SIGMA, TEXT)
     model.mechanisms["relative_time"].null.set_value(jnp.zeros(MODELS["tiny"].dim, jnp.float32))
     np.testing.assert_allclose(model(LATENTS, conditions, SIGMA, TEXT), expected, atol=1e-5)
@@ -119,7 +119,7 @@ def test_new_parts_that_can_start_at_zero_do() -> None:
 
 def test_each_frame_is_told_its_own_vector() -> None:
     """Embeddings of time are those of the noise levels, then a sum for each frame; a stream's tokens keep the noise levels."""
-    model, conditions = model_of(("action", "pose_time")), told(("action", "pose_time"))
+    model, conditions = model_of(("action", "pose_time")), make_conditions(("action", "pose_time"))
     tokens, levels, _ = model.embed_streams(LATENTS, conditions)
     time = model.embed_time(SIGMA)
     framed, of_tokens = model.add_frame_vectors(time, levels, LATENTS.shape, conditions)
@@ -131,7 +131,7 @@ def test_each_frame_is_told_its_own_vector() -> None:
 
 
 def test_levels_of_frames_equal_a_timestep_of_every_token() -> None:
-    model, conditions = model_of(("pose_time",)), told(("pose_time",))
+    model, conditions = model_of(("pose_time",)), make_conditions(("pose_time",))
     tokens, levels, rotary = model.embed_streams(LATENTS, conditions)
     time, levels = model.add_frame_vectors(model.embed_time(SIGMA), levels, LATENTS.shape, conditions)
     every, of_tokens = np.arange(tokens.shape[1]), time[:, levels]
@@ -153,7 +153,7 @@ def test_irasim_tells_no_action_before_the_first_frame() -> None:
 def test_frames_see_their_own_context_and_no_other() -> None:
     """The same as one attention over all context under a mask, for RGB, for earlier frames and for the other stream."""
     streams = ("pose_frame", "history", "action")
-    model, conditions = model_of(streams), told(streams)
+    model, conditions = model_of(streams), make_conditions(streams)
     context = model.framed_context(TEXT, LATENTS.shape, conditions)
     attention = nnx.merge(*_first_layer(model.blocks)).cross_attn
     count = (3 + 2 + 3) * 6
@@ -170,7 +170,7 @@ def test_frames_see_their_own_context_and_no_other() -> None:
 def test_poses_of_earlier_frames_go_to_earlier_frames() -> None:
     """Numbers come in the order of time, tokens as RGB's, then the earlier ones."""
     model = model_of(("pose_frame", "history"))
-    conditions = told(("pose_frame", "history"))
+    conditions = make_conditions(("pose_frame", "history"))
     framed = model.framed_context(TEXT, LATENTS.shape, conditions).framed
     of_rows = model.mechanisms["pose_frame"](conditions["pose_frame"])
     np.testing.assert_allclose(framed[:, :3], of_rows[:, 2:], atol=1e-6)
@@ -187,7 +187,7 @@ def _first_layer(blocks: nnx.Module) -> tuple[nnx.GraphDef, nnx.State]:
 
 def test_bwm_does_without_text_and_enerverse_ac_beside_it() -> None:
     alone, beside = model_of(("pose_context",)), model_of(("pooled_context",))
-    conditions = told(("pose_context", "pooled_context"))
+    conditions = make_conditions(("pose_context", "pooled_context"))
     assert alone.context(TEXT, conditions).shape == (2, 9, 32)
     np.testing.assert_array_equal(alone.context(TEXT, conditions), alone.context(TEXT + 1.0, conditions))
     assert beside.context(TEXT, conditions).shape == (2, 8 + 16, 32)
@@ -210,7 +210,7 @@ def test_pooled_tokens_know_the_order_of_actions() -> None:
 
 
 def test_channels_are_a_wider_patch_embedding() -> None:
-    model, conditions = model_of(("map_channels",)), told(("map_channels",))
+    model, conditions = model_of(("map_channels",)), make_conditions(("map_channels",))
     joined = jnp.concatenate([dit.patchify(LATENTS), dit.patchify(conditions["map_channels"])], axis=-1)
     kernel = jnp.concatenate([model.patch_embedding.kernel[...], model.mechanisms["map_channels"].columns.kernel[...]])
     expected = joined @ kernel + model.patch_embedding.bias[...][None, None]
@@ -239,7 +239,7 @@ def test_rays_go_through_the_pixels_they_belong_to() -> None:
 
 
 def test_earlier_frames_are_rgb_at_their_own_times() -> None:
-    model, conditions = model_of(("action", "history")), told(("action", "history"))
+    model, conditions = model_of(("action", "history")), make_conditions(("action", "history"))
     tokens, levels, (cos, _) = model.embed_streams(LATENTS, conditions)
     embedded = model.patch_embedding(dit.patchify(conditions["history"])) + model.stream_embeddings["history"][...][None, None]
     np.testing.assert_allclose(tokens[:, 18:30], embedded, atol=1e-5)
@@ -298,7 +298,7 @@ def test_shapes_of_bwm_at_full_size() -> None:
 def test_one_way_sampling_with_a_cache_equals_training() -> None:
     """Mechanisms enter beside the cached streams as they do without a cache."""
     streams = ("action", "pose_time", "map_channels", "pooled_context")
-    model, conditions = model_of(streams, visibility="one_way"), told(streams)
+    model, conditions = model_of(streams, visibility="one_way"), make_conditions(streams)
     cache = model.condition_cache(conditions, TEXT)
     expected = model(LATENTS, conditions, SIGMA, TEXT)
     np.testing.assert_allclose(model(LATENTS, conditions, SIGMA, TEXT, cache), expected, atol=2e-5)

@@ -76,7 +76,7 @@ def wan_arrays(naming: str = "official", *streams: str) -> Arrays:
     return {key: random.standard_normal(shape, np.float32) for key, shape in shapes.items()}
 
 
-def fails(path: Path, module: nnx.Module | None = None) -> str:
+def refusal(path: Path, module: nnx.Module | None = None) -> str:
     with pytest.raises(ConfigError) as error:
         fill(module or Leaves(nnx.Rngs(0)), read_tensors(path), LAYOUT)
     return str(error.value)
@@ -129,7 +129,9 @@ def test_an_abstract_module_becomes_real(arrays: Arrays, tmp_path: Path) -> None
     module, real = nnx.eval_shape(lambda: Leaves(nnx.Rngs(0))), Leaves(nnx.Rngs(1))
     for target in (module, real):
         fill(target, read_tensors(tmp_path / "in.safetensors"), LAYOUT)
-    jax.tree.map(np.testing.assert_array_equal, nnx.state(module, nnx.Param), nnx.state(real, nnx.Param))
+    (filled, of_real) = (nnx.state(each, nnx.Param) for each in (module, real))
+    assert jax.tree.leaves(filled)
+    jax.tree.map(np.testing.assert_array_equal, filled, of_real)
 
 
 # Files.
@@ -182,39 +184,39 @@ def test_shards_by_index_by_folder_and_without_index(arrays: Arrays, tmp_path: P
 def test_broken_indexes_are_told(arrays: Arrays, tmp_path: Path) -> None:
     index = sharded(arrays, tmp_path / "shards")
     (index.parent / "model-00002-of-00002.safetensors").rename(tmp_path / "elsewhere.safetensors")
-    assert "names shards that are not there: model-00002-of-00002.safetensors" in fails(index)
+    assert "names shards that are not there: model-00002-of-00002.safetensors" in refusal(index)
     whole = json.loads(index.read_text())
     for name in ("../elsewhere.safetensors", str(tmp_path / "elsewhere.safetensors"), "..\\elsewhere.safetensors", "x.pth"):
         index.write_text(json.dumps({"weight_map": whole["weight_map"] | {"conv": name}}))
-        assert "names files that are no .safetensors beside it" in fails(index)
+        assert "names files that are no .safetensors beside it" in refusal(index)
     first = "model-00001-of-00002.safetensors"
     index.write_text(json.dumps({"weight_map": {"a.weight": first, "other": first}}))
-    assert "names tensors that its shards lack: other" in fails(index)
+    assert "names tensors that its shards lack: other" in refusal(index)
     for text in ("{", "[]", '{"weight_map": 3}', '{"weight_map": {"a": 3}}'):
         index.write_text(text)
-        assert "is no index of safetensors" in fails(index)
+        assert "is no index of safetensors" in refusal(index)
 
 
 def test_folders_that_say_too_little(arrays: Arrays, tmp_path: Path) -> None:
-    assert "there are no weights at" in fails(tmp_path / "none")
+    assert "there are no weights at" in refusal(tmp_path / "none")
     folder = tmp_path / "folder"
     folder.mkdir()
-    assert "holds no .safetensors, .pth or .pt" in fails(folder)
+    assert "holds no .safetensors, .pth or .pt" in refusal(folder)
     (folder / "a.pth").touch()
     (folder / "b.pth").touch()
-    assert "holds several checkpoints (a.pth, b.pth); name one of them" in fails(folder)
+    assert "holds several checkpoints (a.pth, b.pth); name one of them" in refusal(folder)
     save_file(arrays, folder / "a.safetensors")
     save_file(arrays, folder / "b.safetensors")
-    assert "repeats tensors of another file" in fails(folder)
+    assert "repeats tensors of another file" in refusal(folder)
     (tmp_path / "weights.ckpt").touch()
-    assert "is no checkpoint that is known here" in fails(tmp_path / "weights.ckpt")
+    assert "is no checkpoint that is known here" in refusal(tmp_path / "weights.ckpt")
 
 
 def test_a_cut_file_is_told(arrays: Arrays, tmp_path: Path) -> None:
     path = tmp_path / "in.safetensors"
     save_file(arrays, path)
     path.write_bytes(path.read_bytes()[:-10])
-    assert "is no whole safetensors file" in fails(path)
+    assert "is no whole safetensors file" in refusal(path)
 
 
 @pytest.mark.parametrize("wrap", [lambda state: state, lambda state: {"state_dict": state, "epoch": 3}])
@@ -238,12 +240,12 @@ def test_nothing_is_unpickled(tmp_path: Path) -> None:
             return Path.touch, (touched,)
 
     torch.save({"a.weight": Bad()}, tmp_path / "bad.pth")
-    assert "holds more than tensors" in fails(tmp_path / "bad.pth")
+    assert "holds more than tensors" in refusal(tmp_path / "bad.pth")
     (tmp_path / "raw.pth").write_bytes(pickle.dumps({"a.weight": Bad()}, protocol=2))
-    assert "holds more than tensors" in fails(tmp_path / "raw.pth")
+    assert "holds more than tensors" in refusal(tmp_path / "raw.pth")
     assert not touched.exists()
     torch.save({"epoch": 3}, tmp_path / "none.pth")
-    assert "holds no tensors by name" in fails(tmp_path / "none.pth")
+    assert "holds no tensors by name" in refusal(tmp_path / "none.pth")
 
 
 def test_prefixes_are_taken_off(arrays: Arrays, tmp_path: Path) -> None:
@@ -251,7 +253,7 @@ def test_prefixes_are_taken_off(arrays: Arrays, tmp_path: Path) -> None:
         save_file({prefix + key: array for key, array in arrays.items()}, tmp_path / "in.safetensors")
         assert read_tensors(tmp_path / "in.safetensors").keys() == arrays.keys()
     save_file({"model.gamma": arrays["gamma"], "gamma": arrays["gamma"]}, tmp_path / "in.safetensors")
-    assert "holds gamma twice" in fails(tmp_path / "in.safetensors")
+    assert "holds gamma twice" in refusal(tmp_path / "in.safetensors")
 
 
 def test_what_does_not_fit_is_named(arrays: Arrays, tmp_path: Path) -> None:
@@ -260,7 +262,7 @@ def test_what_does_not_fit_is_named(arrays: Arrays, tmp_path: Path) -> None:
     save_file(arrays | {"conv": np.zeros((5, 2, 3, 3, 3), np.float32), "extra": np.zeros(1, np.float32)}, path)
     module = Leaves(nnx.Rngs(0))
     before = np.array(module.linear.kernel[...])
-    message = fails(path, module)
+    message = refusal(path, module)
     assert str(path) in message
     assert "1 missing: gamma (for gamma)" in message
     assert "conv is [5, 2, 3, 3, 3], the model's convolution.kernel needs [5, 2, 3, 1, 2]" in message

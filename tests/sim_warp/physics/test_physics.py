@@ -109,7 +109,7 @@ def test_arms_follow_their_commands(key: str) -> None:
     assert not motion.overflow and motion.arm_overlap == 0.0
 
 
-def standing(robot: RobotSpec, scene: Scene, frames: int) -> Motion:
+def stand_still(robot: RobotSpec, scene: Scene, frames: int) -> Motion:
     return simulate([World(robot, scene, at_home(robot, frames))], "cpu")[0]
 
 
@@ -120,7 +120,7 @@ def test_a_lid_stays_where_it_is_left(share: float) -> None:
     assert laptop.hinge is not None
     start = laptop.hinge.lower + share * (laptop.hinge.upper - laptop.hinge.lower)
     left = replace(scene, objects=(replace(laptop, hinge=replace(laptop.hinge, start=start)),))
-    angle = standing(ROBOTS["piper"], left, 34).object_joint[:, 0]
+    angle = stand_still(ROBOTS["piper"], left, 34).object_joint[:, 0]
     assert angle[0] == pytest.approx(start) and np.abs(angle - start).max() < np.radians(1)
 
 
@@ -128,7 +128,7 @@ def test_a_scene_beyond_the_template_is_refused() -> None:
     scene = scene_of("blocks_ranking_rgb")
     crowded = replace(scene, objects=(*scene.objects, replace(scene.objects[0], name="fourth")))
     with pytest.raises(ConfigError, match=f"has 4 free and 0 hinged objects; the template holds {FREE_SLOTS} free ones"):
-        standing(ROBOTS["piper"], crowded, 1)
+        stand_still(ROBOTS["piper"], crowded, 1)
 
 
 def driven(robot: RobotSpec, timeline: Timeline) -> Cell:

@@ -31,33 +31,33 @@ def parts():
     return Scene("test", 0, (cube, plate)), pose, np.zeros((FRAMES, 2), np.float32), tools
 
 
-def found(parts, holds=(HOLD,)):
+def find_problem(parts, holds=(HOLD,)):
     scene, pose, penetration, tools = parts
     return find_implausible(scene, holds, pose, penetration, tools, FRAME_RATE)
 
 
 def test_what_moves_with_the_hand_is_plausible(parts):
-    assert found(parts) is None
+    assert find_problem(parts) is None
     assert measure_slip(parts[3][:, 0], parts[1][:, 0]) < 1e-6
 
 
 def test_a_blow_passes_and_what_stays_sunk_does_not(parts):
     parts[2][10:13, 0] = 0.006
-    assert found(parts) is None
+    assert find_problem(parts) is None
     parts[2][13, 0] = 0.006
-    assert "cube sank 6 mm" in found(parts)
+    assert "cube sank 6 mm" in find_problem(parts)
 
 
 @pytest.mark.parametrize("away", [(0.7, 0, 0.0), (0, -0.5, 0.0), (0, 0, -0.4)])
 def test_what_leaves_the_table_is_told(parts, away):
     parts[1][-1, 0, :3] += np.float32(away)
-    assert "cube left the table" in found(parts)
+    assert "cube left the table" in find_problem(parts)
 
 
 def test_creep_counts_while_held_and_in_the_frame_of_the_hand(parts):
     _, pose, _, _ = parts
     pose[21:, 0, 0] += 0.05
-    assert found(parts) is None, "let go at frame 20"
+    assert find_problem(parts) is None, "let go at frame 20"
     pose[15:, 0, 0] += 0.011
-    assert "cube crept 11 mm in the left hand" in found(parts)
-    assert found(parts, holds=()) is None
+    assert "cube crept 11 mm in the left hand" in find_problem(parts)
+    assert find_problem(parts, holds=()) is None

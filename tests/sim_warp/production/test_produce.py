@@ -1,12 +1,13 @@
 """From jobs to episodes: the same bytes every time and in any company, paired over robots, conditions from commands only."""
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.sim_warp.small import SLOW, TASK
+from tests.sim_warp.small import SLOW, TASK, WITH_SLOW
 from xew.config import ConfigError
 from xew.dataset import find_accepted
 from xew.episode import (
@@ -24,12 +25,16 @@ from xew.episode import (
 from xew.sim_warp.physics import Motion, World, simulate
 from xew.sim_warp.production import cells as cells_module
 from xew.sim_warp.production import produce as produce_module
+from xew.sim_warp.production import surfaces as surfaces_module
 from xew.sim_warp.production.cells import Cell, Job
 from xew.sim_warp.production.episodes import fill_instruction
+from xew.sim_warp.production.kept_tracks import load_tracks, save_tracks, tracks_key, tracks_path
 from xew.sim_warp.production.produce import produce
 from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
+from xew.sim_warp.production.surfaces import read_surfaces
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import command_streams_batch
+from xew.sim_warp.robots import RobotSpec
 from xew.sim_warp.scene import scene_rng
 from xew.sim_warp.tasks import get_task
 
@@ -47,7 +52,7 @@ def renderer() -> Renderer:
 def data(tmp_path_factory: pytest.TempPathFactory, renderer: Renderer) -> Path:
     """All jobs made together."""
     out = tmp_path_factory.mktemp("data")
-    produce(JOBS, out, renderer)
+    produce(JOBS, out, renderer, robots=WITH_SLOW)
     return out
 
 
@@ -56,7 +61,7 @@ def record_of(data: Path, seed: int, robot: str) -> Record:
 
 
 def test_headers_are_those_on_disk(data: Path, renderer: Renderer, tmp_path: Path) -> None:
-    records = produce(JOBS[:1], tmp_path, renderer)[0]
+    records = produce(JOBS[:1], tmp_path, renderer, robots=WITH_SLOW)[0]
     assert [record.robot for record in records] == list(ROBOTS)
     assert records == [record_of(tmp_path, 0, robot) for robot in ROBOTS] == [record_of(data, 0, robot) for robot in ROBOTS]
     first = records[0]
@@ -70,21 +75,21 @@ def test_the_same_bytes_alone_among_others_and_in_groups(
 ) -> None:
     others = [Job("grab_roller", 1, ("piper",)), *reversed(JOBS)]
     monkeypatch.setattr(produce_module, "FRAMES_AT_ONCE", 1)  # every seed is a group of its own
-    monkeypatch.setattr(produce_module, "plan_cells", shortened(produce_module.plan_cells))
-    produce(others, tmp_path / "among", renderer)
+    monkeypatch.setattr(produce_module, "plan_cells", shorten_plans(produce_module.plan_cells))
+    produce(others, tmp_path / "among", renderer, robots=WITH_SLOW)
     for job in JOBS:
-        produce([job], tmp_path / "alone", renderer)
+        produce([job], tmp_path / "alone", renderer, robots=WITH_SLOW)
         for robot in ROBOTS:
             expected = record_of(data, job.seed, robot)
             assert record_of(tmp_path / "among", job.seed, robot) == expected
             assert record_of(tmp_path / "alone", job.seed, robot) == expected
 
 
-def shortened(plan_cells: object) -> object:
-    """Only the first frames of a real task: company for the others, not an episode."""
+def shorten_plans(plan_cells: object) -> object:
+    """Planning of which only the first frames are kept: company for the others, no whole episode."""
 
-    def first_frames(jobs: list[Job], out: Path) -> list[list[Cell]]:
-        return [[cut(cell) for cell in cells] for cells in plan_cells(jobs, out)]  # type: ignore[operator]
+    def first_frames(jobs: list[Job], robots: Mapping[str, RobotSpec]) -> list[list[Cell]]:
+        return [[cut(cell) for cell in cells] for cells in plan_cells(jobs, robots)]  # type: ignore[operator]
 
     def cut(cell: Cell) -> Cell:
         return replace(cell, commands=replace(cell.commands, action=cell.commands.action[:12]))
@@ -121,7 +126,7 @@ def test_a_rejected_seed_keeps_its_headers_and_no_pictures(data: Path) -> None:
 
 
 def test_a_robot_that_comes_late_to_a_rejected_seed_gets_no_pictures(renderer: Renderer, tmp_path: Path) -> None:
-    record = produce([Job(TASK, 1, ROBOTS[:1], rejected=True)], tmp_path, renderer)[0][0]
+    record = produce([Job(TASK, 1, ROBOTS[:1], rejected=True)], tmp_path, renderer, robots=WITH_SLOW)[0][0]
     assert record.success and record.hashes == {}
 
 
@@ -162,7 +167,7 @@ def test_an_instruction_that_its_scene_cannot_fill_is_told(instruction: str) -> 
 
 
 def test_an_episode_without_videos_gets_them_on_demand(data: Path, renderer: Renderer, tmp_path: Path) -> None:
-    record = produce(JOBS[:1], tmp_path, renderer, videos=False)[0][0]
+    record = produce(JOBS[:1], tmp_path, renderer, videos=False, robots=WITH_SLOW)[0][0]
     folder, full = (
         episode_folder(tmp_path, TASK, record.seed, record.robot),
         episode_folder(data, TASK, record.seed, record.robot),
@@ -204,7 +209,7 @@ def test_conditions_see_commands_and_no_future(
         return replace(motion, object_pose=pose, joint_pos=joints)
 
     monkeypatch.setattr(cells_module, "simulate", elsewhere)
-    record = produce(JOBS[:1], tmp_path, renderer)[0][0]
+    record = produce(JOBS[:1], tmp_path, renderer, robots=WITH_SLOW)[0][0]
     before = record_of(data, 0, record.robot)
     assert record.hashes["rgb"] != before.hashes["rgb"] and record.hashes["states"] != before.hashes["states"]
     assert record.hashes["robot"] == before.hashes["robot"]
@@ -212,8 +217,47 @@ def test_conditions_see_commands_and_no_future(
 
 def test_streams_follow_from_the_recorded_commands(data: Path, renderer: Renderer) -> None:
     folder, record = find_accepted(data)[0]
-    (streams,) = command_streams_batch([(record.robot, read_states(folder).action)], renderer=renderer)
+    (streams,) = command_streams_batch([(WITH_SLOW[record.robot], read_states(folder).action)], renderer=renderer)
     assert array_hash(streams.render) == record.hashes["robot"]
+
+
+def test_points_on_surfaces_are_rendered_once(
+    data: Path, renderer: Renderer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, record = find_accepted(data)[0]
+    first = read_surfaces(folder, renderer, tmp_path)
+    assert first is not None and first.visible.any()
+    with monkeypatch.context() as patch:
+        patch.setattr(surfaces_module, "track_surfaces", None)  # would be called to render
+        again = read_surfaces(folder, renderer, tmp_path)
+    assert again is not None and again.names == first.names
+    for field in fields(first):
+        assert np.array_equal(getattr(again, field.name), getattr(first, field.name), equal_nan=field.name == "pixels")
+    kept = tracks_path(tmp_path, record)
+    kept.write_bytes(kept.read_bytes()[:-40])
+    mended = read_surfaces(folder, renderer, tmp_path)
+    assert mended is not None and np.array_equal(mended.shown, first.shown), "a damaged file is made anew"
+    kept.unlink()
+    kept.mkdir()
+    assert read_surfaces(folder, renderer, tmp_path) is not None, "what cannot be kept is not missed"
+
+
+def test_kept_points_are_of_one_robot_scene_motion_and_camera(data: Path, tmp_path: Path) -> None:
+    folder, record = find_accepted(data)[0]
+    robot, states = WITH_SLOW[record.robot], read_states(folder)
+    key = tracks_key(robot, record.scene_hash, states)
+    assert key == tracks_key(robot, record.scene_hash, read_states(folder))
+    others = [
+        tracks_key(WITH_SLOW["arx_x5"], record.scene_hash, states),
+        tracks_key(robot, "another", states),
+        tracks_key(robot, record.scene_hash, replace(states, joint_pos=states.joint_pos + np.float32(0.1))),
+        tracks_key(robot, record.scene_hash, replace(states, extrinsics=2 * states.extrinsics)),
+    ]
+    assert len({key, *others}) == 5
+    tracks = read_surfaces(folder)
+    assert tracks is not None
+    save_tracks(tmp_path / "tracks.npz", key, tracks)
+    assert load_tracks(tmp_path / "tracks.npz", key) is not None and load_tracks(tmp_path / "tracks.npz", others[0]) is None
 
 
 def test_measured_states_are_not_the_commands(data: Path) -> None:
@@ -228,5 +272,5 @@ def test_a_disk_that_fills_up_stops_the_work(renderer: Renderer, tmp_path: Path,
 
     monkeypatch.setattr("xew.episode.write_video", full)
     with pytest.raises(EpisodeError, match="No space left on device"):
-        produce(JOBS[:1], tmp_path, renderer)
+        produce(JOBS[:1], tmp_path, renderer, robots=WITH_SLOW)
     assert not list(tmp_path.glob("*/*/*"))

@@ -127,7 +127,9 @@ def test_a_base_that_leans_is_tried_leaning() -> None:
 def test_one_batch_mixes_bodies_with_other_robots(tmp_path: Path) -> None:
     """Folders have no colon, and the header finds its robot again."""
     robots = adopt_robots(["piper", "body:0-1", "body:2"], tmp_path)
-    (records,) = produce([Job(TASK, 0, robots)], tmp_path, Renderer("cpu"), videos=False)
+    (records,) = produce(
+        [Job(TASK, 0, robots)], tmp_path, Renderer("cpu"), videos=False, robots={name: get_robot(name) for name in robots}
+    )
     assert {record.robot: record.success for record in records} == dict.fromkeys(("piper", "body_0", "body_1", "body_2"), True)
     folder = episode_folder(tmp_path, TASK, 0, "body_2")
     assert folder.name == "body_2" and verify_episode(folder).robot == "body_2"

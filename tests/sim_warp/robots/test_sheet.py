@@ -9,7 +9,10 @@ import pytest
 
 from xew.episode import read_video
 from xew.sim_warp.rendering.streams import articulation_clip, nine_views, reference_image
+from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.robots.sheet import main, sheet, write_references, write_sheets
+
+PIPER = ROBOTS["piper"]
 
 
 def read(path: Path) -> np.ndarray:
@@ -17,19 +20,19 @@ def read(path: Path) -> np.ndarray:
 
 
 def test_reference_renders_are_written_as_they_are(tmp_path: Path) -> None:
-    write_references("piper", tmp_path)
-    own = tmp_path / "piper"
+    own = write_references(PIPER, tmp_path)
     views = [f"view_{azimuth:03d}.png" for azimuth in range(0, 360, 40)]
+    assert own == tmp_path / "piper"
     assert {path.name for path in own.iterdir()} == {"front.png", "clip.mkv", "clip.png", "ray_map.png", *views}
-    assert np.array_equal(read(own / "front.png"), reference_image("piper"))
-    assert np.array_equal(np.stack([read(own / view) for view in views]), nine_views("piper"))
-    assert np.array_equal(read_video(own / "clip.mkv"), articulation_clip("piper"))
+    assert np.array_equal(read(own / "front.png"), reference_image(PIPER))
+    assert np.array_equal(np.stack([read(own / view) for view in views]), nine_views(PIPER))
+    assert np.array_equal(read_video(own / "clip.mkv"), articulation_clip(PIPER))
     assert read(own / "clip.png").shape == (240, 17 * 320, 3)
 
 
 def test_sheets_are_written_for_each_robot_and_for_all(tmp_path: Path) -> None:
-    one, together = write_sheets(("ur5_wsg",), tmp_path)
-    assert np.array_equal(read(one), sheet(nine_views("ur5_wsg")))
+    one, together = write_sheets([ROBOTS["ur5_wsg"]], tmp_path)
+    assert np.array_equal(read(one), sheet(nine_views(ROBOTS["ur5_wsg"])))
     assert read(together).shape == (120, 6 * 160, 3)
 
 

@@ -1,7 +1,7 @@
 """The paper's claims, as inequalities and equivalences that can be asked of any study's numbers.
 
 Where the paper's text has a number, the bound is that number. Where it has a word only ("substantial", "several times"), the
-bound is ours and the claim says so in its test.
+bound is ours and the claim says so in its test. To add a claim: a function of a `Reader` and one entry in CLAIMS.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -2,6 +2,7 @@
 
 Our value stands large, the paper's value beside it where it prints one. A row that was not run says so, a section that has
 fewer episodes than the protocol asks for says how many, and robots that were held out are never averaged.
+To add a table: a function of a `Builder`, and its name in `build_tables`.
 """
 
 from collections.abc import Sequence

@@ -71,6 +71,42 @@ def torch_device() -> str:
     return "cuda" if importlib.import_module("torch").cuda.is_available() else "cpu"
 
 
+class PointTracker:
+    """What trackers share that are given each point at one frame (`query_frames`) and then follow it in both directions."""
+
+    def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        """Pixels float32 [t k 2] in the prediction, NaN where a point is lost.
+
+        Args:
+            prediction: [t h w 3] uint8, the predicted video.
+            target: [t h w 3] uint8, the true video; not looked at.
+            points: [t k 2] float32, true projections [pixels, x right, y down, center of the first pixel at 0].
+            visible: [t k] bool, where a true point is seen; a point that is never seen is lost in all frames.
+        """
+        check_tracks(prediction, points, visible)
+        tracks = lost_tracks(visible.shape)
+        frames = query_frames(visible)
+        asked = np.flatnonzero(frames >= 0)
+        if len(asked) == 0:
+            return tracks
+        found, seen = self.follow(prediction, frames[asked], points[frames[asked], asked])
+        tracks[:, asked] = np.where(seen[..., None], found, np.nan)
+        return tracks
+
+    def follow(self, video: np.ndarray, frames: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Find points again in all frames of a video.
+
+        Args:
+            video: [t h w 3] uint8.
+            frames: [n] int, the frame at which each point is given.
+            points: [n 2] float32, where it is there [pixels, x right, y down, center of the first pixel at 0].
+
+        Returns:
+            Tracks [t n 2] float32 in the same pixels, and bool [t n] where they hold.
+        """
+        raise NotImplementedError
+
+
 def query_frames(visible: np.ndarray) -> np.ndarray:
     """The frame at which each point is given to a tracker: int [k], -1 for a point that is never seen.
 

@@ -16,11 +16,9 @@ import numpy as np
 
 from xew.config import ConfigError
 from xew.metrics.estimators.adapters import (
-    check_tracks,
+    PointTracker,
     import_package,
     import_torch,
-    lost_tracks,
-    query_frames,
     read_state_dict,
     torch_device,
 )
@@ -47,37 +45,23 @@ def open_cotracker(checkpoint: Path) -> "CoTracker":
     return CoTracker(predictor.to(torch_device()))
 
 
-class CoTracker:
+class CoTracker(PointTracker):
     """The tracker: see `xew.metrics.backends.Tracker`. Lost is where the network's visibility is 0.9 or less."""
 
     def __init__(self, predictor: Callable[..., Any]) -> None:
         self._predictor = predictor
         self._torch = import_torch("CoTracker3")
 
-    def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
-        """Pixels float32 [t k 2] in the prediction, NaN where a point is lost.
-
-        Args:
-            prediction: [t h w 3] uint8, the predicted video.
-            target: [t h w 3] uint8, the true video; not looked at.
-            points: [t k 2] float32, true projections [pixels, x right, y down, center of the first pixel at 0].
-            visible: [t k] bool, where a true point is seen; a point that is never seen is lost in all frames.
-        """
-        check_tracks(prediction, points, visible)
-        tracks = lost_tracks(visible.shape)
-        frames = query_frames(visible)
-        asked = np.flatnonzero(frames >= 0)
-        if len(asked) == 0:
-            return tracks
-        queries = np.column_stack([frames[asked], points[frames[asked], asked]]).astype(np.float32)
+    def follow(self, video: np.ndarray, frames: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Tracks [t n 2] and where they hold [t n], of points [n 2] given at frames [n] of a video [t h w 3] uint8."""
+        queries = np.column_stack([frames, points]).astype(np.float32)
         device = torch_device()
-        video = self._torch.from_numpy(np.ascontiguousarray(prediction.transpose(0, 3, 1, 2))).to(device).float()
+        images = self._torch.from_numpy(np.ascontiguousarray(video.transpose(0, 3, 1, 2))).to(device).float()
         with self._torch.inference_mode():
             found, seen = self._predictor(
-                video[None], queries=self._torch.from_numpy(queries)[None].to(device), backward_tracking=True
+                images[None], queries=self._torch.from_numpy(queries)[None].to(device), backward_tracking=True
             )
-        tracks[:, asked] = np.where(seen[0].cpu().numpy()[..., None], found[0].cpu().numpy(), np.nan)
-        return tracks
+        return found[0].cpu().numpy(), seen[0].cpu().numpy()
 
 
 def _window(checkpoint: Path) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from xew.config import ConfigError
-from xew.metrics.estimators.adapters import check_tracks, import_package, lost_tracks, query_frames
+from xew.metrics.estimators.adapters import PointTracker, import_package
 from xew.metrics.networks.pickles import read_arrays
 
 SIDE = 256
@@ -49,7 +49,7 @@ def open_tapir(checkpoint: Path) -> "Tapir":
     return Tapir(model.ParameterizedTAPIR, content["params"], content["state"], options)
 
 
-class Tapir:
+class Tapir(PointTracker):
     """The tracker: see `xew.metrics.backends.Tracker`. Lost is where the network finds it likelier than not that the point is
     hidden or that it is off by more than it was trained to tolerate."""
 
@@ -57,28 +57,14 @@ class Tapir:
         self._weights = jax.device_put((params, state))
         self._run = jax.jit(functools.partial(_run, network, dict(options)))
 
-    def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
-        """Pixels float32 [t k 2] in the prediction, NaN where a point is lost.
-
-        Args:
-            prediction: [t h w 3] uint8, the predicted video.
-            target: [t h w 3] uint8, the true video; not looked at.
-            points: [t k 2] float32, true projections [pixels, x right, y down, center of the first pixel at 0].
-            visible: [t k] bool, where a true point is seen; a point that is never seen is lost in all frames.
-        """
-        check_tracks(prediction, points, visible)
-        tracks = lost_tracks(visible.shape)
-        frames = query_frames(visible)
-        asked = np.flatnonzero(frames >= 0)
-        if len(asked) == 0:
-            return tracks
-        scale = SIDE / np.array(prediction.shape[2:0:-1], np.float32)  # of x and y
+    def follow(self, video: np.ndarray, frames: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Tracks [t n 2] and where they hold [t n], of points [n 2] given at frames [n] of a video [t h w 3] uint8."""
+        scale = SIDE / np.array(video.shape[2:0:-1], np.float32)  # of x and y
         # Its pixels' centers are at halves, ours at whole numbers.
-        x, y = ((points[frames[asked], asked] + 0.5) * scale).T
-        queries = np.column_stack([frames[asked], y, x]).astype(np.float32)
-        found, seen = (np.asarray(array) for array in self._run(self._weights, _resize(prediction), queries))
-        tracks[:, asked] = np.where(seen[..., None], found / scale - 0.5, np.nan).swapaxes(0, 1)
-        return tracks
+        x, y = ((points + 0.5) * scale).T
+        queries = np.column_stack([frames, y, x]).astype(np.float32)
+        found, seen = (np.asarray(array) for array in self._run(self._weights, _resize(video), queries))
+        return (found / scale - 0.5).swapaxes(0, 1), seen.swapaxes(0, 1)
 
 
 def _run(

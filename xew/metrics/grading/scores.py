@@ -75,7 +75,7 @@ class Cell:
 
 
 class CellStore:
-    """Graded videos, a file each, complete or not there: whoever is stopped goes on from what stands.
+    """Graded videos, a file each, complete or not there: a grading that was stopped goes on from what is there.
 
     Args:
         folder: of the videos of models.
@@ -130,10 +130,21 @@ def check_out(path: Path) -> None:
 
 
 def baselines_folder(data: Path, out: Path) -> Path:
-    """Where baselines on a data set are kept: beside it, for all tables; beside the table where that cannot be written to."""
-    beside = data.absolute().with_name(f"{data.absolute().name}-baselines")
+    """Folder of the scores of baselines on a data set, see `folder_beside_data`."""
+    return folder_beside_data(data, out, "baselines")
+
+
+def surfaces_folder(data: Path, out: Path) -> Path:
+    """Folder of the points on surfaces of a data set's episodes, see `folder_beside_data`."""
+    return folder_beside_data(data, out, "surfaces")
+
+
+def folder_beside_data(data: Path, out: Path, name: str) -> Path:
+    """Folder for what is made of a data set once, for all score tables: beside the data, or beside the table where the former
+    cannot be written to."""
+    beside = data.absolute().with_name(f"{data.absolute().name}-{name}")
     writable = os.access(beside if beside.exists() else beside.parent, os.W_OK)
-    return beside if writable else path_beside(out, "baselines")
+    return beside if writable else path_beside(out, name)
 
 
 def path_beside(path: Path, ending: str) -> Path:

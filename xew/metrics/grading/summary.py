@@ -27,7 +27,7 @@ Column = tuple[str, str, str]
 
 @dataclass(frozen=True)
 class Summary:
-    """What the scores of some models come to, robot by robot."""
+    """The means of some models' scores and the differences between them, robot by robot."""
 
     means: pd.DataFrame
     """robot dimension metric unit model condition mean low high episodes truth noise versus_truth."""

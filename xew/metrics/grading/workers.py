@@ -56,7 +56,7 @@ E = TypeVar("E", bound=Callable[..., np.ndarray])
 def make_opener(
     name: str, registry: Any, open_: Callable[[str, Path | None], E], checkpoint: Path | None
 ) -> Callable[[jax.Device], E]:
-    """How a thread on a device comes by an estimator: its own, or, of one with weights, the device's, used in turn."""
+    """Make what opens an estimator for a thread: its own, or, where it has weights, its device's, used in turn."""
     if pick(registry, name, "estimator").needs is None:
         return lambda _: open_(name, checkpoint)
     opened: dict[jax.Device, E] = {}

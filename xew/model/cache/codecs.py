@@ -11,7 +11,8 @@ from xew.dataset import Episode
 from xew.episode import complete_folder
 from xew.model.cache.clips import clip_starts, take_frames
 from xew.model.cache.keys import codec_path
-from xew.model.codecs.codec import Codec, codec_class
+from xew.model.codecs.codec import codec_class
+from xew.model.codecs.contract import Codec
 from xew.model.runs.folder import load_run_codec
 from xew.model.settings.parts import Encoding
 from xew.model.video.frames import to_model_size

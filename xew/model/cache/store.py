@@ -15,7 +15,7 @@ from xew.files import replacing
 from xew.model.cache.clips import clip_starts
 from xew.model.cache.codecs import load_codec
 from xew.model.cache.keys import stream_path
-from xew.model.codecs.codec import Codec
+from xew.model.codecs.contract import Codec
 from xew.model.conditions import Condition
 from xew.model.settings.parts import Encoding
 

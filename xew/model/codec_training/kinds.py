@@ -15,7 +15,8 @@ from jax import Array
 from jaxtyping import Float, Key
 
 from xew.config import pick
-from xew.model.codecs.codec import Codec, ConvAutoencoderCodec, WanVaeCodec
+from xew.model.codecs.autoencoders import ConvAutoencoderCodec, OfSize, WanVaeCodec
+from xew.model.codecs.contract import Codec
 from xew.model.codecs.conv_autoencoder import AUTOENCODERS, AutoencoderSize, ConvAutoencoder, save_autoencoder
 from xew.model.codecs.vae import VAES, VaeSize, VideoVae
 from xew.model.codecs.vae_layouts import save_vae
@@ -74,20 +75,6 @@ class Kind(Protocol):
 
     def options(self, weights: Path) -> str:
         """Options that tell `latents` and `train` to use the weights in a folder."""
-
-
-class OfSize:
-    """What both kinds read off their size."""
-
-    size: Any
-
-    @property
-    def spatial_factor(self) -> int:
-        return self.size.spatial_factor
-
-    @property
-    def channels(self) -> int:
-        return self.size.channels
 
 
 @dataclass(frozen=True)

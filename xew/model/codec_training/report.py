@@ -22,7 +22,7 @@ from xew.dataset import Dataset, Episode
 from xew.model.codec_training.pictures import ALIGNED, differs_from_corner, draw_descriptions, read_aligned
 from xew.model.codec_training.settings import CodecExperiment, select_episodes
 from xew.model.codecs.ceiling import LPIPS_EVERY, choose_evenly, reconstruct
-from xew.model.codecs.codec import Codec
+from xew.model.codecs.contract import Codec
 from xew.model.settings.settings import Clip
 from xew.model.video.comparison import strip
 from xew.model.video.frames import TEMPORAL_FACTOR

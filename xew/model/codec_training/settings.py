@@ -9,8 +9,8 @@ from xew.config import ConfigError, load, pick
 from xew.dataset import Dataset, Episode
 from xew.model.codec_training.kinds import KINDS, Kind
 from xew.model.codec_training.pictures import ALIGNED, UNALIGNED, Cut
-from xew.model.settings.checks import check_least
-from xew.model.settings.settings import Clip
+from xew.model.settings.checks import LEAST_OF_STEPS, check_least, check_steps
+from xew.model.settings.settings import Clip, StepSettings
 from xew.protocol import SPLITS, expand_robots, seed_split
 
 Seeds = Literal["train", "test"]
@@ -34,24 +34,20 @@ class PictureSettings:
 
 
 @dataclass(frozen=True)
-class CodecTrainSettings:
-    """How the autoencoder learns."""
+class CodecTrainSettings(StepSettings):
+    """How the autoencoder learns. A sample is a clip."""
 
-    batch: int
-    """Number of clips a step."""
-    steps: int = 0
-    """Number of steps; give this or `seconds`."""
-    seconds: float = 0.0
-    """Time [s] of training after the first step, which compiles; the rate follows the time. What has passed before an
-    interruption counts."""
-    seed: int = 0
     learning_rate: float = 1e-3
     warmup_steps: int = 200
     decay_to: float = 0.02
-    """Cosine decay of the rate to this part of its peak at the end."""
-    weight_decay: float = 0.01
-    clip_norm: float = 1.0
     ema_decay: float = 0.998
+    log_every: int = 50
+    save_every: int = 2000
+    sample_every: int = 2000
+    keep_checkpoints: int = 1
+    seconds: float = 0.0
+    """Time [s] of training after the first step, which compiles; give this or `steps`. The rate follows the time. What has
+    passed before an interruption counts."""
     l1: float = 1.0
     """Weight of the mean absolute difference, on a scale of -1 to 1."""
     mse: float = 2.0
@@ -78,11 +74,6 @@ class CodecTrainSettings:
     """Side [pixels] of the squares that are cut out at random; 0 takes whole pictures."""
     statistics_clips: int = 2048
     """Number of clips from which the mean and deviation of the latents are computed at the end."""
-    log_every: int = 50
-    save_every: int = 2000
-    sample_every: int = 2000
-    """Number of steps between sample pictures; 0 draws none."""
-    keep_checkpoints: int = 1
 
 
 @dataclass(frozen=True)
@@ -148,15 +139,9 @@ class CodecExperiment:
         return Cut(frames, self.pictures.every, self.clip.height, self.clip.width)
 
 
-LEAST = {
+LEAST = LEAST_OF_STEPS | {
     "clip.frames": 1,
-    "train.steps": 0,
     "train.seconds": 0,
-    "train.batch": 1,
-    "train.learning_rate": 0,
-    "train.warmup_steps": 0,
-    "train.decay_to": 0,
-    "train.ema_decay": 0,
     "train.l1": 0,
     "train.mse": 0,
     "train.lpips": 0,
@@ -169,10 +154,6 @@ LEAST = {
     "train.jitter": 0,
     "train.crop": 0,
     "train.statistics_clips": 1,
-    "train.log_every": 1,
-    "train.save_every": 1,
-    "train.sample_every": 0,
-    "train.keep_checkpoints": 1,
     "pictures.every": 1,
     "pictures.device_share": 0,
     "pictures.host_gb": 0,
@@ -193,8 +174,7 @@ def check_codec_experiment(experiment: CodecExperiment, path: Path | str) -> Cod
     check_streams(experiment.streams)
     _ = experiment.train_robots
     factor, clip, train = experiment.autoencoder.spatial_factor, experiment.clip, experiment.train
-    if (train.steps > 0) == (train.seconds > 0):
-        raise ConfigError(f"{path}: train.steps is {train.steps}, train.seconds {train.seconds:g}; give one of them, over 0.")
+    check_steps(train, "seconds", str(path))
     for name, frames in (("clip.frames", clip.frames), ("pictures.frames", experiment.pictures.frames)):
         if frames % 4 != 1:
             raise ConfigError(f"{path}: {name} is {frames}; it must be 4 k + 1, for example {max(5, frames // 4 * 4 + 1)}.")

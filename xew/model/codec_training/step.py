@@ -19,7 +19,7 @@ from jaxtyping import Float, Key, UInt8
 from xew.model.codec_training.kinds import Kind
 from xew.model.codec_training.sampling import Batch
 from xew.model.codec_training.settings import CodecExperiment, CodecTrainSettings
-from xew.model.codecs.codec import to_signed
+from xew.model.codecs.contract import to_signed
 from xew.model.codecs.vae import LatentStatistic
 from xew.model.runs.checkpoint import TrainState
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from xew.config import ConfigError
-from xew.model.codecs.codec import Codec
+from xew.model.codecs.contract import Codec
 from xew.model.video.frames import to_camera_size, to_model_size
 
 T = TypeVar("T")

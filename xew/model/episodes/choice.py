@@ -58,7 +58,6 @@ def replay_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
 
 def _select_training(dataset: Dataset, robots: Sequence[str], *, need_all: bool) -> list[Episode]:
     """Episodes of training seeds of some robots. Raises ConfigError if a robot has none (one of all, unless all are needed)."""
-    robots = expand_robots(robots)
     chosen = dataset.select(robots=robots, split="train")
     missing = [robot for robot in robots if robot not in {record.robot for _, record in chosen}]
     if missing and (need_all or not chosen):
@@ -87,7 +86,7 @@ def sample_episodes(dataset: Dataset, choice: EpisodeChoice) -> dict[str, Episod
 
     In an adapted run the robots adapted to are the target, and seen are those of the run that it started from.
     """
-    split, targets = choice.split, expand_robots(choice.adapt.robots)
+    split, targets = choice.split, choice.adapt.robots
     roles = dict.fromkeys(split.train_robots, "seen") | dict.fromkeys(split.held_out_robots, "unseen")
     roles |= dict.fromkeys(targets, "target")
     found = dataset.select(robots=tuple(roles), split="test") or training_episodes(dataset, choice)

@@ -22,7 +22,8 @@ from jax.experimental import multihost_utils
 from xew import config
 from xew.config import ConfigError
 from xew.files import checkpoint_time
-from xew.model.codecs.codec import Codec, CodecSettings, codec_class
+from xew.model.codecs.codec import codec_class
+from xew.model.codecs.contract import Codec, CodecSettings
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.settings.settings import AdaptSettings
 

@@ -26,7 +26,7 @@ from xew.config import pick
 from xew.dataset import Episode
 from xew.model.cache.clips import read_streams, take_frames
 from xew.model.cache.scales import Scale, apply_scales
-from xew.model.codecs.codec import Codec, encode_pictures, to_pictures, to_signed
+from xew.model.codecs.contract import Codec, encode_pictures, to_pictures, to_signed
 from xew.model.conditions import Condition, clip_numbers
 from xew.model.devices.sharding import batch_sharding, replicated_sharding
 from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES, NoiseSchedule

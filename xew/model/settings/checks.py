@@ -5,31 +5,45 @@ from operator import attrgetter
 from typing import Any, Protocol
 
 from xew.config import ConfigError, pick
-from xew.model.codecs.codec import CodecSettings, codec_class
+from xew.model.codecs.codec import codec_class
+from xew.model.codecs.contract import CodecSettings
 from xew.model.conditions import Condition
 from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES
 from xew.model.network.dit import PATCH, STREAMS, ModelSize
 from xew.model.network.mechanisms import MECHANISMS
 from xew.model.settings.parts import pick_conditions
-from xew.model.settings.settings import AdaptSettings, Clip, ModelSettings, RolloutSettings, TrainSettings, count_replayed
+from xew.model.settings.settings import (
+    AdaptSettings,
+    Clip,
+    ModelSettings,
+    RolloutSettings,
+    StepSettings,
+    TrainSettings,
+    count_replayed,
+)
 from xew.model.video.frames import TEMPORAL_FACTOR
 from xew.protocol import Split
 
-LEAST = {
-    "clip.height": 1,
-    "clip.width": 1,
-    "model.unroll": 1,
+LEAST_OF_STEPS: dict[str, float] = {
     "train.batch": 1,
-    "train.accumulate": 1,
+    "train.steps": 0,
     "train.learning_rate": 0,
     "train.warmup_steps": 0,
+    "train.decay_to": 0,
     "train.clip_norm": 0,
     "train.ema_decay": 0,
-    "train.history_noise": 0,
     "train.log_every": 1,
     "train.save_every": 1,
     "train.sample_every": 0,
     "train.keep_checkpoints": 1,
+}
+"""Numbers of any training, of a world model or a codec, that mean nothing below."""
+LEAST = LEAST_OF_STEPS | {
+    "clip.height": 1,
+    "clip.width": 1,
+    "model.unroll": 1,
+    "train.accumulate": 1,
+    "train.history_noise": 0,
     "adapt.lora_rank": 0,
     "rollout.steps": 1,
     "rollout.batch": 1,
@@ -81,6 +95,15 @@ def check_least(least: Mapping[str, float], settings: Any, source: str) -> None:
             raise ConfigError(f"{source}: {name} is {value:g}; it must be at least {smallest:g}.")
 
 
+def check_steps(train: StepSettings, other: str, source: str) -> None:
+    """Raise ConfigError unless a training has one length, in steps or in the `other` unit, and a moving average that moves."""
+    length = getattr(train, other)
+    if (train.steps > 0) == (length > 0):
+        raise ConfigError(f"{source}: train.steps is {train.steps}, train.{other} {length:g}; give one of them, over 0.")
+    if train.ema_decay >= 1:
+        raise ConfigError(f"{source}: train.ema_decay is {train.ema_decay:g}; it must be under 1.")
+
+
 def _check_conditions(conditions: Sequence[Condition], source: str) -> None:
     feeders: dict[str, str] = {}
     for condition in conditions:
@@ -107,10 +130,7 @@ def _check_sizes(experiment: Settings, source: str) -> None:
 
 def _check_training(experiment: Settings, source: str) -> None:
     train, adapt = experiment.train, experiment.adapt
-    if (train.steps > 0) == (train.epochs > 0):
-        raise ConfigError(f"{source}: train.steps is {train.steps}, train.epochs {train.epochs:g}; give one of them, over 0.")
-    if train.ema_decay >= 1:
-        raise ConfigError(f"{source}: train.ema_decay is {train.ema_decay:g}; it must be under 1.")
+    check_steps(train, "epochs", source)
     for name, shift in {"train": train.shift, "rollout": experiment.rollout.shift}.items():
         if shift is not None and not shift > 0:
             raise ConfigError(f"{source}: {name}.shift is {shift:g}; it must be over 0 (1 leaves the levels as they are).")

@@ -8,7 +8,7 @@ import numpy as np
 import optax
 
 from xew.config import pick
-from xew.model.codecs.codec import CodecSettings
+from xew.model.codecs.contract import CodecSettings
 from xew.model.codecs.vae import VaeSize
 from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition, list_conditions
 from xew.model.network.dit import STREAMS, token_grid
@@ -83,6 +83,7 @@ class EpisodeChoice:
 
     split: Split
     adapt: AdaptSettings = field(default_factory=AdaptSettings)
+    """Adaptation, with every robot by its own key."""
     replay: tuple[str, ...] = ()
     """Robots whose training episodes are replayed, in an adaptation with replay."""
     samples: bool = False

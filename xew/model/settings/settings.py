@@ -63,36 +63,46 @@ class ModelSettings:
 
 
 @dataclass(frozen=True)
-class TrainSettings:
+class StepSettings:
+    """What the trainings of world models and of codecs have in common: steps, AdamW, and how often what is written."""
+
     batch: int
-    """Samples of one step over all devices."""
+    """Number of samples of a step, over all devices."""
     steps: int = 0
+    """Number of steps; 0 where the config gives the length in another unit."""
+    seed: int = 0
+    learning_rate: float = 5e-5
+    """Peak of the learning rate."""
+    warmup_steps: int = 0
+    """Number of steps in which the learning rate rises to its peak."""
+    decay_to: float = 1.0
+    """Cosine decay of the learning rate to this part of its peak at the end; 1 keeps it constant."""
+    weight_decay: float = 0.01
+    clip_norm: float = 1.0
+    """Largest global norm of the gradients; larger ones are scaled down to it."""
+    ema_decay: float = 0.0
+    """Decay of the moving average of the parameters; 0 keeps none."""
+    log_every: int = 20
+    save_every: int = 1000
+    sample_every: int = 1000
+    """Number of steps between samples of what has been learned; 0 draws none."""
+    keep_checkpoints: int = 2
+
+
+@dataclass(frozen=True)
+class TrainSettings(StepSettings):
     epochs: float = 0.0
     """Passes over the training samples; give this or `steps`."""
-    seed: int = 0
     accumulate: int = 1
     """Parts of the batch that are computed one after another: less memory, the same step."""
     chunks: Literal[1, 2] = 1
     """Consecutive clips of a sample; the second starts from the predicted, not the true, end of the first."""
-    learning_rate: float = 5e-5
-    warmup_steps: int = 0
-    decay_to: float = 1.0
-    """Cosine decay of the learning rate to this part of its peak at the last step; 1 keeps it constant."""
-    weight_decay: float = 0.01
-    clip_norm: float = 1.0
-    ema_decay: float = 0.0
-    """Decay of the moving average of the parameters; 0 keeps none."""
     mu_dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of AdamW's first moment; bfloat16 saves two bytes a parameter."""
     shift: float = 5.0
     """Shift of the noise levels, in training and in sampling."""
     history_noise: float = 0.0
     """Standard deviation of what is added to earlier frames' latents in training; Ctrl-World has 0.3."""
-    log_every: int = 20
-    save_every: int = 1000
-    sample_every: int = 1000
-    """Number of steps between sample videos; 0 draws none."""
-    keep_checkpoints: int = 2
 
 
 @dataclass(frozen=True)

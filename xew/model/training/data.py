@@ -17,7 +17,7 @@ from xew.episode import Record
 from xew.model.cache.clips import sample_starts
 from xew.model.cache.scales import Scale, apply_scales, load_scales
 from xew.model.cache.store import LatentCache, open_cache
-from xew.model.codecs.codec import latent_frames
+from xew.model.codecs.contract import latent_frames
 from xew.model.settings.parts import ClipInputs, Encoding, Instructions
 from xew.model.settings.settings import count_replayed
 from xew.model.text.instructions import VOCABULARY

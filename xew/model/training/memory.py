@@ -17,7 +17,7 @@ from flax import nnx
 from jax.sharding import AbstractMesh, Mesh
 
 from xew.config import ConfigError
-from xew.model.codecs.codec import latent_frames
+from xew.model.codecs.contract import latent_frames
 from xew.model.codecs.vae import abstract_vae
 from xew.model.network.dit import ModelSize, RematName
 from xew.model.runs.checkpoint import TrainState

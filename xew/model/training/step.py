@@ -2,6 +2,7 @@
 
 Reads  `TrainState`, `Batch`
 Writes the next `TrainState`, `StepResult`
+The optimizer is made in settings/optimizer.py, the noise in diffusion/flow_matching.py.
 
 The parameters are float32. The linear layers' are rounded to the network's dtype once a step, before they are gathered
 along `fsdp`, so that the traffic and the gradients have that dtype too; the numbers are the same as if every layer
@@ -19,7 +20,7 @@ from flax import nnx
 from jax import Array
 from jax.sharding import Mesh
 
-from xew.model.codecs.codec import Codec
+from xew.model.codecs.contract import Codec
 from xew.model.devices.sharding import gather_parameters, place_shapes
 from xew.model.diffusion.flow_matching import ReplaceReference, TrainingPair, put_first, sample_losses, training_pair
 from xew.model.network.dit import cast_params

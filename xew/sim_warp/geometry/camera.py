@@ -1,4 +1,7 @@
-"""Cameras as objects: where they stand and what they show, by the convention of `xew.projection`. NumPy only."""
+"""Cameras as objects: where they stand and what they show, by the convention of `xew.projection`. NumPy only.
+
+All episodes are seen by HEAD_CAMERA; to see them from elsewhere, change it.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -4,10 +4,9 @@ Reads  `Job`s: (task, seed) and robots
 Writes `Cell`s: first with scene, plan and joint commands (`plan_cells`), then with their motion (`simulate_cells`)
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from xew.sim_warp.physics import Motion, World, simulate
 from xew.sim_warp.plan import ToolPath
 from xew.sim_warp.production.outcome import find_failure
 from xew.sim_warp.rendering.observe import Recording, scene_recording
-from xew.sim_warp.robots import RobotSpec, get_robot
+from xew.sim_warp.robots import ROBOTS, RobotSpec
 from xew.sim_warp.scene import Scene, scene_rng
 from xew.sim_warp.tasks import Task, get_task
 
@@ -30,6 +29,7 @@ class Job:
     """Key of the registry or module:NAME."""
     seed: int
     robots: tuple[str, ...]
+    """Names under which episodes know them."""
     rejected: bool = False
     """Whether another robot has failed on it already; then nothing is rendered."""
 
@@ -74,11 +74,12 @@ class Cell:
         return scene_recording(self.robot, self.scene, motion.joint_pos, motion.object_pose, motion.object_joint)
 
 
-def plan_cells(jobs: Sequence[Job], data: Path | None = None) -> list[list[Cell]]:
+def plan_cells(jobs: Sequence[Job], robots: Mapping[str, RobotSpec] = ROBOTS) -> list[list[Cell]]:
     """Scene, plan and commands of every cell, by job; the commands of all cells of a robot are solved together.
 
     Args:
-        data: data set whose own robots count too.
+        jobs: the seeds, and the names of the robots that do each.
+        robots: all of these robots by name.
     """
     tasks = [get_task(job.task) for job in jobs]
     scenes = [task.sample(scene_rng(job.task, job.seed), job.seed) for job, task in zip(jobs, tasks, strict=True)]
@@ -86,7 +87,7 @@ def plan_cells(jobs: Sequence[Job], data: Path | None = None) -> list[list[Cell]
     seeds: list[list[Cell]] = [[] for _ in jobs]
     for name in dict.fromkeys(robot for job in jobs for robot in job.robots):
         mine = [index for index, job in enumerate(jobs) if name in job.robots]
-        robot = get_robot(name, data)
+        robot = robots[name]
         for index, commands in zip(mine, joint_commands(robot, [paths[index] for index in mine]), strict=True):
             seeds[index].append(Cell(jobs[index].task, tasks[index], scenes[index], paths[index], name, robot, commands))
     return seeds

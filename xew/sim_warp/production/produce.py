@@ -7,7 +7,7 @@ The robots of a seed are made together, because a seed counts only when all of t
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -15,13 +15,19 @@ from xew.episode import Record
 from xew.sim_warp.production.cells import Cell, Job, plan_cells, simulate_cells
 from xew.sim_warp.production.episodes import render_cells, write_cell
 from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.robots import ROBOTS, RobotSpec
 
 FRAMES_AT_ONCE = 4096
 """Number of frames in one group of seeds: about half a megabyte of pixels each."""
 
 
 def produce(
-    jobs: Sequence[Job], out: Path, renderer: Renderer, batch: int | None = None, videos: bool = True
+    jobs: Sequence[Job],
+    out: Path,
+    renderer: Renderer,
+    batch: int | None = None,
+    videos: bool = True,
+    robots: Mapping[str, RobotSpec] = ROBOTS,
 ) -> list[list[Record]]:
     """Make all episodes of some seeds and write them under `out`; the headers of each job in the order of its robots.
 
@@ -33,8 +39,9 @@ def produce(
         renderer: draws the pictures; its device steps the physics, too.
         batch: worlds that a GPU steps together, None for all.
         videos: store them; without, an episode has all states and hashes, and `rerender.add_videos` makes its videos.
+        robots: the robots of the jobs by name.
     """
-    planned = plan_cells(jobs, out)
+    planned = plan_cells(jobs, robots)
     seeds = simulate_cells(planned, renderer.device.alias, batch)
     rejected = {(job.task, job.seed) for job in jobs if job.rejected}
     records: list[list[Record]] = []

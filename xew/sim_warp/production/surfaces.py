@@ -1,8 +1,8 @@
 """Points on surfaces of episodes on disk, and how many of them the camera sees.
 
 Reads  <data>/<task>/<seed>/<robot>/
-Writes nothing: the points follow from recorded states and from the shapes of the robot and of the task's objects, so that
-       episodes of earlier versions have them too
+Writes nothing beside the episodes: the points follow from recorded states and from the shapes of the robot and of the task's
+       objects, so that episodes of earlier versions have them too. A folder may be named that keeps them (kept_tracks.py)
 """
 
 from collections import defaultdict
@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from xew.config import ConfigError
-from xew.episode import Record, data_folder, read_record, read_states
+from xew.episode import Record, States, data_folder, read_record, read_states
+from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.geometry.camera import Camera
+from xew.sim_warp.production.kept_tracks import load_tracks, save_tracks, tracks_key, tracks_path
 from xew.sim_warp.rendering.observe import scene_recording
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import default_renderer
@@ -48,12 +50,13 @@ def scene_names(scene: Scene) -> tuple[str, ...]:
     return *scene.names, *(f"{thing.name} lid" for thing in scene.objects if thing.hinge is not None)
 
 
-def read_surfaces(folder: Path, renderer: Renderer | None = None) -> SurfaceTracks | None:
+def read_surfaces(folder: Path, renderer: Renderer | None = None, keep: Path | None = None) -> SurfaceTracks | None:
     """Points on the surfaces of an accepted episode.
 
     Args:
         folder: of the episode.
         renderer: whose buffer says what is seen; by default the process's own.
+        keep: folder that keeps tracks; what it has of this episode is not rendered again. None keeps nothing.
 
     Returns:
         The tracks; None where the shapes are not known: the episode was imported, or is not of the scene that its task now
@@ -71,6 +74,18 @@ def read_surfaces(folder: Path, renderer: Renderer | None = None) -> SurfaceTrac
     if scene is None:
         return None
     states = read_states(folder)
+    if keep is None:
+        return _render_surfaces(robot, scene, states, renderer)
+    path, key = tracks_path(keep, record), tracks_key(robot, record.scene_hash, states)
+    tracks = load_tracks(path, key)
+    if tracks is None:
+        tracks = _render_surfaces(robot, scene, states, renderer)
+        save_tracks(path, key, tracks)
+    return tracks
+
+
+def _render_surfaces(robot: RobotSpec, scene: Scene, states: States, renderer: Renderer | None) -> SurfaceTracks:
+    """The tracks of an episode of a scene, by its states."""
     recording = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
     height, width = states.robot_mask.shape[1:]
     camera = Camera(states.intrinsics, states.extrinsics, width, height)

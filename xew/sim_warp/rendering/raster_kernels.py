@@ -1,4 +1,4 @@
-"""Warp kernels that find which triangle each sample of an image shows, and that draw shadow maps; `render.py` launches them.
+"""Warp kernels that find which triangle each sample of an image shows, and that draw shadow maps; `passes.py` launches them.
 
 All kernels of a chunk of frames run together, and a chunk mixes frames of different worlds. A sample of the image keeps
 one 64-bit key: the bits of 1 / depth over the index of the triangle. Keys meet in an atomic maximum, which has no order,

@@ -4,8 +4,9 @@ Reads  `World`s: meshes and their poses; a camera; the stage
 Writes `Frames`: RGB, robot mask, depth, bodies, optical flow
 
 It makes two kinds of frame: with the stage (table, wall, ground, shadows) what the head camera sees of an episode, without
-it the bodies alone on white. The kernels (raster_kernels.py, then shading_kernels.py) are the same on CPU and GPU, and a
-frame's bytes do not depend on what else is rendered with it.
+it the bodies alone on white. This file takes worlds apart into chunks of frames and puts their images together again; what is
+done to a chunk lies in passes.py. The kernels (raster_kernels.py, then shading_kernels.py) are the same on CPU and GPU, and
+a frame's bytes do not depend on what else is rendered with it.
 """
 
 from collections.abc import Sequence
@@ -16,13 +17,12 @@ import warp as wp
 
 from xew.sim_warp import stage
 from xew.sim_warp.devices.waiting import wait_for
-from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera, look_at, project
-from xew.sim_warp.rendering import raster_kernels as raster
+from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera, project
 from xew.sim_warp.rendering import shading_kernels as shading
+from xew.sim_warp.rendering.lighting import camera_view
 from xew.sim_warp.rendering.packing import (
     Body,
     FrameTable,
-    PackedGeometry,
     World,
     check_world,
     distinct_worlds,
@@ -30,21 +30,15 @@ from xew.sim_warp.rendering.packing import (
     pack_geometry,
     pack_points,
 )
+from xew.sim_warp.rendering.passes import FLOW_LIMIT, Call, Chunk, Passes
 from xew.threads import PARSING
 
 __all__ = ["FLOW_LIMIT", "Body", "Frames", "Renderer", "World"]
 
-FLOW_LIMIT = 25.0
-"""Longest optical flow [pixels], the paper's clip."""
-SHADOW_SIZE = 512
-"""Side of a shadow map [texels], about 3.5 mm each on the table: less than two pixels of the head camera."""
 FRAMES_PER_CHUNK = {"cpu": 4, "cuda": 512}
 """Number of frames that are on the device at once; one takes about 6 MB."""
-STRIPES = {"cpu": 1, "cuda": 8}
-"""Number of threads that share a triangle's rows, so that one large triangle does not hold up a GPU."""
 STAGES_KEPT = 16
 """Number of cameras whose lit stage is kept, about 10 MB each."""
-IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def _nothing() -> np.ndarray:
@@ -85,11 +79,7 @@ class Renderer:
         self.device = wp.get_device(device)
         kind = "cuda" if self.device.is_cuda else "cpu"
         self._frames_per_chunk = frames_per_chunk or FRAMES_PER_CHUNK[kind]
-        self._stripes = STRIPES[kind]
-        self._lights = wp.array([_light(light) for light in stage.LIGHTS], dtype=raster.Light, device=self.device)
-        self._shading = _shading()
-        ramp = stage.srgb_from_linear(np.linspace(0, 1, shading.COLORS))
-        self._srgb = wp.array(ramp, dtype=wp.uint8, device=self.device)
+        self._passes = Passes(self.device)
         self._pinned = wp.empty(0, dtype=wp.uint8, device="cpu")
         self._stages: dict[tuple[bytes, int, int], shading.LitStage] = {}
 
@@ -167,11 +157,11 @@ class Renderer:
         """Images of all frames of all worlds on the host, by the names of `Frames`; colors, with shadows, if asked for."""
         kinds, kind = distinct_worlds(worlds)
         table, pose = pack_frames(worlds, kind)
-        call = _Call(
+        call = Call(
             geometry=pack_geometry(kinds, self.device),
             pose=wp.array(pose, dtype=wp.transform, device=self.device),
             camera=camera,
-            view=_camera_view(camera),
+            view=camera_view(camera),
             stage=self._stage(camera, ground),
             shadows=len(stage.LIGHTS) if ground and colors else 0,
             wanted=wanted,
@@ -203,168 +193,25 @@ class Renderer:
             host[name] = np.empty((count, *values.shape[1:]), values.dtype)
         host[name][chunk] = values
 
-    def _render_chunk(self, call: "_Call", frames: FrameTable, pixel: np.ndarray) -> dict[str, wp.array]:
+    def _render_chunk(self, call: Call, frames: FrameTable, pixel: np.ndarray) -> dict[str, wp.array]:
         """Images of some frames on the device, by the names of `Frames`."""
-        chunk = _Chunk(self.device, call.geometry, frames)
-        drawn = self._draw(call, chunk)
-        images = {"rgb": self._shade(call, chunk, drawn)} if call.colors else {}
-        images |= self._measure(call, chunk, drawn)
+        passes, chunk = self._passes, Chunk(self.device, call.geometry, frames)
+        drawn = passes.draw(call, chunk)
+        images = {"rgb": passes.shade(call, chunk, drawn)} if call.colors else {}
+        images |= passes.measure(call, chunk, drawn)
         if pixel.shape[1]:
-            images |= self._probe(call, chunk, drawn, pixel)
-        return images
-
-    def _draw(self, call: "_Call", chunk: "_Chunk") -> "_Drawn":
-        """Visibility of a chunk's frames and, if there are shadows, their shadow maps."""
-        count, lights = chunk.count, call.shadows
-        drawn = _Drawn(
-            vertex=self._zeros((count, chunk.vertex_count), wp.vec3),
-            shadow_vertex=self._zeros((count, lights, chunk.vertex_count), wp.vec3),
-            key=self._zeros((count, raster.SAMPLES, call.camera.height, call.camera.width), wp.uint64),
-            shadow_map=self._zeros((count, lights, SHADOW_SIZE, SHADOW_SIZE), wp.uint32),
-            shadow_tile=self._zeros((count, lights, SHADOW_SIZE // raster.TILE, SHADOW_SIZE // raster.TILE), wp.uint32),
-        )
-        self._launch(
-            raster.place_vertices,
-            (count, chunk.vertex_count),
-            [call.geometry.arrays, chunk.world, chunk.pose, call.pose, call.view, self._lights],
-            [drawn.vertex, drawn.shadow_vertex],
-        )
-        self._launch(
-            raster.draw_triangles,
-            (count, chunk.triangle_count, self._stripes),
-            [call.geometry.arrays, chunk.world, call.view, drawn.vertex, self._stripes],
-            [drawn.key],
-        )
-        self._launch(
-            raster.draw_shadows,
-            (count, lights, chunk.triangle_count),
-            [call.geometry.arrays, chunk.world, drawn.shadow_vertex],
-            [drawn.shadow_map, drawn.shadow_tile],
-        )
-        return drawn
-
-    def _shade(self, call: "_Call", chunk: "_Chunk", drawn: "_Drawn") -> wp.array:
-        """Colors of a chunk's frames."""
-        height, width = call.camera.height, call.camera.width
-        posed = [call.geometry.arrays, chunk.world, chunk.pose, call.pose, call.view]
-        seen = [drawn.vertex, drawn.key, drawn.shadow_map, drawn.shadow_tile]
-        rgb = self._empty((chunk.count, height, width, 3), wp.uint8)
-        self._launch(
-            shading.shade_pixels,
-            (chunk.count, height, width),
-            [*posed, self._lights, self._shading, call.stage, self._srgb, *seen],
-            [rgb],
-        )
-        return rgb
-
-    def _measure(self, call: "_Call", chunk: "_Chunk", drawn: "_Drawn") -> dict[str, wp.array]:
-        """Mask, bodies, depth and optical flow of a chunk's frames, as far as wanted."""
-        shape = (chunk.count, call.camera.height, call.camera.width)
-        posed = [call.geometry.arrays, chunk.world, chunk.pose, chunk.next_pose, call.pose, call.view]
-        images = {"robot_mask": self._empty(shape, wp.bool)}
-        for name, dtype in (("body", wp.int16), ("depth", wp.float32), ("optical_flow", wp.vec2)):
-            images[name] = self._empty(shape if name in call.wanted else (0, 0, 0), dtype)
-        self._launch(
-            shading.measure_pixels,
-            shape,
-            [*posed, call.stage, FLOW_LIMIT, drawn.key],
-            list(images.values()),
-        )
-        return {name: image for name, image in images.items() if image.size}
-
-    def _probe(self, call: "_Call", chunk: "_Chunk", drawn: "_Drawn", pixel: np.ndarray) -> dict[str, wp.array]:
-        """What is seen at pixels [t k 2] x y of a chunk's frames."""
-        shape = pixel.shape[:2]
-        images = {"point_body": self._empty(shape, int), "point_depth": self._empty(shape, float)}
-        self._launch(
-            shading.probe_pixels,
-            shape,
-            [call.geometry.arrays, chunk.world, call.stage, wp.array(pixel, dtype=wp.vec2i, device=self.device), drawn.key],
-            list(images.values()),
-        )
+            images |= passes.probe(call, chunk, drawn, pixel)
         return images
 
     def _stage(self, camera: Camera, ground: bool) -> shading.LitStage:
-        """What never moves as this camera sees it; drawn and lit at first use. Nothing looks the same from anywhere."""
+        """The lit stage of a camera, made at first use. Without a ground one entry serves all cameras of a size."""
         view = camera.intrinsics.tobytes() + camera.extrinsics.tobytes() if ground else b""
         key = (view, camera.width, camera.height)
         if key not in self._stages:
             if len(self._stages) >= STAGES_KEPT:
                 self._stages.clear()
-            self._stages[key] = self._lit_stage(camera, ground)
+            self._stages[key] = self._passes.light_stage(camera, ground)
         return self._stages[key]
-
-    def _lit_stage(self, camera: Camera, ground: bool) -> shading.LitStage:
-        bodies = [Body(stage.stage_mesh(), False)] if ground else []
-        table, pose = pack_frames([World(bodies, np.tile(IDENTITY, (1, len(bodies), 1)))], [0])
-        call = _Call(
-            geometry=pack_geometry([bodies], self.device),
-            pose=wp.array(pose, dtype=wp.transform, device=self.device),
-            camera=camera,
-            view=_camera_view(camera),
-            stage=shading.LitStage(),
-        )
-        chunk = _Chunk(self.device, call.geometry, table)
-        drawn = self._draw(call, chunk)
-        height, width, lights = camera.height, camera.width, len(stage.LIGHTS) if ground else 0
-        lit = shading.LitStage()
-        lit.key = drawn.key[0]
-        lit.ambient = self._zeros((height, width), wp.vec3)
-        lit.direct = self._zeros((lights, height, width), wp.vec3)
-        lit.shadow_texel = self._zeros((lights, height, width), wp.vec3)
-        self._launch(
-            shading.light_stage,
-            (height, width),
-            [call.geometry.arrays, call.view, self._lights, self._shading, drawn.vertex, drawn.key, wp.vec3(*stage.SKY)],
-            [lit.ambient, lit.direct, lit.shadow_texel],
-        )
-        return lit
-
-    def _launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
-
-    def _zeros(self, shape: tuple[int, ...], dtype: type) -> wp.array:
-        return wp.zeros(shape, dtype=dtype, device=self.device)
-
-    def _empty(self, shape: tuple[int, ...], dtype: type) -> wp.array:
-        return wp.empty(shape, dtype=dtype, device=self.device)
-
-
-@dataclass(frozen=True)
-class _Call:
-    """What is the same for all frames of a call of the renderer."""
-
-    geometry: PackedGeometry
-    pose: wp.array
-    camera: Camera
-    view: raster.View
-    stage: shading.LitStage
-    shadows: int = 0
-    wanted: frozenset[str] = frozenset()
-    colors: bool = True
-
-
-class _Chunk:
-    """The frames that are on the device at once."""
-
-    def __init__(self, device: wp.Device, geometry: PackedGeometry, frames: FrameTable) -> None:
-        self.count = len(frames.world)
-        self.vertex_count = int(geometry.vertex_counts[frames.world].max())
-        self.triangle_count = int(geometry.triangle_counts[frames.world].max())
-        self.world, self.pose, self.next_pose = (
-            wp.array(column, dtype=int, device=device) for column in (frames.world, frames.pose, frames.next_pose)
-        )
-
-
-@dataclass(frozen=True)
-class _Drawn:
-    """What `_draw` leaves for the kernels after it, as they describe it in raster_kernels.py."""
-
-    vertex: wp.array
-    shadow_vertex: wp.array
-    key: wp.array
-    shadow_map: wp.array
-    shadow_tile: wp.array
 
 
 def _split_by_world(images: dict[str, np.ndarray], worlds: Sequence[World]) -> list[Frames]:
@@ -385,41 +232,3 @@ def _nearest_pixel(camera: Camera, points: np.ndarray) -> np.ndarray:
     """[t k 2] int32 pixel x, y of points [t k 3]; (-1, -1) for those behind the camera."""
     pixel, _ = project(camera, points)
     return np.where(np.isfinite(pixel), np.clip(np.round(pixel), -1, 1 << 20), -1).astype(np.int32)
-
-
-def _camera_view(camera: Camera) -> raster.View:
-    view = raster.View()
-    view.rotation = wp.mat33(*camera.extrinsics[:3, :3].ravel())
-    view.translation = wp.vec3(*camera.extrinsics[:3, 3])
-    view.focal = wp.vec2(camera.intrinsics[0, 0], camera.intrinsics[1, 1])
-    view.center = wp.vec2(*camera.intrinsics[:2, 2])
-    return view
-
-
-def _light(source: stage.Light) -> raster.Light:
-    """A light with the view of its shadow map."""
-    light = raster.Light()
-    light.intensity = source.intensity
-    direction = np.array(source.direction) / np.linalg.norm(source.direction)
-    light.to_light = wp.vec3(*-direction)
-    if source.position is None:
-        position = np.array(stage.SHADOW_CENTER) - direction * stage.SHADOW_DISTANCE
-    else:
-        position = np.array(source.position)
-    light.position = wp.vec3(*position)
-    camera = look_at(position, position + direction, (0.0, 1.0, 0.0), stage.SHADOW_ANGLE, SHADOW_SIZE, SHADOW_SIZE)
-    light.view = _camera_view(camera)
-    if source.position is None:
-        light.view.parallel = 1
-        light.view.focal = wp.vec2(SHADOW_SIZE / stage.SHADOW_WIDTH, SHADOW_SIZE / stage.SHADOW_WIDTH)
-    return light
-
-
-def _shading() -> shading.Shading:
-    values = shading.Shading()
-    values.ambient = stage.AMBIENT
-    values.sky_share = stage.SKY_SHARE
-    values.exposure = stage.EXPOSURE
-    values.specular = stage.SPECULAR
-    values.knee, values.ceiling = stage.KNEE, stage.CEILING
-    return values

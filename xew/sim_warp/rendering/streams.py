@@ -1,6 +1,6 @@
 """Images that follow from a robot and its commands alone: what a model may know in advance.
 
-Reads  a robot, or its name, and canonical commands [t 16]; never a recorded state, so that no condition sees the future
+Reads  a robot and canonical commands [t 16]; never a recorded state, so that no condition sees the future
 Writes the robot-only render with mask and exact optical flow, ray map, and task-independent views of the robot
 To add one, write a pure function of (robot, action, camera) here.
 """
@@ -20,7 +20,6 @@ from xew.sim_warp.geometry.poses import matrix_from_pose
 from xew.sim_warp.kinematics.forward import tool_pose
 from xew.sim_warp.rendering.bodies import robot_bodies, robot_pose
 from xew.sim_warp.rendering.render import FLOW_LIMIT, Body, Renderer, World
-from xew.sim_warp.robots import get_robot
 
 VIEW_COUNT = 9
 CLIP_FRAMES = 17
@@ -61,18 +60,17 @@ def default_renderer() -> Renderer:
     return Renderer()
 
 
-def command_streams(robot: str | RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> CommandStreams:
+def command_streams(robot: RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> CommandStreams:
     """Render [t h w 3] uint8, mask [t h w] and exact optical flow [t h w 2] pixels of canonical commands [t 16].
 
     Raises:
-        ConfigError: there is no such robot.
         ValueError: the action does not have 16 columns.
     """
     return command_streams_batch([(robot, action)], camera)[0]
 
 
 def command_streams_batch(
-    commands: Sequence[tuple[str | RobotSpec, np.ndarray]], camera: Camera = HEAD_CAMERA, renderer: Renderer | None = None
+    commands: Sequence[tuple[RobotSpec, np.ndarray]], camera: Camera = HEAD_CAMERA, renderer: Renderer | None = None
 ) -> list[CommandStreams]:
     """`command_streams` of many (robot, action [t 16]) at once; each does not depend on the others."""
     batch = (renderer or default_renderer()).render_batch(_worlds(commands), camera, ground=False, optical_flow=True)
@@ -80,19 +78,15 @@ def command_streams_batch(
 
 
 def command_renders(
-    commands: Sequence[tuple[str | RobotSpec, np.ndarray]], camera: Camera = HEAD_CAMERA, renderer: Renderer | None = None
+    commands: Sequence[tuple[RobotSpec, np.ndarray]], camera: Camera = HEAD_CAMERA, renderer: Renderer | None = None
 ) -> list[np.ndarray]:
     """Only the renders [t h w 3] uint8 of `command_streams_batch`, of which an episode keeps a video."""
     batch = (renderer or default_renderer()).render_batch(_worlds(commands), camera, ground=False)
     return [frames.rgb for frames in batch]
 
 
-def _worlds(commands: Sequence[tuple[str | RobotSpec, np.ndarray]]) -> list[World]:
-    robots = [get_robot(robot) for robot, _ in commands]
-    return [
-        World(robot_bodies(robot), robot_pose(robot, _check_action(action)))
-        for robot, (_, action) in zip(robots, commands, strict=True)
-    ]
+def _worlds(commands: Sequence[tuple[RobotSpec, np.ndarray]]) -> list[World]:
+    return [World(robot_bodies(robot), robot_pose(robot, _check_action(action))) for robot, action in commands]
 
 
 def flow_to_rgb(flow: np.ndarray, clip: float = FLOW_LIMIT) -> np.ndarray:
@@ -126,7 +120,7 @@ def color_wheel() -> np.ndarray:
     return cv2.cvtColor(np.stack([hue, saturation, np.full_like(hue, 255)], -1), cv2.COLOR_HSV2RGB)
 
 
-def ray_map(robot: str | RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> np.ndarray:
+def ray_map(robot: RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> np.ndarray:
     """The tool frames of canonical commands [t 16] drawn into the image: [t h w 3] uint8.
 
     On gray, each tool has a base marker, a disc at the origin of its frame whose color goes with the gripper, and over it
@@ -134,7 +128,6 @@ def ray_map(robot: str | RobotSpec, action: np.ndarray, camera: Camera = HEAD_CA
     EnerVerse-AC's trajectory maps. A tool that is nearer covers one that is farther; a tool that is not in front of the
     camera is left out.
     """
-    robot = get_robot(robot)
     action = _check_action(action)
     canvas = np.full((len(action), camera.height, camera.width, 3), RAY_MAP_GROUND, np.uint8)
     tools = [_tool_points(robot, arm, action) for arm in range(len(ARMS))]
@@ -167,30 +160,27 @@ def _draw_tool(image: np.ndarray, pixels: np.ndarray, arm: int, gripper: float) 
         cv2.line(image, origin, end, axis_color, round(width * AXIS_WIDTH), cv2.LINE_AA, 4)
 
 
-def reference_image(robot: str | RobotSpec) -> np.ndarray:
+def reference_image(robot: RobotSpec) -> np.ndarray:
     """The robot at home, seen from the front, [h w 3] uint8: the first of its nine views."""
     return nine_views(robot)[0]
 
 
-def nine_views(robot: str | RobotSpec) -> np.ndarray:
+def nine_views(robot: RobotSpec) -> np.ndarray:
     """The robot at home from nine azimuths 40 degrees apart, [9 h w 3] uint8, the first from the front."""
-    robot = get_robot(robot)
     bodies, pose = robot_bodies(robot), robot_pose(robot, home_action(robot)[None])
     cameras = _fit_cameras(bodies, pose, [index * 360 / VIEW_COUNT for index in range(VIEW_COUNT)])
     return np.concatenate([default_renderer().render(bodies, pose, camera, ground=False).rgb for camera in cameras])
 
 
-def side_view(robot: str | RobotSpec, azimuth: float) -> np.ndarray:
+def side_view(robot: RobotSpec, azimuth: float) -> np.ndarray:
     """The robot at home from one azimuth [deg], as in `nine_views` but as near as this view allows: [h w 3] uint8."""
-    robot = get_robot(robot)
     bodies, pose = robot_bodies(robot), robot_pose(robot, home_action(robot)[None])
     return default_renderer().render(bodies, pose, _fit_cameras(bodies, pose, [azimuth])[0], ground=False).rgb[0]
 
 
-def articulation_clip(robot: str | RobotSpec) -> np.ndarray:
+def articulation_clip(robot: RobotSpec) -> np.ndarray:
     """A clip of the robot, seen from the front, that sweeps every joint and both grippers (`articulation_action`): [17 h w 3]
     uint8."""
-    robot = get_robot(robot)
     bodies, pose = robot_bodies(robot), robot_pose(robot, articulation_action(robot))
     camera = _fit_cameras(bodies, pose, [0.0])[0]
     return default_renderer().render(bodies, pose, camera, ground=False).rgb

@@ -10,6 +10,7 @@ view_000.png to view_320.png (nine azimuths in degrees), clip.mkv (17 frames tha
 Look at the sheets after every change of a shape: a robot that a person would not recognize is a defect.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,7 +35,7 @@ from xew.sim_warp.rendering.streams import (
     reference_image,
     side_view,
 )
-from xew.sim_warp.robots import ROBOTS, get_robot
+from xew.sim_warp.robots import ROBOTS, RobotSpec, get_robot
 
 GRID_COLUMNS, GRID_WIDTH, GRID_HEIGHT = 8, 240, 180
 """Numbers of robots in a row of a grid, and of pixels of each."""
@@ -47,37 +48,38 @@ def sheet(views: np.ndarray) -> np.ndarray:
     return np.vstack([np.hstack(list(views[row : row + 3])) for row in (0, 3, 6)])
 
 
-def overview(views: dict[str, np.ndarray], head: dict[str, np.ndarray]) -> np.ndarray:
+def overview(robots: Sequence[RobotSpec], views: Sequence[np.ndarray], head: Sequence[np.ndarray]) -> np.ndarray:
     """All robots in one picture [h w 3] uint8, a row each at half size: the title, what the head camera sees at home, and every
     other of the nine views.
 
     Args:
-        views: [9 h w 3] uint8, nine views by robot.
-        head: [h w 3] uint8, the head camera's view by robot.
+        robots: which.
+        views: [9 h w 3] uint8, nine views of each.
+        head: [h w 3] uint8, the head camera's view of each.
     """
     rows = []
-    for key, images in views.items():
-        small = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in (head[key], *images[::2])]
+    for robot, images, seen in zip(robots, views, head, strict=True):
+        small = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in (seen, *images[::2])]
         row = np.ascontiguousarray(np.hstack(small))
-        cv2.putText(row, get_robot(key).title, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (20, 20, 20), 1, cv2.LINE_AA)
+        cv2.putText(row, robot.title, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (20, 20, 20), 1, cv2.LINE_AA)
         rows.append(row)
     return np.vstack(rows)
 
 
-def grid(keys: tuple[str, ...]) -> np.ndarray:
+def grid(robots: Sequence[RobotSpec]) -> np.ndarray:
     """Robots at home side by side with their titles, eight in a row, [h w 3] uint8."""
     tiles = []
-    for key in keys:
-        image = cv2.resize(side_view(key, GRID_AZIMUTH), (GRID_WIDTH, GRID_HEIGHT), interpolation=cv2.INTER_AREA)
-        cv2.putText(image, get_robot(key).title, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (20, 20, 20), 1, cv2.LINE_AA)
+    for robot in robots:
+        image = cv2.resize(side_view(robot, GRID_AZIMUTH), (GRID_WIDTH, GRID_HEIGHT), interpolation=cv2.INTER_AREA)
+        cv2.putText(image, robot.title, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (20, 20, 20), 1, cv2.LINE_AA)
         tiles.append(image)
     tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % GRID_COLUMNS)
     return np.vstack([np.hstack(tiles[row : row + GRID_COLUMNS]) for row in range(0, len(tiles), GRID_COLUMNS)])
 
 
-def write_grid(keys: tuple[str, ...], path: Path) -> None:
+def write_grid(robots: Sequence[RobotSpec], path: Path) -> None:
     """Draw `grid` as a PNG. Raises EpisodeError if it cannot be written."""
-    picture = grid(keys)
+    picture = grid(robots)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -85,31 +87,30 @@ def write_grid(keys: tuple[str, ...], path: Path) -> None:
     save(path, picture)
 
 
-def head_view(key: str, renderer: Renderer) -> np.ndarray:
+def head_view(robot: RobotSpec, renderer: Renderer) -> np.ndarray:
     """The robot at home over the empty table, as the head camera sees it, [h w 3] uint8."""
-    robot = get_robot(key)
     return renderer.render(robot_bodies(robot), robot_pose(robot, home_action(robot)[None]), HEAD_CAMERA).rgb[0]
 
 
-def write_references(key: str, folder: Path) -> None:
-    """Write the reference renders of a robot into <folder>/<key>/, see the head of this file.
+def write_references(robot: RobotSpec, folder: Path) -> Path:
+    """Write the reference renders of a robot into <folder>/<key>/, see the head of this file; returns that folder.
 
     Raises:
         EpisodeError: they cannot be written.
     """
-    robot = get_robot(key)
     own = folder / robot.key
     try:
         own.mkdir(parents=True, exist_ok=True)
-        save(own / "front.png", reference_image(key))
-        for index, image in enumerate(nine_views(key)):
+        save(own / "front.png", reference_image(robot))
+        for index, image in enumerate(nine_views(robot)):
             save(own / f"view_{index * 360 // VIEW_COUNT:03d}.png", image)
-        clip = articulation_clip(key)
+        clip = articulation_clip(robot)
         write_video(own / "clip.mkv", clip)
         save(own / "clip.png", np.hstack([*clip]))
-        save(own / "ray_map.png", np.hstack([*ray_map(key, articulation_action(robot)[::4])]))
+        save(own / "ray_map.png", np.hstack([*ray_map(robot, articulation_action(robot)[::4])]))
     except OSError as error:
         raise EpisodeError(f"cannot write to {own}: {error.strerror}. Choose another folder with --references.") from error
+    return own
 
 
 def save(path: Path, image: np.ndarray) -> None:
@@ -118,16 +119,16 @@ def save(path: Path, image: np.ndarray) -> None:
         raise EpisodeError(f"{path} cannot be written; choose another folder.")
 
 
-def write_sheets(keys: tuple[str, ...], folder: Path) -> list[Path]:
+def write_sheets(robots: Sequence[RobotSpec], folder: Path) -> list[Path]:
     """Draw robot_<key>.png of every robot and robots.png of all; the files."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise EpisodeError(f"cannot write to {folder}: {error.strerror}. Choose another folder with --out.") from error
     renderer = Renderer()
-    views = {key: nine_views(key) for key in keys}
-    pictures = {f"robot_{get_robot(key).key}": sheet(images) for key, images in views.items()}
-    pictures["robots"] = overview(views, {key: head_view(key, renderer) for key in keys})
+    views = [nine_views(robot) for robot in robots]
+    pictures = {f"robot_{robot.key}": sheet(images) for robot, images in zip(robots, views, strict=True)}
+    pictures["robots"] = overview(robots, views, [head_view(robot, renderer) for robot in robots])
     for name, picture in pictures.items():
         save(folder / f"{name}.png", picture)
     return [folder / f"{name}.png" for name in pictures]
@@ -151,7 +152,7 @@ class Args:
 def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
-    robots = expand_robots(args.robots)
+    robots = [get_robot(name) for name in expand_robots(args.robots)]
     if args.grid is not None:
         write_grid(robots, args.grid)
         print(args.grid)
@@ -159,9 +160,8 @@ def main() -> None:
     if args.references is None:
         print(*write_sheets(robots, args.out), sep="\n")
         return
-    for key in robots:
-        write_references(key, args.references)
-        print(args.references / get_robot(key).key)
+    for robot in robots:
+        print(write_references(robot, args.references))
 
 
 if __name__ == "__main__":

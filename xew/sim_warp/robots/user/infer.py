@@ -1,19 +1,23 @@
-"""Inference from a URDF: its hands, the joints of its arms, its tool frame, which way its fingers close.
+"""Inference from a URDF: its hands, the joints of its arms, its tool frame, which way its fingers close, its limits.
 
-Reads  a Urdf
-Writes the fields of an Arm that a draft leaves open. Where the URDF leaves more than one reading, a ConfigError says which
-field of robot.yaml decides.
+Reads  a Urdf, and a RobotDraft
+Writes arms (`complete_arms`) and limits (`complete_limits`) of which nothing is open but where they stand
+Where the URDF leaves more than one reading, a ConfigError says which field of robot.yaml decides.
 """
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError
+from xew.sim_warp.embodiment.spec import Arm
 from xew.sim_warp.embodiment.urdf import Joint, Urdf
 from xew.sim_warp.geometry.poses import Pose
 from xew.sim_warp.kinematics.forward import link_matrices
+from xew.sim_warp.robots.user.draft import ArmDraft, RobotDraft
 
 ARM_JOINTS = (6, 7)
 TIP_MARGIN = 0.015
@@ -25,6 +29,103 @@ LARGEST_ANGLE = 2 * math.pi
 """Largest position limit [rad]; one beyond it is a placeholder."""
 LARGEST_SPEED, DEFAULT_SPEED = 10.0, 3.0
 """Largest speed limit [rad/s], and the one that is used where the URDF has none, 0 or a larger one: those are placeholders."""
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+STROKE_TOLERANCE = 1e-3
+"""Largest difference between the strokes of the two fingers of a hand, which move together [m]."""
+
+
+def complete_arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]:
+    """Left and right arm with nothing open but homes and bases."""
+    drafts = fill_right_arm(draft.arms)
+    found = [] if all(arm.fingers for arm in drafts) else find_fingers(urdf)
+    arms: list[Arm] = []
+    for side, given in enumerate(drafts):
+        fingers = given.fingers or found[min(side, len(found) - 1)]
+        _check_joints(urdf, fingers, source)
+        joints = given.joints or arm_joints(urdf, fingers)
+        _check_joints(urdf, joints, source)
+        ends = finger_ends(urdf, fingers)
+        closed, opened = given.finger_closed or ends[0], given.finger_open or ends[1]
+        link = _find_link(urdf, given.tool_link, source) if given.tool_link else hand_link(urdf, fingers)
+        tool = given.tool_pose or tool_frame(urdf, joints, fingers, ends[0])
+        if given.tool_pose and given.tool_at_tips:
+            tool = tool_at_tips(urdf, link, Rotation.from_quat(given.tool_pose[3:]).as_matrix(), fingers, ends[0])
+        arms.append(
+            Arm(
+                root_pose=given.root_pose or IDENTITY,
+                joints=joints,
+                home=given.home or (0.0,) * len(joints),
+                tool_link=link,
+                tool_pose=tool,
+                fingers=fingers,
+                finger_closed=_clip_fingers(urdf, fingers, closed),
+                finger_open=_clip_fingers(urdf, fingers, opened),
+            )
+        )
+        _check_arm(urdf, arms[-1], source)
+    return arms[0], arms[1]
+
+
+def fill_right_arm(arms: tuple[ArmDraft, ArmDraft]) -> tuple[ArmDraft, ArmDraft]:
+    """Both arms, the right one as the left where it is left open, but for its home."""
+    left, right = arms
+    return (left, replace(left, home=None)) if right == ArmDraft() else (left, right)
+
+
+def _check_joints(urdf: Urdf, names: Sequence[str], source: str) -> None:
+    if missing := [name for name in names if name not in urdf.joints]:
+        raise ConfigError(
+            f"{source}: {urdf.path.name} has no joint {', '.join(missing)}; it has {', '.join(urdf.joint_names)}."
+        )
+
+
+def _find_link(urdf: Urdf, name: str, source: str) -> str:
+    """A link, or the child link of a joint, as RoboTwin names it."""
+    if name in urdf.links:
+        return name
+    if name in urdf.joints:
+        return urdf.joints[name].child
+    raise ConfigError(f"{source}: {urdf.path.name} has no link or joint {name}; name the one that carries the tool.")
+
+
+def _clip_fingers(urdf: Urdf, fingers: tuple[str, str], positions: tuple[float, float]) -> tuple[float, float]:
+    """Finger positions within the URDF's limits: RoboTwin's scales reach beyond them, to press."""
+    first, second = (
+        min(max(position, urdf.joints[name].lower), urdf.joints[name].upper)
+        for name, position in zip(fingers, positions, strict=True)
+    )
+    return first, second
+
+
+def _check_arm(urdf: Urdf, arm: Arm, source: str) -> None:
+    strokes = np.abs(np.subtract(arm.finger_open, arm.finger_closed))
+    if min(strokes) < 1e-3 or abs(strokes[0] - strokes[1]) > STROKE_TOLERANCE:
+        raise ConfigError(
+            f"{source}: the fingers {', '.join(arm.fingers)} move {1000 * strokes[0]:.0f} and {1000 * strokes[1]:.0f} mm from "
+            "closed to open; expected equal strokes of at least 1 mm. Check finger_closed and finger_open, or gripper_scale."
+        )
+    length = float(np.linalg.norm(arm.tool_pose[3:]))
+    if not (np.isfinite(arm.tool_pose).all() and np.isfinite(arm.root_pose).all() and abs(length - 1) < 1e-3):
+        raise ConfigError(f"{source}: tool_pose {arm.tool_pose} is no position and unit quaternion x y z w.")
+    chain = {joint.name for joint in urdf.chain(arm.tool_link)}
+    if loose := [name for name in arm.joints if name not in chain]:
+        raise ConfigError(f"{source}: {', '.join(loose)} do not lead to {arm.tool_link}; name the joints of this arm.")
+
+
+def complete_limits(
+    draft: RobotDraft, urdf: Urdf, arms: tuple[Arm, Arm], source: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lower and upper position limits [d] rad and speed limits [d] rad/s that experts keep."""
+    both = [joint_limits(urdf, arm.joints) for arm in arms]
+    found = (np.maximum(both[0][0], both[1][0]), np.minimum(both[0][1], both[1][1]), np.minimum(both[0][2], both[1][2]))
+    given = (draft.joint_lower, draft.joint_upper, draft.joint_velocity)
+    lower, upper, speed = (inferred if said is None else np.array(said) for inferred, said in zip(found, given, strict=True))
+    if not len(lower) == len(upper) == len(speed) == len(arms[0].joints) or not (lower < upper).all() or not (speed > 0).all():
+        raise ConfigError(
+            f"{source}: joint_lower, joint_upper and joint_velocity need {len(arms[0].joints)} numbers each, lower below "
+            "upper and velocities above 0."
+        )
+    return lower, upper, speed
 
 
 def find_fingers(urdf: Urdf) -> list[tuple[str, str]]:

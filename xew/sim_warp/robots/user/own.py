@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError
 from xew.episode import complete_folder
@@ -30,25 +29,15 @@ from xew.protocol import BODY_NAME, ROBOT_NAMES, expand_robots
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
 from xew.sim_warp.robots.user.draft import OWN, ArmDraft, RobotDraft, find_description, read_draft
-from xew.sim_warp.robots.user.infer import (
-    arm_joints,
-    find_fingers,
-    finger_ends,
-    hand_link,
-    joint_limits,
-    tool_at_tips,
-    tool_frame,
-)
+from xew.sim_warp.robots.user.infer import complete_arms, complete_limits, fill_right_arm
 
 FOLDERS = "XEW_ROBOTS"
 """Name of the environment variable that lists folders of robots, separated as in PATH."""
 KEPT = "robots"
 """Name of the folder of a data set that holds its robots."""
-IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-SEARCH_CODE = ("robots/user", "kinematics", "tasks", ".")
-"""Folders of the room whose code decides where a robot is placed; a change in one makes the search begin anew."""
-STROKE_TOLERANCE = 1e-3
-"""Largest difference between the strokes of the two fingers of a hand, which move together [m]."""
+SEARCH_CODE = ("robots/user", "kinematics", "tasks", "assets", "embodiment", "geometry")
+"""Packages of the room whose code, with the files at its root, decides where a robot is placed: a change of it makes the
+search begin anew."""
 
 
 def is_path(name: str) -> bool:
@@ -89,11 +78,11 @@ def robot_key(description: Path) -> str:
 
 def complete_draft(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> RobotSpec:
     """A RobotSpec of a draft and its URDF; `source` names the draft in errors."""
-    arms = _complete_arms(draft, urdf, source)
+    arms = complete_arms(draft, urdf, source)
     counts = [len(arm.joints) for arm in arms]
     if counts[0] != counts[1] or counts[0] not in (6, 7):
         raise ConfigError(f"{source}: the arms have {counts[0]} and {counts[1]} joints; expected equal arms of six or seven.")
-    lower, upper, speed = _complete_limits(draft, urdf, arms, source)
+    lower, upper, speed = complete_limits(draft, urdf, arms, source)
     robot = RobotSpec(
         key=key,
         title=draft.title or urdf.name or key,
@@ -106,103 +95,9 @@ def complete_draft(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> Robo
     return _settle(draft, robot, source)
 
 
-def _complete_arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]:
-    """Left and right arm with nothing open but homes and bases."""
-    told = _fill_right_arm(draft.arms)
-    found = [] if all(arm.fingers for arm in told) else find_fingers(urdf)
-    arms: list[Arm] = []
-    for side, given in enumerate(told):
-        fingers = given.fingers or found[min(side, len(found) - 1)]
-        _check_joints(urdf, fingers, source)
-        joints = given.joints or arm_joints(urdf, fingers)
-        _check_joints(urdf, joints, source)
-        ends = finger_ends(urdf, fingers)
-        closed, opened = given.finger_closed or ends[0], given.finger_open or ends[1]
-        link = _find_link(urdf, given.tool_link, source) if given.tool_link else hand_link(urdf, fingers)
-        tool = given.tool_pose or tool_frame(urdf, joints, fingers, ends[0])
-        if given.tool_pose and given.tool_at_tips:
-            tool = tool_at_tips(urdf, link, Rotation.from_quat(given.tool_pose[3:]).as_matrix(), fingers, ends[0])
-        arms.append(
-            Arm(
-                root_pose=given.root_pose or IDENTITY,
-                joints=joints,
-                home=given.home or (0.0,) * len(joints),
-                tool_link=link,
-                tool_pose=tool,
-                fingers=fingers,
-                finger_closed=_clip_fingers(urdf, fingers, closed),
-                finger_open=_clip_fingers(urdf, fingers, opened),
-            )
-        )
-        _check_arm(urdf, arms[-1], source)
-    return arms[0], arms[1]
-
-
-def _fill_right_arm(arms: tuple[ArmDraft, ArmDraft]) -> tuple[ArmDraft, ArmDraft]:
-    """Both arms, the right one as the left where it is left open, but for its home."""
-    left, right = arms
-    return (left, replace(left, home=None)) if right == ArmDraft() else (left, right)
-
-
-def _check_joints(urdf: Urdf, names: Sequence[str], source: str) -> None:
-    if missing := [name for name in names if name not in urdf.joints]:
-        raise ConfigError(
-            f"{source}: {urdf.path.name} has no joint {', '.join(missing)}; it has {', '.join(urdf.joint_names)}."
-        )
-
-
-def _find_link(urdf: Urdf, name: str, source: str) -> str:
-    """A link, or the child link of a joint, as RoboTwin names it."""
-    if name in urdf.links:
-        return name
-    if name in urdf.joints:
-        return urdf.joints[name].child
-    raise ConfigError(f"{source}: {urdf.path.name} has no link or joint {name}; name the one that carries the tool.")
-
-
-def _clip_fingers(urdf: Urdf, fingers: tuple[str, str], positions: tuple[float, float]) -> tuple[float, float]:
-    """Finger positions within the URDF's limits: RoboTwin's scales reach beyond them, to press."""
-    first, second = (
-        min(max(position, urdf.joints[name].lower), urdf.joints[name].upper)
-        for name, position in zip(fingers, positions, strict=True)
-    )
-    return first, second
-
-
-def _check_arm(urdf: Urdf, arm: Arm, source: str) -> None:
-    strokes = np.abs(np.subtract(arm.finger_open, arm.finger_closed))
-    if min(strokes) < 1e-3 or abs(strokes[0] - strokes[1]) > STROKE_TOLERANCE:
-        raise ConfigError(
-            f"{source}: the fingers {', '.join(arm.fingers)} move {1000 * strokes[0]:.0f} and {1000 * strokes[1]:.0f} mm from "
-            "closed to open; expected equal strokes of at least 1 mm. Check finger_closed and finger_open, or gripper_scale."
-        )
-    length = float(np.linalg.norm(arm.tool_pose[3:]))
-    if not (np.isfinite(arm.tool_pose).all() and np.isfinite(arm.root_pose).all() and abs(length - 1) < 1e-3):
-        raise ConfigError(f"{source}: tool_pose {arm.tool_pose} is no position and unit quaternion x y z w.")
-    chain = {joint.name for joint in urdf.chain(arm.tool_link)}
-    if loose := [name for name in arm.joints if name not in chain]:
-        raise ConfigError(f"{source}: {', '.join(loose)} do not lead to {arm.tool_link}; name the joints of this arm.")
-
-
-def _complete_limits(
-    draft: RobotDraft, urdf: Urdf, arms: tuple[Arm, Arm], source: str
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lower and upper position limits [d] rad and speed limits [d] rad/s that experts keep."""
-    both = [joint_limits(urdf, arm.joints) for arm in arms]
-    found = (np.maximum(both[0][0], both[1][0]), np.minimum(both[0][1], both[1][1]), np.minimum(both[0][2], both[1][2]))
-    given = (draft.joint_lower, draft.joint_upper, draft.joint_velocity)
-    lower, upper, speed = (inferred if said is None else np.array(said) for inferred, said in zip(found, given, strict=True))
-    if not len(lower) == len(upper) == len(speed) == len(arms[0].joints) or not (lower < upper).all() or not (speed > 0).all():
-        raise ConfigError(
-            f"{source}: joint_lower, joint_upper and joint_velocity need {len(arms[0].joints)} numbers each, lower below "
-            "upper and velocities above 0."
-        )
-    return lower, upper, speed
-
-
 def _settle(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
     """The robot with bases and homes, which are found where the draft leaves them open."""
-    left, right = _fill_right_arm(draft.arms)
+    left, right = fill_right_arm(draft.arms)
     if left.root_pose is not None and left.home is not None and right.home is not None:
         return robot
     near = (_posture(left, robot, source), _posture(right, robot, source))
@@ -231,8 +126,9 @@ def _find_place(draft: RobotDraft, robot: RobotSpec, near: tuple[np.ndarray | No
 def _place_digest(draft: RobotDraft, robot: RobotSpec) -> str:
     """SHA-256 over all that a place depends on: the draft, the files of the URDF, and the code that searches."""
     digest = hashlib.sha256(repr((draft, replace(robot, urdf=Path()))).encode())
-    code = sorted(file for folder in SEARCH_CODE for file in (Path(__file__).parents[2] / folder).glob("*.py"))
-    for file in [*load_urdf(robot.urdf).files, *code]:
+    room = Path(__file__).parents[2]
+    code = {*room.glob("*.py"), *(file for folder in SEARCH_CODE for file in (room / folder).rglob("*.py"))}
+    for file in [*load_urdf(robot.urdf).files, *sorted(code)]:
         digest.update(hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
 

@@ -1,0 +1,258 @@
+"""Codecs of learned autoencoders with trained weights: Wan2.2's kind (`wan_vae`) and the project's own (`conv_autoencoder`)."""
+
+import functools
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jax import Array
+from jaxtyping import Float
+
+from xew.config import ConfigError, parse, pick
+from xew.model.codecs.contract import BatchCodec, CodecSettings, FrameBatch, LatentBatch, to_pictures, to_signed
+from xew.model.codecs.conv_autoencoder import (
+    AutoencoderSize,
+    ConvAutoencoder,
+    find_weights,
+    load_autoencoder,
+    save_autoencoder,
+)
+from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae
+from xew.model.codecs.vae_layouts import load_vae, save_vae
+
+PACKAGED_WEIGHTS = Path(__file__).with_name("conv_autoencoder.safetensors")
+"""Weights of conv_autoencoder that come with the package."""
+PACKAGED_SHAPE = (16, 48)
+"""Spatial factor and channels of the packaged weights."""
+
+
+class OfSize:
+    """What is read off the size of an autoencoder."""
+
+    size: Any
+
+    @property
+    def spatial_factor(self) -> int:
+        return self.size.spatial_factor
+
+    @property
+    def channels(self) -> int:
+        return self.size.channels
+
+
+class AutoencoderCodec(OfSize, BatchCodec):  # type: ignore[override]
+    """What the codecs of autoencoders share: the network, and that its weights are written once."""
+
+    fitted: ClassVar[bool] = False
+    file: ClassVar[str]
+    """Name of the files of the codec, without ending."""
+
+    params: Any
+    graph: nnx.GraphDef
+    dtype: str
+    hash: str
+
+    @property
+    def autoencoder(self) -> Any:
+        """The autoencoder itself."""
+        return nnx.merge(self.graph, self.params)
+
+    def write_weights(self, path: Path) -> None:
+        """Write the weights as .safetensors."""
+        raise NotImplementedError
+
+    def describe(self) -> dict[str, Any]:
+        """What `load` needs beside the weights."""
+        return {"size": asdict(self.size), "dtype": self.dtype}
+
+    def save(self, folder: Path) -> None:
+        """Write <file>.safetensors and <file>.json; weights that are there already are not written again."""
+        file = folder / f"{self.file}.json"
+        if not file.exists() or json.loads(file.read_text())["hash"] != self.hash:
+            self.write_weights(file.with_suffix(".safetensors"))
+        file.write_text(json.dumps(self.describe() | {"hash": self.hash}, indent=1) + "\n")
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass, data_fields=("params",), meta_fields=("graph", "size", "dtype", "chunk", "hash")
+)
+@dataclass(frozen=True)
+class WanVaeCodec(AutoencoderCodec):
+    """Wan2.2's autoencoder, or a smaller one of its kind, with trained weights; see `xew.model.codecs.vae`."""
+
+    file: ClassVar[str] = "vae"
+
+    params: Any
+    """State of a `VideoVae` with the statistics of its latents."""
+    graph: nnx.GraphDef
+    size: VaeSize
+    dtype: str
+    chunk: int
+    hash: str
+
+    def encode_batch(self, frames: FrameBatch) -> LatentBatch:
+        """Frames [b t h w 3] in [-1, 1] -> latents [b t' h' w' c] float32: normalized means, as Wan's diffusion takes them."""
+        return self.autoencoder.encode(frames, self.chunk)
+
+    def decode_batch(self, latents: LatentBatch) -> FrameBatch:
+        """Latents [b t' h' w' c] -> frames [b t h w 3] float32 in [-1, 1]."""
+        return self.autoencoder.decode(latents, self.chunk)
+
+    def next_reference(self, latents: LatentBatch) -> Float[Array, "b 1 y x c"]:
+        """The last decoded frame as a picture, encoded alone: [b t' h' w' c] -> [b 1 h' w' c].
+
+        It decodes two latents at a time, so that it fits beside a network in training.
+        """
+        last = self.autoencoder.decode(latents, chunk=2, last_only=True)
+        return self.autoencoder.encode(to_signed(to_pictures(last)))
+
+    def write_weights(self, path: Path) -> None:
+        save_vae(self.autoencoder, path)
+
+    def describe(self) -> dict[str, Any]:
+        return super().describe() | {"chunk": self.chunk}
+
+    @classmethod
+    def load(cls, folder: Path) -> "WanVaeCodec":
+        """Read vae.safetensors and vae.json."""
+        stored = json.loads((folder / "vae.json").read_text())
+        size = parse(VaeSize, stored["size"], str(folder / "vae.json"))
+        return cls.from_weights(folder / "vae.safetensors", size, stored["dtype"], stored["chunk"])
+
+    @classmethod
+    def check(cls, settings: CodecSettings) -> None:
+        size = pick(VAES, settings.vae, "autoencoder")
+        if (settings.spatial_factor, settings.channels) != (size.spatial_factor, size.channels):
+            raise ConfigError(
+                f"codec.spatial_factor is {settings.spatial_factor} and codec.channels {settings.channels}; the autoencoder"
+                f" {settings.vae} has {size.spatial_factor} and {size.channels}: write those."
+            )
+        if settings.chunk < 0:
+            raise ConfigError(f"codec.chunk is {settings.chunk}; expected latent frames at once, or 0 for all.")
+
+    @classmethod
+    def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> "WanVaeCodec":
+        """Read the weights of a config.
+
+        Raises:
+            ConfigError: none are named, or they are missing, broken or of another size.
+        """
+        if settings.weights is None:
+            raise ConfigError(
+                "the codec wan_vae needs codec.weights: Wan2.2_VAE.pth, the vae folder of Wan2.2-TI2V-5B-Diffusers, or the"
+                " folder of an autoencoder trained by `python -m xew.model.train_codec CONFIG`."
+            )
+        return cls.from_weights(settings.weights, pick(VAES, settings.vae, "autoencoder"), settings.dtype, settings.chunk)
+
+    @classmethod
+    def from_weights(cls, weights: Path, size: VaeSize, dtype: str = "float32", chunk: int = 8) -> "WanVaeCodec":
+        """A codec from a file of weights of any known kind."""
+        vae = abstract_vae(size, jnp.dtype(dtype))
+        load_vae(vae, weights)
+        return cls.from_vae(vae, chunk)
+
+    @classmethod
+    def from_vae(cls, vae: VideoVae, chunk: int = 8) -> "WanVaeCodec":
+        """The codec of an autoencoder."""
+        graph, params = nnx.split(vae)
+        dtype = jnp.dtype(vae.dtype).name
+        return cls(params, graph, vae.size, dtype, chunk, hash_leaves(f"wan_vae {vae.size} {dtype}", params))
+
+
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("params",), meta_fields=("graph", "size", "dtype", "hash"))
+@dataclass(frozen=True)
+class ConvAutoencoderCodec(AutoencoderCodec):
+    """The project's own autoencoder of groups of four frames; see `xew.model.codecs.conv_autoencoder`.
+
+    Groups stand alone, so that no latent and no decoded frame depends on the first frame but the first itself.
+    """
+
+    file: ClassVar[str] = "autoencoder"
+
+    params: Any
+    """State of a `ConvAutoencoder` with the statistics of its latents."""
+    graph: nnx.GraphDef
+    size: AutoencoderSize
+    dtype: str
+    hash: str
+
+    def encode_batch(self, frames: FrameBatch) -> LatentBatch:
+        """Frames [b t h w 3] in [-1, 1] -> standardized latents [b t' h' w' c] float32."""
+        return self.autoencoder.encode(frames)
+
+    def decode_batch(self, latents: LatentBatch) -> FrameBatch:
+        """Latents [b t' h' w' c] -> frames [b t h w 3] float32 in [-1, 1]."""
+        return self.autoencoder.decode(latents)
+
+    def next_reference(self, latents: LatentBatch) -> Float[Array, "b 1 y x c"]:
+        """The last decoded frame as a picture, encoded alone: [b t' h' w' c] -> [b 1 h' w' c]; one group is decoded."""
+        autoencoder = self.autoencoder
+        return autoencoder.encode(to_signed(to_pictures(autoencoder.decode_last(latents))))
+
+    def write_weights(self, path: Path) -> None:
+        save_autoencoder(self.autoencoder, path)
+
+    @classmethod
+    def load(cls, folder: Path) -> "ConvAutoencoderCodec":
+        """Read autoencoder.safetensors and autoencoder.json."""
+        stored = json.loads((folder / "autoencoder.json").read_text())
+        return cls.from_weights(folder / "autoencoder.safetensors", stored["dtype"])
+
+    @classmethod
+    def check(cls, settings: CodecSettings) -> None:
+        found = settings.spatial_factor, settings.channels
+        if settings.weights is None and found != PACKAGED_SHAPE:
+            raise ConfigError(
+                f"codec.spatial_factor is {found[0]} and codec.channels {found[1]}; the packaged conv_autoencoder has"
+                f" {PACKAGED_SHAPE[0]} and {PACKAGED_SHAPE[1]}: write those, or name others by codec.weights."
+            )
+
+    @classmethod
+    def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> "ConvAutoencoderCodec":
+        """Read the weights of a config, or those of the package.
+
+        Raises:
+            ConfigError: they are missing or broken, or have another factor or number of channels.
+        """
+        weights = settings.weights or PACKAGED_WEIGHTS
+        if settings.weights is None and not weights.exists():
+            raise ConfigError(
+                "this copy of the package has no weights for the codec conv_autoencoder; train one by `python -m"
+                " xew.model.train_codec configs/codec.yaml` and name its folder by codec.weights."
+            )
+        codec = cls.from_weights(weights, settings.dtype)
+        if (codec.spatial_factor, codec.channels) != (settings.spatial_factor, settings.channels):
+            raise ConfigError(
+                f"codec.spatial_factor is {settings.spatial_factor} and codec.channels {settings.channels};"
+                f" {find_weights(weights)} has {codec.spatial_factor} and {codec.channels}: write those."
+            )
+        return codec
+
+    @classmethod
+    def from_weights(cls, weights: Path, dtype: str = "float32") -> "ConvAutoencoderCodec":
+        """A codec from a file of weights, or from the folder that holds it."""
+        return cls.from_autoencoder(load_autoencoder(weights, jnp.dtype(dtype)))
+
+    @classmethod
+    def from_autoencoder(cls, autoencoder: ConvAutoencoder) -> "ConvAutoencoderCodec":
+        """The codec of an autoencoder."""
+        graph, params = nnx.split(autoencoder)
+        dtype = jnp.dtype(autoencoder.dtype).name
+        name = f"conv_autoencoder {autoencoder.size} {dtype}"
+        return cls(params, graph, autoencoder.size, dtype, hash_leaves(name, params))
+
+
+def hash_leaves(name: str, params: Any) -> str:
+    """SHA-256 of a name and of all leaves of a module's state with their paths."""
+    digest = hashlib.sha256(name.encode())
+    for path, leaf in sorted(nnx.to_flat_state(params), key=lambda item: str(item[0])):
+        digest.update(f"{path}".encode())
+        digest.update(np.asarray(jax.device_get(leaf.get_value())).tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,52 @@
+"""The camera, the lights and the looks of the stage, as the kernels take them."""
+
+import numpy as np
+import warp as wp
+
+from xew.sim_warp import stage
+from xew.sim_warp.geometry.camera import Camera, look_at
+from xew.sim_warp.rendering import raster_kernels as raster
+from xew.sim_warp.rendering import shading_kernels as shading
+
+SHADOW_SIZE = 512
+"""Side of a shadow map [texels], about 3.5 mm each on the table: less than two pixels of the head camera."""
+
+
+def camera_view(camera: Camera) -> raster.View:
+    """The camera as the kernels take it."""
+    view = raster.View()
+    view.rotation = wp.mat33(*camera.extrinsics[:3, :3].ravel())
+    view.translation = wp.vec3(*camera.extrinsics[:3, 3])
+    view.focal = wp.vec2(camera.intrinsics[0, 0], camera.intrinsics[1, 1])
+    view.center = wp.vec2(*camera.intrinsics[:2, 2])
+    return view
+
+
+def light_of(source: stage.Light) -> raster.Light:
+    """A light of the stage, with the view of its shadow map."""
+    light = raster.Light()
+    light.intensity = source.intensity
+    direction = np.array(source.direction) / np.linalg.norm(source.direction)
+    light.to_light = wp.vec3(*-direction)
+    if source.position is None:
+        position = np.array(stage.SHADOW_CENTER) - direction * stage.SHADOW_DISTANCE
+    else:
+        position = np.array(source.position)
+    light.position = wp.vec3(*position)
+    camera = look_at(position, position + direction, (0.0, 1.0, 0.0), stage.SHADOW_ANGLE, SHADOW_SIZE, SHADOW_SIZE)
+    light.view = camera_view(camera)
+    if source.position is None:
+        light.view.parallel = 1
+        light.view.focal = wp.vec2(SHADOW_SIZE / stage.SHADOW_WIDTH, SHADOW_SIZE / stage.SHADOW_WIDTH)
+    return light
+
+
+def stage_shading() -> shading.Shading:
+    """Exposure, ambient light and gloss of the stage."""
+    values = shading.Shading()
+    values.ambient = stage.AMBIENT
+    values.sky_share = stage.SKY_SHARE
+    values.exposure = stage.EXPOSURE
+    values.specular = stage.SPECULAR
+    values.knee, values.ceiling = stage.KNEE, stage.CEILING
+    return values

@@ -1,0 +1,189 @@
+"""The passes of the renderer over the frames that are on the device at once: each launches kernels and leaves arrays there.
+
+Reads  packed geometry and poses (packing.py), the camera and the lights (lighting.py)
+Writes visibility and shadow maps (`Passes.draw`), then colors, masks, depth, optical flow and what is seen at points
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from xew.sim_warp import stage
+from xew.sim_warp.geometry.camera import Camera
+from xew.sim_warp.rendering import raster_kernels as raster
+from xew.sim_warp.rendering import shading_kernels as shading
+from xew.sim_warp.rendering.lighting import SHADOW_SIZE, camera_view, light_of, stage_shading
+from xew.sim_warp.rendering.packing import Body, FrameTable, PackedGeometry, World, pack_frames, pack_geometry
+
+FLOW_LIMIT = 25.0
+"""Longest optical flow [pixels], the paper's clip."""
+STRIPES = {"cpu": 1, "cuda": 8}
+"""Number of threads that share a triangle's rows, so that one large triangle does not hold up a GPU."""
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Call:
+    """What is the same for all frames of a call of the renderer."""
+
+    geometry: PackedGeometry
+    pose: wp.array
+    """[P] wp.transform, poses of the bodies of all frames, world."""
+    camera: Camera
+    view: raster.View
+    """The camera as the kernels take it."""
+    stage: shading.LitStage
+    shadows: int = 0
+    """Number of lights whose shadow maps are drawn."""
+    wanted: frozenset[str] = frozenset()
+    """Names of the optional images of `render.Frames` that are made."""
+    colors: bool = True
+    """Whether colors are made."""
+
+
+class Chunk:
+    """The frames that are on the device at once."""
+
+    def __init__(self, device: wp.Device, geometry: PackedGeometry, frames: FrameTable) -> None:
+        self.count = len(frames.world)
+        self.vertex_count = int(geometry.vertex_counts[frames.world].max())
+        self.triangle_count = int(geometry.triangle_counts[frames.world].max())
+        self.world, self.pose, self.next_pose = (
+            wp.array(column, dtype=int, device=device) for column in (frames.world, frames.pose, frames.next_pose)
+        )
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What `Passes.draw` leaves for the kernels after it, as they describe it in raster_kernels.py."""
+
+    vertex: wp.array
+    """[n v] wp.vec3, m, camera's frame."""
+    shadow_vertex: wp.array
+    """[n l v] wp.vec3, x y [texels] and nearness on each shadow map."""
+    key: wp.array
+    """[n s h w] uint64, nearness and triangle of each sample."""
+    shadow_map: wp.array
+    """[n l m m] uint32, nearness of the nearest caster at each texel."""
+    shadow_tile: wp.array
+    """[n l q q] uint32, largest nearness in and round each tile."""
+
+
+class Passes:
+    """The kernels of the renderer on one device, with what they need of the stage."""
+
+    def __init__(self, device: wp.Device) -> None:
+        self.device = device
+        self._stripes = STRIPES["cuda" if device.is_cuda else "cpu"]
+        self._lights = wp.array([light_of(light) for light in stage.LIGHTS], dtype=raster.Light, device=device)
+        self._shading = stage_shading()
+        ramp = stage.srgb_from_linear(np.linspace(0, 1, shading.COLORS))
+        self._srgb = wp.array(ramp, dtype=wp.uint8, device=device)
+
+    def draw(self, call: Call, chunk: Chunk) -> Drawn:
+        """Visibility of a chunk's frames and, if there are shadows, their shadow maps."""
+        count, lights = chunk.count, call.shadows
+        drawn = Drawn(
+            vertex=self._zeros((count, chunk.vertex_count), wp.vec3),
+            shadow_vertex=self._zeros((count, lights, chunk.vertex_count), wp.vec3),
+            key=self._zeros((count, raster.SAMPLES, call.camera.height, call.camera.width), wp.uint64),
+            shadow_map=self._zeros((count, lights, SHADOW_SIZE, SHADOW_SIZE), wp.uint32),
+            shadow_tile=self._zeros((count, lights, SHADOW_SIZE // raster.TILE, SHADOW_SIZE // raster.TILE), wp.uint32),
+        )
+        self._launch(
+            raster.place_vertices,
+            (count, chunk.vertex_count),
+            [call.geometry.arrays, chunk.world, chunk.pose, call.pose, call.view, self._lights],
+            [drawn.vertex, drawn.shadow_vertex],
+        )
+        self._launch(
+            raster.draw_triangles,
+            (count, chunk.triangle_count, self._stripes),
+            [call.geometry.arrays, chunk.world, call.view, drawn.vertex, self._stripes],
+            [drawn.key],
+        )
+        self._launch(
+            raster.draw_shadows,
+            (count, lights, chunk.triangle_count),
+            [call.geometry.arrays, chunk.world, drawn.shadow_vertex],
+            [drawn.shadow_map, drawn.shadow_tile],
+        )
+        return drawn
+
+    def shade(self, call: Call, chunk: Chunk, drawn: Drawn) -> wp.array:
+        """Colors [t h w 3] uint8 of a chunk's frames."""
+        height, width = call.camera.height, call.camera.width
+        posed = [call.geometry.arrays, chunk.world, chunk.pose, call.pose, call.view]
+        seen = [drawn.vertex, drawn.key, drawn.shadow_map, drawn.shadow_tile]
+        rgb = self._empty((chunk.count, height, width, 3), wp.uint8)
+        self._launch(
+            shading.shade_pixels,
+            (chunk.count, height, width),
+            [*posed, self._lights, self._shading, call.stage, self._srgb, *seen],
+            [rgb],
+        )
+        return rgb
+
+    def measure(self, call: Call, chunk: Chunk, drawn: Drawn) -> dict[str, wp.array]:
+        """Masks of a chunk's frames and, as far as wanted, bodies, depth [m] (all [t h w]) and optical flow [t h w 2] px."""
+        shape = (chunk.count, call.camera.height, call.camera.width)
+        posed = [call.geometry.arrays, chunk.world, chunk.pose, chunk.next_pose, call.pose, call.view]
+        images = {"robot_mask": self._empty(shape, wp.bool)}
+        for name, dtype in (("body", wp.int16), ("depth", wp.float32), ("optical_flow", wp.vec2)):
+            images[name] = self._empty(shape if name in call.wanted else (0, 0, 0), dtype)
+        self._launch(
+            shading.measure_pixels,
+            shape,
+            [*posed, call.stage, FLOW_LIMIT, drawn.key],
+            list(images.values()),
+        )
+        return {name: image for name, image in images.items() if image.size}
+
+    def probe(self, call: Call, chunk: Chunk, drawn: Drawn, pixel: np.ndarray) -> dict[str, wp.array]:
+        """Body [t k] and depth [t k] m that are seen at pixels [t k 2] x y of a chunk's frames."""
+        shape = pixel.shape[:2]
+        images = {"point_body": self._empty(shape, int), "point_depth": self._empty(shape, float)}
+        self._launch(
+            shading.probe_pixels,
+            shape,
+            [call.geometry.arrays, chunk.world, call.stage, wp.array(pixel, dtype=wp.vec2i, device=self.device), drawn.key],
+            list(images.values()),
+        )
+        return images
+
+    def light_stage(self, camera: Camera, ground: bool) -> shading.LitStage:
+        """What never moves as this camera sees it, drawn and lit; without a ground there is nothing of it."""
+        bodies = [Body(stage.stage_mesh(), False)] if ground else []
+        table, pose = pack_frames([World(bodies, np.tile(IDENTITY, (1, len(bodies), 1)))], [0])
+        call = Call(
+            geometry=pack_geometry([bodies], self.device),
+            pose=wp.array(pose, dtype=wp.transform, device=self.device),
+            camera=camera,
+            view=camera_view(camera),
+            stage=shading.LitStage(),
+        )
+        chunk = Chunk(self.device, call.geometry, table)
+        drawn = self.draw(call, chunk)
+        height, width, lights = camera.height, camera.width, len(stage.LIGHTS) if ground else 0
+        lit = shading.LitStage()
+        lit.key = drawn.key[0]
+        lit.ambient = self._zeros((height, width), wp.vec3)
+        lit.direct = self._zeros((lights, height, width), wp.vec3)
+        lit.shadow_texel = self._zeros((lights, height, width), wp.vec3)
+        self._launch(
+            shading.light_stage,
+            (height, width),
+            [call.geometry.arrays, call.view, self._lights, self._shading, drawn.vertex, drawn.key, wp.vec3(*stage.SKY)],
+            [lit.ambient, lit.direct, lit.shadow_texel],
+        )
+        return lit
+
+    def _launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    def _zeros(self, shape: tuple[int, ...], dtype: type) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=self.device)
+
+    def _empty(self, shape: tuple[int, ...], dtype: type) -> wp.array:
+        return wp.empty(shape, dtype=dtype, device=self.device)
