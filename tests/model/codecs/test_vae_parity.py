@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from tests.torch_ops import make_torchvision_importable
 from xew.config import ConfigError
 from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae
 from xew.model.codecs.vae_layouts import diffusers_layout, load_vae, official_layout
@@ -16,6 +17,7 @@ from xew.model.weights.layout import checkpoint_shapes
 from xew.model.weights.writing import save_weights
 
 torch = pytest.importorskip("torch")
+operators = make_torchvision_importable()
 diffusers = pytest.importorskip("diffusers")
 
 REFERENCE = Path(__file__).parents[1] / "reference"

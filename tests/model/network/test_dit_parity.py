@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from tests.torch_ops import make_torchvision_importable
+
 torch = pytest.importorskip("torch")
+operators = make_torchvision_importable()
 diffusers = pytest.importorskip("diffusers")
 
 from safetensors.torch import load_file, save_file  # noqa: E402
