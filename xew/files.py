@@ -1,11 +1,159 @@
-"""Files, for all rooms: written whole or not at all, digests of their content, and the user's folder for what is kept."""
+"""Files, for all rooms: names and paths that files give, files written whole or not at all, and digests of their content.
 
+Data sets, rollouts, runs and score tables come from anybody. A name that one of them holds becomes part of a path only through
+`check_name` and `path_below`, and what is opened is a regular file (`demand_regular`).
+"""
+
+import errno
+import fnmatch
 import hashlib
 import json
 import os
+import re
+import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+NAME = re.compile(r"\w[\w.+-]*(?::[^\W\d]\w*)?")
+"""Form of the name of a task or robot in a file: a key, or `module:NAME`. It is no path, neither hidden nor an option."""
+MOST_LETTERS = 200
+"""Largest length of a name [bytes]; file systems take 255 with an ending."""
+SHOWN_LETTERS = 80
+"""Largest number of letters of a wrong name that a message shows."""
+KINDS = {stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
+"""Names of what a path may lead to that is neither a file nor a folder, by the type in its mode."""
+
+
+RUN_MARK = ".xew-run"
+"""Name of the file that marks the folder of a run; runs of earlier versions have none."""
+RUN_FILES = (
+    RUN_MARK,
+    "config.yaml",
+    "codec/*",
+    "scales.json",
+    "checkpoints/*",
+    "start.json",
+    "metrics.jsonl",
+    "events.out.tfevents.*",
+    "autoencoder.*",
+    "vae.*",
+    "report.md",
+    "pictures/*.png",
+)
+"""Patterns of the paths of what trainings write into the folder of a run."""
+
+
+class EpisodeError(Exception):
+    """An episode, or another thing on disk that should hold one, is not as it should be; the message says what to do."""
+
+
+def check_name(name: object, what: str) -> str:
+    """The name of a task or robot, as a file gives it, where it is fit to be a folder's name.
+
+    Args:
+        name: as found.
+        what: it names, for the message.
+
+    Raises:
+        EpisodeError: it is no text, too long, or has other characters than `NAME`; a path is refused so.
+    """
+    if not isinstance(name, str) or not NAME.fullmatch(name) or len(name.encode()) > MOST_LETTERS:
+        raise EpisodeError(
+            f"the {what} is {_shorten(name)}, expected a key of letters, digits, _, -, + and dots, or module:NAME; correct it "
+            "where it stands, or leave that file out."
+        )
+    return name
+
+
+def check_label(text: object, what: str) -> str:
+    """The name of a model or condition, as a file gives it, where it is fit to print; it may have spaces and slashes.
+
+    Raises:
+        EpisodeError: it is no printable text, or reads as a path to elsewhere.
+    """
+    if not isinstance(text, str) or not text.isprintable() or len(text) > MOST_LETTERS:
+        raise EpisodeError(f"the {what} is {_shorten(text)}, expected printable text of at most {MOST_LETTERS} letters.")
+    if text.startswith(("/", "~")) or "\\" in text or ".." in PurePosixPath(text).parts:
+        raise EpisodeError(f"the {what} is {_shorten(text)}, which reads as a path to elsewhere; give it a plain name.")
+    return text
+
+
+def _shorten(name: object) -> str:
+    text = repr(name)
+    return text if len(text) <= SHOWN_LETTERS else f"{text[:SHOWN_LETTERS]}…"
+
+
+def plain_markdown(text: str) -> str:
+    """Text as part of Markdown, in which it opens no HTML tag, link, picture or cell of a table."""
+    text = re.sub(r"<(?=[A-Za-z/!?])", r"\\<", text.replace("|", r"\|"))
+    return text.replace("](", r"]\(")
+
+
+def csv_text(frame: Any) -> str:
+    """A table (pandas) as CSV without its index; texts that would begin a spreadsheet's formula get a quote in front."""
+    texts = {column: frame[column].map(_plain_cell) for column in frame if frame[column].dtype.kind not in "biufcmM"}
+    return frame.assign(**texts).rename(columns=_plain_cell).to_csv(index=False)
+
+
+def _plain_cell(value: object) -> object:
+    if not isinstance(value, str) or len(value) < 2 or value[0] not in "=+-@\t\r":
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return f"'{value}"
+    return value
+
+
+def path_below(root: Path, *names: str) -> Path:
+    """The path of names below a root, with links followed to see where it ends.
+
+    Raises:
+        EpisodeError: it ends elsewhere than below the root, or links lead in a circle.
+    """
+    path = Path(root, *names)
+    try:
+        end, top = path.resolve(), Path(root).resolve()
+    except (OSError, RuntimeError, ValueError) as error:
+        raise EpisodeError(f"{path} leads nowhere ({error}); put the folder or file itself there.") from error
+    if end == top or not end.is_relative_to(top):
+        raise EpisodeError(f"{path} leads to {end}, which is not below {root}; put the folder or file itself there.")
+    return path
+
+
+def demand_regular(path: Path) -> Path:
+    """The path itself, where it is that of a regular file. Others may block for ever or never end.
+
+    Raises:
+        OSError: it is a FIFO, a socket, a device or a folder; or there is nothing (FileNotFoundError).
+    """
+    mode = os.stat(path).st_mode
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, "is a folder, expected a file", str(path))
+    if not stat.S_ISREG(mode):
+        found = KINDS.get(stat.S_IFMT(mode), "no file")
+        raise OSError(errno.EINVAL, f"is {found}, expected a regular file", str(path))
+    return Path(path)
+
+
+def read_text(path: Path) -> str:
+    """The text of a regular file. Raises OSError as `demand_regular`, UnicodeDecodeError if it is not UTF-8."""
+    return demand_regular(path).read_text(encoding="utf-8")
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        OSError: there is none, or it is no regular file.
+        ValueError: it is no JSON in UTF-8, or nested too deeply.
+    """
+    try:
+        return json.loads(read_text(path))
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
 
 
 @contextmanager
@@ -26,9 +174,45 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def remove_written(folder: Path, patterns: Sequence[str]) -> list[Path]:
+    """Remove files that were written here, and folders that become empty; whatever else lies there stays.
+
+    Args:
+        folder: of which it is known that xew made it.
+        patterns: of the paths of its files, relative to the folder, as `fnmatch` reads them; `*` stands for levels, too.
+
+    Returns:
+        What has stayed. Links are removed themselves, never what they lead to.
+
+    Raises:
+        OSError: something cannot be removed.
+    """
+    left: list[Path] = []
+    for path in sorted(folder.rglob("*"), reverse=True):  # what lies in a folder before the folder
+        if path.is_dir() and not path.is_symlink():
+            if not any(path.iterdir()):
+                path.rmdir()
+        elif any(fnmatch.fnmatch(path.relative_to(folder).as_posix(), pattern) for pattern in patterns):
+            path.unlink()
+        else:
+            left.append(path)
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+    return left
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a training has made a folder, by its mark; in earlier versions by a config beside what trainings write."""
+    if (folder / RUN_MARK).is_file():
+        return True
+    return (folder / "config.yaml").is_file() and any(
+        (folder / name).exists() for name in ("codec", "checkpoints", "metrics.jsonl")
+    )
+
+
 def file_digest(path: Path) -> str:
     """SHA-256 of a file's content, in hexadecimal digits. Raises OSError if it cannot be read."""
-    with path.open("rb") as file:
+    with demand_regular(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -8,7 +8,6 @@ Writes <study>/scores.parquet with the column `variant`, its curves, and report/
 The merged table says in its attribute `study` what was planned, so that whoever reads it can tell what is missing.
 """
 
-import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,6 +18,7 @@ from xew.analysis import report
 from xew.analysis.scores import TRAINING, VARIANT, Scores, merge_scores, write_scores
 from xew.analysis.studies.config import Study, load_study
 from xew.config import ConfigError, user_errors
+from xew.files import remove_written
 from xew.protocol import TASK_COUNT, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expected_counts
 
 
@@ -53,7 +53,7 @@ def main(args: Args) -> None:
     shown = [name for name in graded if name not in planned or planned[name].of == name]
     rollouts = tuple(args.study / "rollouts" / name for name in shown)
     table, data, out = args.study / "scores.parquet", study.data_folder, args.study / "report"
-    shutil.rmtree(out, ignore_errors=True)  # a larger study's figures would stay
+    remove_written(out, report.FILES)  # a larger study's figures would stay
     report.main(report.Args(scores=table, data=data, rollouts=rollouts, distances=args.distances, out=out))
 
 

@@ -27,7 +27,7 @@ import tyro
 from scipy.stats import spearmanr
 from tqdm import tqdm
 
-from xew.config import ConfigError, user_errors
+from xew.config import ConfigError, admit, user_errors
 from xew.dataset import find_accepted
 from xew.episode import EpisodeError, Record, read_video
 from xew.metrics import METRICS
@@ -80,6 +80,8 @@ class Args:
     """Grade predictors made on purpose, in place of both tables."""
     metrics: tuple[str, ...] = tuple(METRICS)
     """Names of the metrics of the predictors' table."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own, such as my_lab.tasks, that the run and the data may name."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,7 @@ class Estimators:
 @user_errors
 def main(args: Args) -> None:
     """Grade, write, and print both tables."""
+    admit(args.trust)
     estimators = Estimators(open_masker(args.masks, args.masks_checkpoint), open_tracker(args.tracks, args.tracks_checkpoint))
     through_codec = None if args.codec is None else open_codec(args.codec, args.codec_opener)
     episodes = find_accepted(args.data)

@@ -37,6 +37,8 @@ class Flags:
     """Render the episodes anew; no video needs to be there."""
     batch: int = 4
     """Number of clips that the codec encodes at once."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
 @user_errors

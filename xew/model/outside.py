@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from xew.config import ConfigError, user_errors
+from xew.config import ConfigError, admit, user_errors
 from xew.dataset import Episode
 from xew.episode import Record, read_video
 from xew.model.conditions import Command
@@ -174,12 +174,15 @@ class Args:
     """Name of what the model is told of the robot, for the tables."""
     out: Path | None = None
     """Folder to write to; rollouts/NAME where left out."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
 @user_errors
 def main(arguments: Sequence[str] | None = None) -> None:
     """Predict episodes with a model from outside, and write them."""
     args = tyro.cli(Args, args=arguments, prog="python -m xew.model.outside", description=__doc__.splitlines()[0])
+    admit(args.trust)
     if args.max_frames < 0:
         raise ConfigError(f"--max-frames is {args.max_frames}; expected a number of frames, or 0 for all.")
     name = args.model.rpartition(":")[2]

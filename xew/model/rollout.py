@@ -7,7 +7,6 @@ Episodes are predicted in batches over all devices; while these work on one, the
 Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … --out … --rollout.steps …]
 """
 
-import json
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,10 +24,10 @@ from tqdm import tqdm
 
 from xew.command_line import find_path, parse_command
 from xew.compilation import keep_compiled_programs
-from xew.config import CONVERTER, ConfigError, parse, user_errors
+from xew.config import CONVERTER, ConfigError, admit, parse, user_errors
 from xew.dataset import Episode, read_dataset
 from xew.episode import Record, episode_folder
-from xew.files import checkpoint_time
+from xew.files import checkpoint_time, read_json
 from xew.model.cache.codecs import load_codec
 from xew.model.cache.scales import Scale, load_run_scales
 from xew.model.codecs.codec import Codec, codec_class
@@ -38,7 +37,7 @@ from xew.model.experiment import Experiment, parse_experiment
 from xew.model.network.dit import cast_params
 from xew.model.network.dit_layouts import load_dit_params
 from xew.model.runs.checkpoint import restore_params
-from xew.model.runs.folder import load_run_codec, load_run_config
+from xew.model.runs.folder import load_run_codec, load_run_config, read_run_config
 from xew.model.sampling.predict import Prediction, Predictor
 from xew.model.settings.checks import check_experiment
 from xew.model.settings.settings import RolloutSettings
@@ -162,7 +161,7 @@ def is_done(out: Path, episode: Episode, header: dict[str, Any]) -> bool:
 def _read_header(folder: Path) -> dict[str, Any]:
     """A rollout's header; settings that came after it was written have their defaults."""
     path = folder / "rollout.json"
-    header: dict[str, Any] = json.loads(path.read_text())
+    header: dict[str, Any] = read_json(path)
     if "config" in header:
         header["config"] = CONVERTER.unstructure(parse(Experiment, header["config"], str(path)))
     return header
@@ -255,6 +254,8 @@ class Flags:
     """Robots to predict; all of the data where left out."""
     out: Path | None = None
     """Folder to write to; rollouts/<name of the run> where left out."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own, such as my_lab.tasks, that the run and the data may name."""
 
 
 @dataclass(frozen=True)
@@ -302,12 +303,13 @@ def parse_rollout(arguments: Sequence[str] | None) -> tuple[Path, Flags, Experim
     command = parse_command(
         Flags,
         Sampling,
-        lambda run: Sampling(load_run_config(run).rollout),
+        lambda run: Sampling(read_run_config(run).rollout),
         words,
         prog=prog,
         description=description,
         metavar="RUN",
     )
+    admit(command.flags.trust)
     experiment = replace(load_run_config(command.path), rollout=command.config.rollout)
     check_experiment(experiment, str(command.path / "config.yaml"))
     return command.path, command.flags, experiment

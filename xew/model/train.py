@@ -65,6 +65,8 @@ class Flags:
     """With --estimate: number of devices."""
     memory_gb: float | None = None
     """With --estimate: memory of each device [GB]."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
 @user_errors

@@ -21,9 +21,10 @@ import tyro
 from PIL import Image
 from tqdm import tqdm
 
-from xew.config import user_errors
+from xew.config import admit, user_errors
 from xew.dataset import explain_missing, read_dataset
 from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, read_record, read_states, read_video, verify_episode
+from xew.files import path_below
 from xew.sim_warp.devices.workers import Workers, quiet_warp
 from xew.sim_warp.generate import yield_table
 from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
@@ -64,12 +65,15 @@ class Args:
     """Number of seeds of each task that are drawn."""
     grid: Path | None = None
     """PNG file for one picture of all tasks and robots at work: the first accepted seed of each task."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
 @user_errors
 def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
+    admit(args.trust)
     cells, damaged = read_headers(args.data)
     print(yield_table([record for _, record in cells]))
     for folder, record in cells:
@@ -146,9 +150,9 @@ def draw_pictures(cells: list[tuple[Path, Record]], out: Path, seeds: int) -> No
     _make_folder(out, "--pictures")
     for task, of_task in tqdm(by_task.items(), desc="drawing", unit="task"):
         for seed in sorted(of_task)[:seeds]:
-            save_png(out / f"{task}_{seed}.png", contact_sheet(of_task[seed]))
+            save_png(path_below(out, f"{task}_{seed}.png"), contact_sheet(of_task[seed]))
             for folder, record in of_task[seed]:
-                save_png(out / f"{task}_{seed}_{record.robot}.png", strip(folder))
+                save_png(path_below(out, f"{task}_{seed}_{record.robot}.png"), strip(folder))
 
 
 def seeds_by_task(cells: list[tuple[Path, Record]]) -> dict[str, dict[int, list[tuple[Path, Record]]]]:

@@ -10,7 +10,6 @@
 
 import dataclasses
 import json
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +20,9 @@ from jax.experimental import multihost_utils
 
 from xew import config
 from xew.config import ConfigError
-from xew.files import checkpoint_time
+from xew.files import RUN_FILES, RUN_MARK, checkpoint_time, is_run, remove_written
 from xew.model.codecs.codec import Codec, CodecSettings, codec_class
-from xew.model.experiment import Experiment, load_experiment
+from xew.model.experiment import Experiment, load_recorded
 from xew.model.settings.settings import AdaptSettings
 
 T = TypeVar("T")
@@ -85,7 +84,7 @@ def prepare_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite
         ConfigError: it holds a run and neither was asked, or it would be continued with another config or codec.
     """
     out = experiment.out
-    claim_run(out, experiment, load_experiment, resume=resume, overwrite=overwrite)
+    claim_run(out, experiment, load_recorded, resume=resume, overwrite=overwrite)
     _check_same_codec(experiment.codec, codec, out)
     try:
         (out / "codec").mkdir(exist_ok=True)
@@ -110,8 +109,9 @@ def claim_run(out: Path, settings: T, read: Callable[[Path], T], *, resume: bool
         ConfigError: it holds a run and neither was asked, or it would be continued with another config.
     """
     saved = out / "config.yaml"
+    config.admit_named(settings)  # of a run with the same settings, the user has named them too
     if saved.exists() and overwrite:
-        shutil.rmtree(out)
+        _remove_run(out)
     elif saved.exists() and resume:
         _check_same(read(saved), settings, out)
     elif saved.exists():
@@ -122,9 +122,23 @@ def claim_run(out: Path, settings: T, read: Callable[[Path], T], *, resume: bool
         raise ConfigError(f"{out} is not empty and holds no run; choose another --out.")
     try:
         out.mkdir(parents=True, exist_ok=True)
+        (out / RUN_MARK).touch()
         config.save(settings, saved)
     except OSError as error:
         raise ConfigError(f"cannot write the run {out}: {error}; choose another --out.") from error
+
+
+def _remove_run(out: Path) -> None:
+    """Remove what trainings have written into the folder of a run. Raises ConfigError if it is none, or holds anything else."""
+    if not is_run(out):
+        raise ConfigError(f"{out} has a config.yaml but holds no run, so it is not replaced; choose another --out.")
+    try:
+        left = remove_written(out, RUN_FILES)
+    except OSError as error:
+        raise ConfigError(f"cannot replace the run {out}: {error}; choose another --out.") from error
+    if left:
+        shown = ", ".join(str(path.relative_to(out)) for path in left[:3])
+        print(f"{out}: the run is replaced; what is not its own stays there ({shown})")
 
 
 def _check_same_codec(settings: CodecSettings, codec: Codec, out: Path) -> None:
@@ -207,9 +221,19 @@ def load_run(out: Path) -> tuple[Experiment, Codec]:
 
 def load_run_config(out: Path) -> Experiment:
     """The config that a run was trained with. Raises ConfigError if the folder holds none."""
+    _demand_run(out)
+    return load_recorded(out / "config.yaml")
+
+
+def read_run_config(out: Path) -> Experiment:
+    """The config of a run as it is written; nothing that it names is looked up. Raises ConfigError if the folder holds none."""
+    _demand_run(out)
+    return config.load(Experiment, out / "config.yaml")
+
+
+def _demand_run(out: Path) -> None:
     if not (out / "config.yaml").exists():
         raise ConfigError(f"{out} holds no run; train one: python -m xew.model.train CONFIG --out {out}")
-    return load_experiment(out / "config.yaml")
 
 
 def load_run_codec(out: Path, settings: CodecSettings) -> Codec:
