@@ -140,7 +140,8 @@ def admit(names: Iterable[str]) -> None:
     for module in modules:
         if not all(part.isidentifier() for part in module.split(".")):
             raise ConfigError(f"--trust {module!r} is no name of a module; expected one as my_lab.tasks.")
-    os.environ[TRUST] = ",".join(sorted({*_admitted(), *modules}))
+    if modules:
+        os.environ[TRUST] = ",".join(sorted({*_admitted(), *modules}))
 
 
 def admit_named(content: Any) -> None:

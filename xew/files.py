@@ -234,7 +234,7 @@ def digest_tree(path: Path) -> str:
 def checkpoint_time(run: Path, step: int) -> int | None:
     """When a run's checkpoint was begun [ns], which tells it from another of the same step; None if there is none."""
     try:
-        return json.loads((run / "checkpoints" / str(step) / "_CHECKPOINT_METADATA").read_text())["init_timestamp_nsecs"]
+        return read_json(run / "checkpoints" / str(step) / "_CHECKPOINT_METADATA")["init_timestamp_nsecs"]
     except (OSError, ValueError, KeyError):
         return None
 

@@ -17,7 +17,7 @@ import tyro
 from xew.analysis import report
 from xew.analysis.scores import TRAINING, VARIANT, Scores, merge_scores, write_scores
 from xew.analysis.studies.config import Study, load_study
-from xew.config import ConfigError, user_errors
+from xew.config import ConfigError, admit, demand_admitted, load, user_errors
 from xew.files import remove_written
 from xew.protocol import TASK_COUNT, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expected_counts
 
@@ -32,12 +32,17 @@ class Args:
     """Trainings of variants that are graded; all that have scores where left out."""
     distances: Path | None = None
     """Folder of python -m xew.analysis.distance; without it the report has the paper's distances."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own tasks, such as my_lab.tasks, that the study may name."""
 
 
 @user_errors
 def main(args: Args) -> None:
     """Merge the tables, write the merged one and its report."""
-    study = load_study(args.study / "study.yaml")
+    admit(args.trust)
+    path = args.study / "study.yaml"
+    demand_admitted(load(Study, path), str(path))
+    study = load_study(path)
     study = replace(study, out=args.study)
     planned = {run.name: run for run in study.planned_runs}
     graded = args.variants or tuple(name for name in planned if (args.study / "scores" / f"{name}.parquet").exists())

@@ -18,7 +18,7 @@ from xew.analysis.studies.plan import Step, step_key
 from xew.config import ConfigError
 from xew.dataset import find_accepted
 from xew.episode import EpisodeError
-from xew.files import RUN_FILES, checkpoint_time, file_digest, is_run, remove_written, replacing
+from xew.files import RUN_FILES, checkpoint_time, file_digest, is_run, read_json, remove_written, replacing
 
 ROLLOUT_FILES = ("*/*/*/rgb.mkv", "*/*/*/rollout.json")
 """Patterns of the paths of what `xew.model.rollout` writes into its tree."""
@@ -44,7 +44,7 @@ class Ledger:
     def record(self, step: Step) -> Mapping[str, Any]:
         """What is noted of a step; empty if it was never begun or its record is damaged."""
         try:
-            return json.loads(self._path(step).read_text())
+            return read_json(self._path(step))
         except (OSError, ValueError):
             return {}
 
@@ -119,7 +119,7 @@ def _remove_product(step: Step) -> None:
         ConfigError: the folder of a run holds none, or something cannot be removed.
     """
     run = step.kind in ("train", "adapt")
-    if run and step.product.exists() and any(step.product.iterdir()) and not is_run(step.product):
+    if run and step.product.is_dir() and any(step.product.iterdir()) and not is_run(step.product):
         raise ConfigError(f"{step.product} is the place of a run and holds something else; move it away.")
     try:
         remove_written(step.product, RUN_FILES if run else ROLLOUT_FILES)

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from xew.config import ConfigError
-from xew.files import digest_files
+from xew.files import digest_files, read_json
 from xew.metrics.grading.scores import KEY, Cell, write_whole
 
 FORMAT = 1
@@ -66,7 +66,7 @@ def read_bundle(path: Path) -> Bundle:
         ConfigError: it is not; the message says what does not hold.
     """
     try:
-        bundle = json.loads(path.read_text())
+        bundle = read_json(path)
         given, samples = bundle.pop("digest"), bundle["samples"]
         wrong = []
         if bundle["format"] != FORMAT:

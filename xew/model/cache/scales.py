@@ -16,7 +16,7 @@ from jax.experimental import multihost_utils
 
 from xew.config import ConfigError
 from xew.dataset import Episode
-from xew.files import replacing
+from xew.files import read_json, replacing
 from xew.model.cache.keys import scales_path
 from xew.model.conditions import Command, Condition
 from xew.model.episodes.commands import episode_command
@@ -97,7 +97,7 @@ def read_scales(path: Path, conditions: Sequence[Condition], remedy: str) -> dic
     if not names:
         return {}
     try:
-        content: dict[str, Any] = json.loads(path.read_text())
+        content: dict[str, Any] = read_json(path)
         arrays = {name: (content[name]["middle"], content[name]["width"], content[name]["limit"]) for name in sorted(names)}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{path} does not hold the scales of {', '.join(sorted(names))} ({error}); {remedy}.") from error

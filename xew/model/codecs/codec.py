@@ -23,6 +23,7 @@ from jax import Array, lax
 from jaxtyping import Float, Shaped, UInt8
 
 from xew.config import ConfigError, parse, pick
+from xew.files import demand_regular, read_json
 from xew.model.codecs.conv_autoencoder import (
     AutoencoderSize,
     ConvAutoencoder,
@@ -264,7 +265,7 @@ class PatchCodec(BatchCodec):
     @classmethod
     def load(cls, folder: Path) -> "PatchCodec":
         """Read codec.npz."""
-        with np.load(folder / "codec.npz") as stored:
+        with demand_regular(folder / "codec.npz").open("rb") as file, np.load(file) as stored:
             first, later = (Basis(*(stored[f"{name}_{f.name}"] for f in fields(Basis))) for name in ("first", "later"))
             return cls(int(stored["spatial_factor"]), first, later)
 
@@ -353,14 +354,14 @@ class WanVaeCodec(BatchCodec):
         """Write vae.safetensors and vae.json; weights that are there already are not written again."""
         description = {"size": asdict(self.size), "dtype": self.dtype, "chunk": self.chunk, "hash": self.hash}
         file = folder / "vae.json"
-        if not file.exists() or json.loads(file.read_text())["hash"] != self.hash:
+        if not file.exists() or read_json(file)["hash"] != self.hash:
             save_vae(self.vae, folder / "vae.safetensors")
         file.write_text(json.dumps(description, indent=1) + "\n")
 
     @classmethod
     def load(cls, folder: Path) -> "WanVaeCodec":
         """Read vae.safetensors and vae.json."""
-        stored = json.loads((folder / "vae.json").read_text())
+        stored = read_json(folder / "vae.json")
         size = parse(VaeSize, stored["size"], str(folder / "vae.json"))
         return cls.from_weights(folder / "vae.safetensors", size, stored["dtype"], stored["chunk"])
 
@@ -451,14 +452,14 @@ class ConvAutoencoderCodec(BatchCodec):
         """Write autoencoder.safetensors and autoencoder.json; weights that are there already are not written again."""
         description = {"size": asdict(self.size), "dtype": self.dtype, "hash": self.hash}
         file = folder / "autoencoder.json"
-        if not file.exists() or json.loads(file.read_text())["hash"] != self.hash:
+        if not file.exists() or read_json(file)["hash"] != self.hash:
             save_autoencoder(self.autoencoder, folder / "autoencoder.safetensors")
         file.write_text(json.dumps(description, indent=1) + "\n")
 
     @classmethod
     def load(cls, folder: Path) -> "ConvAutoencoderCodec":
         """Read autoencoder.safetensors and autoencoder.json."""
-        stored = json.loads((folder / "autoencoder.json").read_text())
+        stored = read_json(folder / "autoencoder.json")
         return cls.from_weights(folder / "autoencoder.safetensors", stored["dtype"])
 
     @classmethod

@@ -20,7 +20,7 @@ from jax.experimental import multihost_utils
 
 from xew import config
 from xew.config import ConfigError
-from xew.files import RUN_FILES, RUN_MARK, checkpoint_time, is_run, remove_written
+from xew.files import RUN_FILES, RUN_MARK, checkpoint_time, is_run, read_json, remove_written
 from xew.model.codecs.codec import Codec, CodecSettings, codec_class
 from xew.model.experiment import Experiment, load_recorded
 from xew.model.settings.settings import AdaptSettings
@@ -199,7 +199,7 @@ def trace_start(out: Path, run: Path | None) -> list[KeptStep]:
 def _read_start(out: Path, run: Path) -> KeptStep:
     """Read which checkpoint of a run another was adapted from. Raises ConfigError if it has gone, or the note is lost."""
     try:
-        note = json.loads((out / START).read_text())
+        note = read_json(out / START)
     except (OSError, ValueError) as error:
         raise ConfigError(
             f"{out} does not tell from which checkpoint of {run} it was adapted ({error}); copy the whole run, or "
