@@ -24,7 +24,7 @@ import cattrs
 import tyro
 import yaml
 
-from xew.files import EpisodeError, demand_regular
+from xew.files import EpisodeError, demand_regular, write_text
 
 T = TypeVar("T")
 
@@ -81,8 +81,8 @@ def parse(cls: type[T], content: Any, source: str) -> T:
 
 
 def save(config: Any, path: Path) -> None:
-    """Write the resolved config as YAML that `load` reads back to an equal object."""
-    path.write_text(yaml.safe_dump(CONVERTER.unstructure(config), sort_keys=False, allow_unicode=True))
+    """Write the resolved config as YAML that `load` reads back to an equal object. Raises OSError where it cannot."""
+    write_text(path, yaml.safe_dump(CONVERTER.unstructure(config), sort_keys=False, allow_unicode=True))
 
 
 def digest(config: Any) -> str:

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import cv2
 import numpy as np
 
 from xew.config import ConfigError, parse
@@ -317,6 +318,11 @@ def write_video(path: Path, video: np.ndarray, frame_rate: float = 1000 / 60) ->
         for frame in video:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         container.mux(stream.encode())
+
+
+def encode_png(image: np.ndarray) -> bytes:
+    """The PNG file of an RGB image [h w 3] uint8."""
+    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
 
 
 def open_video(path: Path) -> Any:

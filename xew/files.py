@@ -6,11 +6,13 @@ Data sets, rollouts, runs and score tables come from anybody. A name that one of
 
 import errno
 import fnmatch
+import glob
 import hashlib
 import json
 import os
 import re
 import stat
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -22,6 +24,8 @@ MOST_LETTERS = 200
 """Largest length of a name [bytes]; file systems take 255 with an ending."""
 SHOWN_LETTERS = 80
 """Largest number of letters of a wrong name that a message shows."""
+SETTLED_S = 2.0
+"""Age from which the file of a process that does not exist here is taken for left [s]; on another machine it may exist."""
 KINDS = {stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
 """Names of what a path may lead to that is neither a file nor a folder, by the type in its mode."""
 
@@ -160,18 +164,50 @@ def read_json(path: Path) -> Any:
 def replacing(path: Path) -> Iterator[Path]:
     """Give a name beside `path` to write to, which becomes `path` when the block ends well.
 
-    Who reads `path` finds the old file or the new one. What a failed block has left is removed; folders are made.
+    Who reads `path` finds the old file or the new one. What a failed block has left is removed, and so is what a process that
+    was killed has left of this file; folders are made.
 
     Raises:
         OSError: it cannot be written there, or the disk is full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    _sweep(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         yield temporary
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file of UTF-8 whole or not at all. Raises OSError as `replacing`."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all. Raises OSError as `replacing`."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _sweep(path: Path) -> None:
+    """Remove what processes that have ended have left of a file that they were writing."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*"):
+        number = left.name.rpartition(".")[2]
+        if number.isdecimal() and not _is_alive(int(number)) and time.time() - left.stat().st_mtime > SETTLED_S:
+            left.unlink(missing_ok=True)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def remove_written(folder: Path, patterns: Sequence[str]) -> list[Path]:

@@ -5,7 +5,6 @@ Names lie in labels.yaml, a line each.
 
 import csv
 import io
-import json
 import re
 import shutil
 import subprocess
@@ -102,7 +101,8 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 "task": "lift_pot",
                 "seed": TEST_SEED_START + seed,
             }
-            | {"robot": robot, "metric": metric, "value": float(rng.uniform(0.1, 0.2)), "frames": 5, "exact_frames": 0}
+            | {"seed": TEST_SEED_START + seed, "robot": robot, "metric": metric, "value": float(rng.uniform(0.1, 0.2))}
+            | {"frames": 5, "exact_frames": 0}
             for number, label in enumerate(LABELS)
             for seed in range(2)
             for robot in ("piper", "ur5_wsg")
@@ -122,9 +122,8 @@ def test_a_report_with_such_names_is_written_whole(report: Path) -> None:
     assert "<script>window" not in text and 'onerror="' not in text and "<img src=x" not in text
     assert not re.search(r"(?<!\\)<(script|img|svg)|\]\(javascript|!\[x\]\(http", (report / "report.md").read_text())
     for path in report.rglob("*.csv"):
-        cells = [cell for row in csv.reader(path.open()) for cell in row]
+        cells = [cell for row in csv.reader(io.StringIO(path.read_text())) for cell in row]
         assert not [cell for cell in cells if cell[:1] in ("=", "+", "@") and len(cell) > 1], path
-    json.dumps([path.name for path in report.rglob("*")])
 
 
 @needs_chromium

@@ -40,7 +40,7 @@ from xew.analysis.tables.table import Table, TableCell, TableRow, TableSection, 
 from xew.config import ConfigError, user_errors
 from xew.dataset import find_records
 from xew.episode import Record, episode_folder, read_video
-from xew.files import csv_text, path_below, plain_markdown
+from xew.files import csv_text, path_below, plain_markdown, write_bytes, write_text
 from xew.protocol import BASELINES, HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
 from xew.statistics import MIN_SCENES
@@ -395,11 +395,10 @@ def _write_report(out: Path, html: str, markdown: tuple[str, Mapping[str, bytes]
         out.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
             path = path_below(out, name)
-            path.parent.mkdir(exist_ok=True)
-            path.write_bytes(content)
-        (out / "report.md").write_text(text)
-        (out / "summary.csv").write_text(csv_text(summary))
-        (out / "index.html").write_text(html)
+            write_bytes(path, content)
+        write_text(out / "report.md", text)
+        write_text(out / "summary.csv", csv_text(summary))
+        write_text(out / "index.html", html)
     except OSError as error:
         raise ConfigError(f"cannot write the report to {out}: {error}. Choose another --out.") from error
 

@@ -30,6 +30,7 @@ from xew.analysis.studies.plan import Step, plan, write_configs
 from xew.analysis.studies.runner import StudyRunner
 from xew.analysis.studies.status import exit_with_failures, format_cost, format_status
 from xew.config import ConfigError, admit_named, load, read_yaml, save, user_errors
+from xew.files import write_text
 
 CHECK_CONFIGS = """
 import sys
@@ -78,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         seconds = correct_by_ledger(estimate(study, steps), steps, ledger)
         failed = StudyRunner(study, steps, ledger, machines, critical_paths(steps, seconds)).run()
         table = format_status(study, steps, ledger, failed)
-        (study.out / "status.txt").write_text(table + "\n")
+        write_text(study.out / "status.txt", table + "\n")
     print(table)
     if failed:
         exit_with_failures(failed, ledger, steps)

@@ -30,6 +30,7 @@ from tqdm import tqdm
 from xew.config import ConfigError, admit, user_errors
 from xew.dataset import find_accepted
 from xew.episode import EpisodeError, Record, read_video
+from xew.files import replacing, write_text
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
 from xew.metrics.calibration.matrix import grade_predictors, matrix, to_markdown
@@ -324,9 +325,10 @@ def write(out: Path, text: str, tables: dict[str, pd.DataFrame], name: str = "ca
     """Write a text of this name and tables. Raises EpisodeError if the folder cannot be written."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        (out / name).write_text(text)
+        write_text(out / name, text)
         for key, table in tables.items():
-            table.to_parquet(out / f"{key}.parquet", index=False)
+            with replacing(out / f"{key}.parquet") as temporary:
+                table.to_parquet(temporary, index=False)
     except OSError as error:
         raise EpisodeError(f"cannot write the tables to {out}: {error}; choose another --out.") from error
 

@@ -25,7 +25,7 @@ from xew.command_line import parse_command
 from xew.compilation import keep_compiled_programs
 from xew.config import load, user_errors
 from xew.dataset import Dataset, Episode, read_dataset
-from xew.files import file_digest
+from xew.files import file_digest, write_text
 from xew.model.codec_training.kinds import Kind
 from xew.model.codec_training.pictures import Pictures, gather_pictures, read_frames
 from xew.model.codec_training.report import measure_codec, report_rows, report_scalars, write_report
@@ -182,7 +182,7 @@ def finish(experiment: CodecExperiment, module: Any, batches: Batches, dataset: 
 def write_description(experiment: CodecExperiment, description: dict[str, Any]) -> None:
     """Write the file beside the weights."""
     path = experiment.out / f"{experiment.autoencoder.file}.json"
-    path.write_text(json.dumps(description, indent=1) + "\n")
+    write_text(path, json.dumps(description, indent=1) + "\n")
 
 
 def latent_statistics(kind: Kind, module: Any, batches: Batches, count: int) -> tuple[jax.Array, jax.Array]:

@@ -23,8 +23,8 @@ from tqdm import tqdm
 
 from xew.config import admit, user_errors
 from xew.dataset import explain_missing, read_dataset
-from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, read_record, read_states, read_video, verify_episode
-from xew.files import path_below
+from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, encode_png, read_record, read_states, read_video, verify_episode
+from xew.files import path_below, replacing, write_bytes
 from xew.sim_warp.devices.workers import Workers, quiet_warp
 from xew.sim_warp.generate import yield_table
 from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
@@ -175,7 +175,8 @@ def draw_grid(cells: list[tuple[Path, Record]], path: Path) -> None:
     _make_folder(path.parent, "--grid")
     picture = grid([of_task[min(of_task)] for of_task in seeds_by_task(cells).values()])
     try:
-        Image.fromarray(picture).save(path, format="PNG", optimize=True)
+        with replacing(path) as temporary:
+            Image.fromarray(picture).save(temporary, format="PNG", optimize=True)
     except OSError as error:
         raise EpisodeError(f"cannot write {path}: {error.strerror}. Choose another file with --grid.") from error
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
@@ -280,8 +281,10 @@ def tile(rows: list[list[np.ndarray]]) -> np.ndarray:
 
 def save_png(path: Path, image: np.ndarray) -> None:
     """Write an image [h w 3] uint8 RGB. Raises EpisodeError where it cannot be written."""
-    if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
-        raise EpisodeError(f"cannot write {path}; choose another folder with --pictures.")
+    try:
+        write_bytes(path, encode_png(image))
+    except OSError as error:
+        raise EpisodeError(f"cannot write {path}: {error.strerror}. Choose another folder with --pictures.") from error
 
 
 if __name__ == "__main__":

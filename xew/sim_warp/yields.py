@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from xew.config import user_errors
 from xew.episode import EpisodeError, Record
+from xew.files import write_text
 from xew.protocol import expand_robots
 from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
@@ -191,8 +192,7 @@ def main() -> None:
 
 def write_page(path: Path, text: str) -> None:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+        write_text(path, text)
     except OSError as error:
         raise EpisodeError(f"cannot write {path}: {error.strerror}. Choose another file with --page.") from error
 

@@ -23,7 +23,7 @@ from jax import Array, lax
 from jaxtyping import Float, Shaped, UInt8
 
 from xew.config import ConfigError, parse, pick
-from xew.files import demand_regular, read_json
+from xew.files import demand_regular, read_json, replacing, write_text
 from xew.model.codecs.conv_autoencoder import (
     AutoencoderSize,
     ConvAutoencoder,
@@ -260,7 +260,8 @@ class PatchCodec(BatchCodec):
         arrays = {
             f"{name}_{f.name}": getattr(getattr(self, name), f.name) for name in ("first", "later") for f in fields(Basis)
         }
-        np.savez(folder / "codec.npz", spatial_factor=self.spatial_factor, **arrays)
+        with replacing(folder / "codec.npz") as temporary, temporary.open("wb") as file:
+            np.savez(file, spatial_factor=self.spatial_factor, **arrays)
 
     @classmethod
     def load(cls, folder: Path) -> "PatchCodec":
@@ -356,7 +357,7 @@ class WanVaeCodec(BatchCodec):
         file = folder / "vae.json"
         if not file.exists() or read_json(file)["hash"] != self.hash:
             save_vae(self.vae, folder / "vae.safetensors")
-        file.write_text(json.dumps(description, indent=1) + "\n")
+        write_text(file, json.dumps(description, indent=1) + "\n")
 
     @classmethod
     def load(cls, folder: Path) -> "WanVaeCodec":
@@ -454,7 +455,7 @@ class ConvAutoencoderCodec(BatchCodec):
         file = folder / "autoencoder.json"
         if not file.exists() or read_json(file)["hash"] != self.hash:
             save_autoencoder(self.autoencoder, folder / "autoencoder.safetensors")
-        file.write_text(json.dumps(description, indent=1) + "\n")
+        write_text(file, json.dumps(description, indent=1) + "\n")
 
     @classmethod
     def load(cls, folder: Path) -> "ConvAutoencoderCodec":

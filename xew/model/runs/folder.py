@@ -20,7 +20,7 @@ from jax.experimental import multihost_utils
 
 from xew import config
 from xew.config import ConfigError
-from xew.files import RUN_FILES, RUN_MARK, checkpoint_time, is_run, read_json, remove_written
+from xew.files import RUN_FILES, RUN_MARK, checkpoint_time, is_run, read_json, remove_written, write_text
 from xew.model.codecs.codec import Codec, CodecSettings, codec_class
 from xew.model.experiment import Experiment, load_recorded
 from xew.model.settings.settings import AdaptSettings
@@ -74,7 +74,7 @@ def note_start(out: Path, run: Path) -> None:
     if step is None:
         raise ConfigError(f"{run} has no checkpoint to start from; train it: python -m xew.model.train CONFIG --out {run}")
     note = {"run": str(run), "step": step, "saved": checkpoint_time(run, step)}
-    (out / START).write_text(json.dumps(note, indent=1) + "\n")
+    write_text(out / START, json.dumps(note, indent=1) + "\n")
 
 
 def prepare_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite: bool) -> None:
