@@ -38,6 +38,7 @@ RUN_FILES = (
     "codec/*",
     "scales.json",
     "checkpoints/*",
+    "sums/*.json",
     "start.json",
     "metrics.jsonl",
     "events.out.tfevents.*",

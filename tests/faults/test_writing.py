@@ -48,14 +48,11 @@ def writes_in_place(source: Source) -> Iterator[str]:
                 root = ast.unparse(node.context_expr).split(".")[0]
                 if called in WHOLE or root in beside:
                     beside |= _names(node.optional_vars)
-            if isinstance(node, ast.Assign) and any(
-                inner.id in beside for inner in ast.walk(node.value) if isinstance(inner, ast.Name)
-            ):
-                beside |= {inner.id for target in node.targets for inner in ast.walk(target) if isinstance(inner, ast.Name)}
+            if isinstance(node, ast.Assign) and _names(node.value) & beside:
+                beside |= {name for target in node.targets for name in _names(target)}
         for node in ast.walk(function):
-            if isinstance(node, ast.Call) and _writes(node):
-                if not _names(node) & beside and not _into_memory(node):
-                    yield f"{name}:{node.lineno} {function.name}: {ast.unparse(node)[:80]}"
+            if isinstance(node, ast.Call) and _writes(node) and not _names(node) & beside and not _into_memory(node):
+                yield f"{name}:{node.lineno} {function.name}: {ast.unparse(node)[:80]}"
 
 
 def _names(node: ast.AST) -> set[str]:

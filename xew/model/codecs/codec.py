@@ -267,7 +267,13 @@ class PatchCodec(BatchCodec):
     def load(cls, folder: Path) -> "PatchCodec":
         """Read codec.npz."""
         with demand_regular(folder / "codec.npz").open("rb") as file, np.load(file) as stored:
+            if wrong := [name for name in stored.files if not np.isfinite(stored[name]).all()]:
+                raise ConfigError(f"{folder / 'codec.npz'} holds NaN or infinite numbers in {wrong[0]}; copy or make it again.")
             first, later = (Basis(*(stored[f"{name}_{f.name}"] for f in fields(Basis))) for name in ("first", "later"))
+            for basis, frames in ((first, 1), (later, TEMPORAL_FACTOR)):
+                patch, channels = 3 * frames * int(stored["spatial_factor"]) ** 2, first.scale.size
+                if [np.shape(getattr(basis, f.name)) for f in fields(Basis)] != [(patch,), (patch, channels), (channels,)]:
+                    raise ValueError(f"codec.npz holds no basis of patches [{patch}] and channels [{channels}]")
             return cls(int(stored["spatial_factor"]), first, later)
 
     @classmethod

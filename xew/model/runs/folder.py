@@ -196,21 +196,30 @@ def trace_start(out: Path, run: Path | None) -> list[KeptStep]:
     return kept
 
 
+@dataclass(frozen=True)
+class _StartNote:
+    """What start.json says."""
+
+    run: str
+    step: int
+    saved: int | None
+
+
 def _read_start(out: Path, run: Path) -> KeptStep:
     """Read which checkpoint of a run another was adapted from. Raises ConfigError if it has gone, or the note is lost."""
     try:
-        note = read_json(out / START)
-    except (OSError, ValueError) as error:
+        note = config.parse(_StartNote, read_json(out / START), str(out / START))
+    except (OSError, ValueError, ConfigError) as error:
         raise ConfigError(
             f"{out} does not tell from which checkpoint of {run} it was adapted ({error}); copy the whole run, or "
             "adapt again with --overwrite."
         ) from error
-    if not (run / "config.yaml").exists() or checkpoint_time(run, note["step"]) != note["saved"]:
+    if not (run / "config.yaml").exists() or checkpoint_time(run, note.step) != note.saved:
         raise ConfigError(
-            f"{out} was adapted from step {note['step']} of {run}, which is not there any more or was trained anew; "
+            f"{out} was adapted from step {note.step} of {run}, which is not there any more or was trained anew; "
             "put that run back (a longer train.keep_checkpoints keeps it), or adapt again with --overwrite."
         )
-    return KeptStep(run, note["step"], load_run_config(run).adapt)
+    return KeptStep(run, note.step, load_run_config(run).adapt)
 
 
 def load_run(out: Path) -> tuple[Experiment, Codec]:
@@ -239,9 +248,25 @@ def _demand_run(out: Path) -> None:
 def load_run_codec(out: Path, settings: CodecSettings) -> Codec:
     """The codec, of these settings, that a run was trained with. Raises ConfigError if the folder lacks it."""
     try:
-        return codec_class(settings).load(out / "codec")
+        return load_kept_codec(settings, out / "codec", "copy the whole run again, or train again")
     except FileNotFoundError as error:
         raise ConfigError(f"{out} lacks its codec ({error.filename}); copy the whole run, or train again.") from error
+
+
+def load_kept_codec(settings: CodecSettings, folder: Path, remedy: str) -> Codec:
+    """The codec, of these settings, that is kept in a folder.
+
+    Raises:
+        FileNotFoundError: it lacks a file.
+        ConfigError: it is damaged; `remedy` says what to do.
+    """
+    try:
+        return codec_class(settings).load(folder)
+    except (FileNotFoundError, ConfigError):
+        raise
+    except Exception as error:  # zipfile, zlib, NumPy and safetensors each have their own
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ConfigError(f"{folder} is damaged ({reason}); {remedy}.") from error
 
 
 def _check_same(saved: Any, asked: Any, out: Path) -> None:

@@ -108,6 +108,8 @@ def fill(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Coll
     for path, source in wanted.items():
         variable = leaves[path]
         value = _leaf_value(tensors, source, variable.shape, np.dtype(variable.dtype))
+        if jax.numpy.issubdtype(value.dtype, jax.numpy.inexact) and not np.isfinite(value).all():
+            raise ConfigError(f"{tensors.source}: {source.keys[0]} holds NaN or infinite numbers; get the file again.")
         variable.set_value(_place(value, variable.get_value()))
 
 
