@@ -111,6 +111,7 @@ def pick(registry: Mapping[str, T], name: str, kind: str, also: tuple[type, ...]
         if not isinstance(found, (*expected, *also)):
             names = " or ".join(kind.__name__ for kind in expected)
             raise ConfigError(f"the {kind} {name!r} is a {type(found).__name__}; expected a {names}.")
+        admit([module])  # its code has run by the user's own word; files may name it from now on
         return cast(T, found)
     raise ConfigError(f"unknown {kind} {name!r};{suggestion(name, registry)} known: {', '.join(registry)}, or module:NAME.")
 

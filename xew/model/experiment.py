@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from xew.command_line import parse_command
-from xew.config import admit, admit_named, demand_admitted, load, pick
+from xew.config import admit, demand_admitted, load, pick
 from xew.model.codecs.codec import CodecSettings, latent_frames
 from xew.model.codecs.vae import VAES
 from xew.model.conditions import Condition
@@ -169,7 +169,6 @@ def parse_experiment(flags: type[F], arguments: Sequence[str] | None, prog: str,
         flags, Experiment, functools.partial(load, Experiment), arguments, prog=prog, description=description
     )
     admit(getattr(command.flags, "trust", ()))
-    admit_named(command.config)
     check_experiment(command.config, str(command.path))
     return command.flags, command.config
 

@@ -24,7 +24,7 @@ import tyro
 import warp as wp
 from tqdm import tqdm
 
-from xew.config import admit_named, user_errors
+from xew.config import user_errors
 from xew.dataset import find_records
 from xew.episode import EpisodeError, Record, episode_folder, remove_left_overs
 from xew.protocol import TEST_SEED_START, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expand_robots
@@ -192,7 +192,6 @@ def _check(args: Args) -> None:
     """Check names, numbers and the folder before any work. Raises ConfigError or EpisodeError."""
     for task in args.tasks:
         get_task(task)
-    admit_named([*args.tasks, *args.robots])  # the user has typed them
     for robot in expand_robots(args.robots):
         if not is_path(robot):
             get_robot(robot, args.out)

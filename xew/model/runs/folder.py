@@ -109,7 +109,6 @@ def claim_run(out: Path, settings: T, read: Callable[[Path], T], *, resume: bool
         ConfigError: it holds a run and neither was asked, or it would be continued with another config.
     """
     saved = out / "config.yaml"
-    config.admit_named(settings)  # of a run with the same settings, the user has named them too
     if saved.exists() and overwrite:
         _remove_run(out)
     elif saved.exists() and resume:
