@@ -10,9 +10,11 @@ was found, what was expected and what to do; `user_errors` turns it into that me
 
 import dataclasses
 import difflib
+import errno
 import functools
 import importlib
 import json
+import math
 import os
 import re
 import sys
@@ -29,10 +31,16 @@ from xew.files import EpisodeError, demand_regular, write_text
 T = TypeVar("T")
 
 
+LARGEST = 2**63 - 1
+"""Largest whole number of a config."""
 IMPORT_PATH = re.compile(r"([^\W\d]\w*(?:\.[^\W\d]\w*)*):[^\W\d]\w*")
 """Form of the name of an object of a module, `module:NAME`."""
 TRUST = "XEW_TRUST"
 """Name of the environment variable that lists admitted modules, separated by commas; processes inherit it."""
+
+
+DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
+"""Numbers of errors of the system that are no mistake of this program, also where they name no file."""
 
 
 class ConfigError(Exception):
@@ -65,7 +73,9 @@ def read_yaml(path: Path | str) -> Any:
         beside = sorted(str(p) for p in path.parent.glob("*.yaml"))
         known = f" There is: {', '.join(beside)}." if beside else ""
         raise ConfigError(f"cannot read the config {path}: {error.strerror or error}.{known}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except RecursionError as error:
+        raise ConfigError(f"{path} is nested too deeply for a config.") from error
+    except (yaml.YAMLError, ValueError) as error:
         raise ConfigError(f"{path} is not YAML: {error}") from error
 
 
@@ -173,6 +183,26 @@ def demand_admitted(content: Any, source: str) -> None:
             )
 
 
+def check_finite(settings: Any, source: str, name: str = "") -> None:
+    """Check the numbers of a config, as given or nested: they are finite, and whole ones fit into 64 bits.
+
+    Raises:
+        ConfigError: one does not; `source` names the config and `name` where in it the settings stand.
+    """
+    if dataclasses.is_dataclass(settings) and not isinstance(settings, type):
+        settings = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
+    if isinstance(settings, Mapping):
+        for key, value in settings.items():
+            check_finite(value, source, f"{name}.{key}".lstrip("."))
+    elif isinstance(settings, (list, tuple)):
+        for value in settings:
+            check_finite(value, source, name)
+    elif isinstance(settings, float) and not math.isfinite(settings):
+        raise ConfigError(f"{source}: {name} is {settings}; expected a finite number.")
+    elif isinstance(settings, int) and not -LARGEST <= settings <= LARGEST:
+        raise ConfigError(f"{source}: {name} is {settings}; expected a number of at most 64 bits.")
+
+
 def find_import_paths(content: Any) -> list[str]:
     """All texts of the form `module:NAME` in a config or in plain content, sorted."""
     if dataclasses.is_dataclass(content) and not isinstance(content, type):
@@ -192,7 +222,7 @@ def _admitted() -> list[str]:
 
 def suggestion(name: str, known: Iterable[str]) -> str:
     """' did you mean …?' or nothing."""
-    close = difflib.get_close_matches(name, list(known), n=1)
+    close = difflib.get_close_matches(str(name), list(known), n=1)
     return f" did you mean {close[0]!r}?" if close else ""
 
 
@@ -208,6 +238,12 @@ def user_errors(main: Callable[..., T]) -> Callable[..., T]:
             return main(*args, **kwargs)
         except (ConfigError, EpisodeError) as error:
             print(f"error: {error}", file=sys.stderr)
+            raise SystemExit(2) from None
+        except OSError as error:
+            if error.filename is None and error.errno not in DISK_FAULTS:
+                raise
+            where = f"{error.filename}: " if error.filename is not None else ""
+            print(f"error: {where}{error.strerror}; mend that, or name another place.", file=sys.stderr)
             raise SystemExit(2) from None
         except KeyboardInterrupt:
             print("stopped; the same command goes on from what is done", file=sys.stderr)

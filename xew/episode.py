@@ -285,11 +285,21 @@ def read_states(folder: Path) -> States:
     try:
         arrays = read_npz(path)
         arrays["robot_mask"] = np.unpackbits(arrays["robot_mask"], axis=-1).astype(bool)
-        return States(**arrays)
+        return _check_camera(States(**arrays))
     except FileNotFoundError as error:
         raise EpisodeError(f"{path} does not exist: the cell was rejected or its folder is damaged.") from error
     except Exception as error:  # zipfile, zlib and NumPy each have their own
         raise EpisodeError(f"{path} is damaged ({error}); delete its folder and run generate again.") from error
+
+
+def _check_camera(states: States) -> States:
+    """The same states. Raises ValueError where their camera could see nothing."""
+    intrinsics, extrinsics = states.intrinsics, states.extrinsics
+    if intrinsics.shape != (3, 3) or extrinsics.shape != (4, 4):
+        raise ValueError(f"its camera has intrinsics {intrinsics.shape} and extrinsics {extrinsics.shape}")
+    if not (np.isfinite(intrinsics).all() and np.isfinite(extrinsics).all() and min(intrinsics[0, 0], intrinsics[1, 1]) > 0):
+        raise ValueError("its camera has a focal length of 0 or less, or numbers that are not finite")
+    return states
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:

@@ -5,13 +5,16 @@ Data sets, rollouts, runs and score tables come from anybody. A name that one of
 """
 
 import errno
+import fcntl
 import fnmatch
 import glob
 import hashlib
 import json
 import os
 import re
+import socket
 import stat
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -245,6 +248,44 @@ def is_run(folder: Path) -> bool:
     return (folder / "config.yaml").is_file() and any(
         (folder / name).exists() for name in ("codec", "checkpoints", "metrics.jsonl")
     )
+
+
+@contextmanager
+def hold_lock(path: Path) -> Iterator[None]:
+    """Hold the lock of a folder or file that a command writes, until the block or the process ends.
+
+    The lock is a file beside it, `.NAME.lock`, which says who holds it and goes with the lock. Where the file system has no
+    locks there is none.
+
+    Raises:
+        EpisodeError: another process holds it; the message says which.
+        OSError: nothing can be written there.
+    """
+    path = path.absolute()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.lock")
+    while True:
+        with beside.open("a+", encoding="utf-8") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                file.seek(0)
+                holder = " ".join(file.read().split()) or "another process"
+                raise EpisodeError(
+                    f"{path} is being written by {holder}; wait for it, stop it, or choose another --out."
+                ) from error
+            except OSError:  # no locks here
+                pass
+            if not beside.exists() or os.fstat(file.fileno()).st_ino != beside.stat().st_ino:
+                continue  # it was removed by who held it, after it was opened here
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()} ({Path(sys.argv[0]).stem})\n")
+            file.flush()
+            try:
+                yield
+            finally:
+                beside.unlink(missing_ok=True)
+            return
 
 
 def file_digest(path: Path) -> str:

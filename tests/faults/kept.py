@@ -1,5 +1,6 @@
 """JSON files that xew writes and reads again: a whole one of each kind, and who reads it."""
 
+import contextlib
 import json
 from collections.abc import Callable
 from dataclasses import asdict
@@ -70,10 +71,11 @@ def bundle(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
     content = json.loads(path.read_text())
 
     def read() -> None:
-        changed = json.loads(path.read_text())
-        if isinstance(changed, dict) and "digest" in changed:  # whoever changes it can write its digest, too
-            changed.pop("digest")
-            path.write_text(json.dumps(changed | {"digest": bundles.digest(changed)}))
+        with contextlib.suppress(ValueError, RecursionError):
+            changed = json.loads(path.read_text())
+            if isinstance(changed, dict) and "digest" in changed:  # whoever changes it can write its digest, too
+                changed.pop("digest")
+                path.write_text(json.dumps(changed | {"digest": bundles.digest(changed)}))
         choices = {name: content[name] for name in bundles.CHOICES}
         differences(read_bundle(path), choices, [CELL])
 

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import h5py
 import numpy as np
 import pandas as pd
@@ -33,7 +32,6 @@ from xew.metrics.calibration.perturbations import render_perturbation
 from xew.model import outside
 from xew.model.experiment import load_experiment
 from xew.model.runs.folder import claim_run, load_run_config
-from xew.protocol import ROBOT_NAMES
 from xew.rollout import RolloutError, find_rollouts, read_rollout, write_rollout
 from xew.sim_warp.inspect import draw_pictures, find_problem, read_headers
 from xew.sim_warp.manifest import read_manifest
@@ -402,4 +400,3 @@ def test_a_run_of_an_earlier_version_is_still_replaced(tmp_path: Path) -> None:
 
 def test_data_as_they_were_still_open(own: Path) -> None:
     assert [record.robot for _, record in read_dataset(own.parents[2]).accepted] == ["piper"]
-    assert "piper" in ROBOT_NAMES and cv2.__version__

@@ -4,7 +4,9 @@ Values that stand in place of others lie in values.yaml, a line each.
 """
 
 import copy
+import itertools
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,9 @@ from xew.episode import EpisodeError
 
 LISTED = yaml.safe_load((Path(__file__).parent / "values.yaml").read_text(encoding="utf-8"))
 REMOVED = object()
+ALL = bool(os.environ.get("XEW_ALL_FAULTS"))
+"""Whether all inputs are tried, as `make test-faults` does; else one of SHARE."""
+SHARE = 9
 DEEP = "[" * 100_000
 
 
@@ -60,7 +65,7 @@ def test_whatever_is_changed_is_told_in_one_line(kind: str, tmp_path: Path, reco
     content = json.loads(json.dumps(content))
     tried, refused, wrong = 0, 0, []
     with reading.at_most_seconds(240):
-        for text in texts(content):
+        for text in itertools.islice(texts(content), 0, None, 1 if ALL else SHARE):
             path.write_text(text, encoding="utf-8")
             tried += 1
             try:

@@ -40,7 +40,7 @@ from xew.analysis.tables.table import Table, TableCell, TableRow, TableSection, 
 from xew.config import ConfigError, user_errors
 from xew.dataset import find_records
 from xew.episode import Record, episode_folder, read_video
-from xew.files import csv_text, path_below, plain_markdown, write_bytes, write_text
+from xew.files import csv_text, hold_lock, path_below, plain_markdown, write_bytes, write_text
 from xew.protocol import BASELINES, HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
 from xew.statistics import MIN_SCENES
@@ -392,13 +392,12 @@ def _write_report(out: Path, html: str, markdown: tuple[str, Mapping[str, bytes]
     """Write all files, the page last, so that everything it speaks of exists once it does."""
     text, files = markdown
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        for name, content in files.items():
-            path = path_below(out, name)
-            write_bytes(path, content)
-        write_text(out / "report.md", text)
-        write_text(out / "summary.csv", csv_text(summary))
-        write_text(out / "index.html", html)
+        with hold_lock(out):
+            for name, content in files.items():
+                write_bytes(path_below(out, name), content)
+            write_text(out / "report.md", text)
+            write_text(out / "summary.csv", csv_text(summary))
+            write_text(out / "index.html", html)
     except OSError as error:
         raise ConfigError(f"cannot write the report to {out}: {error}. Choose another --out.") from error
 

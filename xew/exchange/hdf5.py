@@ -145,6 +145,11 @@ def _assemble(
     rgb = reader.pictures(pictures, frames)
     if any(np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1).max() > 0.01 for pose in poses):
         raise reader.error("the end poses hold quaternions that are not of length 1", "x y z and a unit quaternion w x y z")
+    matrix = reader.constant(intrinsics, (3, 3))
+    if min(matrix[0, 0], matrix[1, 1]) <= 0:
+        raise reader.error(
+            f"{intrinsics} has the focal lengths {matrix[0, 0]:g} and {matrix[1, 1]:g}", "numbers of pixels over 0"
+        )
     scale = rgb.shape[2] / WIDTH
     return Recorded(
         layout,
@@ -152,7 +157,7 @@ def _assemble(
         np.stack(grippers, 1),
         np.stack([tool_center(pose) for pose in poses], 1) if poses else None,
         np.stack([_resize(image) for image in rgb]) if scale != 1 else rgb,
-        _center_pixels(reader.constant(intrinsics, (3, 3)), scale),
+        _center_pixels(matrix, scale),
         _world_to_camera(reader, extrinsics),
         reader.instruction(),
     )

@@ -24,7 +24,7 @@ import xew
 from xew.config import ConfigError, user_errors
 from xew.episode import EpisodeError, Record, States, episode_folder, read_record, read_states, write_episode
 from xew.exchange.hdf5 import Recorded, read_robotwin, text_beside
-from xew.files import check_name
+from xew.files import check_name, hold_lock
 from xew.protocol import ACTION_DIM, ARMS
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.geometry.camera import Camera
@@ -260,7 +260,8 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     if args.robot:
         get_robot(args.robot, args.out)  # a mistake in it is told once, not for every file
-    records, refused = import_all(find_episodes(args.source), args)
+    with hold_lock(args.out):
+        records, refused = import_all(find_episodes(args.source), args)
     rendered = sum("robot" in record.hashes for record in records)
     print(f"{len(records)} episodes under {args.out}, {rendered} with the robot's own kinematics")
     if refused:

@@ -28,7 +28,7 @@ from tqdm import tqdm
 from xew.compilation import keep_compiled_programs
 from xew.config import ConfigError, admit, pick, suggestion, user_errors
 from xew.episode import EpisodeError, verify_episode
-from xew.files import csv_text
+from xew.files import csv_text, hold_lock
 from xew.metrics import METRICS
 from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, identity, open_masker, open_tracker
 from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, grade, input_kind
@@ -130,6 +130,12 @@ def main(args: Args) -> None:
         check(args, args.check)
         return
     check_out(args.out)
+    with hold_lock(args.out):
+        grade_tables(args)
+
+
+def grade_tables(args: Args) -> None:
+    """Grade, write the tables and print the summary. Raises EpisodeError where a rollout could not be graded."""
     metrics = choose_metrics(args)
     attributes = describe(settings(args), metrics)
     store = CellStore(path_beside(args.out, "cells"), baselines_folder(args.data, args.out))

@@ -25,6 +25,7 @@ from tqdm import tqdm
 from xew.config import ConfigError, admit, user_errors
 from xew.dataset import Episode
 from xew.episode import Record, read_video
+from xew.files import hold_lock
 from xew.model.conditions import Command
 from xew.model.episodes.choice import select_episodes
 from xew.model.episodes.commands import episode_command
@@ -193,6 +194,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     pending = [item for item in items if not is_done(out, *item)]
     model = load_model(args.model)
     with (
+        hold_lock(out),
         tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
         RolloutWriter(out, progress.update, resize=None) as writer,
     ):

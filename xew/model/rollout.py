@@ -27,7 +27,7 @@ from xew.compilation import keep_compiled_programs
 from xew.config import CONVERTER, ConfigError, admit, parse, user_errors
 from xew.dataset import Episode, read_dataset
 from xew.episode import Record, episode_folder
-from xew.files import checkpoint_time, read_json
+from xew.files import checkpoint_time, hold_lock, read_json
 from xew.model.cache.codecs import load_codec
 from xew.model.cache.scales import Scale, load_run_scales
 from xew.model.codecs.codec import Codec, codec_class
@@ -162,6 +162,8 @@ def _read_header(folder: Path) -> dict[str, Any]:
     """A rollout's header; settings that came after it was written have their defaults."""
     path = folder / "rollout.json"
     header: dict[str, Any] = read_json(path)
+    if not isinstance(header, dict):
+        raise ConfigError(f"{path} holds {type(header).__name__}, expected an object.")
     if "config" in header:
         header["config"] = CONVERTER.unstructure(parse(Experiment, header["config"], str(path)))
     return header
@@ -279,6 +281,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     pending = [item for item in headers if not is_done(out, *item)]
     experiment.instructions.encode([record.instruction for (_, record), _ in pending])  # all at once, where that costs
     with (
+        hold_lock(out),
         tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
         RolloutWriter(out, progress.update) as writer,
     ):

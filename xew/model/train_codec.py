@@ -25,7 +25,7 @@ from xew.command_line import parse_command
 from xew.compilation import keep_compiled_programs
 from xew.config import load, user_errors
 from xew.dataset import Dataset, Episode, read_dataset
-from xew.files import file_digest, write_text
+from xew.files import file_digest, hold_lock, write_text
 from xew.model.codec_training.kinds import Kind
 from xew.model.codec_training.pictures import Pictures, gather_pictures, read_frames
 from xew.model.codec_training.report import measure_codec, report_rows, report_scalars, write_report
@@ -71,7 +71,9 @@ def main(arguments: Sequence[str] | None = None, prog: str = "python -m xew.mode
     experiment, flags = check_codec_experiment(command.config, command.path), command.flags
     check_one_of(flags.resume, flags.overwrite)
     keep_compiled_programs()
-    if not train_codec(experiment, resume=flags.resume, overwrite=flags.overwrite):
+    with hold_lock(experiment.out):
+        ended = train_codec(experiment, resume=flags.resume, overwrite=flags.overwrite)
+    if not ended:
         sys.exit(STOPPED)
 
 

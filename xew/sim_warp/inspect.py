@@ -24,7 +24,7 @@ from tqdm import tqdm
 from xew.config import admit, user_errors
 from xew.dataset import explain_missing, read_dataset
 from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, encode_png, read_record, read_states, read_video, verify_episode
-from xew.files import path_below, replacing, write_bytes
+from xew.files import hold_lock, path_below, replacing, write_bytes
 from xew.sim_warp.devices.workers import Workers, quiet_warp
 from xew.sim_warp.generate import yield_table
 from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
@@ -91,7 +91,8 @@ def main() -> None:
     if args.rerender:
         rerender([folder for folder, _ in pictured], args.rerender)
     if args.render:
-        render_videos([folder for folder, record in pictured if not record.videos])
+        with hold_lock(args.data):
+            render_videos([folder for folder, record in pictured if not record.videos])
     if args.pictures:
         draw_pictures(pictured, args.pictures, args.seeds)
     if args.grid:

@@ -71,6 +71,8 @@ def attempt_seeds(args: Args) -> Iterator[list[Record]]:
     for name in robots:
         get_robot(name)
     jobs = [Job(task, args.first_seed + index, robots) for task in tasks for index in range(args.seeds)]
+    if args.workers is not None and args.workers < 1:
+        raise EpisodeError(f"--workers is {args.workers}; expected at least 1, or none for as many as there are cores.")
     if not jobs or not robots or args.first_seed < 0:
         raise EpisodeError(
             f"nothing to try of {len(tasks)} tasks, {len(robots)} robots and {args.seeds} seeds from {args.first_seed}; name "

@@ -11,11 +11,12 @@ import json
 import socket
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from xew.analysis.studies.plan import Step, step_key
-from xew.config import ConfigError
+from xew.config import ConfigError, parse
 from xew.dataset import find_accepted
 from xew.episode import EpisodeError
 from xew.files import RUN_FILES, checkpoint_time, file_digest, is_run, read_json, remove_written, replacing
@@ -24,6 +25,19 @@ ROLLOUT_FILES = ("*/*/*/rgb.mkv", "*/*/*/rollout.json")
 """Patterns of the paths of what `xew.model.rollout` writes into its tree."""
 GRADES = ("parquet", "*.parquet", "summary.md", "summary.csv", "pairs.csv", "bundle.json", "cells/*.json", "baselines/*.json")
 """Patterns of the endings of what `xew.metrics.evaluate` writes beside a score table."""
+
+
+@dataclass(frozen=True)
+class _Record:
+    """What is noted of a step."""
+
+    key: str
+    status: Literal["begun", "done", "failed"]
+    at: str
+    outcome: str | None = None
+    error: str | None = None
+    seconds: float | None = None
+    host: str | None = None
 
 
 class Ledger:
@@ -44,9 +58,10 @@ class Ledger:
     def record(self, step: Step) -> Mapping[str, Any]:
         """What is noted of a step; empty if it was never begun or its record is damaged."""
         try:
-            return read_json(self._path(step))
-        except (OSError, ValueError):
+            found = asdict(parse(_Record, read_json(self._path(step)), ""))
+        except (OSError, ValueError, ConfigError):
             return {}
+        return {name: value for name, value in found.items() if value is not None}
 
     def key(self, step: Step) -> str:
         """Key of a step whose needs are done as far as they will be."""

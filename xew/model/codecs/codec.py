@@ -42,6 +42,8 @@ FrameBatch = Float[Array, "b t h w 3"]
 LatentBatch = Float[Array, "b k y x c"]
 PACKAGED_WEIGHTS = Path(__file__).with_name("conv_autoencoder.safetensors")
 """Weights of conv_autoencoder that come with the package."""
+LARGEST_WIDTH = 4096
+"""Largest number of channels that a description of an autoencoder may give."""
 PACKAGED_SHAPE = (16, 48)
 """Spatial factor and channels of the packaged weights."""
 
@@ -311,6 +313,16 @@ class PatchCodec(BatchCodec):
         return cls(spatial_factor, _fit(first, channels, whitening, True), _fit(later, channels, whitening, False))
 
 
+@dataclass(frozen=True)
+class _KeptVae:
+    """What vae.json says."""
+
+    size: VaeSize
+    dtype: Literal["float32", "bfloat16"]
+    chunk: int
+    hash: str
+
+
 @functools.partial(
     jax.tree_util.register_dataclass, data_fields=("params",), meta_fields=("graph", "size", "dtype", "chunk", "hash")
 )
@@ -369,8 +381,12 @@ class WanVaeCodec(BatchCodec):
     def load(cls, folder: Path) -> "WanVaeCodec":
         """Read vae.safetensors and vae.json."""
         stored = read_json(folder / "vae.json")
-        size = parse(VaeSize, stored["size"], str(folder / "vae.json"))
-        return cls.from_weights(folder / "vae.safetensors", size, stored["dtype"], stored["chunk"])
+        kept = parse(_KeptVae, stored, str(folder / "vae.json"))
+        size = kept.size
+        numbers = [size.channels, size.encoder_dim, size.decoder_dim, size.patch, *(64 * m for m in size.multipliers)]
+        if not 0 < min(numbers) <= max(numbers) <= LARGEST_WIDTH or not 0 < size.blocks <= LARGEST_WIDTH // 64:
+            raise ConfigError(f"{folder / 'vae.json'}: {kept.size} is no size of an autoencoder; copy the whole run again.")
+        return cls.from_weights(folder / "vae.safetensors", kept.size, kept.dtype, kept.chunk)
 
     @classmethod
     def check(cls, settings: CodecSettings) -> None:

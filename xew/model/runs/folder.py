@@ -109,6 +109,8 @@ def claim_run(out: Path, settings: T, read: Callable[[Path], T], *, resume: bool
         ConfigError: it holds a run and neither was asked, or it would be continued with another config.
     """
     saved = out / "config.yaml"
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"{out} is a file; choose another --out.")
     if saved.exists() and overwrite:
         _remove_run(out)
     elif saved.exists() and resume:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from typing import Any, Protocol
 
-from xew.config import ConfigError, pick
+from xew.config import ConfigError, check_finite, pick
 from xew.model.codecs.codec import CodecSettings, codec_class
 from xew.model.conditions import Condition
 from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES
@@ -24,6 +24,11 @@ LEAST = {
     "train.learning_rate": 0,
     "train.warmup_steps": 0,
     "train.clip_norm": 0,
+    "train.weight_decay": 0,
+    "train.decay_to": 0,
+    "train.steps": 0,
+    "train.epochs": 0,
+    "train.seed": 0,
     "train.ema_decay": 0,
     "train.history_noise": 0,
     "train.log_every": 1,
@@ -34,6 +39,8 @@ LEAST = {
     "rollout.steps": 1,
     "rollout.batch": 1,
     "rollout.max_frames": 0,
+    "rollout.guidance": 0,
+    "rollout.seed": 0,
 }
 """Numbers of an experiment that mean nothing below."""
 
@@ -61,6 +68,7 @@ class Settings(Protocol):
 
 def check_experiment(experiment: Settings, source: str) -> None:
     """Raise ConfigError, naming the source, with a choice of an experiment that does not exist or does not fit."""
+    check_finite(experiment, source)
     check_least(LEAST, experiment, source)
     codec_class(experiment.codec).check(experiment.codec)
     pick(SAMPLERS, experiment.rollout.sampler, "sampler")
