@@ -31,7 +31,7 @@ from xew.model.codecs.conv_autoencoder import (
     load_autoencoder,
     save_autoencoder,
 )
-from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae
+from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae, check_size
 from xew.model.codecs.vae_layers import as_row
 from xew.model.codecs.vae_layouts import load_vae, save_vae
 from xew.model.video.frames import TEMPORAL_FACTOR
@@ -42,8 +42,6 @@ FrameBatch = Float[Array, "b t h w 3"]
 LatentBatch = Float[Array, "b k y x c"]
 PACKAGED_WEIGHTS = Path(__file__).with_name("conv_autoencoder.safetensors")
 """Weights of conv_autoencoder that come with the package."""
-LARGEST_WIDTH = 4096
-"""Largest number of channels that a description of an autoencoder may give."""
 PACKAGED_SHAPE = (16, 48)
 """Spatial factor and channels of the packaged weights."""
 
@@ -382,10 +380,7 @@ class WanVaeCodec(BatchCodec):
         """Read vae.safetensors and vae.json."""
         stored = read_json(folder / "vae.json")
         kept = parse(_KeptVae, stored, str(folder / "vae.json"))
-        size = kept.size
-        numbers = [size.channels, size.encoder_dim, size.decoder_dim, size.patch, *(64 * m for m in size.multipliers)]
-        if not 0 < min(numbers) <= max(numbers) <= LARGEST_WIDTH or not 0 < size.blocks <= LARGEST_WIDTH // 64:
-            raise ConfigError(f"{folder / 'vae.json'}: {kept.size} is no size of an autoencoder; copy the whole run again.")
+        check_size(kept.size, str(folder / "vae.json"))
         return cls.from_weights(folder / "vae.safetensors", kept.size, kept.dtype, kept.chunk)
 
     @classmethod
