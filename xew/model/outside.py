@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from xew.config import ConfigError, admit, user_errors
 from xew.dataset import Episode
-from xew.episode import Record, read_video
+from xew.episode import Record, read_video, remove_left_overs
 from xew.files import hold_lock
 from xew.model.conditions import Command
 from xew.model.episodes.choice import select_episodes
@@ -198,6 +198,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
         RolloutWriter(out, progress.update, resize=None) as writer,
     ):
+        remove_left_overs(out)
         for episode, header in pending:
             writer.write(episode[1], predict(model, args.model, read_inputs(episode, args.max_frames)), header)
     print(f"{out}: {len(pending)} rollouts new, {len(items) - len(pending)} there before, {args.model}")

@@ -26,7 +26,7 @@ from xew.command_line import find_path, parse_command
 from xew.compilation import keep_compiled_programs
 from xew.config import CONVERTER, ConfigError, admit, parse, user_errors
 from xew.dataset import Episode, read_dataset
-from xew.episode import Record, episode_folder
+from xew.episode import Record, episode_folder, remove_left_overs
 from xew.files import checkpoint_time, hold_lock, read_json
 from xew.model.cache.codecs import load_codec
 from xew.model.cache.scales import Scale, load_run_scales
@@ -285,6 +285,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
         RolloutWriter(out, progress.update) as writer,
     ):
+        remove_left_overs(out)
         predict_and_write(predictor, pending, writer)
     source = "published weights" if step is None else f"checkpoint {step}"
     print(f"{out}: {len(pending)} rollouts new, {len(headers) - len(pending)} there before, {source}")

@@ -3,6 +3,8 @@
 <out>/config.yaml       the resolved config, itself a valid input
 <out>/codec/            the codec that the latents were made with
 <out>/scales.json       normalization of conditions that are numbers, where there are any
+<out>/sums/STEP.json     checksums of a checkpoint's files
+<out>/.xew-run          the mark of a run: only what trainings wrote beside it is ever replaced
 <out>/checkpoints/STEP  params, optimizer, position of the data; ema where it is kept
 <out>/start.json        of an adapted run: where it started from
 <out>/metrics.jsonl     and TensorBoard's event files

@@ -68,6 +68,15 @@ class Settings(Protocol):
 
 def check_experiment(experiment: Settings, source: str) -> None:
     """Raise ConfigError, naming the source, with a choice of an experiment that does not exist or does not fit."""
+    try:
+        _check_choices(experiment, source)
+    except ConfigError as error:
+        if source in str(error):
+            raise
+        raise type(error)(f"{source}: {error}") from error
+
+
+def _check_choices(experiment: Settings, source: str) -> None:
     check_finite(experiment, source)
     check_least(LEAST, experiment, source)
     codec_class(experiment.codec).check(experiment.codec)
