@@ -43,7 +43,7 @@ test-fast: $(STAMP)
 	$(PYTEST) -m "not slow" $(TESTS)
 
 test-faults: $(STAMP)
-	XEW_ALL_FAULTS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/faults -rP --no-header -q | grep -v "^_\|^-" 
+	XEW_ALL_FAULTS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/faults
 
 lint: $(STAMP)
 	$(BIN)/ruff check

@@ -19,7 +19,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import IO, Any
 
 NAME = re.compile(r"\w[\w.+-]*(?::[^\W\d]\w*)?")
 """Form of the name of a task or robot in a file: a key, or `module:NAME`. It is no path, neither hidden nor an option."""
@@ -254,38 +254,49 @@ def is_run(folder: Path) -> bool:
 def hold_lock(path: Path) -> Iterator[None]:
     """Hold the lock of a folder or file that a command writes, until the block or the process ends.
 
-    The lock is a file beside it, `.NAME.lock`, which says who holds it and goes with the lock. Where the file system has no
-    locks there is none.
+    The lock is a file beside it, `.NAME.lock`, which says who holds it and goes with the lock. Where none can be made, because
+    the file system has no locks or nothing may be written beside, there is none.
 
     Raises:
         EpisodeError: another process holds it; the message says which.
-        OSError: nothing can be written there.
     """
     path = path.absolute()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.lock")
+    file = _lock(path, path.with_name(f".{path.name}.lock"))
+    try:
+        yield
+    finally:
+        if file is not None:
+            Path(file.name).unlink(missing_ok=True)
+            file.close()
+
+
+def _lock(path: Path, beside: Path) -> IO[str] | None:
+    """The locked file, open; None where there can be none. Raises EpisodeError as `hold_lock`."""
     while True:
-        with beside.open("a+", encoding="utf-8") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                file.seek(0)
-                holder = " ".join(file.read().split()) or "another process"
-                raise EpisodeError(
-                    f"{path} is being written by {holder}; wait for it, stop it, or choose another --out."
-                ) from error
-            except OSError:  # no locks here
-                pass
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = beside.open("a+", encoding="utf-8")
+        except OSError:
+            return None
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if not beside.exists() or os.fstat(file.fileno()).st_ino != beside.stat().st_ino:
+                file.close()
                 continue  # it was removed by who held it, after it was opened here
             file.truncate(0)
             file.write(f"process {os.getpid()} on {socket.gethostname()} ({Path(sys.argv[0]).stem})\n")
             file.flush()
-            try:
-                yield
-            finally:
-                beside.unlink(missing_ok=True)
-            return
+        except BlockingIOError as error:
+            file.seek(0)
+            holder = " ".join(file.read().split()) or "another process"
+            file.close()
+            raise EpisodeError(
+                f"{path} is being written by {holder}; wait for it, stop it, or choose another --out."
+            ) from error
+        except OSError:
+            file.close()
+            return None
+        return file
 
 
 def file_digest(path: Path) -> str:

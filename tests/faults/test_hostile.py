@@ -90,7 +90,8 @@ def test_names_that_lead_elsewhere_are_refused_and_those_of_users_are_not() -> N
 
 
 @pytest.mark.parametrize("key", ["task", "robot"])
-def test_a_header_with_such_a_name_is_refused_by_its_reader(key: str, own: Path) -> None:
+def test_a_header_with_such_a_name_is_refused_by_its_reader(key: str, own: Path, record_property: Any) -> None:
+    record_property("tried names in headers", len(NAMES["refused"]) + len(NAMES["accepted"]))
     for name in NAMES["refused"]:
         change(own, **{key: name})
         with pytest.raises(EpisodeError, match=r"episode.json is damaged") as error:
@@ -100,7 +101,8 @@ def test_a_header_with_such_a_name_is_refused_by_its_reader(key: str, own: Path)
         assert getattr(read_record(change(own, **{key: name})), key) == name
 
 
-def test_such_names_and_seeds_make_no_path() -> None:
+def test_such_names_and_seeds_make_no_path(record_property: Any) -> None:
+    record_property("tried names of folders", 2 * len(NAMES["refused"]) + 2)
     for name in (name for name in NAMES["refused"] if isinstance(name, str)):
         for names in ((name, 0, "piper"), ("place_empty_cup", 0, name)):
             with pytest.raises(EpisodeError):

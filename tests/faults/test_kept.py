@@ -76,7 +76,7 @@ def test_whatever_is_changed_is_told_in_one_line(kind: str, tmp_path: Path, reco
                     wrong.append(f"{text[:80]}: says {str(error)[:100]!r}")
             except Exception as error:  # what is looked for
                 wrong.append(f"{text[:300]}: {type(error).__name__}: {str(error)[:200]}")
-    record_property("inputs", tried)
+    record_property(f"tried JSON of kind {kind}", tried)
     print(f"{kind}: {tried} inputs, {refused} refused, {len(wrong)} not understood")
     assert not wrong, "\n".join(wrong[:10]) + f"\n{len(wrong)} of {tried}"
 

@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -127,7 +128,8 @@ def test_a_report_with_such_names_is_written_whole(report: Path) -> None:
 
 
 @needs_chromium
-def test_a_browser_runs_nothing_of_them_and_shows_each(report: Path) -> None:
+def test_a_browser_runs_nothing_of_them_and_shows_each(report: Path, record_property: Any) -> None:
+    record_property("tried names in a browser", len(LABELS))
     complaints: list[str] = []
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])

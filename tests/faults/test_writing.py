@@ -19,7 +19,7 @@ METHODS = {"write_text", "write_bytes", "touch", "to_parquet", "to_csv", "to_jso
 FUNCTIONS = {"np.savez", "np.savez_compressed", "np.save", "save_file", "cv2.imwrite", "shutil.copyfile", "shutil.copy"}
 """Functions that write to a path among their arguments."""
 MAY_WRITE_IN_PLACE = {
-    "xew/files.py": ("write_text", "write_bytes"),
+    "xew/files.py": ("write_text", "write_bytes", "_lock"),
     "xew/episode.py": ("write_video",),  # into a folder that takes its name when it is complete
     "xew/exchange/lerobot.py": ("add", "_open", "_write_meta"),  # the same
     "xew/model/codecs/codec.py": (),
