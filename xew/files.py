@@ -27,6 +27,11 @@ MOST_LETTERS = 200
 """Largest length of a name [bytes]; file systems take 255 with an ending."""
 SHOWN_LETTERS = 80
 """Largest number of letters of a wrong name that a message shows."""
+ACTIVE_TAG = re.compile(
+    r"<(?=[A-Za-z/!?])(?!(?!base|embed|form|iframe|link|math|meta|object|plaintext|script|style|svg|template|textarea|title|xmp)"
+    r"[a-z]+>)"
+)
+"""Beginnings of HTML tags in Markdown, but for those without attributes that only format, as <frame> in a name."""
 SETTLED_S = 2.0
 """Age from which the file of a process that does not exist here is taken for left [s]; on another machine it may exist."""
 KINDS = {stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
@@ -94,9 +99,8 @@ def _shorten(name: object) -> str:
 
 
 def plain_markdown(text: str) -> str:
-    """Text as part of Markdown, in which it opens no HTML tag, link, picture or cell of a table."""
-    text = re.sub(r"<(?=[A-Za-z/!?])", r"\\<", text.replace("|", r"\|"))
-    return text.replace("](", r"]\(")
+    """Text as part of Markdown, in which it opens no link, picture, cell of a table, or HTML tag that does anything."""
+    return ACTIVE_TAG.sub(r"\\<", text.replace("|", r"\|")).replace("](", r"]\(")
 
 
 def csv_text(frame: Any) -> str:

@@ -89,7 +89,7 @@ class Ledger:
         if step.kind in ("train", "adapt"):
             goes_on = goes_on and _digest_run(step.product) is not None
         if not goes_on and step.kind in ("train", "adapt", "rollout"):
-            _remove_product(step)
+            _remove_product(step, begun=bool(self.record(step)))
         self._write(step, {"key": key, "status": "begun"})
         return goes_on
 
@@ -127,14 +127,18 @@ class Ledger:
             raise ConfigError(f"cannot write {path}: {error}. Free some space, or choose another --out.") from error
 
 
-def _remove_product(step: Step) -> None:
+def _remove_product(step: Step, begun: bool) -> None:
     """Remove the run or the rollouts of a step, and nothing that lies beside them.
+
+    Args:
+        step: whose product it is.
+        begun: whether this study has begun the step before, so that what lies there is its own, however damaged.
 
     Raises:
         ConfigError: the folder of a run holds none, or something cannot be removed.
     """
     run = step.kind in ("train", "adapt")
-    if run and step.product.is_dir() and any(step.product.iterdir()) and not is_run(step.product):
+    if run and not begun and step.product.is_dir() and any(step.product.iterdir()) and not is_run(step.product):
         raise ConfigError(f"{step.product} is the place of a run and holds something else; move it away.")
     try:
         remove_written(step.product, RUN_FILES if run else ROLLOUT_FILES)
