@@ -29,7 +29,7 @@ from xew.exchange import robotwin
 from xew.exchange.hdf5 import read_robotwin
 from xew.files import check_name, path_below
 from xew.metrics.calibration.perturbations import render_perturbation
-from xew.model import outside
+from xew.model import outside, rollout
 from xew.model.experiment import load_experiment
 from xew.model.runs.folder import claim_run, load_run_config
 from xew.rollout import RolloutError, find_rollouts, read_rollout, write_rollout
@@ -240,6 +240,9 @@ def test_no_module_that_a_run_names_is_imported(evil: Path, tmp_path: Path) -> N
         (run / "config.yaml").write_text(yaml.safe_dump(changed))
         with pytest.raises(UntrustedError, match=r"config.yaml names 'evil_data.evil:SPLIT'"):
             load_run_config(run)
+        assert not evil.exists()
+        with pytest.raises(SystemExit, match="2"):
+            rollout.main([str(run)])
         assert not evil.exists()
         with pytest.raises(ConfigError):  # a config that the user names is trusted, and says that this is no split
             load_experiment(run / "config.yaml")

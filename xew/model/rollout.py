@@ -7,6 +7,7 @@ Episodes are predicted in batches over all devices; while these work on one, the
 Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … --out … --rollout.steps …]
 """
 
+import itertools
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -37,7 +38,7 @@ from xew.model.experiment import Experiment, parse_experiment
 from xew.model.network.dit import cast_params
 from xew.model.network.dit_layouts import load_dit_params
 from xew.model.runs.checkpoint import restore_params
-from xew.model.runs.folder import load_run_codec, load_run_config, read_run_config
+from xew.model.runs.folder import load_run_codec, load_run_config
 from xew.model.sampling.predict import Prediction, Predictor
 from xew.model.settings.checks import check_experiment
 from xew.model.settings.settings import RolloutSettings
@@ -291,6 +292,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"{out}: {len(pending)} rollouts new, {len(headers) - len(pending)} there before, {source}")
 
 
+def _find_trusted(words: Sequence[str]) -> list[str]:
+    """Modules behind --trust among a command's arguments; what is no name of a module is told when the options are parsed."""
+    first = words.index("--trust") + 1 if "--trust" in words else len(words)
+    given = itertools.takewhile(lambda word: not word.startswith("-"), words[first:])
+    return [word for word in given if word.replace(".", "_").isidentifier() and ".." not in word]
+
+
 def parse_rollout(arguments: Sequence[str] | None) -> tuple[Path, Flags, Experiment]:
     """Parse the command line: the run or config, the command's flags, and the experiment with its overrides.
 
@@ -304,10 +312,11 @@ def parse_rollout(arguments: Sequence[str] | None) -> tuple[Path, Flags, Experim
     wrong = [word for word in words if word.startswith("--") and "." in word and not word.startswith("--rollout.")]
     if path is not None and wrong:
         raise ConfigError(f"{' '.join(wrong)}: of a trained run only --rollout.… can be chosen anew (see --help for the rest).")
+    admit(_find_trusted(words))  # the run's config is read before the options are parsed
     command = parse_command(
         Flags,
         Sampling,
-        lambda run: Sampling(read_run_config(run).rollout),
+        lambda run: Sampling(load_run_config(run).rollout),
         words,
         prog=prog,
         description=description,

@@ -237,12 +237,6 @@ def load_run_config(out: Path) -> Experiment:
     return load_recorded(out / "config.yaml")
 
 
-def read_run_config(out: Path) -> Experiment:
-    """The config of a run as it is written; nothing that it names is looked up. Raises ConfigError if the folder holds none."""
-    _demand_run(out)
-    return config.load(Experiment, out / "config.yaml")
-
-
 def _demand_run(out: Path) -> None:
     if not (out / "config.yaml").exists():
         raise ConfigError(f"{out} holds no run; train one: python -m xew.model.train CONFIG --out {out}")
