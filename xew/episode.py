@@ -297,8 +297,8 @@ def _check_camera(states: States) -> States:
     intrinsics, extrinsics = states.intrinsics, states.extrinsics
     if intrinsics.shape != (3, 3) or extrinsics.shape != (4, 4):
         raise ValueError(f"its camera has intrinsics {intrinsics.shape} and extrinsics {extrinsics.shape}")
-    if not (np.isfinite(intrinsics).all() and np.isfinite(extrinsics).all() and min(intrinsics[0, 0], intrinsics[1, 1]) > 0):
-        raise ValueError("its camera has a focal length of 0 or less, or numbers that are not finite")
+    if not (np.isfinite(intrinsics).all() and np.isfinite(extrinsics).all() and intrinsics[0, 0] * intrinsics[1, 1] != 0):
+        raise ValueError("its camera has a focal length of 0, or numbers that are not finite")
     return states
 
 

@@ -181,7 +181,7 @@ def test_numbers_are_checked_wherever_they_stand() -> None:
     check_finite({"a": [1.5, True, "x", None, 2**62]}, "a file")
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
 def test_a_camera_without_a_focal_length_is_refused(value: float, tmp_path: Path) -> None:
     (folder,) = synthetic.write_synthetic_data(tmp_path, seeds=(0,), robots=("piper",), frames=2)
     states, record = read_states(folder), read_record(folder)
