@@ -3,6 +3,7 @@
 #   make test    every room's tests, with PyTorch, diffusers and transformers beside to compare with
 #   make test-fast   in two minutes, for the edit loop: no trainings, simulations or whole commands, no parity with others'
 #                    networks (SLOW in tests/conftest.py lists what is left out); make test-fast TESTS=tests/metrics for one room
+#   make test-faults   hostile and broken inputs, kills, full disks: all of tests/faults, with the counts of what was tried
 #   make lint    ruff and mypy
 #   make setup   only the environment (.venv, at the versions of requirements/test.txt)
 
@@ -13,7 +14,7 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 REFERENCE := .venv/.reference
 
-.PHONY: setup demo test test-fast lint clean
+.PHONY: setup demo test test-fast test-faults lint clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
@@ -40,6 +41,9 @@ test: $(REFERENCE)
 
 test-fast: $(STAMP)
 	$(PYTEST) -m "not slow" $(TESTS)
+
+test-faults: $(STAMP)
+	XEW_ALL_FAULTS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/faults
 
 lint: $(STAMP)
 	$(BIN)/ruff check

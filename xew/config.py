@@ -2,13 +2,21 @@
 
 Whatever a user gets wrong (a missing file, an unknown key, a wrong type, an unknown name) raises ConfigError with what
 was found, what was expected and what to do; `user_errors` turns it into that message and exit code 2.
+
+`module:NAME` imports a module, which runs its code. It is for what a user types, and for the config that the user names
+(`pick`). What data, runs, rollouts and score tables say of themselves is imported only from modules that the user admits
+(`pick_recorded`).
 """
 
 import dataclasses
 import difflib
+import errno
 import functools
 import importlib
 import json
+import math
+import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -18,13 +26,29 @@ import cattrs
 import tyro
 import yaml
 
-from xew.episode import EpisodeError
+from xew.files import EpisodeError, demand_regular, write_text
 
 T = TypeVar("T")
 
 
+LARGEST = 2**63 - 1
+"""Largest whole number of a config."""
+IMPORT_PATH = re.compile(r"([^\W\d]\w*(?:\.[^\W\d]\w*)*):[^\W\d]\w*")
+"""Form of the name of an object of a module, `module:NAME`."""
+TRUST = "XEW_TRUST"
+"""Name of the environment variable that lists admitted modules, separated by commas; processes inherit it."""
+
+
+DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
+"""Numbers of errors of the system that are no mistake of this program, also where they name no file."""
+
+
 class ConfigError(Exception):
     """A user's setting cannot be used; the message says what to do."""
+
+
+class UntrustedError(ConfigError):
+    """A file names a module that the user has not admitted; nothing of it was imported."""
 
 
 def load(cls: type[T], path: Path | str, overrides: Sequence[str] = ()) -> T:
@@ -44,12 +68,14 @@ def read_yaml(path: Path | str) -> Any:
     """The content of a YAML file. Raises ConfigError if it is missing or not YAML."""
     path = Path(path)
     try:
-        return yaml.safe_load(path.read_text())
+        return yaml.safe_load(demand_regular(path).read_text())
     except OSError as error:
         beside = sorted(str(p) for p in path.parent.glob("*.yaml"))
         known = f" There is: {', '.join(beside)}." if beside else ""
         raise ConfigError(f"cannot read the config {path}: {error.strerror or error}.{known}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except RecursionError as error:
+        raise ConfigError(f"{path} is nested too deeply for a config.") from error
+    except (yaml.YAMLError, ValueError) as error:
         raise ConfigError(f"{path} is not YAML: {error}") from error
 
 
@@ -65,8 +91,8 @@ def parse(cls: type[T], content: Any, source: str) -> T:
 
 
 def save(config: Any, path: Path) -> None:
-    """Write the resolved config as YAML that `load` reads back to an equal object."""
-    path.write_text(yaml.safe_dump(CONVERTER.unstructure(config), sort_keys=False, allow_unicode=True))
+    """Write the resolved config as YAML that `load` reads back to an equal object. Raises OSError where it cannot."""
+    write_text(path, yaml.safe_dump(CONVERTER.unstructure(config), sort_keys=False, allow_unicode=True))
 
 
 def digest(config: Any) -> str:
@@ -95,13 +121,108 @@ def pick(registry: Mapping[str, T], name: str, kind: str, also: tuple[type, ...]
         if not isinstance(found, (*expected, *also)):
             names = " or ".join(kind.__name__ for kind in expected)
             raise ConfigError(f"the {kind} {name!r} is a {type(found).__name__}; expected a {names}.")
+        admit([module])  # its code has run by the user's own word; files may name it from now on
         return cast(T, found)
     raise ConfigError(f"unknown {kind} {name!r};{suggestion(name, registry)} known: {', '.join(registry)}, or module:NAME.")
 
 
+def pick_recorded(registry: Mapping[str, T], name: str, kind: str) -> T:
+    """`pick` for a name that a file gives: `module:NAME` only of a module that the user has admitted.
+
+    Raises:
+        UntrustedError: the module is not admitted; it is not imported.
+        ConfigError: as `pick`.
+    """
+    if name not in registry:
+        demand_admitted(name, f"the {kind}")
+    return pick(registry, name, kind)
+
+
+def admit(names: Iterable[str]) -> None:
+    """Admit modules, in this process and in those that it starts.
+
+    Args:
+        names: modules, as `my_lab.tasks`, with all that lies below them; or `module:NAME`, of which the module counts.
+
+    Raises:
+        ConfigError: one is no name of a module.
+    """
+    modules = [name.partition(":")[0] for name in names]
+    for module in modules:
+        if not all(part.isidentifier() for part in module.split(".")):
+            raise ConfigError(f"--trust {module!r} is no name of a module; expected one as my_lab.tasks.")
+    if modules:
+        os.environ[TRUST] = ",".join(sorted({*_admitted(), *modules}))
+
+
+def admit_named(content: Any) -> None:
+    """Admit every module that a config names as `module:NAME`: the user named the config.
+
+    Args:
+        content: a config, as a dataclass or as plain content.
+    """
+    admit(find_import_paths(content))
+
+
+def demand_admitted(content: Any, source: str) -> None:
+    """Check what a file says of itself before anything that it names is looked up.
+
+    Args:
+        content: a name, a config as a dataclass, or plain content.
+        source: what says so, for the message.
+
+    Raises:
+        UntrustedError: it names a module that the user has not admitted.
+    """
+    for name in find_import_paths(content):
+        module = name.partition(":")[0]
+        if not any(module == admitted or module.startswith(f"{admitted}.") for admitted in _admitted()):
+            raise UntrustedError(
+                f"{source} names {name!r}, which would run the code of a module that you did not name yourself. If you trust "
+                f"{module}, admit it: --trust {module}"
+            )
+
+
+def check_finite(settings: Any, source: str, name: str = "") -> None:
+    """Check the numbers of a config, as given or nested: they are finite, and whole ones fit into 64 bits.
+
+    Raises:
+        ConfigError: one does not; `source` names the config and `name` where in it the settings stand.
+    """
+    if dataclasses.is_dataclass(settings) and not isinstance(settings, type):
+        settings = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
+    if isinstance(settings, Mapping):
+        for key, value in settings.items():
+            check_finite(value, source, f"{name}.{key}".lstrip("."))
+    elif isinstance(settings, (list, tuple)):
+        for value in settings:
+            check_finite(value, source, name)
+    elif isinstance(settings, float) and not math.isfinite(settings):
+        raise ConfigError(f"{source}: {name} is {settings}; expected a finite number.")
+    elif isinstance(settings, int) and not -LARGEST <= settings <= LARGEST:
+        raise ConfigError(f"{source}: {name} is {settings}; expected a number of at most 64 bits.")
+
+
+def find_import_paths(content: Any) -> list[str]:
+    """All texts of the form `module:NAME` in a config or in plain content, sorted."""
+    if dataclasses.is_dataclass(content) and not isinstance(content, type):
+        content = {field.name: getattr(content, field.name) for field in dataclasses.fields(content)}
+    if isinstance(content, str):
+        return [content] if IMPORT_PATH.fullmatch(content) else []
+    if isinstance(content, Mapping):
+        content = content.values()
+    elif not isinstance(content, (list, tuple)):
+        return []
+    return sorted({name for value in content for name in find_import_paths(value)})
+
+
+def _admitted() -> list[str]:
+    return [name for name in os.environ.get(TRUST, "").split(",") if name]
+
+
 def suggestion(name: str, known: Iterable[str]) -> str:
     """' did you mean …?' or nothing."""
-    close = difflib.get_close_matches(name, list(known), n=1)
+    close = difflib.get_close_matches(str(name), list(known), n=1)
     return f" did you mean {close[0]!r}?" if close else ""
 
 
@@ -117,6 +238,12 @@ def user_errors(main: Callable[..., T]) -> Callable[..., T]:
             return main(*args, **kwargs)
         except (ConfigError, EpisodeError) as error:
             print(f"error: {error}", file=sys.stderr)
+            raise SystemExit(2) from None
+        except OSError as error:
+            if error.filename is None and error.errno not in DISK_FAULTS:
+                raise
+            where = f"{error.filename}: " if error.filename is not None else ""
+            print(f"error: {where}{error.strerror}; mend that, or name another place.", file=sys.stderr)
             raise SystemExit(2) from None
         except KeyboardInterrupt:
             print("stopped; the same command goes on from what is done", file=sys.stderr)

@@ -13,18 +13,24 @@ Quaternions are x y z w; the world frame has its origin under the table's center
 
 import hashlib
 import json
+import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
+import cv2
 import numpy as np
 
+from xew.config import ConfigError, parse
+from xew.files import EpisodeError as EpisodeError
+from xew.files import check_label, check_name, demand_regular, path_below, read_json
 from xew.threads import PARSING
 
 SCHEMA_VERSION = 2
@@ -32,12 +38,14 @@ WIDTH, HEIGHT = 320, 240
 FAILURES = ("plan", "grasp", "slip", "timeout", "physics", "overflow")
 """plan: no joint path. grasp: never held. slip: held and lost. timeout: the plan ended short of success.
 physics: an object sank into something, fell off the table or crept in a hand. overflow: a physics buffer was too small."""
+HELD = ("episode.json", "states.npz", "rgb.mkv", "robot.mkv")
+"""Names of the files of an episode. A folder that holds anything else is never replaced by one."""
+SEED_END = 2**63
+"""End of the range of seeds; tables store them in 64 bits."""
+FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2"
+"""Containers that are read, by FFmpeg's names. Others, such as playlists, name further files, which FFmpeg would open."""
 TEMPORARY = ".writing-"
 """Beginning of the name of a folder that is not complete yet."""
-
-
-class EpisodeError(Exception):
-    """An episode, or a folder that should hold one, is not as it should be; the message says what to do."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +118,23 @@ class Record:
 
 
 def episode_folder(data: Path, task: str, seed: int, robot: str) -> Path:
-    return Path(data) / task / f"{seed:07d}" / robot
+    """The folder of an episode, or of what belongs to it in a tree of the same form.
+
+    Raises:
+        EpisodeError: a name or the seed could not be that of a folder (`xew.files.check_name`).
+    """
+    return Path(data).joinpath(*_folder_names(task, seed, robot))
+
+
+def place_episode(root: Path, task: str, seed: int, robot: str) -> Path:
+    """`episode_folder` for who writes there: links out of the tree are not followed but raise EpisodeError, too."""
+    return path_below(root, *_folder_names(task, seed, robot))
+
+
+def _folder_names(task: str, seed: int, robot: str) -> tuple[str, str, str]:
+    if not 0 <= seed < SEED_END:
+        raise EpisodeError(f"the seed is {seed}, expected a whole number from 0 to 2^63 - 1.")
+    return check_name(task, "task"), f"{seed:07d}", check_name(robot, "robot")
 
 
 def data_folder(episode: Path) -> Path:
@@ -150,9 +174,9 @@ def write_episode(
     Raises:
         EpisodeError: the folder cannot be written or the disk is full; nothing half-written remains.
     """
-    folder = episode_folder(data, record.task, record.seed, record.robot)
+    folder = place_episode(data, record.task, record.seed, record.robot)
     try:
-        with complete_folder(folder) as temporary:
+        with complete_folder(folder, HELD) as temporary:
             hashes = {}
             if states is not None:
                 hashes["states"] = states_hash(states)
@@ -170,8 +194,17 @@ def write_episode(
 
 
 @contextmanager
-def complete_folder(folder: Path) -> Iterator[Path]:
-    """Give a temporary folder to fill, which takes the name `folder` when the block ends well and else is removed."""
+def complete_folder(folder: Path, held: Collection[str] = ()) -> Iterator[Path]:
+    """Give a temporary folder to fill, which takes the name `folder` when the block ends well and else is removed.
+
+    Args:
+        folder: to make.
+        held: names of what is written there. A folder of that name that holds nothing else is replaced.
+
+    Raises:
+        EpisodeError: the folder holds something else, which is left as it is.
+    """
+    _demand_replaceable(folder, held)
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=folder.parent))
     replaced = temporary.with_name(f"{temporary.name}-replaced")
@@ -185,6 +218,18 @@ def complete_folder(folder: Path) -> Iterator[Path]:
             shutil.rmtree(left, ignore_errors=True)
 
 
+def _demand_replaceable(folder: Path, held: Collection[str]) -> None:
+    """Raise EpisodeError where something is in a folder's place that was not written here."""
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise EpisodeError(f"{folder} is no folder but stands where one is to be written; move it away.")
+    others = sorted(entry.name for entry in folder.iterdir() if entry.name not in held) if folder.is_dir() else []
+    if others:
+        raise EpisodeError(
+            f"{folder} is to be replaced and holds {', '.join(others[:3])}, which xew did not write there; move that away, or "
+            "choose another --out."
+        )
+
+
 def _pack(states: States) -> dict[str, np.ndarray]:
     """Bring arrays to the form in which they are stored: the mask with eight pixels a byte."""
     arrays = {f.name: getattr(states, f.name) for f in fields(States)}
@@ -196,18 +241,32 @@ def read_record(folder: Path) -> Record:
     """The header of an episode folder. Raises EpisodeError if there is none or it cannot be understood."""
     path = Path(folder) / "episode.json"
     try:
-        header = json.loads(path.read_text())
-        version = header["schema_version"]
-        if version != SCHEMA_VERSION:
+        header = read_json(path)
+        version = header.get("schema_version") if isinstance(header, dict) else None
+        if isinstance(version, int) and version != SCHEMA_VERSION:
             raise EpisodeError(f"{path} has schema version {version}, this xew reads {SCHEMA_VERSION}; generate the data anew.")
-        for name in ("object_names", "keypoint_names"):
-            header[name] = tuple(header[name])
-        header["unknown"] = tuple(header.get("unknown", ()))
-        return Record(**header)
+        return _check_record(parse(Record, header, "its header"))
     except FileNotFoundError as error:
         raise EpisodeError(f"{path} does not exist; `python -m xew.sim_warp.generate` makes episodes.") from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise EpisodeError(f"{path} is damaged ({error}); delete its folder and run generate again.") from error
+    except (OSError, ValueError, ConfigError) as error:
+        raise EpisodeError(f"{path} is damaged ({_one_line(error)}); delete its folder and run generate again.") from error
+
+
+def _check_record(record: Record) -> Record:
+    """The same header. Raises ValueError for names that could lead elsewhere and for numbers that mean nothing."""
+    try:
+        _folder_names(record.task, record.seed, record.robot)
+        for name in (*record.object_names, *record.keypoint_names):
+            check_label(name, "name of an object or keypoint")
+    except EpisodeError as error:
+        raise ValueError(str(error).rstrip(".")) from error
+    if not (math.isfinite(record.frame_rate) and record.frame_rate > 0 and record.frame_count >= 0):
+        raise ValueError(f"it has {record.frame_count} frames at {record.frame_rate} a second")
+    return record
+
+
+def _one_line(error: Exception) -> str:
+    return "; ".join(str(error).splitlines())
 
 
 def demand_known(folder: Path, *names: str) -> None:
@@ -226,17 +285,27 @@ def read_states(folder: Path) -> States:
     try:
         arrays = read_npz(path)
         arrays["robot_mask"] = np.unpackbits(arrays["robot_mask"], axis=-1).astype(bool)
-        return States(**arrays)
+        return _check_camera(States(**arrays))
     except FileNotFoundError as error:
         raise EpisodeError(f"{path} does not exist: the cell was rejected or its folder is damaged.") from error
     except Exception as error:  # zipfile, zlib and NumPy each have their own
         raise EpisodeError(f"{path} is damaged ({error}); delete its folder and run generate again.") from error
 
 
+def _check_camera(states: States) -> States:
+    """The same states. Raises ValueError where their camera could see nothing."""
+    intrinsics, extrinsics = states.intrinsics, states.extrinsics
+    if intrinsics.shape != (3, 3) or extrinsics.shape != (4, 4):
+        raise ValueError(f"its camera has intrinsics {intrinsics.shape} and extrinsics {extrinsics.shape}")
+    if not (np.isfinite(intrinsics).all() and np.isfinite(extrinsics).all() and intrinsics[0, 0] * intrinsics[1, 1] != 0):
+        raise ValueError("its camera has a focal length of 0, or numbers that are not finite")
+    return states
+
+
 def read_npz(path: Path) -> dict[str, np.ndarray]:
     """All arrays of an .npz by name [any shapes]; threads may call it. Raises what zipfile, zlib and NumPy raise."""
     # Opened here, since np.load leaves a file that is no archive open.
-    with PARSING, path.open("rb") as file, np.load(file) as stored:
+    with PARSING, demand_regular(path).open("rb") as file, np.load(file) as stored:
         return {name: stored[name] for name in stored.files}
 
 
@@ -261,13 +330,28 @@ def write_video(path: Path, video: np.ndarray, frame_rate: float = 1000 / 60) ->
         container.mux(stream.encode())
 
 
+def encode_png(image: np.ndarray) -> bytes:
+    """The PNG file of an RGB image [h w 3] uint8."""
+    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+
+
+def open_video(path: Path) -> Any:
+    """Open a video as a PyAV container, which reads no other file than this one.
+
+    Raises:
+        OSError: it is no regular file. av.FFmpegError (an OSError, too): it is no Matroska or MP4.
+    """
+    options = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
+    return av.open(str(demand_regular(path).absolute()), container_options=options)
+
+
 def read_video(path: Path) -> np.ndarray:
     """Read a video as uint8 RGB [t h w 3]. Raises EpisodeError if it is missing or holds no readable frame."""
     try:
-        with av.open(str(path)) as container:
+        with open_video(path) as container:
             container.streams.video[0].codec_context.thread_count = 1
             frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    except (av.FFmpegError, IndexError):  # IndexError: a file without a video in it
+    except (av.FFmpegError, OSError, IndexError):  # IndexError: a file without a video in it
         frames = []
     if not frames:
         raise EpisodeError(

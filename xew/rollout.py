@@ -13,20 +13,23 @@ Trees come from anybody: nothing outside them is read, and no video is read in p
 import json
 import re
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import av
 import cv2
 import numpy as np
 
-from xew.episode import EpisodeError, complete_folder, episode_folder, read_npz, write_video
+from xew.episode import SEED_END, EpisodeError, complete_folder, open_video, place_episode, read_npz, write_video
+from xew.files import check_label, check_name, demand_regular, read_json
 
 VIDEO_SUFFIXES = (".mkv", ".mp4", ".npz")
 RATE_TOLERANCE = 0.01
 """Relative; containers round times to a tick, and people 16.667 to two digits. 16 frames a second are another rate."""
 GAP_TOLERANCE = 0.1
 """Relative, or a tick and a half of the container's clock: by how much one frame may come early in a constant rate."""
+HELD = ("rgb.mkv", "rollout.json")
+"""Names of the files of a rollout of ours. A folder that holds anything else is never replaced by one."""
 PNG_END = b"IEND\xaeB`\x82"
 
 
@@ -64,9 +67,9 @@ def write_rollout(root: Path, task: str, seed: int, robot: str, video: np.ndarra
     Raises:
         RolloutError: the folder cannot be written or the disk is full; nothing half-written remains.
     """
-    folder = episode_folder(root, task, seed, robot)
+    folder = place_episode(root, task, seed, robot)
     try:
-        with complete_folder(folder) as temporary:
+        with complete_folder(folder, HELD) as temporary:
             write_video(temporary / "rgb.mkv", video)
             (temporary / "rollout.json").write_text(json.dumps(header | {"frame_count": len(video)}, indent=1) + "\n")
     except OSError as error:
@@ -113,8 +116,13 @@ def read_rollout(folder: Path) -> Rollout:
     if frame_count is not None and (not isinstance(frame_count, int) or isinstance(frame_count, bool) or frame_count < 1):
         raise RolloutError(f"{path}: frame_count is {frame_count!r}, expected a positive whole number.")
     task, seed = folder.parts[-3:-1]
-    if not seed.isdecimal():
+    if not seed.isdecimal() or int(seed) >= SEED_END:
         raise RolloutError(f"{folder}: the folder above it is {seed!r}, expected a seed; the tree is <task>/<seed>/<robot>/.")
+    try:
+        check_name(task, "task")
+        check_name(folder.name, "robot")
+    except EpisodeError as error:
+        raise RolloutError(f"{folder}: {error}") from error
     return Rollout(
         folder=folder,
         task=task,
@@ -168,16 +176,15 @@ def _check_inside(root: Path, file: Path) -> None:
 
 def _name(path: Path, key: str, name: object) -> str:
     """A name that is fit to print and to name a file with."""
-    if not isinstance(name, str) or not name.isprintable():
-        raise RolloutError(f"{path}: {key} is {name!r}, expected printable text.")
-    if name.startswith(("/", "~")) or "\\" in name or ".." in PurePosixPath(name).parts:
-        raise RolloutError(f"{path}: {key} is {name!r}, which reads as a path to elsewhere; give it a plain name.")
-    return name
+    try:
+        return check_label(name, key)
+    except EpisodeError as error:
+        raise RolloutError(f"{path}: {error}") from error
 
 
 def _read_header(path: Path) -> dict[str, Any]:
     try:
-        header = json.loads(path.read_text())
+        header = read_json(path)
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:
@@ -211,7 +218,7 @@ def _read_container(path: Path, frame_rate: float | None) -> np.ndarray:
     frames: list[np.ndarray] = []
     times: list[float] = []
     try:
-        with av.open(str(path)) as container:
+        with open_video(path) as container:
             if len(container.streams.video) != 1:
                 raise RolloutError(f"{path} holds {len(container.streams.video)} videos, expected one.")
             stream = container.streams.video[0]
@@ -222,7 +229,7 @@ def _read_container(path: Path, frame_rate: float | None) -> np.ndarray:
                 frames.append(_rgb(path, frame))
                 times.append(float(frame.pts * frame.time_base) if frame.pts is not None else np.nan)
             tick, promised = float(stream.time_base), _promised_frames(container, stream, times)
-    except (av.FFmpegError, ValueError) as error:
+    except (av.FFmpegError, OSError, ValueError) as error:
         after = f"breaks off after {len(frames)} frames" if frames else "holds no readable frame"
         raise RolloutError(f"{path} {after} ({error}); make this rollout again.") from error
     if not frames:
@@ -301,7 +308,7 @@ def _read_pngs(paths: tuple[Path, ...]) -> np.ndarray:
 def _read_png(path: Path) -> np.ndarray:
     """RGB of 8 bits [h w 3]; what OpenCV would quietly convert or fill up is an error."""
     try:
-        content = path.read_bytes()
+        content = demand_regular(path).read_bytes()
     except OSError as error:
         raise RolloutError(f"{path} cannot be read ({error}); make this rollout again.") from error
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None

@@ -38,7 +38,7 @@ from xew.analysis.distances.workspaces import (
     workspace_cloud,
 )
 from xew.config import ConfigError, user_errors
-from xew.files import replacing
+from xew.files import csv_text, replacing
 from xew.protocol import ROBOT_NAMES
 from xew.sim_warp.robots import RobotSpec, Urdf, get_robot, load_urdf
 
@@ -178,7 +178,7 @@ def _import_image_distance(name: str) -> ImageDistance:
 def _write(frame: pd.DataFrame, path: Path) -> None:
     try:
         with replacing(path) as temporary:
-            frame.to_csv(temporary, index=False)
+            temporary.write_text(csv_text(frame))
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error}. Choose another --out.") from error
 

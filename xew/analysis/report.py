@@ -13,6 +13,7 @@ With --paper it reads nothing: the paper's own figures come with the package, an
 """
 
 import platform
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
@@ -39,6 +40,7 @@ from xew.analysis.tables.table import Table, TableCell, TableRow, TableSection, 
 from xew.config import ConfigError, user_errors
 from xew.dataset import find_records
 from xew.episode import Record, episode_folder, read_video
+from xew.files import csv_text, hold_lock, path_below, plain_markdown, write_bytes, write_text
 from xew.protocol import BASELINES, HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
 from xew.statistics import MIN_SCENES
@@ -53,6 +55,10 @@ FRAME_ZERO = {
 }
 CURVE_METRICS = ("lpips", "psnr", "mask_iou")
 """Metrics whose error is drawn by frame."""
+FILES = ("index.html", "report.md", "*.csv", "figures/*", "tables/*")
+"""Patterns of the paths of what is written into the folder of a report."""
+NO_FILE_NAME = re.compile(r"[<>\"/\\|?*()\[\]`']+")
+"""Letters of the names of models that stand in no name of a figure's file."""
 SHEET_TASKS = 8
 """Largest number of tasks on the contact sheet."""
 
@@ -155,7 +161,7 @@ def _report_scores(args: Args, scores: Scores) -> None:
     notes = [*report_study.missing_note(missing), *_caution_notes(held_out)]
     text, files = _write_markdown(sentences, notes, held_out, seen, scores, [*strips, *sheets], chart_files(curves))
     if len(missing):
-        files["missing.csv"] = missing.to_csv(index=False).encode()
+        files["missing.csv"] = csv_text(missing).encode()
     _write_report(args.out, html, (text, files), flat_summary(held_out + seen))
 
 
@@ -313,7 +319,7 @@ def _make_strip(
     caption = f", seed {row['seed']} · {' · '.join(filter(None, key[:2]))} · {word}, LPIPS {row['value']:.3f}"
     columns = [f"frame {t}" for t in times]
     html = page.labeled_picture(pictures.data_uri(image), caption, columns, ["observed", "predicted", "difference"], title)
-    return Picture("_".join((*map(str, key[:5]), word)).replace("/", "-") + ".png", image, html)
+    return Picture(NO_FILE_NAME.sub("-", "_".join((*map(str, key[:5]), word))) + ".png", image, html)
 
 
 def _curve_chart(scores: Scores, held_out: Sequence[str]) -> Chart:
@@ -367,7 +373,8 @@ def _write_markdown(
     charts: Mapping[str, bytes],
 ) -> tuple[str, dict[str, bytes]]:
     """The text of report.md, and the files beside it."""
-    lines = [f"# {TITLE}", "", *(f"- {sentence}" for sentence in sentences), *(f"\n> {note}" for note in notes)]
+    told = [f"- {plain_markdown(sentence)}" for sentence in sentences]
+    lines = [f"# {TITLE}", "", *told, *(f"\n> {plain_markdown(note)}" for note in notes)]
     for heading, tables in (("Robots never seen in training", held_out), ("Robots seen in training", seen)):
         lines += ["", f"## {heading}"]
         for table in tables:
@@ -377,7 +384,7 @@ def _write_markdown(
     lines += ["", "## Figures", "", *(f"![{name}](figures/{name})" for name in files if name.endswith(".png"))]
     made_tables = [run_table(table, scores.metrics) for table in (*held_out, *seen)]
     written = {f"tables/{table.name}.tex": formats.latex(table).encode() for table in made_tables}
-    written |= {f"tables/{table.name}.csv": formats.table_frame(table).to_csv(index=False).encode() for table in made_tables}
+    written |= {f"tables/{table.name}.csv": csv_text(formats.table_frame(table)).encode() for table in made_tables}
     return "\n".join(lines) + "\n", written | {f"figures/{name}": content for name, content in files.items()}
 
 
@@ -385,13 +392,12 @@ def _write_report(out: Path, html: str, markdown: tuple[str, Mapping[str, bytes]
     """Write all files, the page last, so that everything it speaks of exists once it does."""
     text, files = markdown
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        for name, content in files.items():
-            (out / name).parent.mkdir(exist_ok=True)
-            (out / name).write_bytes(content)
-        (out / "report.md").write_text(text)
-        summary.to_csv(out / "summary.csv", index=False)
-        (out / "index.html").write_text(html)
+        with hold_lock(out):
+            for name, content in files.items():
+                write_bytes(path_below(out, name), content)
+            write_text(out / "report.md", text)
+            write_text(out / "summary.csv", csv_text(summary))
+            write_text(out / "index.html", html)
     except OSError as error:
         raise ConfigError(f"cannot write the report to {out}: {error}. Choose another --out.") from error
 

@@ -7,17 +7,16 @@ variant has one training.
 """
 
 import operator
-import re
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
-from xew.config import ConfigError
-from xew.files import replacing
+from xew.config import IMPORT_PATH, ConfigError, parse
+from xew.files import EpisodeError, check_label, check_name, demand_regular, replacing
 from xew.protocol import BASELINES, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES
 
 VARIANT = "variant"
@@ -50,8 +49,6 @@ EARLIER_TITLES = {
     "object_coverage": "Objects found",
 }
 """Titles of metrics in score tables that were written before tables carried them."""
-IMPORT_PATH = re.compile(r"[^\W\d]\w*(?:\.[^\W\d]\w*)*:[^\W\d]\w*")
-"""Name of a robot from outside, `module:NAME`."""
 LISTED = 20
 """Largest number of rows of each kind that an error names; it counts the others."""
 
@@ -150,6 +147,8 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
         raise ConfigError(f"{path} has no {', '.join(missing)}; it is no score table of xew. Make one: {command}")
     if rows.empty:
         raise ConfigError(f"{path} holds no row. Grade some rollouts: {command}")
+    _check_attributes(path, rows.attrs)
+    _check_texts(path, rows)
     metrics = _read_metric_infos(path, rows.attrs["metrics"])
     added = {robot for robot in rows["robot"].unique() if IMPORT_PATH.fullmatch(str(robot))}
     wrong = _find_wrong_rows(rows, metrics, {*ROBOT_NAMES, *added, *rows.attrs.get("robots", ()), *own_robots})
@@ -243,11 +242,25 @@ def _read(path: Path, command: str) -> pd.DataFrame:
     if path.is_dir():
         raise ConfigError(f"{path} is a folder; name a score table, or make one: {EVALUATE.format(path='scores.parquet')}")
     try:
-        return pd.read_parquet(path)
+        return pd.read_parquet(demand_regular(path))
     except FileNotFoundError as error:
         raise ConfigError(f"{path} does not exist; make it: {command}") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:  # the latter of damaged attributes
         raise ConfigError(f"{path} cannot be read ({error}); delete it and make it anew: {command}") from error
+
+
+def _check_texts(path: Path, rows: pd.DataFrame) -> None:
+    """Raise ConfigError for names that could lead elsewhere: files of reports are named after them."""
+    try:
+        for column, check in (("task", check_name), ("robot", check_name), ("model", check_label), ("condition", check_label)):
+            for name in rows[column].unique():
+                check(name, column)
+        for name in rows[VARIANT].unique() if VARIANT in rows else ():
+            check_label(name, VARIANT)
+        if not pd.api.types.is_integer_dtype(rows["seed"]) or (rows["seed"] < 0).any():
+            raise EpisodeError("the seeds are no whole numbers from 0 on.")
+    except EpisodeError as error:
+        raise ConfigError(f"{path} is no score table of xew: {error}") from error
 
 
 def _read_metric_infos(path: Path, described: Mapping[str, Mapping[str, Any]]) -> tuple[MetricInfo, ...]:
@@ -255,11 +268,36 @@ def _read_metric_infos(path: Path, described: Mapping[str, Mapping[str, Any]]) -
     for metric, info in described.items():
         if missing := [name for name in DEFINITION if name not in info]:
             raise ConfigError(f"{path} does not say the {', '.join(missing)} of {metric}; it is no score table of this xew.")
-    known = {field.name for field in fields(MetricInfo)}
-    return tuple(
-        MetricInfo(name=metric, **{"estimated": _guess_estimated(metric, info)} | {k: v for k, v in info.items() if k in known})
-        for metric, info in described.items()
-    )
+    known = {field.name for field in fields(MetricInfo)} - {"name"}
+    infos = []
+    for metric, info in described.items():
+        said = {"estimated": _guess_estimated(metric, info)} | {key: value for key, value in info.items() if key in known}
+        found = parse(MetricInfo, {"name": metric, **said}, f"{path}: the metric {metric}")
+        low, high = (-np.inf if found.low is None else found.low), (np.inf if found.high is None else found.high)
+        if not low < high:
+            raise ConfigError(f"{path}: the metric {metric} ranges from {found.low} to {found.high}; make the table anew.")
+        infos.append(found)
+    return tuple(infos)
+
+
+@dataclass(frozen=True)
+class _Attributes:
+    """Types of the attributes that are read of a score table; further ones are somebody else's."""
+
+    protocol: int
+    metrics: dict[str, dict[str, Any]]
+    versions: dict[str, str] = field(default_factory=dict)
+    estimators: dict[str, Any] = field(default_factory=dict)
+    frame_zero: Literal["given", "absent", "predicted"] = "given"
+    allowed: tuple[str, ...] = ()
+    robots: tuple[str, ...] = ()
+    study: dict[str, Any] = field(default_factory=dict)
+
+
+def _check_attributes(path: Path, attributes: Mapping[Hashable, Any]) -> None:
+    """Raise ConfigError for attributes of other types than they have."""
+    known = {entry.name for entry in fields(_Attributes)}
+    parse(_Attributes, {name: value for name, value in attributes.items() if name in known}, f"{path}, its attributes")
 
 
 def _guess_estimated(metric: str, info: Mapping[str, Any]) -> bool:

@@ -29,7 +29,8 @@ from xew.analysis.studies.machines import open_machines, usable_gpus
 from xew.analysis.studies.plan import Step, plan, write_configs
 from xew.analysis.studies.runner import StudyRunner
 from xew.analysis.studies.status import exit_with_failures, format_cost, format_status
-from xew.config import ConfigError, load, save, user_errors
+from xew.config import ConfigError, admit_named, load, read_yaml, save, user_errors
+from xew.files import write_text
 
 CHECK_CONFIGS = """
 import sys
@@ -62,6 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Plan, estimate, run and report."""
     args = read_arguments(sys.argv[1:] if arguments is None else arguments)
     study = args.study
+    admit_named([study, read_yaml(study.experiment)])  # their steps then know these names in data and runs
     steps, ledger = plan(study), Ledger(study.out)
     if args.dry_run:
         check_configs([study.experiment])
@@ -77,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         seconds = correct_by_ledger(estimate(study, steps), steps, ledger)
         failed = StudyRunner(study, steps, ledger, machines, critical_paths(steps, seconds)).run()
         table = format_status(study, steps, ledger, failed)
-        (study.out / "status.txt").write_text(table + "\n")
+        write_text(study.out / "status.txt", table + "\n")
     print(table)
     if failed:
         exit_with_failures(failed, ledger, steps)

@@ -8,7 +8,6 @@ Writes <study>/scores.parquet with the column `variant`, its curves, and report/
 The merged table says in its attribute `study` what was planned, so that whoever reads it can tell what is missing.
 """
 
-import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,7 +17,8 @@ import tyro
 from xew.analysis import report
 from xew.analysis.scores import TRAINING, VARIANT, Scores, merge_scores, write_scores
 from xew.analysis.studies.config import Study, load_study
-from xew.config import ConfigError, user_errors
+from xew.config import ConfigError, admit, demand_admitted, load, user_errors
+from xew.files import remove_written
 from xew.protocol import TASK_COUNT, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expected_counts
 
 
@@ -32,12 +32,17 @@ class Args:
     """Trainings of variants that are graded; all that have scores where left out."""
     distances: Path | None = None
     """Folder of python -m xew.analysis.distance; without it the report has the paper's distances."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own tasks, such as my_lab.tasks, that the study may name."""
 
 
 @user_errors
 def main(args: Args) -> None:
     """Merge the tables, write the merged one and its report."""
-    study = load_study(args.study / "study.yaml")
+    admit(args.trust)
+    path = args.study / "study.yaml"
+    demand_admitted(load(Study, path), str(path))
+    study = load_study(path)
     study = replace(study, out=args.study)
     planned = {run.name: run for run in study.planned_runs}
     graded = args.variants or tuple(name for name in planned if (args.study / "scores" / f"{name}.parquet").exists())
@@ -53,7 +58,7 @@ def main(args: Args) -> None:
     shown = [name for name in graded if name not in planned or planned[name].of == name]
     rollouts = tuple(args.study / "rollouts" / name for name in shown)
     table, data, out = args.study / "scores.parquet", study.data_folder, args.study / "report"
-    shutil.rmtree(out, ignore_errors=True)  # a larger study's figures would stay
+    remove_written(out, report.FILES)  # a larger study's figures would stay
     report.main(report.Args(scores=table, data=data, rollouts=rollouts, distances=args.distances, out=out))
 
 

@@ -12,12 +12,14 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import h5py
 import numpy as np
 
 from xew.episode import HEIGHT, WIDTH, EpisodeError
+from xew.files import demand_regular, read_text
 
 TOOL_OFFSET = 0.12
 """Distance of RoboTwin's end pose behind the tool center point, along the approach [m], whatever the robot."""
@@ -56,13 +58,40 @@ def read_robotwin(path: Path) -> Recorded:
         EpisodeError: it is no HDF5 file, truncated, or lacks something, or something has another shape than it should.
     """
     try:
-        with h5py.File(path, "r") as file:
+        with h5py.File(demand_regular(path), "r") as file:
+            demand_whole(path, file)
             reader = _Reader(path, file)
             return _read_modern(reader) if "state" in file else _read_legacy(reader)
     except EpisodeError:
         raise
     except Exception as error:  # h5py has OSError, RuntimeError and others for damaged files
         raise EpisodeError(f"{path} cannot be read as HDF5 ({' '.join(str(error).split())}); copy it again.") from error
+
+
+def demand_whole(path: Path, file: h5py.File) -> None:
+    """Check that a file holds all of its data itself, before any is read.
+
+    HDF5 can link to other files (external links), keep arrays in them (external storage) or put arrays together from them
+    (virtual datasets), and its library would read whatever file of this machine is named.
+
+    Raises:
+        EpisodeError: it does one of these.
+    """
+    found: list[str] = []
+
+    def look(name: str, link: Any) -> None:
+        if not isinstance(link, (h5py.HardLink, h5py.SoftLink)):
+            found.append(f"{name} is a link to another file")
+            return
+        stored = file[name] if isinstance(link, h5py.HardLink) else None
+        if isinstance(stored, h5py.Dataset) and stored.is_virtual:
+            found.append(f"{name} is put together from other files (a virtual dataset)")
+        elif isinstance(stored, h5py.Dataset) and stored.external:
+            found.append(f"{name} is stored in another file")
+
+    file.visititems_links(look)
+    if found:
+        raise EpisodeError(f"{path}: {found[0]}; expected a file that holds all of its data itself. It is not read.")
 
 
 def _read_legacy(reader: "_Reader") -> Recorded:
@@ -116,6 +145,11 @@ def _assemble(
     rgb = reader.pictures(pictures, frames)
     if any(np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1).max() > 0.01 for pose in poses):
         raise reader.error("the end poses hold quaternions that are not of length 1", "x y z and a unit quaternion w x y z")
+    matrix = reader.constant(intrinsics, (3, 3))
+    if min(matrix[0, 0], matrix[1, 1]) <= 0:
+        raise reader.error(
+            f"{intrinsics} has the focal lengths {matrix[0, 0]:g} and {matrix[1, 1]:g}", "numbers of pixels over 0"
+        )
     scale = rgb.shape[2] / WIDTH
     return Recorded(
         layout,
@@ -123,7 +157,7 @@ def _assemble(
         np.stack(grippers, 1),
         np.stack([tool_center(pose) for pose in poses], 1) if poses else None,
         np.stack([_resize(image) for image in rgb]) if scale != 1 else rgb,
-        _center_pixels(reader.constant(intrinsics, (3, 3)), scale),
+        _center_pixels(matrix, scale),
         _world_to_camera(reader, extrinsics),
         reader.instruction(),
     )
@@ -256,7 +290,7 @@ def text_beside(episode: Path, name: str) -> str:
     """A text file of the folder that holds RoboTwin's data/ with the episodes; empty where there is none."""
     path = episode.absolute().parent.parent / name
     try:
-        return path.read_text() if path.is_file() else ""
+        return read_text(path) if path.exists() else ""
     except (OSError, UnicodeDecodeError) as error:
         raise EpisodeError(f"{path} cannot be read as text ({error}); copy it again, or remove it.") from error
 
@@ -271,7 +305,7 @@ def _first_instruction(text: str) -> str:
     """The first entry of a JSON list, of RoboTwin's {"seen": […], "unseen": […]}, or plain text."""
     try:
         content = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return text
     if isinstance(content, dict):
         content = content.get("seen") or content.get("unseen") or []

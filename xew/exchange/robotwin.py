@@ -24,6 +24,7 @@ import xew
 from xew.config import ConfigError, user_errors
 from xew.episode import EpisodeError, Record, States, episode_folder, read_record, read_states, write_episode
 from xew.exchange.hdf5 import Recorded, read_robotwin, text_beside
+from xew.files import check_name, hold_lock
 from xew.protocol import ACTION_DIM, ARMS
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.geometry.camera import Camera
@@ -84,7 +85,7 @@ def import_episode(path: Path, args: Args) -> Record:
     """
     recorded = read_robotwin(path)
     name, robot = _robot(path, recorded, args)
-    task, seed = args.task or _task(path), _seed(path)
+    task, seed = check_name(args.task or _task(path), f"task of {path}"), _seed(path)
     action = canonical_action(recorded)
     folder = episode_folder(args.out, task, seed, name)
     if (folder / "episode.json").is_file():
@@ -201,12 +202,12 @@ def _task(path: Path) -> str:
 
 def _seed(path: Path) -> int:
     """The scene's seed by RoboTwin's seed.txt, or the episode's number where there is none."""
-    digits = "".join(filter(str.isdigit, path.stem))
+    digits = "".join(filter(str.isdecimal, path.stem))
     if not digits:
         raise EpisodeError(f"{path}: the file's name has no number; RoboTwin calls them episode0.hdf5 and so on.")
     seeds = text_beside(path, "seed.txt").split()
     number = int(digits)
-    return int(seeds[number]) if number < len(seeds) and seeds[number].isdigit() else number
+    return int(seeds[number]) if number < len(seeds) and seeds[number].isdecimal() and len(seeds[number]) < 20 else number
 
 
 def _build_states(
@@ -259,7 +260,8 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     if args.robot:
         get_robot(args.robot, args.out)  # a mistake in it is told once, not for every file
-    records, refused = import_all(find_episodes(args.source), args)
+    with hold_lock(args.out):
+        records, refused = import_all(find_episodes(args.source), args)
     rendered = sum("robot" in record.hashes for record in records)
     print(f"{len(records)} episodes under {args.out}, {rendered} with the robot's own kinematics")
     if refused:

@@ -27,9 +27,10 @@ import tyro
 from scipy.stats import spearmanr
 from tqdm import tqdm
 
-from xew.config import ConfigError, user_errors
+from xew.config import ConfigError, admit, user_errors
 from xew.dataset import find_accepted
 from xew.episode import EpisodeError, Record, read_video
+from xew.files import replacing, write_text
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
 from xew.metrics.calibration.matrix import grade_predictors, matrix, to_markdown
@@ -80,6 +81,8 @@ class Args:
     """Grade predictors made on purpose, in place of both tables."""
     metrics: tuple[str, ...] = tuple(METRICS)
     """Names of the metrics of the predictors' table."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own, such as my_lab.tasks, that the run and the data may name."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,7 @@ class Estimators:
 @user_errors
 def main(args: Args) -> None:
     """Grade, write, and print both tables."""
+    admit(args.trust)
     estimators = Estimators(open_masker(args.masks, args.masks_checkpoint), open_tracker(args.tracks, args.tracks_checkpoint))
     through_codec = None if args.codec is None else open_codec(args.codec, args.codec_opener)
     episodes = find_accepted(args.data)
@@ -321,9 +325,10 @@ def write(out: Path, text: str, tables: dict[str, pd.DataFrame], name: str = "ca
     """Write a text of this name and tables. Raises EpisodeError if the folder cannot be written."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        (out / name).write_text(text)
+        write_text(out / name, text)
         for key, table in tables.items():
-            table.to_parquet(out / f"{key}.parquet", index=False)
+            with replacing(out / f"{key}.parquet") as temporary:
+                table.to_parquet(temporary, index=False)
     except OSError as error:
         raise EpisodeError(f"cannot write the tables to {out}: {error}; choose another --out.") from error
 

@@ -26,8 +26,9 @@ import tyro
 from tqdm import tqdm
 
 from xew.compilation import keep_compiled_programs
-from xew.config import ConfigError, pick, suggestion, user_errors
+from xew.config import ConfigError, admit, pick, suggestion, user_errors
 from xew.episode import EpisodeError, verify_episode
+from xew.files import csv_text, hold_lock
 from xew.metrics import METRICS
 from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, identity, open_masker, open_tracker
 from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, grade, input_kind
@@ -105,6 +106,8 @@ class Args:
     """Grade nothing: check that a bundle is consistent, and, where rollouts are named, that it was made from them."""
     regrade: int = 0
     """With --check: grade so many of its videos anew and compare."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
 WRITTEN = {
@@ -121,12 +124,19 @@ WRITTEN = {
 @user_errors
 def main(args: Args) -> None:
     """Grade, write, and print what came out; or check a bundle."""
+    admit(args.trust)
     keep_compiled_programs()
     cv2.setNumThreads(1)  # episodes are shared out to threads; OpenCV's own would only get in their way
     if args.check is not None:
         check(args, args.check)
         return
     check_out(args.out)
+    with hold_lock(args.out):
+        grade_tables(args)
+
+
+def grade_tables(args: Args) -> None:
+    """Grade, write the tables and print the summary. Raises EpisodeError where a rollout could not be graded."""
     metrics = choose_metrics(args)
     attributes = describe(settings(args), metrics)
     store = CellStore(path_beside(args.out, "cells"), baselines_folder(args.data, args.out))
@@ -152,8 +162,8 @@ def _write_summary(args: Args, rows: pd.DataFrame) -> str:
         return "no scores"
     summary = summarize(rows, args.resample, HELD_OUT_ROBOTS)
     write_whole(path_beside(args.out, "summary.md"), to_markdown(summary).encode())
-    write_whole(path_beside(args.out, "summary.csv"), summary.means.to_csv(index=False).encode())
-    write_whole(path_beside(args.out, "pairs.csv"), summary.pairs.to_csv(index=False).encode())
+    write_whole(path_beside(args.out, "summary.csv"), csv_text(summary.means).encode())
+    write_whole(path_beside(args.out, "pairs.csv"), csv_text(summary.pairs).encode())
     written = "\n".join(f"{path_beside(args.out, ending)}  {what}" for ending, what in WRITTEN.items())
     return f"{to_markdown(summary, with_pairs=False)}\n{written}"
 

@@ -74,9 +74,9 @@ class Command:
     @cached_property
     def robot_spec(self) -> "xew.sim_warp.embodiment.spec.RobotSpec":
         """The simulator's description of the robot: of the registry, or kept beside the data."""
-        from xew.sim_warp.robots import get_robot
+        from xew.sim_warp.robots import recorded_robot
 
-        return get_robot(self.robot, self.data)
+        return recorded_robot(self.robot, self.data)
 
     @property
     def camera(self) -> "xew.sim_warp.geometry.camera.Camera":

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from xew.command_line import parse_command
-from xew.config import load, pick
+from xew.config import admit, demand_admitted, load, pick
 from xew.model.codecs.contract import CodecSettings, latent_frames
 from xew.model.codecs.vae import VAES
 from xew.model.conditions import Condition
@@ -103,7 +103,7 @@ class Experiment:
         """Which episodes are read. Raises ConfigError if the run that is replayed has gone."""
         adapt, replay = replace(self.adapt, robots=expand_robots(self.adapt.robots)), tuple[str, ...]()
         if adapt.start_from is not None and adapt.replay:
-            source = load_experiment(adapt.start_from / "config.yaml").robots.train_robots
+            source = load_recorded(adapt.start_from / "config.yaml").robots.train_robots
             replay = tuple(robot for robot in source if robot not in adapt.robots)
         return EpisodeChoice(self.robots, adapt, replay, samples=self.train.sample_every > 0)
 
@@ -145,6 +145,19 @@ def load_experiment(path: Path | str, overrides: Sequence[str] = ()) -> Experime
     return experiment
 
 
+def load_recorded(path: Path) -> Experiment:
+    """Read and check the config that a run was trained with, which may be anybody's.
+
+    Raises:
+        UntrustedError: it names a module that the user has not admitted.
+        ConfigError: as `load_experiment`.
+    """
+    experiment = load(Experiment, path)
+    demand_admitted(experiment, str(path))
+    check_experiment(experiment, str(path))
+    return experiment
+
+
 def parse_experiment(flags: type[F], arguments: Sequence[str] | None, prog: str, description: str) -> tuple[F, Experiment]:
     """Parse a command on a config, with its own flags and overrides of the config, which is checked.
 
@@ -155,6 +168,7 @@ def parse_experiment(flags: type[F], arguments: Sequence[str] | None, prog: str,
     command = parse_command(
         flags, Experiment, functools.partial(load, Experiment), arguments, prog=prog, description=description
     )
+    admit(getattr(command.flags, "trust", ()))
     check_experiment(command.config, str(command.path))
     return command.flags, command.config
 

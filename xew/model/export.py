@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import tyro
 from flax import nnx
 
-from xew.config import ConfigError, user_errors
+from xew.config import ConfigError, admit, user_errors
 from xew.model.network.dit import parameter_count
 from xew.model.network.dit_layouts import Naming, save_dit, wan_layout
 from xew.model.network.tokens import WAVELENGTH_BASE
@@ -66,12 +66,15 @@ class Args:
     """Type of the weights."""
     checkpoint: int | None = None
     """Step of the checkpoint; the latest where left out."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own, such as my_lab.models, that the run may name."""
 
 
 @user_errors
 def main(arguments: Sequence[str] | None = None) -> None:
     """Write the network of a run."""
     args = tyro.cli(Args, args=arguments, prog="python -m xew.model.export", description=__doc__.splitlines()[0])
+    admit(args.trust)
     export(args.run, args.out, args.naming, args.dtype, args.checkpoint)
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from xew.config import ConfigError, user_errors
 from xew.dataset import Dataset, Episode, read_dataset
+from xew.files import write_text
 from xew.model.cache.codecs import prepare_codec
 from xew.model.cache.encode import encode_episodes
 from xew.model.cache.keys import CACHE_VERSION
@@ -37,6 +38,8 @@ class Flags:
     """Render the episodes anew; no video needs to be there."""
     batch: int = 4
     """Number of clips that the codec encodes at once."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
 @user_errors
@@ -64,7 +67,7 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
     written = encode_episodes(cache, [*episodes, *replay_episodes(dataset, experiment.choice)], source, batch)
     header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip), "streams": list(cache.streams)}
     header |= {"episodes": len(episodes), "ceiling": report_ceiling(experiment, cache, dataset, episodes, source)}
-    (encoding.folder / "header.json").write_text(json.dumps(header, indent=1) + "\n")
+    write_text(encoding.folder / "header.json", json.dumps(header, indent=1) + "\n")
     robots, streams = sorted({record.robot for _, record in episodes}), ", ".join(cache.streams)
     print(f"{encoding.folder}: {len(episodes)} episodes of {', '.join(robots)}")
     print(f"streams {streams}, {written / 1e6:.1f} MB new")

@@ -22,9 +22,10 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from xew.config import ConfigError, user_errors
+from xew.config import ConfigError, admit, user_errors
 from xew.dataset import Episode
-from xew.episode import Record, read_video
+from xew.episode import Record, read_video, remove_left_overs
+from xew.files import hold_lock
 from xew.model.conditions import Command
 from xew.model.episodes.choice import select_episodes
 from xew.model.episodes.commands import episode_command
@@ -174,12 +175,15 @@ class Args:
     """Name of what the model is told of the robot, for the tables."""
     out: Path | None = None
     """Folder to write to; rollouts/NAME where left out."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
 @user_errors
 def main(arguments: Sequence[str] | None = None) -> None:
     """Predict episodes with a model from outside, and write them."""
     args = tyro.cli(Args, args=arguments, prog="python -m xew.model.outside", description=__doc__.splitlines()[0])
+    admit(args.trust)
     if args.max_frames < 0:
         raise ConfigError(f"--max-frames is {args.max_frames}; expected a number of frames, or 0 for all.")
     name = args.model.rpartition(":")[2]
@@ -190,9 +194,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     pending = [item for item in items if not is_done(out, *item)]
     model = load_model(args.model)
     with (
+        hold_lock(out),
         tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
         RolloutWriter(out, progress.update, resize=None) as writer,
     ):
+        remove_left_overs(out)
         for episode, header in pending:
             writer.write(episode[1], predict(model, args.model, read_inputs(episode, args.max_frames)), header)
     print(f"{out}: {len(pending)} rollouts new, {len(items) - len(pending)} there before, {args.model}")

@@ -7,7 +7,7 @@ Episodes are predicted in batches over all devices; while these work on one, the
 Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … --out … --rollout.steps …]
 """
 
-import json
+import itertools
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,10 +25,10 @@ from tqdm import tqdm
 
 from xew.command_line import find_path, parse_command
 from xew.compilation import keep_compiled_programs
-from xew.config import CONVERTER, ConfigError, parse, user_errors
+from xew.config import CONVERTER, ConfigError, admit, parse, user_errors
 from xew.dataset import Episode, read_dataset
-from xew.episode import Record, episode_folder
-from xew.files import checkpoint_time
+from xew.episode import Record, episode_folder, remove_left_overs
+from xew.files import checkpoint_time, hold_lock, read_json
 from xew.model.cache.codecs import load_codec
 from xew.model.cache.scales import Scale, load_run_scales
 from xew.model.codecs.codec import codec_class
@@ -163,7 +163,9 @@ def is_done(out: Path, episode: Episode, header: dict[str, Any]) -> bool:
 def _read_header(folder: Path) -> dict[str, Any]:
     """A rollout's header; settings that came after it was written have their defaults."""
     path = folder / "rollout.json"
-    header: dict[str, Any] = json.loads(path.read_text())
+    header: dict[str, Any] = read_json(path)
+    if not isinstance(header, dict):
+        raise ConfigError(f"{path} holds {type(header).__name__}, expected an object.")
     if "config" in header:
         header["config"] = CONVERTER.unstructure(parse(Experiment, header["config"], str(path)))
     return header
@@ -256,6 +258,8 @@ class Flags:
     """Robots to predict; all of the data where left out."""
     out: Path | None = None
     """Folder to write to; rollouts/<name of the run> where left out."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own, such as my_lab.tasks, that the run and the data may name."""
 
 
 @dataclass(frozen=True)
@@ -279,12 +283,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     pending = [item for item in headers if not is_done(out, *item)]
     experiment.instructions.encode([record.instruction for (_, record), _ in pending])  # all at once, where that costs
     with (
+        hold_lock(out),
         tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
         RolloutWriter(out, progress.update) as writer,
     ):
+        remove_left_overs(out)
         predict_and_write(predictor, pending, writer)
     source = "published weights" if step is None else f"checkpoint {step}"
     print(f"{out}: {len(pending)} rollouts new, {len(headers) - len(pending)} there before, {source}")
+
+
+def _find_trusted(words: Sequence[str]) -> list[str]:
+    """Modules behind --trust among a command's arguments; what is no name of a module is told when the options are parsed."""
+    first = words.index("--trust") + 1 if "--trust" in words else len(words)
+    given = itertools.takewhile(lambda word: not word.startswith("-"), words[first:])
+    return [word for word in given if word.replace(".", "_").isidentifier() and ".." not in word]
 
 
 def parse_rollout(arguments: Sequence[str] | None) -> tuple[Path, Flags, Experiment]:
@@ -300,6 +313,7 @@ def parse_rollout(arguments: Sequence[str] | None) -> tuple[Path, Flags, Experim
     wrong = [word for word in words if word.startswith("--") and "." in word and not word.startswith("--rollout.")]
     if path is not None and wrong:
         raise ConfigError(f"{' '.join(wrong)}: of a trained run only --rollout.… can be chosen anew (see --help for the rest).")
+    admit(_find_trusted(words))  # the run's config is read before the options are parsed
     command = parse_command(
         Flags,
         Sampling,
@@ -309,6 +323,7 @@ def parse_rollout(arguments: Sequence[str] | None) -> tuple[Path, Flags, Experim
         description=description,
         metavar="RUN",
     )
+    admit(command.flags.trust)
     experiment = replace(load_run_config(command.path), rollout=command.config.rollout)
     check_experiment(experiment, str(command.path / "config.yaml"))
     return command.path, command.flags, experiment

@@ -6,17 +6,20 @@ Command: python -m xew.model.train CONFIG [--resume | --overwrite] [--train.step
          python -m xew.model.train CONFIG --estimate --devices 8 --memory-gb 80
 """
 
+import contextlib
 import itertools
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import jax
 import numpy as np
 from jax.sharding import AbstractMesh
 
 from xew.compilation import keep_compiled_programs
 from xew.config import ConfigError, user_errors
 from xew.dataset import read_dataset
+from xew.files import hold_lock
 from xew.model.cache.scales import share_scales
 from xew.model.devices.sharding import (
     AXES,
@@ -65,6 +68,8 @@ class Flags:
     """With --estimate: number of devices."""
     memory_gb: float | None = None
     """With --estimate: memory of each device [GB]."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
 @user_errors
@@ -77,7 +82,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     check_one_of(flags.resume, flags.overwrite)
     start_processes(flags.distributed)
     keep_compiled_programs()
-    if not train(experiment, resume=flags.resume, overwrite=flags.overwrite, ignore_memory=flags.ignore_memory):
+    with hold_lock(experiment.out) if jax.process_index() == 0 else contextlib.nullcontext():
+        ended = train(experiment, resume=flags.resume, overwrite=flags.overwrite, ignore_memory=flags.ignore_memory)
+    if not ended:
         sys.exit(STOPPED)
 
 

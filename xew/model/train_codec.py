@@ -25,7 +25,7 @@ from xew.command_line import parse_command
 from xew.compilation import keep_compiled_programs
 from xew.config import load, user_errors
 from xew.dataset import Dataset, Episode, read_dataset
-from xew.files import file_digest
+from xew.files import file_digest, hold_lock, write_text
 from xew.model.codec_training.kinds import Kind
 from xew.model.codec_training.pictures import Pictures, gather_pictures, read_frames
 from xew.model.codec_training.report import measure_codec, report_rows, report_scalars, write_report
@@ -71,7 +71,9 @@ def main(arguments: Sequence[str] | None = None, prog: str = "python -m xew.mode
     experiment, flags = check_codec_experiment(command.config, command.path), command.flags
     check_one_of(flags.resume, flags.overwrite)
     keep_compiled_programs()
-    if not train_codec(experiment, resume=flags.resume, overwrite=flags.overwrite):
+    with hold_lock(experiment.out):
+        ended = train_codec(experiment, resume=flags.resume, overwrite=flags.overwrite)
+    if not ended:
         sys.exit(STOPPED)
 
 
@@ -182,7 +184,7 @@ def finish(experiment: CodecExperiment, module: Any, batches: Batches, dataset: 
 def write_description(experiment: CodecExperiment, description: dict[str, Any]) -> None:
     """Write the file beside the weights."""
     path = experiment.out / f"{experiment.autoencoder.file}.json"
-    path.write_text(json.dumps(description, indent=1) + "\n")
+    write_text(path, json.dumps(description, indent=1) + "\n")
 
 
 def latent_statistics(kind: Kind, module: Any, batches: Batches, count: int) -> tuple[jax.Array, jax.Array]:

@@ -27,6 +27,7 @@ from tqdm import tqdm
 from xew.config import user_errors
 from xew.dataset import find_records
 from xew.episode import EpisodeError, Record, episode_folder, remove_left_overs
+from xew.files import hold_lock
 from xew.protocol import TEST_SEED_START, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expand_robots
 from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
@@ -191,6 +192,8 @@ def _check(args: Args) -> None:
     """Check tasks and numbers before any work. Raises ConfigError or EpisodeError."""
     for task in args.tasks:
         get_task(task)
+    if args.workers is not None and args.workers < 1:
+        raise EpisodeError(f"--workers is {args.workers}; expected at least 1, or none for as many as there are cores.")
     if not args.tasks or not args.robots or min(args.train_seeds, args.test_seeds) < 0 or args.batch < 1:
         raise EpisodeError(
             f"nothing to make of {len(args.tasks)} tasks, {len(args.robots)} robots, {args.train_seeds} training and "
@@ -302,7 +305,8 @@ def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
     _print_device(args.device)
-    families = generate(args)
+    with hold_lock(args.out):
+        families = generate(args)
     print(yield_table([record for family in families for seed in family.done.values() for record in seed.values()]))
     _demand_enough(families)
 

@@ -21,9 +21,10 @@ import tyro
 from PIL import Image
 from tqdm import tqdm
 
-from xew.config import user_errors
+from xew.config import admit, user_errors
 from xew.dataset import explain_missing, read_dataset
-from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, read_record, read_states, read_video, verify_episode
+from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, encode_png, read_record, read_states, read_video, verify_episode
+from xew.files import hold_lock, path_below, replacing, write_bytes
 from xew.sim_warp.devices.workers import Workers, quiet_warp
 from xew.sim_warp.generate import yield_table
 from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
@@ -64,12 +65,15 @@ class Args:
     """Number of seeds of each task that are drawn."""
     grid: Path | None = None
     """PNG file for one picture of all tasks and robots at work: the first accepted seed of each task."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
 @user_errors
 def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
+    admit(args.trust)
     cells, damaged = read_headers(args.data)
     print(yield_table([record for _, record in cells]))
     for folder, record in cells:
@@ -87,7 +91,8 @@ def main() -> None:
     if args.rerender:
         rerender([folder for folder, _ in pictured], args.rerender)
     if args.render:
-        render_videos([folder for folder, record in pictured if not record.videos])
+        with hold_lock(args.data):
+            render_videos([folder for folder, record in pictured if not record.videos])
     if args.pictures:
         draw_pictures(pictured, args.pictures, args.seeds)
     if args.grid:
@@ -146,9 +151,9 @@ def draw_pictures(cells: list[tuple[Path, Record]], out: Path, seeds: int) -> No
     _make_folder(out, "--pictures")
     for task, of_task in tqdm(by_task.items(), desc="drawing", unit="task"):
         for seed in sorted(of_task)[:seeds]:
-            save_png(out / f"{task}_{seed}.png", contact_sheet(of_task[seed]))
+            save_png(path_below(out, f"{task}_{seed}.png"), contact_sheet(of_task[seed]))
             for folder, record in of_task[seed]:
-                save_png(out / f"{task}_{seed}_{record.robot}.png", strip(folder))
+                save_png(path_below(out, f"{task}_{seed}_{record.robot}.png"), strip(folder))
 
 
 def seeds_by_task(cells: list[tuple[Path, Record]]) -> dict[str, dict[int, list[tuple[Path, Record]]]]:
@@ -171,7 +176,8 @@ def draw_grid(cells: list[tuple[Path, Record]], path: Path) -> None:
     _make_folder(path.parent, "--grid")
     picture = grid([of_task[min(of_task)] for of_task in seeds_by_task(cells).values()])
     try:
-        Image.fromarray(picture).save(path, format="PNG", optimize=True)
+        with replacing(path) as temporary:
+            Image.fromarray(picture).save(temporary, format="PNG", optimize=True)
     except OSError as error:
         raise EpisodeError(f"cannot write {path}: {error.strerror}. Choose another file with --grid.") from error
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
@@ -276,8 +282,10 @@ def tile(rows: list[list[np.ndarray]]) -> np.ndarray:
 
 def save_png(path: Path, image: np.ndarray) -> None:
     """Write an image [h w 3] uint8 RGB. Raises EpisodeError where it cannot be written."""
-    if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
-        raise EpisodeError(f"cannot write {path}; choose another folder with --pictures.")
+    try:
+        write_bytes(path, encode_png(image))
+    except OSError as error:
+        raise EpisodeError(f"cannot write {path}: {error.strerror}. Choose another folder with --pictures.") from error
 
 
 if __name__ == "__main__":

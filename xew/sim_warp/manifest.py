@@ -23,7 +23,7 @@ import tyro
 from xew.config import user_errors
 from xew.dataset import explain_missing, find_records
 from xew.episode import EpisodeError, Record
-from xew.files import replacing
+from xew.files import check_name, read_json, replacing
 from xew.protocol import TEST_SEED_START
 
 PACKAGED = Path(__file__).with_name("seeds.json")
@@ -63,7 +63,7 @@ def read_manifest(path: Path = PACKAGED) -> Manifest:
         EpisodeError: it is not there or not of this form; the message says where.
     """
     try:
-        return _check(_converter().structure(_demand_object(json.loads(Path(path).read_text())), Manifest))
+        return _check(_converter().structure(_demand_object(read_json(Path(path))), Manifest))
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, cattrs.BaseValidationError) as error:
         raise EpisodeError(
             f"{path} is no manifest of seeds ({error}); make one: python -m xew.sim_warp.manifest DATA --out {path}"
@@ -93,8 +93,11 @@ def _demand_object(value: Any) -> dict[str, Any]:
 def _check(manifest: Manifest) -> Manifest:
     """The same manifest. Raises ValueError for names that could lead out of a folder and for seeds that are none."""
     for task, seeds in manifest.tasks.items():
-        if not task or not task.isprintable() or "/" in task or "\\" in task or task.startswith("."):
-            raise ValueError(f"found the task {task!r}, expected a name of the registry or module:NAME")
+        try:
+            for name, what in [(task, "task"), *((robot, "robot") for failed in seeds.rejected.values() for robot in failed)]:
+                check_name(name, what)
+        except EpisodeError as error:
+            raise ValueError(str(error)) from error
         for family, low, high in ((seeds.train, 0, TEST_SEED_START), (seeds.test, TEST_SEED_START, 2 * TEST_SEED_START)):
             if any(not low <= seed < high for seed in family) or sorted(set(family)) != list(family):
                 raise ValueError(f"{task}: seeds must be whole, ascending and from {low} to {high - 1}, found {family[:5]}…")

@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from xew.config import user_errors
 from xew.episode import EpisodeError, Record
+from xew.files import write_text
 from xew.protocol import expand_robots
 from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
@@ -68,6 +69,8 @@ def attempt_seeds(args: Args) -> Iterator[list[Record]]:
     for name in tasks:
         get_task(name)
     jobs = [Job(task, args.first_seed + index, tuple(robots)) for task in tasks for index in range(args.seeds)]
+    if args.workers is not None and args.workers < 1:
+        raise EpisodeError(f"--workers is {args.workers}; expected at least 1, or none for as many as there are cores.")
     if not jobs or not robots or args.first_seed < 0:
         raise EpisodeError(
             f"nothing to try of {len(tasks)} tasks, {len(robots)} robots and {args.seeds} seeds from {args.first_seed}; name "
@@ -189,8 +192,7 @@ def main() -> None:
 
 def write_page(path: Path, text: str) -> None:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+        write_text(path, text)
     except OSError as error:
         raise EpisodeError(f"cannot write {path}: {error.strerror}. Choose another file with --page.") from error
 

@@ -18,6 +18,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from xew.files import csv_text
+
 INK, SOFT, LINE, GROUND = "#1f2328", "#57606a", "#d0d7de", "#ffffff"
 SERIES = ("#1f6feb", "#c2410c", "#15803d", "#7e22ce", "#a16207", "#0e7490")
 """Colors of series in order; baselines are SOFT. In dark mode the page has a lighter one for each."""
@@ -27,6 +29,7 @@ PANEL = (3.5, 2.5)
 """Width and height of a panel [inches]."""
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
+    "text.parse_math": False,  # names may have dollar signs
     "font.size": 9,
     "text.color": INK,
     "axes.labelcolor": INK,
@@ -109,7 +112,7 @@ def themed_color(color: str) -> str:
 
 def chart_files(chart: Chart) -> dict[str, bytes]:
     """Files <name>.png, <name>.pdf and <name>.csv of a chart; the last one only where it has no panel."""
-    numbers = {f"{chart.name}.csv": chart.data.to_csv(index=False).encode()}
+    numbers = {f"{chart.name}.csv": csv_text(chart.data).encode()}
     if not chart.panels:
         return numbers
     columns = min(chart.columns, len(chart.panels))

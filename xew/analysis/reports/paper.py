@@ -49,6 +49,7 @@ from xew.analysis.tables.paper import (
     robot_table,
 )
 from xew.analysis.tables.table import Table
+from xew.files import csv_text
 from xew.protocol import ROBOT_NAMES
 
 TITLE = "The paper's figures, rebuilt from one another"
@@ -235,10 +236,10 @@ def _files(content: Content) -> Iterator[tuple[str, bytes]]:
     """Tables as LaTeX and CSV, the chart as PNG, PDF and CSV, claims as CSV."""
     for table in [*(table for shown in content.shown.values() for table in shown), *content.folded]:
         yield f"tables/{table.name}.tex", formats.latex(table).encode()
-        yield f"tables/{table.name}.csv", formats.table_frame(table).to_csv(index=False).encode()
+        yield f"tables/{table.name}.csv", csv_text(formats.table_frame(table)).encode()
     for name, data in chart_files(content.chart).items():
         yield f"figures/{name}", data
-    yield "findings.csv", findings_frame(content.claims, "paper").to_csv(index=False).encode()
+    yield "findings.csv", csv_text(findings_frame(content.claims, "paper")).encode()
 
 
 def _frame(

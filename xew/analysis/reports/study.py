@@ -39,6 +39,7 @@ from xew.analysis.tables.labels import ACTIONS, LADDER, SHORT_ROBOTS
 from xew.analysis.tables.layouts import build_tables, count_table
 from xew.analysis.tables.outside import outside_tables
 from xew.analysis.tables.table import MARKS, Table
+from xew.files import csv_text, plain_markdown
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
 
 TITLE = "Can the model render a robot that it has never seen?"
@@ -328,7 +329,7 @@ def _write_markdown(content: Content) -> str:
     lines = [
         f"# {TITLE}",
         "",
-        *(f"- {sentence}" for sentence in content.sentences),
+        *(f"- {plain_markdown(sentence)}" for sentence in content.sentences),
         "",
         *(f"> {note}\n" for note in content.lacks),
     ]
@@ -355,7 +356,7 @@ def _files(content: Content) -> Iterator[tuple[str, bytes]]:
     """Tables as LaTeX and CSV, charts as PNG, PDF and CSV, strips as PNG, findings as CSV and LaTeX."""
     for name, table in content.tables.items():
         yield f"tables/{name}.tex", formats.latex(table).encode()
-        yield f"tables/{name}.csv", formats.table_frame(table).to_csv(index=False).encode()
+        yield f"tables/{name}.csv", csv_text(formats.table_frame(table)).encode()
     for chart in content.charts.values():
         for name, data in chart_files(chart).items():
             yield f"figures/{name}", data
@@ -363,6 +364,6 @@ def _files(content: Content) -> Iterator[tuple[str, bytes]]:
         yield f"figures/strip_{part}.png", strip.image
     both = pd.concat([findings_frame(content.findings, "here"), findings_frame(content.printed, "paper")])
     if len(content.missing):
-        yield "missing.csv", content.missing.to_csv(index=False).encode()
-    yield "findings.csv", both.to_csv(index=False).encode()
+        yield "missing.csv", csv_text(content.missing).encode()
+    yield "findings.csv", csv_text(both).encode()
     yield "tables/findings.tex", formats.findings_latex(content.findings, content.printed).encode()

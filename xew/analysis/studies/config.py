@@ -6,12 +6,13 @@ and conditioning of each variant follow from the protocol.
 """
 
 import fnmatch
+import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from xew.config import ConfigError, load, read_yaml, suggestion
+from xew.config import ConfigError, check_finite, load, read_yaml, suggestion
 from xew.protocol import (
     PAPER_PARTS,
     PARTS,
@@ -208,6 +209,7 @@ def load_study(path: Path, overrides: Iterable[str] = ()) -> Study:
 
 def check_study(study: Study, path: Path) -> None:
     """Raises ConfigError for a choice that does not exist or does not fit; `path` names the study's config."""
+    check_finite(study, str(path))
     _check_names(study, path)
     if not study.planned_variants:
         raise ConfigError(f"{path}: no variant of the parts {', '.join(study.parts)} is left; widen variants, robots or shots.")
@@ -216,6 +218,10 @@ def check_study(study: Study, path: Path) -> None:
         raise ConfigError(
             f"{path}: {study.train_seeds} training and {study.test_seeds} test seeds; expected at least {max(shots, 1)} and 1."
         )
+    try:
+        shlex.split(study.machine.train_launcher)
+    except ValueError as error:
+        raise ConfigError(f"{path}: machine.train_launcher is {study.machine.train_launcher!r}: {error}.") from error
     if study.machine.workers < 1 or study.machine.gpus_per_training < 1:
         raise ConfigError(f"{path}: machine.workers and machine.gpus_per_training must be at least 1.")
 

@@ -8,18 +8,36 @@ its product still has the outcome that was noted. Anything else is made again, f
 
 import hashlib
 import json
-import shutil
 import socket
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from xew.analysis.studies.plan import Step, step_key
-from xew.config import ConfigError
+from xew.config import ConfigError, parse
 from xew.dataset import find_accepted
 from xew.episode import EpisodeError
-from xew.files import checkpoint_time, file_digest, replacing
+from xew.files import RUN_FILES, checkpoint_time, file_digest, is_run, read_json, remove_written, replacing
+
+ROLLOUT_FILES = ("*/*/*/rgb.mkv", "*/*/*/rollout.json")
+"""Patterns of the paths of what `xew.model.rollout` writes into its tree."""
+GRADES = ("parquet", "*.parquet", "summary.md", "summary.csv", "pairs.csv", "bundle.json", "cells/*.json", "baselines/*.json")
+"""Patterns of the endings of what `xew.metrics.evaluate` writes beside a score table."""
+
+
+@dataclass(frozen=True)
+class _Record:
+    """What is noted of a step."""
+
+    key: str
+    status: Literal["begun", "done", "failed"]
+    at: str
+    outcome: str | None = None
+    error: str | None = None
+    seconds: float | None = None
+    host: str | None = None
 
 
 class Ledger:
@@ -40,9 +58,10 @@ class Ledger:
     def record(self, step: Step) -> Mapping[str, Any]:
         """What is noted of a step; empty if it was never begun or its record is damaged."""
         try:
-            return json.loads(self._path(step).read_text())
-        except (OSError, ValueError):
+            found = asdict(parse(_Record, read_json(self._path(step)), ""))
+        except (OSError, ValueError, ConfigError):
             return {}
+        return {name: value for name, value in found.items() if value is not None}
 
     def key(self, step: Step) -> str:
         """Key of a step whose needs are done as far as they will be."""
@@ -70,7 +89,7 @@ class Ledger:
         if step.kind in ("train", "adapt"):
             goes_on = goes_on and _digest_run(step.product) is not None
         if not goes_on and step.kind in ("train", "adapt", "rollout"):
-            shutil.rmtree(step.product, ignore_errors=True)
+            _remove_product(step, begun=bool(self.record(step)))
         self._write(step, {"key": key, "status": "begun"})
         return goes_on
 
@@ -93,8 +112,8 @@ class Ledger:
     def forget(self, step: Step) -> None:
         """Have a step made anew; of grades, also remove what a command would go on from (`scores/<variant>.*`)."""
         self._path(step).unlink(missing_ok=True)
-        for path in step.product.parent.glob(f"{step.product.stem}.*") if step.kind == "evaluate" else ():
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        if step.kind == "evaluate":
+            remove_written(step.product.parent, [f"{step.product.stem}.{ending}" for ending in GRADES])
 
     def _path(self, step: Step) -> Path:
         return self.out / "state" / f"{step.name}.json"
@@ -106,6 +125,25 @@ class Ledger:
                 temporary.write_text(json.dumps({**record, "at": time.strftime("%Y-%m-%d %H:%M:%S")}, indent=1) + "\n")
         except OSError as error:
             raise ConfigError(f"cannot write {path}: {error}. Free some space, or choose another --out.") from error
+
+
+def _remove_product(step: Step, begun: bool) -> None:
+    """Remove the run or the rollouts of a step, and nothing that lies beside them.
+
+    Args:
+        step: whose product it is.
+        begun: whether this study has begun the step before, so that what lies there is its own, however damaged.
+
+    Raises:
+        ConfigError: the folder of a run holds none, or something cannot be removed.
+    """
+    run = step.kind in ("train", "adapt")
+    if run and not begun and step.product.is_dir() and any(step.product.iterdir()) and not is_run(step.product):
+        raise ConfigError(f"{step.product} is the place of a run and holds something else; move it away.")
+    try:
+        remove_written(step.product, RUN_FILES if run else ROLLOUT_FILES)
+    except OSError as error:
+        raise ConfigError(f"cannot replace {step.product}: {error}; remove it, or choose another --out.") from error
 
 
 def digest_product(step: Step) -> str | None:

@@ -20,7 +20,7 @@ from typing import Any, Protocol
 from xew.analysis.studies.config import Study
 from xew.analysis.studies.plan import Step
 from xew.analysis.studies.processes import start_step
-from xew.config import ConfigError
+from xew.config import TRUST, ConfigError
 
 PATIENCE_S = 120.0
 """Time that steps have to end after they were asked to [s]; training saves in that time."""
@@ -51,13 +51,14 @@ class Machines(Protocol):
 
 def open_machines(study: Study) -> Machines:
     """The machines that the config names. Raises ConfigError if they are not there or too small."""
+    environment = study.environment | {TRUST: os.environ.get(TRUST, "")}
     if study.machine.ray:
-        return RayCluster(study.machine.ray, study.environment)
+        return RayCluster(study.machine.ray, environment)
     gpus = usable_gpus(study)
     needed = study.machine.gpus_per_training
     if gpus and needed > len(gpus):
         raise ConfigError(f"machine.gpus_per_training is {needed}, there are {len(gpus)} GPUs ({', '.join(gpus)}); lower it.")
-    return ThisMachine(gpus, study.machine.workers, study.environment)
+    return ThisMachine(gpus, study.machine.workers, environment)
 
 
 def usable_gpus(study: Study) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ import yaml
 import xew
 from xew.analysis.studies.config import Settings, Study, build_experiment, run_folder
 from xew.episode import SCHEMA_VERSION
+from xew.files import write_text
 from xew.protocol import Variant
 
 
@@ -82,8 +83,7 @@ def write_configs(study: Study) -> dict[str, Path]:
     for variant in study.planned_runs:
         path, text = _config_path(study, variant), yaml.safe_dump(build_experiment(study, variant), sort_keys=False)
         if not path.exists() or path.read_text() != text:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text)
+            write_text(path, text)
             changed[variant.name] = path
     return changed
 

@@ -7,6 +7,7 @@ import pandas as pd
 
 from xew.analysis.tables.findings import Finding
 from xew.analysis.tables.table import Table, TableCell, TableRow
+from xew.files import plain_markdown
 
 MARK = {"better": "▲", "worse": "▼", "unresolved": "≈", "": ""}
 AGREES = {None: "", True: "✓", False: "✗"}
@@ -38,7 +39,7 @@ def markdown(table: Table) -> str:
 
 
 def _markdown_line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+    return f"| {' | '.join(map(plain_markdown, cells))} |"
 
 
 def _markdown_cell(cell: TableCell) -> str:

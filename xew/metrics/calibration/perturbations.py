@@ -95,14 +95,14 @@ def render_perturbation(folder: Path, states: States) -> Perturbation:
     from xew.sim_warp.geometry.camera import HEAD_CAMERA, project
     from xew.sim_warp.rendering.observe import observe, scene_recording
     from xew.sim_warp.rendering.streams import default_renderer
-    from xew.sim_warp.robots import get_robot
+    from xew.sim_warp.robots import recorded_robot
     from xew.sim_warp.scene import scene_rng
-    from xew.sim_warp.tasks import get_task
+    from xew.sim_warp.tasks import recorded_task
 
     quiet_warp()
     record = read_record(folder)
-    scene = get_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
-    robot = get_robot(record.robot, data_folder(folder))
+    scene = recorded_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
+    robot = recorded_robot(record.robot, data_folder(folder))
     seen = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
     view = observe(default_renderer(), [seen])[0]
     objects, _ = project(HEAD_CAMERA, states.object_pose[..., :3].astype(np.float64))

@@ -11,14 +11,15 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from xew.config import ConfigError
-from xew.files import digest_files
+from xew.config import ConfigError, parse
+from xew.files import digest_files, read_json
 from xew.metrics.grading.scores import KEY, Cell, write_whole
 
 FORMAT = 1
@@ -66,7 +67,8 @@ def read_bundle(path: Path) -> Bundle:
         ConfigError: it is not; the message says what does not hold.
     """
     try:
-        bundle = json.loads(path.read_text())
+        bundle = read_json(path)
+        _check_types(path, bundle)
         given, samples = bundle.pop("digest"), bundle["samples"]
         wrong = []
         if bundle["format"] != FORMAT:
@@ -85,6 +87,49 @@ def read_bundle(path: Path) -> Bundle:
     if wrong:
         raise ConfigError(f"{path} does not hold: {'; '.join(wrong)}.")
     return bundle
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """Types of what a bundle says of one video."""
+
+    model: str
+    condition: str
+    task: str
+    seed: int
+    robot: str
+    frames: int
+    exact_frames: int
+    prediction: str
+    rgb: str
+    states: str
+    values: dict[str, float]
+
+
+@dataclass(frozen=True)
+class _Types:
+    """Types of what is read of a bundle."""
+
+    format: int
+    table: str
+    table_sha256: str
+    protocol: int
+    metrics: dict[str, Any]
+    estimators: dict[str, Any]
+    frame_zero: str
+    allowed: tuple[str, ...]
+    samples: tuple[_Sample, ...]
+    means: tuple[dict[str, Any], ...]
+    digest: str
+
+
+def _check_types(path: Path, bundle: Any) -> None:
+    """Raise ConfigError for what is missing or of another type than a bundle has; ValueError if its table lies elsewhere."""
+    known = {field.name for field in fields(_Types)}
+    found = {name: value for name, value in bundle.items() if name in known} if isinstance(bundle, dict) else bundle
+    read = parse(_Types, found, f"{path} is no bundle of xew, or is damaged")
+    if Path(read.table).name != read.table:
+        raise ValueError(f"its table {read.table!r} does not lie beside it")
 
 
 def differences(bundle: Bundle, choices: dict[str, Any], cells: Iterable[Cell]) -> list[str]:

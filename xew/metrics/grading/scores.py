@@ -27,7 +27,8 @@ import pyarrow.parquet as pq
 
 import xew
 from xew.config import ConfigError
-from xew.files import replacing
+from xew.episode import place_episode
+from xew.files import read_json, replacing
 from xew.metrics import METRICS
 from xew.metrics.grade import Grades
 from xew.protocol import BASELINES
@@ -88,7 +89,7 @@ class CellStore:
     def read(self, cell: Cell) -> Grades | None:
         """What a cell was graded with; None where it was not, or where anything that it depends on has changed."""
         try:
-            stored = json.loads(self._path(cell).read_text())
+            stored = read_json(self._path(cell))
             if stored["content"] != cell.content:
                 return None
             values = {name: math.nan if value is None else value for name, value in stored["values"].items()}
@@ -116,11 +117,10 @@ class CellStore:
         write_whole(self._path(cell), json.dumps(content).encode())
 
     def _path(self, cell: Cell) -> Path:
-        episode = Path(cell.task, f"{cell.seed:07d}", cell.robot)
         if cell.model in BASELINES:
-            return self.baselines / episode / f"{cell.model}-{cell.content}.json"
+            return place_episode(self.baselines, cell.task, cell.seed, cell.robot) / f"{cell.model}-{cell.content}.json"
         name = hashlib.sha256(f"{cell.model}\n{cell.condition}".encode()).hexdigest()[:16]
-        return self.folder / episode / f"{name}.json"
+        return place_episode(self.folder, cell.task, cell.seed, cell.robot) / f"{name}.json"
 
 
 def check_out(path: Path) -> None:

@@ -13,6 +13,7 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
+from xew.files import plain_markdown
 from xew.metrics import METRICS
 from xew.protocol import BASELINES, COPY_FIRST_FRAME, GROUND_TRUTH
 from xew.statistics import DRAWS, LEVEL, MIN_SCENES, UNITS, Mean, Units, bootstrap_means, noise_floor, verdict
@@ -177,4 +178,4 @@ def _pair_lines(pairs: pd.DataFrame) -> list[str]:
 
 def title(model: tuple[Any, ...]) -> str:
     """A model's name for people, with its condition."""
-    return " · ".join(part for part in model if part).replace("|", "/")
+    return plain_markdown(" · ".join(part for part in model if part).replace("|", "/"))

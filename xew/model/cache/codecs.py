@@ -13,7 +13,7 @@ from xew.model.cache.clips import clip_starts, take_frames
 from xew.model.cache.keys import codec_path
 from xew.model.codecs.codec import codec_class
 from xew.model.codecs.contract import Codec
-from xew.model.runs.folder import load_run_codec
+from xew.model.runs.folder import load_kept_codec, load_run_codec
 from xew.model.settings.parts import Encoding
 from xew.model.video.frames import to_model_size
 from xew.model.video.pixels import PixelSource, stored_pixels
@@ -33,7 +33,7 @@ def load_codec(encoding: Encoding, episodes: Sequence[Episode]) -> Codec:
     path = codec_path(encoding, episodes)
     if not path.exists():
         raise ConfigError(f"no codec fitted on {encoding.data} as it is now under {path.parent}; {encoding.remedy}.")
-    return kind.load(path)
+    return load_kept_codec(encoding.codec, path, f"delete it and {encoding.remedy}")
 
 
 def prepare_codec(encoding: Encoding, episodes: Sequence[Episode], source: PixelSource = stored_pixels) -> Codec:

@@ -8,15 +8,14 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from xew.config import ConfigError
+from xew.config import ConfigError, parse
 from xew.dataset import Episode
-from xew.files import replacing
+from xew.files import read_json, replacing
 from xew.model.cache.keys import scales_path
 from xew.model.conditions import Command, Condition
 from xew.model.episodes.commands import episode_command
@@ -87,6 +86,21 @@ def save_scales(path: Path, scales: Mapping[str, Scale]) -> None:
         unfinished.write_text(json.dumps(content, indent=1) + "\n")
 
 
+@dataclass(frozen=True)
+class _StoredScale:
+    """A `Scale` as its file has it."""
+
+    middle: tuple[float, ...]
+    width: tuple[float, ...]
+    limit: float | None
+
+    def as_scale(self) -> Scale:
+        numbers = [*self.middle, *self.width, *([] if self.limit is None else [self.limit])]
+        if len(self.middle) != len(self.width) or not np.isfinite(numbers).all() or min((1.0, *self.width)) <= 0:
+            raise ValueError("expected as many widths over 0 as middles, all finite")
+        return Scale(np.asarray(self.middle, np.float32), np.asarray(self.width, np.float32), self.limit)
+
+
 def read_scales(path: Path, conditions: Sequence[Condition], remedy: str) -> dict[str, Scale]:
     """The scales that the conditions need; nothing is read where none needs one.
 
@@ -97,14 +111,12 @@ def read_scales(path: Path, conditions: Sequence[Condition], remedy: str) -> dic
     if not names:
         return {}
     try:
-        content: dict[str, Any] = json.loads(path.read_text())
-        arrays = {name: (content[name]["middle"], content[name]["width"], content[name]["limit"]) for name in sorted(names)}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ConfigError(f"{path} does not hold the scales of {', '.join(sorted(names))} ({error}); {remedy}.") from error
-    return {
-        name: Scale(np.asarray(middle, np.float32), np.asarray(width, np.float32), limit)
-        for name, (middle, width, limit) in arrays.items()
-    }
+        content = read_json(path)
+        stored = {name: parse(_StoredScale, content[name], name) for name in sorted(names)}
+        return {name: scale.as_scale() for name, scale in stored.items()}
+    except (OSError, ValueError, KeyError, TypeError, ConfigError) as error:
+        found = " ".join(str(error).split())
+        raise ConfigError(f"{path} does not hold the scales of {', '.join(sorted(names))} ({found}); {remedy}.") from error
 
 
 def load_run_scales(conditions: Mapping[str, Condition], run: Path) -> dict[str, Scale]:

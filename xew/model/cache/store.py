@@ -11,7 +11,7 @@ from safetensors.numpy import save_file
 from xew.config import ConfigError
 from xew.dataset import Episode
 from xew.episode import Record
-from xew.files import replacing
+from xew.files import demand_regular, replacing
 from xew.model.cache.clips import clip_starts
 from xew.model.cache.codecs import load_codec
 from xew.model.cache.keys import stream_path
@@ -54,14 +54,14 @@ class LatentCache:
         """
         path = self.path(record, stream)
         try:
-            with safe_open(path, framework="np") as stored:
+            with safe_open(demand_regular(path), framework="np") as stored:
                 clips = stored.get_slice(CLIPS)
                 return clips[min(clip, clips.get_shape()[0] - 1)]
         except FileNotFoundError:
             stale = list(path.parent.glob(f"{path.stem.rpartition('-')[0]}-*.safetensors"))
             found = "was encoded from other data, with another codec or other clips" if stale else "is not in the cache"
             raise ConfigError(f"{path.parent}: the stream {stream} {found}; {self.encoding.remedy}.") from None
-        except SafetensorError as error:
+        except (OSError, SafetensorError) as error:
             raise ConfigError(f"{path} is damaged ({error}); delete it and {self.encoding.remedy}.") from error
 
     def write(self, record: Record, stream: str, clips: np.ndarray) -> int:

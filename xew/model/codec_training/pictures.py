@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from xew.config import ConfigError
 from xew.dataset import Episode
-from xew.episode import EpisodeError, Record, read_states
+from xew.episode import EpisodeError, Record, open_video, read_states
 from xew.model import conditions
 from xew.model.cache.clips import take_frames
 from xew.model.conditions import make_command
@@ -221,14 +221,14 @@ def read_frames(path: Path, wanted: set[int]) -> dict[int, np.ndarray]:
     """Read frames of a video by number, each uint8 [h w 3]. Raises EpisodeError if it does not hold them."""
     frames: dict[int, np.ndarray] = {}
     try:
-        with av.open(str(path)) as container:
+        with open_video(path) as container:
             container.streams.video[0].codec_context.thread_count = 1
             for number, frame in enumerate(container.decode(video=0)):
                 if number in wanted:
                     frames[number] = frame.to_ndarray(format="rgb24")
                 if len(frames) == len(wanted):
                     break
-    except (av.FFmpegError, IndexError):
+    except (av.FFmpegError, OSError, IndexError):
         frames = {}
     if len(frames) < len(wanted):
         raise EpisodeError(

@@ -12,13 +12,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, UInt8
 from tqdm import tqdm
 
 from xew.dataset import Dataset, Episode
+from xew.episode import encode_png
+from xew.files import write_bytes, write_text
 from xew.model.codec_training.pictures import ALIGNED, differs_from_corner, draw_descriptions, read_aligned
 from xew.model.codec_training.settings import CodecExperiment, select_episodes
 from xew.model.codecs.ceiling import LPIPS_EVERY, choose_evenly, reconstruct
@@ -123,8 +124,7 @@ def grade(codec: Codec, truth: Truth, clip: Clip, sheet: Path | None = None) -> 
 
 def write_sheet(path: Path, truth: UInt8[np.ndarray, "t h w 3"], decoded: UInt8[np.ndarray, "t h w 3"]) -> None:
     """Write a few frames of two videos [t h w 3] as a picture, true above decoded."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), cv2.cvtColor(strip(truth, decoded), cv2.COLOR_RGB2BGR))
+    write_bytes(path, encode_png(strip(truth, decoded)))
 
 
 def write_report(qualities: Sequence[Quality], experiment: CodecExperiment) -> str:
@@ -141,7 +141,7 @@ def write_report(qualities: Sequence[Quality], experiment: CodecExperiment) -> s
         mark = " *" if q.trained else ""
         lines.append(f"| {q.robot}{mark} | {q.stream} | {q.psnr:.2f} | {q.lpips:.4f} | {region} | {q.clips} |")
     text = "\n".join((*lines, "", *spread_lines(qualities))) + "\n"
-    (experiment.out / "report.md").write_text(text)
+    write_text(experiment.out / "report.md", text)
     return text
 
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from jax import Array
 from jaxtyping import Float
 
 from xew.config import ConfigError, parse, pick
+from xew.files import read_json, write_text
 from xew.model.codecs.contract import BatchCodec, CodecSettings, FrameBatch, LatentBatch, to_pictures, to_signed
 from xew.model.codecs.conv_autoencoder import (
     AutoencoderSize,
@@ -24,7 +25,7 @@ from xew.model.codecs.conv_autoencoder import (
     load_autoencoder,
     save_autoencoder,
 )
-from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae
+from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae, check_size
 from xew.model.codecs.vae_layouts import load_vae, save_vae
 
 PACKAGED_WEIGHTS = Path(__file__).with_name("conv_autoencoder.safetensors")
@@ -75,9 +76,19 @@ class AutoencoderCodec(OfSize, BatchCodec):  # type: ignore[override]
     def save(self, folder: Path) -> None:
         """Write <file>.safetensors and <file>.json; weights that are there already are not written again."""
         file = folder / f"{self.file}.json"
-        if not file.exists() or json.loads(file.read_text())["hash"] != self.hash:
+        if not file.exists() or read_json(file)["hash"] != self.hash:
             self.write_weights(file.with_suffix(".safetensors"))
-        file.write_text(json.dumps(self.describe() | {"hash": self.hash}, indent=1) + "\n")
+        write_text(file, json.dumps(self.describe() | {"hash": self.hash}, indent=1) + "\n")
+
+
+@dataclass(frozen=True)
+class _KeptVae:
+    """Contents of vae.json."""
+
+    size: VaeSize
+    dtype: Literal["float32", "bfloat16"]
+    chunk: int
+    hash: str
 
 
 @functools.partial(
@@ -122,9 +133,9 @@ class WanVaeCodec(AutoencoderCodec):
     @classmethod
     def load(cls, folder: Path) -> "WanVaeCodec":
         """Read vae.safetensors and vae.json."""
-        stored = json.loads((folder / "vae.json").read_text())
-        size = parse(VaeSize, stored["size"], str(folder / "vae.json"))
-        return cls.from_weights(folder / "vae.safetensors", size, stored["dtype"], stored["chunk"])
+        kept = parse(_KeptVae, read_json(folder / "vae.json"), str(folder / "vae.json"))
+        check_size(kept.size, str(folder / "vae.json"))
+        return cls.from_weights(folder / "vae.safetensors", kept.size, kept.dtype, kept.chunk)
 
     @classmethod
     def check(cls, settings: CodecSettings) -> None:
@@ -202,7 +213,7 @@ class ConvAutoencoderCodec(AutoencoderCodec):
     @classmethod
     def load(cls, folder: Path) -> "ConvAutoencoderCodec":
         """Read autoencoder.safetensors and autoencoder.json."""
-        stored = json.loads((folder / "autoencoder.json").read_text())
+        stored = read_json(folder / "autoencoder.json")
         return cls.from_weights(folder / "autoencoder.safetensors", stored["dtype"])
 
     @classmethod

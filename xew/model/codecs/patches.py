@@ -14,6 +14,7 @@ from jax import Array, lax
 from jaxtyping import Float, Shaped, UInt8
 
 from xew.config import ConfigError
+from xew.files import demand_regular, replacing
 from xew.model.codecs.contract import BatchCodec, CodecSettings, FrameBatch, LatentBatch
 from xew.model.codecs.vae_layers import as_row
 from xew.model.video.frames import TEMPORAL_FACTOR
@@ -96,13 +97,20 @@ class PatchCodec(BatchCodec):
         arrays = {
             f"{name}_{f.name}": getattr(getattr(self, name), f.name) for name in ("first", "later") for f in fields(Basis)
         }
-        np.savez(folder / "codec.npz", spatial_factor=self.spatial_factor, **arrays)
+        with replacing(folder / "codec.npz") as temporary, temporary.open("wb") as file:
+            np.savez(file, spatial_factor=self.spatial_factor, **arrays)
 
     @classmethod
     def load(cls, folder: Path) -> "PatchCodec":
         """Read codec.npz."""
-        with np.load(folder / "codec.npz") as stored:
+        with demand_regular(folder / "codec.npz").open("rb") as file, np.load(file) as stored:
+            if wrong := [name for name in stored.files if not np.isfinite(stored[name]).all()]:
+                raise ConfigError(f"{folder / 'codec.npz'} holds NaN or infinite numbers in {wrong[0]}; copy or make it again.")
             first, later = (Basis(*(stored[f"{name}_{f.name}"] for f in fields(Basis))) for name in ("first", "later"))
+            for basis, frames in ((first, 1), (later, TEMPORAL_FACTOR)):
+                patch, channels = 3 * frames * int(stored["spatial_factor"]) ** 2, first.scale.size
+                if [np.shape(getattr(basis, f.name)) for f in fields(Basis)] != [(patch,), (patch, channels), (channels,)]:
+                    raise ValueError(f"codec.npz holds no basis of patches [{patch}] and channels [{channels}]")
             return cls(int(stored["spatial_factor"]), first, later)
 
     @classmethod

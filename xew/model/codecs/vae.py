@@ -21,6 +21,7 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
+from xew.config import ConfigError
 from xew.model.codecs.vae_chunks import History, apply_in_chunks, even_chunk
 from xew.model.codecs.vae_layers import (
     Downsample,
@@ -82,6 +83,18 @@ class VaeSize:
     def decoder_widths(self) -> list[int]:
         """Widths in front of each stage of the decoder and after the last."""
         return [self.decoder_dim * multiplier for multiplier in (self.multipliers[-1], *self.multipliers[::-1])]
+
+
+LARGEST_WIDTH, MOST_BLOCKS, LARGEST_MULTIPLIER = 4096, 64, 64
+"""Largest numbers that the description of an autoencoder in a file may give."""
+
+
+def check_size(size: VaeSize, source: str) -> None:
+    """Raise ConfigError for a size that no autoencoder has, before a network is made of it."""
+    widths, multipliers = (size.channels, size.encoder_dim, size.decoder_dim, size.patch), size.multipliers
+    wrong = not 0 < min(widths) <= max(widths) <= LARGEST_WIDTH or not 0 < size.blocks <= MOST_BLOCKS
+    if wrong or not multipliers or not 0 < min(multipliers) <= max(multipliers) <= LARGEST_MULTIPLIER:
+        raise ConfigError(f"{source}: {size} is no size of an autoencoder; copy the whole run again.")
 
 
 VAES = {

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from xew.files import write_text
 from xew.model.network.blocks import EPSILON
 from xew.model.network.dit import STREAMS, WorldModel
 from xew.model.network.tokens import PATCH, TIME_FREQUENCIES
@@ -163,7 +164,7 @@ def save_dit(model: WorldModel, path: Path, naming: Naming = "diffusers") -> Non
     """
     save_weights(model, path, dit_layout(model, naming))
     if naming == "diffusers" and Path(path).suffix != ".safetensors":
-        (Path(path) / "config.json").write_text(json.dumps(diffusers_config(model), indent=2))
+        write_text(Path(path) / "config.json", json.dumps(diffusers_config(model), indent=2))
 
 
 def diffusers_config(model: WorldModel) -> dict[str, Any]:

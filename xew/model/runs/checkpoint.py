@@ -2,11 +2,13 @@
 
 import functools
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
@@ -14,6 +16,10 @@ from xew.config import ConfigError
 from xew.model.devices.sharding import place_like
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs.folder import KeptStep, trace_run
+from xew.model.runs.sums import damaged, find_damage, note_sums
+
+SUMMING = ThreadPoolExecutor(1, "sums")
+"""Thread in which checksums of earlier checkpoints are computed, beside the training."""
 
 
 @jax.tree_util.register_dataclass
@@ -47,6 +53,9 @@ def save_state(checkpoints: ocp.CheckpointManager, state: TrainState, data_posit
         return
     items = {"params": state.params, "optimizer": state.optimizer} | ({} if state.ema is None else {"ema": state.ema})
     saves = {name: ocp.args.StandardSave(tree) for name, tree in items.items()}
+    if jax.process_index() == 0:
+        checkpoints.wait_until_finished()
+        SUMMING.submit(note_sums, Path(checkpoints.directory).parent)
     checkpoints.save(step, args=ocp.args.Composite(data=ocp.args.JsonSave(data_position), **saves))
 
 
@@ -55,11 +64,14 @@ def restore_state(checkpoints: ocp.CheckpointManager, like: TrainState) -> tuple
 
     Args:
         like: arrays, or their shapes, types and shardings: where each is to lie, whatever devices saved it.
+
+    Raises:
+        ConfigError: the checkpoint is damaged: something is missing, of another size, changed since, or not finite.
     """
-    step = checkpoints.latest_step()
+    step, out = checkpoints.latest_step(), Path(checkpoints.directory).parent
     items = {"params": like.params, "optimizer": like.optimizer} | ({} if like.ema is None else {"ema": like.ema})
     restores = {name: ocp.args.StandardRestore(_abstract(tree)) for name, tree in items.items()}
-    restored = checkpoints.restore(step, args=ocp.args.Composite(data=ocp.args.JsonRestore(), **restores))
+    restored = _restore(checkpoints, out, step, {"data": ocp.args.JsonRestore(), **restores})
     number = jax.device_put(np.int32(step), like.step.sharding)
     state = TrainState(number, restored["params"], restored["optimizer"], restored.get("ema"))
     return state, restored["data"]
@@ -117,8 +129,30 @@ def _restore_kept(out: Path, like: Any, step: int | None) -> tuple[Any, int]:
         if step not in steps:
             raise ConfigError(f"{out} has no checkpoint of step {step}; it has {', '.join(map(str, sorted(steps)))}.")
         kept = "ema" if (out / "checkpoints" / str(step) / "ema").exists() else "params"
-        restored = checkpoints.restore(step, args=ocp.args.Composite(**{kept: ocp.args.StandardRestore(_abstract(like))}))
-        return restored[kept], step
+        return _restore(checkpoints, out, step, {kept: ocp.args.StandardRestore(_abstract(like))})[kept], step
+
+
+def _restore(checkpoints: ocp.CheckpointManager, out: Path, step: int, restores: dict[str, Any]) -> Any:
+    """Restore parts of a checkpoint. Raises ConfigError if they are not what was written, or hold numbers that are none."""
+    if wrong := find_damage(out, step, restores):
+        raise damaged(out, step, restores, wrong)
+    try:
+        restored = checkpoints.restore(step, args=ocp.args.Composite(**restores))
+    except Exception as error:  # Orbax has many, one for each way of being damaged
+        raise damaged(out, step, restores, error) from error
+    for name in restores.keys() - {"data"}:
+        for path, leaf in jax.tree_util.tree_leaves_with_path(restored[name]):
+            if not _is_finite(leaf):
+                raise damaged(out, step, restores, f"{name}{jax.tree_util.keystr(path)} holds NaN or infinite numbers")
+    return restored
+
+
+def _is_finite(leaf: Any) -> bool:
+    """Whether all numbers of the parts [...] of an array that lie on this process's devices are finite, each part once."""
+    if not jnp.issubdtype(leaf.dtype, jnp.inexact):
+        return True
+    parts = [shard.data for shard in leaf.addressable_shards if shard.replica_id == 0]
+    return all(bool(np.isfinite(np.asarray(part)).all()) for part in parts)
 
 
 def _abstract(tree: Any) -> Any:

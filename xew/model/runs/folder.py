@@ -3,6 +3,8 @@
 <out>/config.yaml       the resolved config, itself a valid input
 <out>/codec/            the codec that the latents were made with
 <out>/scales.json       normalization of conditions that are numbers, where there are any
+<out>/sums/STEP.json     checksums of a checkpoint's files
+<out>/.xew-run          the mark of a run: only what trainings wrote beside it is ever replaced
 <out>/checkpoints/STEP  params, optimizer, position of the data; ema where it is kept
 <out>/start.json        of an adapted run: where it started from
 <out>/metrics.jsonl     and TensorBoard's event files
@@ -10,7 +12,6 @@
 
 import dataclasses
 import json
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +22,10 @@ from jax.experimental import multihost_utils
 
 from xew import config
 from xew.config import ConfigError
-from xew.files import checkpoint_time
+from xew.files import RUN_FILES, RUN_MARK, checkpoint_time, is_run, read_json, remove_written, write_text
 from xew.model.codecs.codec import codec_class
 from xew.model.codecs.contract import Codec, CodecSettings
-from xew.model.experiment import Experiment, load_experiment
+from xew.model.experiment import Experiment, load_recorded
 from xew.model.settings.settings import AdaptSettings
 
 T = TypeVar("T")
@@ -76,7 +77,7 @@ def note_start(out: Path, run: Path) -> None:
     if step is None:
         raise ConfigError(f"{run} has no checkpoint to start from; train it: python -m xew.model.train CONFIG --out {run}")
     note = {"run": str(run), "step": step, "saved": checkpoint_time(run, step)}
-    (out / START).write_text(json.dumps(note, indent=1) + "\n")
+    write_text(out / START, json.dumps(note, indent=1) + "\n")
 
 
 def prepare_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite: bool) -> None:
@@ -86,7 +87,7 @@ def prepare_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite
         ConfigError: it holds a run and neither was asked, or it would be continued with another config or codec.
     """
     out = experiment.out
-    claim_run(out, experiment, load_experiment, resume=resume, overwrite=overwrite)
+    claim_run(out, experiment, load_recorded, resume=resume, overwrite=overwrite)
     _check_same_codec(experiment.codec, codec, out)
     try:
         (out / "codec").mkdir(exist_ok=True)
@@ -111,8 +112,10 @@ def claim_run(out: Path, settings: T, read: Callable[[Path], T], *, resume: bool
         ConfigError: it holds a run and neither was asked, or it would be continued with another config.
     """
     saved = out / "config.yaml"
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"{out} is a file; choose another --out.")
     if saved.exists() and overwrite:
-        shutil.rmtree(out)
+        _remove_run(out)
     elif saved.exists() and resume:
         _check_same(read(saved), settings, out)
     elif saved.exists():
@@ -123,9 +126,23 @@ def claim_run(out: Path, settings: T, read: Callable[[Path], T], *, resume: bool
         raise ConfigError(f"{out} is not empty and holds no run; choose another --out.")
     try:
         out.mkdir(parents=True, exist_ok=True)
+        (out / RUN_MARK).touch()
         config.save(settings, saved)
     except OSError as error:
         raise ConfigError(f"cannot write the run {out}: {error}; choose another --out.") from error
+
+
+def _remove_run(out: Path) -> None:
+    """Remove what trainings have written into the folder of a run. Raises ConfigError if it is none, or holds anything else."""
+    if not is_run(out):
+        raise ConfigError(f"{out} has a config.yaml but holds no run, so it is not replaced; choose another --out.")
+    try:
+        left = remove_written(out, RUN_FILES)
+    except OSError as error:
+        raise ConfigError(f"cannot replace the run {out}: {error}; choose another --out.") from error
+    if left:
+        shown = ", ".join(str(path.relative_to(out)) for path in left[:3])
+        print(f"{out}: the run is replaced; what is not its own stays there ({shown})")
 
 
 def _check_same_codec(settings: CodecSettings, codec: Codec, out: Path) -> None:
@@ -183,21 +200,30 @@ def trace_start(out: Path, run: Path | None) -> list[KeptStep]:
     return kept
 
 
+@dataclass(frozen=True)
+class _StartNote:
+    """What start.json says."""
+
+    run: str
+    step: int
+    saved: int | None
+
+
 def _read_start(out: Path, run: Path) -> KeptStep:
     """Read which checkpoint of a run another was adapted from. Raises ConfigError if it has gone, or the note is lost."""
     try:
-        note = json.loads((out / START).read_text())
-    except (OSError, ValueError) as error:
+        note = config.parse(_StartNote, read_json(out / START), str(out / START))
+    except (OSError, ValueError, ConfigError) as error:
         raise ConfigError(
             f"{out} does not tell from which checkpoint of {run} it was adapted ({error}); copy the whole run, or "
             "adapt again with --overwrite."
         ) from error
-    if not (run / "config.yaml").exists() or checkpoint_time(run, note["step"]) != note["saved"]:
+    if not (run / "config.yaml").exists() or checkpoint_time(run, note.step) != note.saved:
         raise ConfigError(
-            f"{out} was adapted from step {note['step']} of {run}, which is not there any more or was trained anew; "
+            f"{out} was adapted from step {note.step} of {run}, which is not there any more or was trained anew; "
             "put that run back (a longer train.keep_checkpoints keeps it), or adapt again with --overwrite."
         )
-    return KeptStep(run, note["step"], load_run_config(run).adapt)
+    return KeptStep(run, note.step, load_run_config(run).adapt)
 
 
 def load_run(out: Path) -> tuple[Experiment, Codec]:
@@ -208,17 +234,37 @@ def load_run(out: Path) -> tuple[Experiment, Codec]:
 
 def load_run_config(out: Path) -> Experiment:
     """The config that a run was trained with. Raises ConfigError if the folder holds none."""
+    _demand_run(out)
+    return load_recorded(out / "config.yaml")
+
+
+def _demand_run(out: Path) -> None:
     if not (out / "config.yaml").exists():
         raise ConfigError(f"{out} holds no run; train one: python -m xew.model.train CONFIG --out {out}")
-    return load_experiment(out / "config.yaml")
 
 
 def load_run_codec(out: Path, settings: CodecSettings) -> Codec:
     """The codec, of these settings, that a run was trained with. Raises ConfigError if the folder lacks it."""
     try:
-        return codec_class(settings).load(out / "codec")
+        return load_kept_codec(settings, out / "codec", "copy the whole run again, or train again")
     except FileNotFoundError as error:
         raise ConfigError(f"{out} lacks its codec ({error.filename}); copy the whole run, or train again.") from error
+
+
+def load_kept_codec(settings: CodecSettings, folder: Path, remedy: str) -> Codec:
+    """The codec, of these settings, that is kept in a folder.
+
+    Raises:
+        FileNotFoundError: it lacks a file.
+        ConfigError: it is damaged; `remedy` says what to do.
+    """
+    try:
+        return codec_class(settings).load(folder)
+    except (FileNotFoundError, ConfigError):
+        raise
+    except Exception as error:  # zipfile, zlib, NumPy and safetensors each have their own
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ConfigError(f"{folder} is damaged ({reason}); {remedy}.") from error
 
 
 def _check_same(saved: Any, asked: Any, out: Path) -> None:

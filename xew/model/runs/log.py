@@ -5,6 +5,7 @@ Only TensorBoard's own writer is used, so that neither TensorFlow nor PyTorch is
 
 import io
 import json
+import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +16,7 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
-from xew.files import replacing
+from xew.files import demand_regular, replacing
 
 FRAME_MILLISECONDS = 120
 
@@ -60,12 +61,21 @@ class RunLog:
 
 
 def _keep_until(path: Path, step: int) -> None:
-    """Leave out of metrics.jsonl the lines of later steps, and one that was cut off."""
-    lines = path.read_text().splitlines(keepends=True)
-    kept = [line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= step]
+    """Leave out of metrics.jsonl the lines of later steps, and those that were cut off or damaged."""
+    lines = demand_regular(path).read_text(errors="replace").splitlines(keepends=True)
+    kept = [line for line in lines if line.endswith("\n") and _step_of(line) <= step]
     if kept != lines:
         with replacing(path) as temporary:
             temporary.write_text("".join(kept))
+
+
+def _step_of(line: str) -> float:
+    """The step of a line; infinity where it cannot be read."""
+    try:
+        step = json.loads(line)["step"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return math.inf
+    return step if isinstance(step, int) else math.inf
 
 
 def _encode_image(frames: list[np.ndarray], kind: str) -> Summary.Image:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from typing import Any, Protocol
 
-from xew.config import ConfigError, pick
+from xew.config import ConfigError, check_finite, pick
 from xew.model.codecs.codec import codec_class
 from xew.model.codecs.contract import CodecSettings
 from xew.model.conditions import Condition
@@ -31,6 +31,8 @@ LEAST_OF_STEPS: dict[str, float] = {
     "train.warmup_steps": 0,
     "train.decay_to": 0,
     "train.clip_norm": 0,
+    "train.weight_decay": 0,
+    "train.seed": 0,
     "train.ema_decay": 0,
     "train.log_every": 1,
     "train.save_every": 1,
@@ -42,12 +44,15 @@ LEAST = LEAST_OF_STEPS | {
     "clip.height": 1,
     "clip.width": 1,
     "model.unroll": 1,
+    "train.epochs": 0,
     "train.accumulate": 1,
     "train.history_noise": 0,
     "adapt.lora_rank": 0,
     "rollout.steps": 1,
     "rollout.batch": 1,
     "rollout.max_frames": 0,
+    "rollout.guidance": 0,
+    "rollout.seed": 0,
 }
 """Numbers of an experiment that mean nothing below."""
 
@@ -75,6 +80,16 @@ class Settings(Protocol):
 
 def check_experiment(experiment: Settings, source: str) -> None:
     """Raise ConfigError, naming the source, with a choice of an experiment that does not exist or does not fit."""
+    try:
+        _check_choices(experiment, source)
+    except ConfigError as error:
+        if source in str(error):
+            raise
+        raise type(error)(f"{source}: {error}") from error
+
+
+def _check_choices(experiment: Settings, source: str) -> None:
+    check_finite(experiment, source)
     check_least(LEAST, experiment, source)
     codec_class(experiment.codec).check(experiment.codec)
     pick(SAMPLERS, experiment.rollout.sampler, "sampler")

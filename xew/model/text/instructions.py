@@ -24,7 +24,7 @@ from flax import nnx
 from jaxtyping import Int
 
 from xew.config import ConfigError
-from xew.files import replacing
+from xew.files import read_json, replacing
 from xew.model.text.umt5 import UMT5S, load_umt5
 
 VOCABULARY = 8192
@@ -199,7 +199,7 @@ class _EmbeddingCache:
 
     def _fingerprint(self, path: Path) -> str:
         """Sizes, beginnings and ends of a file or of a folder's files."""
-        noted = json.loads(self.notes.read_text()) if self.notes.exists() else {}
+        noted = read_json(self.notes) if self.notes.exists() else {}
         if not path.exists():
             if str(path) not in noted:
                 raise ConfigError(

@@ -12,6 +12,7 @@ from xew.model.network.dit_layouts import check_dit, load_dit_params
 from xew.model.runs.checkpoint import TrainState, restore_state, restore_sum
 from xew.model.runs.folder import trace_start
 from xew.model.runs.session import Session
+from xew.model.runs.sums import damaged
 from xew.model.settings.network import Network
 from xew.model.training.step import Learner
 
@@ -36,7 +37,10 @@ def begin_state(learner: Learner, start_from: Path | None, session: Session, bat
     if not resumed:
         return learner.init_state(params)
     state, position = restore_state(session.checkpoints, learner.shapes)
-    batches.set_state(position)
+    try:
+        batches.set_state(position)
+    except Exception as error:  # of whatever library the position comes from
+        raise damaged(session.out, session.step, ("data",), f"the position of the data is none: {error}") from error
     return replace(state, base=params)
 
 

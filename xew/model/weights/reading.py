@@ -6,7 +6,6 @@ Writes the leaves of a module, by its `Layout`
 Tensors are read one at a time, so that a checkpoint of 20 GB is never held twice, and nothing is ever unpickled freely.
 """
 
-import json
 import pickle
 import zipfile
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -23,6 +22,7 @@ from jaxtyping import Shaped
 from safetensors import SafetensorError, safe_open
 
 from xew.config import ConfigError
+from xew.files import read_json
 from xew.model.weights.layout import AXES, Layout, Source, list_some, module_leaves, tensor_shape
 
 PREFIXES = ("pipe.dit.", "pipe.", "model.diffusion_model.", "model.", "module.")
@@ -108,6 +108,8 @@ def fill(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Coll
     for path, source in wanted.items():
         variable = leaves[path]
         value = _leaf_value(tensors, source, variable.shape, np.dtype(variable.dtype))
+        if jax.numpy.issubdtype(value.dtype, jax.numpy.inexact) and not np.isfinite(value).all():
+            raise ConfigError(f"{tensors.source}: {source.keys[0]} holds NaN or infinite numbers; get the file again.")
         variable.set_value(_place(value, variable.get_value()))
 
 
@@ -231,7 +233,7 @@ def _open_folder(folder: Path) -> dict[str, Entry]:
 def _open_index(index: Path) -> dict[str, Entry]:
     """Open the shards that an index names; they lie beside it, and whatever points elsewhere is refused."""
     try:
-        names = json.loads(index.read_text())["weight_map"]
+        names = read_json(index)["weight_map"]
         shards = sorted(set(names.values()))
         elsewhere = [name for name in shards if Path(name).name != name or "\\" in name or not name.endswith(".safetensors")]
     except (ValueError, KeyError, TypeError, AttributeError) as error:

@@ -17,7 +17,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
 from xew.config import ConfigError
-from xew.files import replacing
+from xew.files import replacing, write_text
 from xew.model.weights.layout import AXES, Layout, module_leaves, tensor_shape
 
 SHARD_BYTES = 5_000_000_000
@@ -79,7 +79,7 @@ def _write_shards(folder: Path, leaves: Mapping[str, nnx.Variable], layout: Layo
     for shard, tensors in itertools.groupby(_convert(leaves, layout), key=lambda item: plan[item[0]]):
         _write(folder / names[shard], dict(tensors))
     index = {"metadata": {"total_size": sum(sizes.values())}, "weight_map": {key: names[shard] for key, shard in plan.items()}}
-    (folder / "diffusion_pytorch_model.safetensors.index.json").write_text(json.dumps(index, indent=2, sort_keys=True))
+    write_text(folder / "diffusion_pytorch_model.safetensors.index.json", json.dumps(index, indent=2, sort_keys=True))
 
 
 def _plan_shards(sizes: Mapping[str, int], limit: int) -> dict[str, int]:

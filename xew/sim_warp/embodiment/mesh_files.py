@@ -16,6 +16,8 @@ import trimesh
 from trimesh.resolvers import Resolver
 from trimesh.visual import TextureVisuals
 
+from xew.files import demand_regular
+
 LARGEST_FILE = 200e6
 """Largest size of a mesh file [bytes]; a larger one is refused before it is read."""
 MOST_TRIANGLES = 1_000_000
@@ -53,6 +55,10 @@ def read_mesh(path: Path) -> MeshFile:
     Raises:
         MeshError: it is too large, unreadable or empty (triangles that are not finite do not count).
     """
+    try:
+        demand_regular(path)
+    except OSError as error:
+        raise MeshError(f"cannot be read ({error.strerror})") from error
     if path.stat().st_size > LARGEST_FILE:
         raise MeshError(f"has {path.stat().st_size / 1e6:.0f} MB, at most {LARGEST_FILE / 1e6:.0f}; simplify it")
     companions = _Companions(path.parent)
@@ -129,7 +135,7 @@ class _Companions(Resolver):
 
     def get(self, name: str) -> bytes:
         path = self.folder / name.strip().replace("\\", "/")
-        content = path.read_bytes()
+        content = demand_regular(path).read_bytes()
         if path not in self.found:
             self.found.append(path)
         return content

@@ -24,9 +24,9 @@ from xew.sim_warp.physics.plausibility import find_implausible
 from xew.sim_warp.rendering.observe import observe, scene_recording
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import command_renders
-from xew.sim_warp.robots import get_robot
+from xew.sim_warp.robots import recorded_robot
 from xew.sim_warp.scene import Scene, scene_hash, scene_rng
-from xew.sim_warp.tasks import get_task
+from xew.sim_warp.tasks import recorded_task
 
 
 def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarray]:
@@ -40,7 +40,7 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
     """
     demand_known(folder, "joint_pos", "object_pose")
     record, states = read_record(folder), read_states(folder)
-    robot = get_robot(record.robot, data_folder(folder))
+    robot = recorded_robot(record.robot, data_folder(folder))
     scene = _sample_again(folder, record)
     view = observe(renderer, [scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)])[0]
     render = command_renders([(robot, states.action)], renderer=renderer)[0]
@@ -68,7 +68,7 @@ def demand_plausible(folder: Path) -> None:
     """Raise EpisodeError if an accepted episode's states hold what could not have happened (plausibility.py)."""
     record, states = read_record(folder), read_states(folder)
     scene = _sample_again(folder, record)
-    holds = get_task(record.task).plan(scene).path().holds
+    holds = recorded_task(record.task).plan(scene).path().holds
     problem = find_implausible(scene, holds, states.object_pose, states.penetration, states.tool_pose, record.frame_rate)
     if problem:
         raise EpisodeError(f"{folder}: {problem}; delete it and run generate again.")
@@ -76,7 +76,7 @@ def demand_plausible(folder: Path) -> None:
 
 def _sample_again(folder: Path, record: Record) -> Scene:
     """The scene of an episode. Raises EpisodeError if its task has other objects now."""
-    scene = get_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
+    scene = recorded_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
     if scene.names != record.object_names:
         raise EpisodeError(
             f"{folder} has the objects {', '.join(record.object_names)}, {record.task} makes {', '.join(scene.names)} of its "

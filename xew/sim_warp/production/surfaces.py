@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from xew.config import ConfigError
+from xew.config import ConfigError, UntrustedError
 from xew.episode import Record, States, data_folder, read_record, read_states
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.geometry.camera import Camera
@@ -21,9 +21,9 @@ from xew.sim_warp.rendering.observe import scene_recording
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import default_renderer
 from xew.sim_warp.rendering.surfaces import SurfaceTracks, track_surfaces
-from xew.sim_warp.robots import get_robot
+from xew.sim_warp.robots import recorded_robot
 from xew.sim_warp.scene import Scene, scene_hash, scene_rng
-from xew.sim_warp.tasks import get_task
+from xew.sim_warp.tasks import recorded_task
 
 MOVED = 0.01
 """Distance from its first place [m] from which on a body has moved."""
@@ -64,11 +64,14 @@ def read_surfaces(folder: Path, renderer: Renderer | None = None, keep: Path | N
 
     Raises:
         EpisodeError: a file is missing or damaged.
+        UntrustedError: the task or robot is of a module that the user has not admitted.
     """
     record = read_record(folder)
     try:
         scene = None if record.source else _find_scene(record)
-        robot = get_robot(record.robot, data_folder(folder))
+        robot = recorded_robot(record.robot, data_folder(folder))
+    except UntrustedError:
+        raise
     except ConfigError:  # of a task or robot that is not known here
         scene = None
     if scene is None:
@@ -94,7 +97,7 @@ def _render_surfaces(robot: RobotSpec, scene: Scene, states: States, renderer: R
 
 def _find_scene(record: Record) -> Scene | None:
     """The scene of an episode; None where its task makes another of its seed now."""
-    scene = get_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
+    scene = recorded_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
     return scene if scene.names == record.object_names and scene_hash(scene) == record.scene_hash else None
 
 

@@ -8,7 +8,8 @@ name it `module:SPEC` wherever a robot is asked for, or name the path of a URDF 
 
 from pathlib import Path
 
-from xew.config import ConfigError, pick
+from xew.config import ConfigError, demand_admitted, pick
+from xew.files import EpisodeError, check_name
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, UrdfError, load_urdf
 from xew.sim_warp.robots import aloha_agilex, arx_x5, franka_panda, piper, ur5_wsg
@@ -27,6 +28,7 @@ __all__ = [
     "keep_robot",
     "load_robot",
     "load_urdf",
+    "recorded_robot",
 ]
 
 ROBOTS: dict[str, RobotSpec] = {
@@ -63,3 +65,24 @@ def get_robot(name: str | RobotSpec, data: Path | None = None) -> RobotSpec:
             raise
         hint = f"A robot at a path is named with a /; a data set keeps its own in <data>/robots, list that in {FOLDERS}."
         raise ConfigError(f"{error} {hint}") from None
+
+
+def recorded_robot(name: str, data: Path | None = None) -> RobotSpec:
+    """The robot that an episode or another file names: it is never a path, and `module:NAME` only of an admitted module.
+
+    Args:
+        name: as recorded.
+        data: as in `get_robot`; what a robot there is read from lies below its folder.
+
+    Raises:
+        UntrustedError: its module is not admitted.
+        ConfigError: there is no such robot, or it cannot be used.
+    """
+    try:
+        check_name(name, "robot")
+    except EpisodeError as error:
+        raise ConfigError(str(error)) from error
+    demand_admitted(name, "the robot")
+    if name not in ROBOTS and is_path(name):  # as arm.urdf, a file of the current folder
+        raise ConfigError(f"the robot is {name!r}, a path; rename the folder that keeps it, and what names it.")
+    return get_robot(name, data)

@@ -19,7 +19,8 @@ import numpy as np
 import tyro
 
 from xew.config import user_errors
-from xew.episode import EpisodeError, write_video
+from xew.episode import EpisodeError, encode_png, write_video
+from xew.files import write_bytes
 from xew.protocol import expand_robots
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
@@ -115,8 +116,10 @@ def write_references(robot: RobotSpec, folder: Path) -> Path:
 
 def save(path: Path, image: np.ndarray) -> None:
     """Write a PNG of [h w 3] uint8."""
-    if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
-        raise EpisodeError(f"{path} cannot be written; choose another folder.")
+    try:
+        write_bytes(path, encode_png(image))
+    except OSError as error:
+        raise EpisodeError(f"{path} cannot be written ({error.strerror}); choose another folder.") from error
 
 
 def write_sheets(robots: Sequence[RobotSpec], folder: Path) -> list[Path]:

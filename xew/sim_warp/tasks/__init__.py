@@ -4,7 +4,7 @@ To add one, write a file with `TASK = Task(...)` here and add its line to `TASKS
 anywhere importable and name it `module:TASK` wherever a task is asked for.
 """
 
-from xew.config import pick
+from xew.config import pick, pick_recorded
 from xew.sim_warp.tasks import (
     beat_block_hammer,
     blocks_ranking_rgb,
@@ -34,7 +34,7 @@ from xew.sim_warp.tasks import (
 )
 from xew.sim_warp.tasks.task import Moment, Task
 
-__all__ = ["TASKS", "Moment", "Task", "get_task"]
+__all__ = ["TASKS", "Moment", "Task", "get_task", "recorded_task"]
 
 TASKS: dict[str, Task] = {
     "beat_block_hammer": beat_block_hammer.TASK,
@@ -68,3 +68,8 @@ TASKS: dict[str, Task] = {
 def get_task(name: str) -> Task:
     """The task of a registry key, or of an import path `module:NAME`. Raises ConfigError if there is none."""
     return pick(TASKS, name, "task")
+
+
+def recorded_task(name: str) -> Task:
+    """The task that an episode names. Raises UntrustedError where its module is not admitted, ConfigError if there is none."""
+    return pick_recorded(TASKS, name, "task")

@@ -20,7 +20,7 @@ import trimesh
 
 from xew.config import ConfigError
 from xew.episode import complete_folder
-from xew.files import cache_folder
+from xew.files import cache_folder, read_json
 from xew.protocol import BODY_NAME, body_key
 from xew.sim_warp.embodiment import mesh_files, prepared, urdf
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
@@ -77,7 +77,7 @@ def load_body(number: int) -> RobotSpec:
 def read_catalog(path: Path = CATALOG) -> tuple[Entry, ...]:
     """The entries of a catalog, by number. Raises ConfigError if it cannot be read."""
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))["bodies"]
+        entries = read_json(path)["bodies"]
         return tuple(
             Entry(
                 entry["candidate"],

@@ -24,7 +24,7 @@ import yaml
 
 from xew.config import ConfigError
 from xew.episode import complete_folder
-from xew.files import cache_folder, replacing
+from xew.files import EpisodeError, cache_folder, check_name, demand_regular, path_below, read_json, replacing
 from xew.protocol import BODY_NAME, ROBOT_NAMES, expand_robots
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
@@ -136,7 +136,7 @@ def _place_digest(draft: RobotDraft, robot: RobotSpec) -> str:
 def _read_place(path: Path, robot: RobotSpec) -> RobotSpec | None:
     """The robot with the bases, homes and tool frames that were found before; None if there are none."""
     try:
-        kept = json.loads(path.read_text(encoding="utf-8"))
+        kept = read_json(path)
         left, right = (
             replace(arm, root_pose=tuple(found["root_pose"]), home=tuple(found["home"]), tool_pose=tuple(found["tool_pose"]))
             for arm, found in zip(robot.arms, kept, strict=True)
@@ -176,11 +176,34 @@ def adopt_robots(names: Sequence[str], data: Path) -> tuple[str, ...]:
 
 def kept_robot(key: str, data: Path | None = None) -> RobotSpec | None:
     """The robot of a key that a data set keeps, or else a folder of `XEW_ROBOTS`; None where neither has it."""
-    listed = [Path(folder) for folder in os.environ.get(FOLDERS, "").split(os.pathsep) if folder]
-    for folder in [*([] if data is None else [Path(data) / KEPT]), *listed]:
+    if data is not None and (kept := Path(data) / KEPT / key / OWN).is_file():
+        try:
+            check_name(key, "robot")
+            _demand_own_files(kept, kept.stat().st_mtime_ns)
+        except EpisodeError as error:
+            raise ConfigError(str(error)) from error
+        return load_robot(kept.parent)
+    for folder in [Path(folder) for folder in os.environ.get(FOLDERS, "").split(os.pathsep) if folder]:
         if (folder / key / OWN).is_file():
             return load_robot(folder / key)
     return None
+
+
+@lru_cache(maxsize=256)
+def _demand_own_files(kept: Path, modified: int) -> None:
+    """Raise EpisodeError where a robot that data hold is read from files outside of its folder: data come from anybody."""
+    folder = kept.parent
+    path_below(folder.parent, folder.name)
+    urdf = path_below(folder, read_draft(path_below(folder, kept.name)).urdf)
+    try:
+        named = [mesh.get("filename", "") for mesh in ElementTree.parse(demand_regular(urdf)).iter()]
+    except (OSError, ElementTree.ParseError) as error:
+        raise EpisodeError(f"{urdf} cannot be read as a URDF ({error}); copy the data set again.") from error
+    for name in filter(None, named):
+        path_below(folder, str(urdf.parent.relative_to(folder) / name))
+    for file in load_urdf(urdf).files:  # what meshes name in turn
+        if not file.resolve().is_relative_to(folder.resolve()):
+            raise EpisodeError(f"{kept} reads {file}, which is not below its folder; copy the data set again.")
 
 
 def _adopt(path: Path, data: Path) -> str:
@@ -214,7 +237,7 @@ def keep_robot(robot: RobotSpec, data: Path, digest: str = "") -> RobotSpec:
     Args:
         digest: SHA-256 of what the robot was made from, by which it is known again.
     """
-    folder = Path(data) / KEPT / robot.key
+    folder = path_below(data, KEPT, robot.key)
     if not (folder / OWN).is_file():
         _write(robot, digest, folder)
     return load_robot(folder)

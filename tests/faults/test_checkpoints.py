@@ -1,0 +1,131 @@
+"""Damaged checkpoints and codecs: one line that names file and step and offers the last good one; flipped bits are noticed."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from xew.config import ConfigError
+from xew.model.codecs.codec import CodecSettings, PatchCodec
+from xew.model.runs.checkpoint import TrainState, open_checkpoints, restore_state, save_state
+from xew.model.runs.folder import load_kept_codec
+from xew.model.runs.log import RunLog
+from xew.model.runs.sums import note_sums
+
+
+def state(step: int, value: float = 1.0, width: int = 64) -> TrainState:
+    params = {"kernel": jnp.full((8, width), value, jnp.float32), "bias": jnp.arange(width, dtype=jnp.float32)}
+    return TrainState(jnp.int32(step), params, {"count": jnp.zeros((3,), jnp.float32)})
+
+
+def save(out: Path, *states: TrainState) -> None:
+    with open_checkpoints(out, keep=5) as checkpoints:
+        for one in states:
+            save_state(checkpoints, one, {"position": 3})
+    note_sums(out)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("run")
+    save(out, state(1), state(2))
+    return out
+
+
+def largest(folder: Path) -> Path:
+    return max((file for file in folder.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size)
+
+
+def flip(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 4
+    file.write_bytes(content)
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "a flipped bit": lambda step: flip(largest(step / "params")),
+    "a file cut off": lambda step: largest(step / "params").write_bytes(largest(step / "params").read_bytes()[:-7]),
+    "an empty file": lambda step: largest(step / "params").write_bytes(b""),
+    "a file missing": lambda step: largest(step / "params").unlink(),
+    "an item missing": lambda step: shutil.rmtree(step / "optimizer"),
+    "the data's position missing": lambda step: shutil.rmtree(step / "data"),
+    "all missing": lambda step: [shutil.rmtree(item) for item in step.iterdir() if item.is_dir()],
+}
+
+
+@pytest.mark.parametrize("sums", ["with sums", "without sums"])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damage_is_told_and_the_last_good_step_is_offered(damage: str, sums: str, whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    DAMAGES[damage](out / "checkpoints/2")
+    if sums == "without sums":
+        if damage == "a flipped bit":
+            pytest.skip("only sums tell it")
+        (out / "sums/2.json").unlink()
+    said = ""
+    with open_checkpoints(out, keep=5) as checkpoints:
+        try:
+            restored, _ = restore_state(checkpoints, state(0))
+        except ConfigError as error:
+            said = str(error)
+    if not said:  # Orbax may have the same bytes twice; then nothing is lost
+        assert sums == "without sums" and damage == "a file missing"
+        np.testing.assert_array_equal(restored.params["kernel"], state(2).params["kernel"])
+        return
+    assert "\n" not in said and f"{out}/checkpoints/2: the checkpoint of step 2 is damaged" in said
+    assert "step 1 is whole" in said
+    shutil.rmtree(out / "checkpoints/2")
+    with open_checkpoints(out, keep=5) as checkpoints:
+        restored, position = restore_state(checkpoints, state(0))
+    assert int(restored.step) == 1 and position == {"position": 3}
+
+
+def test_other_sizes_and_weights_that_are_no_numbers_are_told(whole: Path, tmp_path: Path) -> None:
+    with open_checkpoints(whole, keep=5) as checkpoints, pytest.raises(ConfigError, match="step 2 is damaged"):
+        restore_state(checkpoints, state(0, width=32))
+    save(tmp_path, state(1, float("nan")))
+    with open_checkpoints(tmp_path, keep=5) as checkpoints, pytest.raises(ConfigError, match=r"holds NaN.*no other is known"):
+        restore_state(checkpoints, state(0))
+
+
+def test_whole_checkpoints_are_read_and_sums_go_with_them(whole: Path, tmp_path: Path) -> None:
+    with open_checkpoints(whole, keep=5) as checkpoints:
+        restored, _ = restore_state(checkpoints, state(0))
+    np.testing.assert_array_equal(restored.params["bias"], state(2).params["bias"])
+    assert jax.tree.all(jax.tree.map(lambda leaf: leaf.dtype == jnp.float32, restored.params))
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    shutil.rmtree(out / "checkpoints/1")
+    note_sums(out)
+    assert [path.name for path in (out / "sums").iterdir()] == ["2.json"]
+
+
+def test_a_damaged_codec_is_told(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    codec = PatchCodec.fit([rng.integers(0, 256, (5, 16, 16, 3), np.uint8)], 8, 4)
+    codec.save(tmp_path)
+    settings = CodecSettings(name="patch_pca", spatial_factor=8, channels=4)
+    assert load_kept_codec(settings, tmp_path, "copy it again").hash == codec.hash
+    content = (tmp_path / "codec.npz").read_bytes()
+    arrays = dict(np.load(tmp_path / "codec.npz"))
+    for damaged in (b"", content[:100], content[:-30], b"PK\x03\x04" + content[4:200], b"text"):
+        (tmp_path / "codec.npz").write_bytes(damaged)
+        with pytest.raises(ConfigError, match="copy it again"):
+            load_kept_codec(settings, tmp_path, "copy it again")
+    for name in arrays:
+        for other in (arrays[name] * np.nan if arrays[name].dtype.kind == "f" else np.int64(0), arrays[name][..., None]):
+            np.savez(tmp_path / "codec.npz", **(arrays | {name: other}))
+            with pytest.raises(ConfigError):
+                load_kept_codec(settings, tmp_path, "copy it again")
+
+
+def test_a_damaged_log_of_numbers_is_gone_on_from(tmp_path: Path) -> None:
+    good = '{"step": 1, "a": 2.0}\n'
+    (tmp_path / "metrics.jsonl").write_text(good + 'null\n[1]\n{"a": 1}\n{"step": "x"}\n\x00\x00\n{"step": 9}\n{"step": 2, "b"')
+    RunLog(tmp_path, 3).close()
+    assert (tmp_path / "metrics.jsonl").read_text() == good
