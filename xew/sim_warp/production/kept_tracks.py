@@ -5,7 +5,6 @@ Writes the same; a file says what it was made from, and one that was made from a
 """
 
 import hashlib
-import io
 import threading
 import zipfile
 import zlib
@@ -59,11 +58,10 @@ def load_tracks(path: Path, key: str) -> SurfaceTracks | None:
 def save_tracks(path: Path, key: str, tracks: SurfaceTracks) -> None:
     """Keep tracks under a key; where the disk does not take them, they are made again next time."""
     arrays = {field.name: getattr(tracks, field.name) for field in fields(tracks)}
-    content = io.BytesIO()
-    np.savez_compressed(content, key=np.array(key), **(arrays | {"names": np.array(tracks.names)}))
+    arrays["names"] = np.array(tracks.names)
     try:
-        with _SAVING, replacing(path) as temporary:
-            temporary.write_bytes(content.getvalue())
+        with _SAVING, replacing(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, key=np.array(key), **arrays)
     except OSError:
         return
 
