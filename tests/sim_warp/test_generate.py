@@ -102,7 +102,7 @@ def test_what_is_deleted_is_made_again(undisturbed: Path, tmp_path: Path) -> Non
     shutil.copytree(undisturbed, out)
     for seed, robot in ((2, SLOW), (1, SLOW), (3, "franka_panda")):
         shutil.rmtree(episode_folder(out, TASK, seed, robot))
-    left_over = episode_folder(out, TASK, 0, ".writing-abc")
+    left_over = episode_folder(out, TASK, 0, "franka_panda").with_name(".writing-abc")
     left_over.mkdir()
     generate(arguments(out, workers=1))
     assert contents(out) == contents(undisturbed)
