@@ -26,7 +26,8 @@ import cattrs
 import tyro
 import yaml
 
-from xew.files import EpisodeError, demand_regular, write_text
+from xew.files import demand_regular, write_text
+from xew.names import EpisodeError
 
 T = TypeVar("T")
 

@@ -28,10 +28,11 @@ import av
 import cv2
 import numpy as np
 
+from xew.concurrency import PARSING
 from xew.config import ConfigError, parse
-from xew.files import EpisodeError as EpisodeError
-from xew.files import check_label, check_name, demand_regular, path_below, read_json
-from xew.threads import PARSING
+from xew.files import demand_regular, read_json
+from xew.names import EpisodeError as EpisodeError
+from xew.names import check_label, check_name, path_below
 
 SCHEMA_VERSION = 2
 WIDTH, HEIGHT = 320, 240
@@ -121,7 +122,7 @@ def episode_folder(data: Path, task: str, seed: int, robot: str) -> Path:
     """The folder of an episode, or of what belongs to it in a tree of the same form.
 
     Raises:
-        EpisodeError: a name or the seed could not be that of a folder (`xew.files.check_name`).
+        EpisodeError: a name or the seed could not be that of a folder (`xew.names.check_name`).
     """
     return Path(data).joinpath(*_folder_names(task, seed, robot))
 

@@ -1,8 +1,4 @@
-"""Files, for all rooms: names and paths that files give, files written whole or not at all, and digests of their content.
-
-Data sets, rollouts, runs and score tables come from anybody. A name that one of them holds becomes part of a path only through
-`check_name` and `path_below`, and what is opened is a regular file (`demand_regular`).
-"""
+"""Files, for all rooms: regular files are read, files are written whole or not at all, locked, removed and digested."""
 
 import errno
 import fcntl
@@ -11,27 +7,17 @@ import glob
 import hashlib
 import json
 import os
-import re
 import socket
 import stat
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import IO, Any
 
-NAME = re.compile(r"\w[\w.+-]*(?::[^\W\d]\w*)?")
-"""Form of the name of a task or robot in a file: a key, or `module:NAME`. It is no path, neither hidden nor an option."""
-MOST_LETTERS = 200
-"""Largest length of a name [bytes]; file systems take 255 with an ending."""
-SHOWN_LETTERS = 80
-"""Largest number of letters of a wrong name that a message shows."""
-ACTIVE_TAG = re.compile(
-    r"<(?=[A-Za-z/!?])(?!(?!base|embed|form|iframe|link|math|meta|object|plaintext|script|style|svg|template|textarea|title|xmp)"
-    r"[a-z]+>)"
-)
-"""Beginnings of HTML tags in Markdown, but for those without attributes that only format, as <frame> in a name."""
+from xew.names import EpisodeError
+
 SETTLED_S = 2.0
 """Age from which the file of a process that does not exist here is taken for left [s]; on another machine it may exist."""
 KINDS = {stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
@@ -56,83 +42,6 @@ RUN_FILES = (
     "pictures/*.png",
 )
 """Patterns of the paths of what trainings write into the folder of a run."""
-
-
-class EpisodeError(Exception):
-    """An episode, or another thing on disk that should hold one, is not as it should be; the message says what to do."""
-
-
-def check_name(name: object, what: str) -> str:
-    """The name of a task or robot, as a file gives it, where it is fit to be a folder's name.
-
-    Args:
-        name: as found.
-        what: it names, for the message.
-
-    Raises:
-        EpisodeError: it is no text, too long, or has other characters than `NAME`; a path is refused so.
-    """
-    if not isinstance(name, str) or not NAME.fullmatch(name) or len(name.encode()) > MOST_LETTERS:
-        raise EpisodeError(
-            f"the {what} is {_shorten(name)}, expected a key of letters, digits, _, -, + and dots, or module:NAME; correct it "
-            "where it stands, or leave that file out."
-        )
-    return name
-
-
-def check_label(text: object, what: str) -> str:
-    """The name of a model or condition, as a file gives it, where it is fit to print; it may have spaces and slashes.
-
-    Raises:
-        EpisodeError: it is no printable text, or reads as a path to elsewhere.
-    """
-    if not isinstance(text, str) or not text.isprintable() or len(text) > MOST_LETTERS:
-        raise EpisodeError(f"the {what} is {_shorten(text)}, expected printable text of at most {MOST_LETTERS} letters.")
-    if text.startswith(("/", "~")) or "\\" in text or ".." in PurePosixPath(text).parts:
-        raise EpisodeError(f"the {what} is {_shorten(text)}, which reads as a path to elsewhere; give it a plain name.")
-    return text
-
-
-def _shorten(name: object) -> str:
-    text = repr(name)
-    return text if len(text) <= SHOWN_LETTERS else f"{text[:SHOWN_LETTERS]}…"
-
-
-def plain_markdown(text: str) -> str:
-    """Text as part of Markdown, in which it opens no link, picture, cell of a table, or HTML tag that does anything."""
-    return ACTIVE_TAG.sub(r"\\<", text.replace("|", r"\|")).replace("](", r"]\(")
-
-
-def csv_text(frame: Any) -> str:
-    """A table (pandas) as CSV without its index; texts that would begin a spreadsheet's formula get a quote in front."""
-    texts = {column: frame[column].map(_plain_cell) for column in frame if frame[column].dtype.kind not in "biufcmM"}
-    return frame.assign(**texts).rename(columns=_plain_cell).to_csv(index=False)
-
-
-def _plain_cell(value: object) -> object:
-    if not isinstance(value, str) or len(value) < 2 or value[0] not in "=+-@\t\r":
-        return value
-    try:
-        float(value)
-    except ValueError:
-        return f"'{value}"
-    return value
-
-
-def path_below(root: Path, *names: str) -> Path:
-    """The path of names below a root, with links followed to see where it ends.
-
-    Raises:
-        EpisodeError: it ends elsewhere than below the root, or links lead in a circle.
-    """
-    path = Path(root, *names)
-    try:
-        end, top = path.resolve(), Path(root).resolve()
-    except (OSError, RuntimeError, ValueError) as error:
-        raise EpisodeError(f"{path} leads nowhere ({error}); put the folder or file itself there.") from error
-    if end == top or not end.is_relative_to(top):
-        raise EpisodeError(f"{path} leads to {end}, which is not below {root}; put the folder or file itself there.")
-    return path
 
 
 def demand_regular(path: Path) -> Path:

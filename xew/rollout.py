@@ -21,7 +21,8 @@ import cv2
 import numpy as np
 
 from xew.episode import SEED_END, EpisodeError, complete_folder, open_video, place_episode, read_npz, write_video
-from xew.files import check_label, check_name, demand_regular, read_json
+from xew.files import demand_regular, read_json
+from xew.names import check_label, check_name
 
 VIDEO_SUFFIXES = (".mkv", ".mp4", ".npz")
 RATE_TOLERANCE = 0.01

@@ -27,11 +27,11 @@ from xew.dataset import read_dataset
 from xew.episode import EpisodeError, complete_folder, episode_folder, place_episode, read_record, read_video
 from xew.exchange import robotwin
 from xew.exchange.hdf5 import read_robotwin
-from xew.files import check_name, path_below
 from xew.metrics.calibration.perturbations import render_perturbation
 from xew.model import outside, rollout
 from xew.model.experiment import load_experiment
 from xew.model.runs.folder import claim_run, load_run_config
+from xew.names import check_name, path_below
 from xew.rollout import RolloutError, find_rollouts, read_rollout, write_rollout
 from xew.sim_warp.inspect import draw_pictures, find_problem, read_headers
 from xew.sim_warp.manifest import read_manifest

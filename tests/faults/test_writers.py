@@ -23,8 +23,8 @@ from xew.analysis.report import Args, main
 from xew.analysis.reports import page
 from xew.analysis.tables import formats
 from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection
-from xew.files import csv_text, plain_markdown
 from xew.metrics.grading.summary import title
+from xew.names import csv_text, plain_markdown
 from xew.protocol import TEST_SEED_START
 
 LABELS = yaml.safe_load((Path(__file__).parent / "labels.yaml").read_text(encoding="utf-8"))

@@ -38,7 +38,8 @@ from xew.analysis.distances.workspaces import (
     workspace_cloud,
 )
 from xew.config import ConfigError, user_errors
-from xew.files import csv_text, replacing
+from xew.files import replacing
+from xew.names import csv_text
 from xew.protocol import ROBOT_NAMES
 from xew.sim_warp.robots import RobotSpec, Urdf, get_robot, load_urdf
 

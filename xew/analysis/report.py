@@ -40,7 +40,8 @@ from xew.analysis.tables.table import Table, TableCell, TableRow, TableSection, 
 from xew.config import ConfigError, user_errors
 from xew.dataset import find_records
 from xew.episode import Record, episode_folder, read_video
-from xew.files import csv_text, hold_lock, path_below, plain_markdown, write_bytes, write_text
+from xew.files import hold_lock, write_bytes, write_text
+from xew.names import csv_text, path_below, plain_markdown
 from xew.protocol import BASELINES, HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
 from xew.statistics import MIN_SCENES

@@ -16,7 +16,8 @@ import numpy as np
 import pandas as pd
 
 from xew.config import IMPORT_PATH, ConfigError, parse
-from xew.files import EpisodeError, check_label, check_name, demand_regular, replacing
+from xew.files import demand_regular, replacing
+from xew.names import EpisodeError, check_label, check_name
 from xew.protocol import BASELINES, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES
 
 VARIANT = "variant"

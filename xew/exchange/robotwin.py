@@ -24,7 +24,8 @@ import xew
 from xew.config import ConfigError, user_errors
 from xew.episode import EpisodeError, Record, States, episode_folder, read_record, read_states, write_episode
 from xew.exchange.hdf5 import Recorded, read_robotwin, text_beside
-from xew.files import check_name, hold_lock
+from xew.files import hold_lock
+from xew.names import check_name
 from xew.protocol import ACTION_DIM, ARMS
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.geometry.camera import Camera

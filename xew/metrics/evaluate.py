@@ -26,9 +26,10 @@ import tyro
 from tqdm import tqdm
 
 from xew.compilation import keep_compiled_programs
+from xew.concurrency import map_in_order
 from xew.config import ConfigError, admit, pick, suggestion, user_errors
 from xew.episode import EpisodeError, verify_episode
-from xew.files import csv_text, hold_lock
+from xew.files import hold_lock
 from xew.metrics import METRICS
 from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, identity, open_masker, open_tracker
 from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, grade, input_kind
@@ -50,9 +51,9 @@ from xew.metrics.grading.summary import summarize, to_markdown
 from xew.metrics.grading.workers import Bench, make_opener, open_nothing, worker_count
 from xew.metrics.metric import SUITES
 from xew.metrics.truth import Truth, read_truth
+from xew.names import csv_text
 from xew.protocol import HELD_OUT_ROBOTS
 from xew.rollout import RolloutError
-from xew.threads import map_in_order
 
 PROTOCOL = 4
 """Version of the grading: it goes up when any score would change, and scores of another version are graded anew."""

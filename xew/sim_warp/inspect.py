@@ -24,7 +24,8 @@ from tqdm import tqdm
 from xew.config import admit, user_errors
 from xew.dataset import explain_missing, read_dataset
 from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, encode_png, read_record, read_states, read_video, verify_episode
-from xew.files import hold_lock, path_below, replacing, write_bytes
+from xew.files import hold_lock, replacing, write_bytes
+from xew.names import path_below
 from xew.sim_warp.devices.workers import Workers, quiet_warp
 from xew.sim_warp.generate import yield_table
 from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again

@@ -23,7 +23,8 @@ import tyro
 from xew.config import user_errors
 from xew.dataset import explain_missing, find_records
 from xew.episode import EpisodeError, Record
-from xew.files import check_name, read_json, replacing
+from xew.files import read_json, replacing
+from xew.names import check_name
 from xew.protocol import TEST_SEED_START
 
 PACKAGED = Path(__file__).with_name("seeds.json")

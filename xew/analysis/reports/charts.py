@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from xew.files import csv_text
+from xew.names import csv_text
 
 INK, SOFT, LINE, GROUND = "#1f2328", "#57606a", "#d0d7de", "#ffffff"
 SERIES = ("#1f6feb", "#c2410c", "#15803d", "#7e22ce", "#a16207", "#0e7490")

@@ -49,7 +49,7 @@ from xew.analysis.tables.paper import (
     robot_table,
 )
 from xew.analysis.tables.table import Table
-from xew.files import csv_text
+from xew.names import csv_text
 from xew.protocol import ROBOT_NAMES
 
 TITLE = "The paper's figures, rebuilt from one another"

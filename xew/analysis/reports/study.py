@@ -39,7 +39,7 @@ from xew.analysis.tables.labels import ACTIONS, LADDER, SHORT_ROBOTS
 from xew.analysis.tables.layouts import build_tables, count_table
 from xew.analysis.tables.outside import outside_tables
 from xew.analysis.tables.table import MARKS, Table
-from xew.files import csv_text, plain_markdown
+from xew.names import csv_text, plain_markdown
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
 
 TITLE = "Can the model render a robot that it has never seen?"

@@ -21,7 +21,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Literal
 
-from xew.processes import leave_with_parent
+from xew.concurrency import leave_with_parent
 
 PRELOADED = ("xew.model.train", "xew.model.rollout", "xew.metrics.evaluate")
 """Modules that the fork server imports. None of them may start a thread or a JAX backend at import, which no fork survives."""

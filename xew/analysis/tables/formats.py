@@ -7,7 +7,7 @@ import pandas as pd
 
 from xew.analysis.tables.findings import Finding
 from xew.analysis.tables.table import Table, TableCell, TableRow
-from xew.files import plain_markdown
+from xew.names import plain_markdown
 
 MARK = {"better": "▲", "worse": "▼", "unresolved": "≈", "": ""}
 AGREES = {None: "", True: "✓", False: "✗"}

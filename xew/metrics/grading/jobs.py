@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
+from xew.concurrency import map_in_order
 from xew.config import ConfigError
 from xew.episode import EpisodeError, Record, episode_folder, read_record
 from xew.files import digest_files
@@ -16,7 +17,6 @@ from xew.metrics.grading.scores import Cell
 from xew.metrics.truth import Truth
 from xew.protocol import GROUND_TRUTH
 from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video, resize_video
-from xew.threads import map_in_order
 
 SOFTNESS = 0.8
 """Standard deviation [pixels] of the blur through which estimators see the true video. Reference-aligned ones hardly err on the

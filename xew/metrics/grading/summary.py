@@ -13,8 +13,8 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
-from xew.files import plain_markdown
 from xew.metrics import METRICS
+from xew.names import plain_markdown
 from xew.protocol import BASELINES, COPY_FIRST_FRAME, GROUND_TRUTH
 from xew.statistics import DRAWS, LEVEL, MIN_SCENES, UNITS, Mean, Units, bootstrap_means, noise_floor, verdict
 

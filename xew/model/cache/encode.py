@@ -6,13 +6,13 @@ from collections.abc import Sequence
 import numpy as np
 from tqdm import tqdm
 
+from xew.concurrency import map_in_order
 from xew.dataset import Episode
 from xew.episode import Record
 from xew.model.cache.clips import cut_clip, needed_pixels, read_streams
 from xew.model.cache.store import LatentCache
 from xew.model.codecs.contract import Codec, check_clip_shape, encode_pictures
 from xew.model.video.pixels import PixelSource, stored_pixels
-from xew.threads import map_in_order
 
 
 def encode_episodes(

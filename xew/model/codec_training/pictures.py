@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from tqdm import tqdm
 
+from xew.concurrency import map_in_order
 from xew.config import ConfigError
 from xew.dataset import Episode
 from xew.episode import EpisodeError, Record, open_video, read_states
@@ -25,7 +26,6 @@ from xew.model import conditions
 from xew.model.cache.clips import take_frames
 from xew.model.conditions import make_command
 from xew.model.video.frames import TEMPORAL_FACTOR, to_model_size
-from xew.threads import map_in_order
 
 STORED = {"rgb": "rgb.mkv", "robot_render": "robot.mkv"}
 """Streams that every episode has as a file."""

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from xew.concurrency import map_in_order
 from xew.model.codec_training.pictures import Pictures
 from xew.model.codec_training.settings import CodecTrainSettings
-from xew.threads import map_in_order
 
 THREADS = 4
 """Number of threads that pick clips in the host's memory."""

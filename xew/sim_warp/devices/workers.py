@@ -18,9 +18,9 @@ from typing import TypeVar
 
 import warp
 
+from xew.concurrency import leave_with_parent
 from xew.config import ConfigError
 from xew.episode import EpisodeError
-from xew.processes import leave_with_parent
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

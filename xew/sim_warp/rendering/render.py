@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 
+from xew.concurrency import PARSING
 from xew.sim_warp import stage
 from xew.sim_warp.devices.waiting import wait_for
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera, project
@@ -31,7 +32,6 @@ from xew.sim_warp.rendering.packing import (
     pack_points,
 )
 from xew.sim_warp.rendering.passes import FLOW_LIMIT, Call, Chunk, Passes
-from xew.threads import PARSING
 
 __all__ = ["FLOW_LIMIT", "Body", "Frames", "Renderer", "World"]
 

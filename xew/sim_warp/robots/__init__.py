@@ -9,7 +9,7 @@ name it `module:SPEC` wherever a robot is asked for, or name the path of a URDF 
 from pathlib import Path
 
 from xew.config import ConfigError, demand_admitted, pick
-from xew.files import EpisodeError, check_name
+from xew.names import EpisodeError, check_name
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, UrdfError, load_urdf
 from xew.sim_warp.robots import aloha_agilex, arx_x5, franka_panda, piper, ur5_wsg

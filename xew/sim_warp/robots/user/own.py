@@ -24,7 +24,8 @@ import yaml
 
 from xew.config import ConfigError
 from xew.episode import complete_folder
-from xew.files import EpisodeError, cache_folder, check_name, demand_regular, path_below, read_json, replacing
+from xew.files import cache_folder, demand_regular, read_json, replacing
+from xew.names import EpisodeError, check_name, path_below
 from xew.protocol import BODY_NAME, ROBOT_NAMES, expand_robots
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf

@@ -1,5 +1,6 @@
-"""Threads, for all rooms: work that is done ahead, in order, and what only one thread may do at a time."""
+"""Threads and processes, for all rooms: work done ahead in order, one parser at a time, processes that end with others."""
 
+import multiprocessing
 import os
 import threading
 from collections import deque
@@ -43,3 +44,21 @@ def map_in_order(
             pool.shutdown(wait=False, cancel_futures=True)
             if stop is not None:
                 stop.set()
+
+
+def leave_with_parent(leave: Callable[[], object]) -> None:
+    """Have this process leave when the process that started it has ended, so that none works on unwatched.
+
+    Args:
+        leave: ends this process; a thread of this process calls it. Nothing happens in a process that multiprocessing did
+            not start.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        parent.join()
+        leave()
+
+    threading.Thread(target=watch, daemon=True).start()

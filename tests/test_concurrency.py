@@ -1,12 +1,16 @@
-"""Work done ahead by threads: in order, not too far, and to an end where something fails."""
+"""Work done ahead by threads is in order and ends where something fails; a started process ends with the one that started it."""
 
+import multiprocessing
+import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
+from multiprocessing.connection import Connection
 
 import pytest
 
-from xew.threads import map_in_order
+from xew.concurrency import leave_with_parent, map_in_order
 
 
 def test_results_come_in_order_and_not_too_far_ahead() -> None:
@@ -68,3 +72,46 @@ def test_where_one_fails_nothing_more_is_begun() -> None:
     with pytest.raises(ValueError, match="three"):
         list(map_in_order(fails, range(1000), 2, stop))
     assert len(begun) < 20
+
+
+def work(told: Connection) -> None:
+    leave_with_parent(lambda: os._exit(1))
+    told.send(os.getpid())
+    time.sleep(60)
+
+
+def start_work(told: Connection) -> None:
+    process = multiprocessing.get_context("spawn").Process(target=work, args=(told,))
+    process.start()
+    process.join()
+
+
+def test_a_process_leaves_when_its_parent_is_killed() -> None:
+    heard, told = multiprocessing.Pipe(duplex=False)
+    parent = multiprocessing.get_context("spawn").Process(target=start_work, args=(told,))
+    parent.start()
+    child = heard.recv()
+    assert parent.pid is not None
+    os.kill(parent.pid, signal.SIGKILL)
+    parent.join()
+    told.close()
+    end = time.monotonic() + 20
+    while not is_gone(child) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert is_gone(child)
+
+
+def is_gone(process: int) -> bool:
+    """Has a process that is not ours to wait for ended? What init has not collected yet counts as ended."""
+    try:
+        with open(f"/proc/{process}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+def test_the_first_process_has_no_parent_to_leave_with() -> None:
+    assert multiprocessing.parent_process() is None
+    before, left = threading.enumerate(), []
+    leave_with_parent(lambda: left.append(True))
+    assert threading.enumerate() == before and not left, "nothing watches for a parent that there is not"
