@@ -129,3 +129,18 @@ def named_exceptions(request: pytest.FixtureRequest) -> Iterator[None]:
     yield
     for option, strict in loosened.items():
         jax.config.update(option, strict)
+
+
+@pytest.fixture(scope="module")
+def quick_compile() -> Iterator[None]:
+    """Leave out what makes programs fast, for modules most of whose time is compiling.
+
+    Programs of the two kinds may differ in the last bit, and JAX does not tell them apart in memory.
+    """
+    import jax
+
+    jax.clear_caches()
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+    jax.clear_caches()

@@ -11,7 +11,11 @@ import pytest
 from tests.commands import run_command
 from xew.metrics import METRICS
 
-pytestmark = [pytest.mark.slow, pytest.mark.loose_types("Optax raises its decays to an int32 count of steps")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.loose_types("Optax raises its decays to an int32 count of steps"),
+    pytest.mark.usefixtures("quick_compile"),
+]
 
 MODULE = '''"""One of each kind."""
 

@@ -1,4 +1,4 @@
-"""Work done ahead by threads is in order and ends where something fails; a started process ends with the one that started it."""
+"""Work done ahead by threads is in order and ends where something fails; a process ends with the one that started it."""
 
 import multiprocessing
 import os

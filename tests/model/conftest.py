@@ -1,4 +1,4 @@
-"""What the tests of the model room share: exceptions from strict types for two libraries, and quick compiling."""
+"""What the tests of the model room share: exceptions from strict types for two libraries."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -35,16 +35,3 @@ def loosely(function: Callable[..., Any]) -> Callable[..., Any]:
             return function(*arguments, **named)
 
     return call
-
-
-@pytest.fixture(scope="module")
-def quick_compile() -> Iterator[None]:
-    """Leave out what makes programs fast, for modules most of whose time is compiling.
-
-    Programs of the two kinds may differ in the last bit, and JAX does not tell them apart in memory.
-    """
-    jax.clear_caches()
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-    jax.clear_caches()

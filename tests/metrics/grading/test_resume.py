@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.metrics.quick import QUICK
 from tests.metrics.small import write_many
 from tests.synthetic import write_synthetic_data
 from xew import files
@@ -26,6 +27,7 @@ from xew.metrics.grading.workers import Bench
 from xew.protocol import BASELINES
 from xew.rollout import write_rollout
 
+ROOT = Path(__file__).parents[3]
 ROBOTS = ("franka_panda", "piper")
 SEEDS = tuple(range(1_000_000, 1_000_003))
 METRICS = ("psnr", "mask_iou")
@@ -55,7 +57,7 @@ def no_baselines_are_kept(world: Path, whole: dict[str, bytes]) -> None:
 
 
 def arguments(world: Path, out: Path) -> Args:
-    return Args((world / "rollouts",), world / "data", out, METRICS, workers=2)
+    return Args((world / "rollouts",), world / "data", out, METRICS, masks=QUICK, workers=2)
 
 
 def read_all(out: Path) -> dict[str, bytes]:
@@ -111,8 +113,9 @@ def test_killed_at_random_on_two_devices_it_ends_in_the_same_bytes(
 ) -> None:
     out = tmp_path / "scores.parquet"
     command = [sys.executable, "-m", "xew.metrics.evaluate", world / "rollouts", "--data", world / "data", "--out", out]
-    command += ["--metrics", *METRICS, "--workers", "2"]
+    command += ["--metrics", *METRICS, "--masks", QUICK, "--workers", "2"]
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    environment["PYTHONPATH"] = str(ROOT)  # the masker
     run = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wanted = random.randrange(1, CELLS - 2)
     deadline = time.monotonic() + 120
@@ -197,10 +200,10 @@ def test_a_second_run_grades_nothing_anew_and_metrics_come_beside_those_that_are
     monkeypatch.setattr(evaluate, "grade", notes)
     out = tmp_path / "scores.parquet"
     for metrics in (("psnr",), METRICS, METRICS):
-        main(Args((world / "rollouts",), world / "data", out, metrics, workers=1))
+        main(Args((world / "rollouts",), world / "data", out, metrics, masks=QUICK, workers=1))
     assert asked == [("psnr",)] * CELLS + [("mask_iou",)] * CELLS
     assert read_all(out) == whole
-    main(Args((world / "rollouts",), world / "data", out, METRICS, workers=1, overwrite=True))
+    main(Args((world / "rollouts",), world / "data", out, METRICS, masks=QUICK, workers=1, overwrite=True))
     assert len(asked) == 3 * CELLS and read_all(out) == whole
 
 
