@@ -132,7 +132,7 @@ def test_robots_with_an_import_path_need_no_word(tmp_path: Path) -> None:
     rows = graded(robots=("piper", "my_lab.robots:SPEC"))
     assert set(read_scores(written(tmp_path / "s.parquet", rows)).rows["robot"]) == {"piper", "my_lab.robots:SPEC"}
     for name in ("my_lab/robots:SPEC", "../robots:SPEC", ":SPEC", "my_lab:", "1a:B"):
-        with pytest.raises(ConfigError, match="the robot is unknown"):
+        with pytest.raises(ConfigError, match=r"the robot is (unknown|')"):
             read_scores(written(tmp_path / "s.parquet", graded(robots=("piper", name))))
 
 
@@ -209,7 +209,7 @@ def test_missing_cells_of_a_study_are_by_variant(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("protocol", 3), ("estimators", {"masks": "sam2"}), ("frame_zero", "copied"), ("metrics", {"lpips": METRICS["lpips"]})],
+    [("protocol", 3), ("estimators", {"masks": "sam2"}), ("frame_zero", "absent"), ("metrics", {"lpips": METRICS["lpips"]})],
 )
 def test_tables_that_do_not_compare_are_not_merged(key: str, value: object, tmp_path: Path) -> None:
     rows = graded()

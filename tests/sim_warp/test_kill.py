@@ -40,7 +40,7 @@ def test_what_fails_leaves_what_was_there(tmp_path: Path) -> None:
     with complete_folder(folder) as temporary:
         (temporary / "file").write_text("old")
     try:
-        with complete_folder(folder) as temporary:
+        with complete_folder(folder, held=["file"]) as temporary:
             (temporary / "file").write_text("new")
             raise OSError("full")
     except OSError:

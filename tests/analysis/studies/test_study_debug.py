@@ -1,4 +1,4 @@
-"""The debug study from nothing to a report by its real commands, then once more from its data, killed again and again.
+"""The debug study from nothing to a report by its real commands, then a part of it from its data, killed again and again.
 
 The task is the tests' own of twelve simulated frames, and of the 18 models five are made, something of every part.
 """
@@ -33,6 +33,8 @@ MADE = (
 """Something of each table."""
 ADAPTED = "few_shot-piper-1"
 """An adaptation from one of the others."""
+PART = (ADAPTED, "--parts", "few_shot", "forgetting")
+"""What is killed: a training, an adaptation from it, and all that they need and lead to."""
 KILLS = 3
 
 
@@ -47,15 +49,14 @@ class Place:
     def study(self) -> Path:
         return self.root / "study"
 
-    @property
-    def command(self) -> list[str]:
-        """The command of the study."""
+    def command(self, *variants: str) -> list[str]:
+        """Of a study of these variants (and of more choices after them)."""
         files = [str(CONFIG), "--experiment", str(ROOT / "configs" / "debug.yaml")]
-        return [sys.executable, "-m", "xew.analysis.study", *files, "--out", "study", "--tasks", TASK, "--variants", *MADE]
+        return [sys.executable, "-m", "xew.analysis.study", *files, "--out", "study", "--tasks", TASK, "--variants", *variants]
 
-    def run(self) -> str:
+    def run(self, *variants: str) -> str:
         """What the study's command prints; it must end well."""
-        done = subprocess.run(self.command, cwd=self.root, env=self.environment, capture_output=True, text=True)
+        done = subprocess.run(self.command(*variants), cwd=self.root, env=self.environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
@@ -72,7 +73,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
 @pytest.fixture(scope="module")
 def printed(place: Place) -> str:
     """The whole study, from nothing."""
-    return place.run()
+    return place.run(*MADE)
 
 
 def rows_of(study: Path) -> pd.DataFrame:
@@ -96,7 +97,7 @@ def test_from_nothing_to_a_report(place: Place, printed: str) -> None:
 
 def test_done_is_done(place: Place, printed: str) -> None:
     before = {path: path.stat().st_mtime_ns for path in place.study.rglob("*") if path.is_file() and "state" not in path.parts}
-    again = place.run()
+    again = place.run(*MADE)
     after = {path: path.stat().st_mtime_ns for path in before}
     changed = {path.name for path in before if before[path] != after[path]}
     assert changed <= {"study.yaml", "status.txt", ".lock"}
@@ -108,24 +109,30 @@ def test_an_adaptation_started_from_its_variant(place: Place, printed: str) -> N
     assert Path(start["run"]).name == VARIANTS[ADAPTED].start.name  # type: ignore[union-attr]
 
 
-def test_killed_anywhere_it_ends_in_the_same_report(place: Place, printed: str) -> None:
-    """The study again from nothing but data and compiled programs, killed as it goes: the same bytes at the end."""
+def test_killed_anywhere_it_ends_in_the_same_videos_and_scores(place: Place, printed: str) -> None:
+    """A part of the study again from nothing but data and compiled programs, killed as it goes: the same bytes at the end."""
     killed = Place(place.root / "killed", place.environment)
     shutil.copytree(place.study / "data", killed.study / "data")
     moments = random.Random(int(time.time()))
     for number in range(KILLS):
-        seconds = moments.uniform(3, 15)
+        seconds = moments.uniform(3, 10)
         print(f"kill {number} after {seconds:.2f} s")
-        process = subprocess.Popen(killed.command, cwd=killed.root, env=killed.environment, stdout=subprocess.PIPE)
+        process = subprocess.Popen(killed.command(*PART), cwd=killed.root, env=killed.environment, stdout=subprocess.PIPE)
         try:
             process.communicate(timeout=seconds)
             break
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()
-    killed.run()
-    assert different_files(place.study / "report", killed.study / "report") == []
-    pd.testing.assert_frame_equal(rows_of(place.study), rows_of(killed.study))
+    killed.run(*PART)
+    found, expected = rows_of(killed.study), rows_of(place.study)
+    made = [folder.name for folder in (killed.study / "rollouts").iterdir()]
+    assert ADAPTED in made and len(made) > 1
+    for variant in made:
+        folders = (study / "rollouts" / variant for study in (place.study, killed.study))
+        assert different_files(*folders) == []
+        rows = (table[table["variant"] == variant].reset_index(drop=True) for table in (expected, found))
+        pd.testing.assert_frame_equal(*rows, check_categorical=False)
 
 
 def different_files(straight: Path, killed: Path) -> list[str]:

@@ -4,7 +4,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -133,7 +133,10 @@ class WanVaeCodec(AutoencoderCodec):
     @classmethod
     def load(cls, folder: Path) -> "WanVaeCodec":
         """Read vae.safetensors and vae.json."""
-        kept = parse(_KeptVae, read_json(folder / "vae.json"), str(folder / "vae.json"))
+        stored = read_json(folder / "vae.json")
+        if isinstance(stored, dict):  # a training has written its record beside it
+            stored = {name: stored[name] for name in stored.keys() & {field.name for field in fields(_KeptVae)}}
+        kept = parse(_KeptVae, stored, str(folder / "vae.json"))
         check_size(kept.size, str(folder / "vae.json"))
         return cls.from_weights(folder / "vae.safetensors", kept.size, kept.dtype, kept.chunk)
 
