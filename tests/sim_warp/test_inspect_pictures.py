@@ -72,5 +72,5 @@ def test_a_png_keeps_its_colors_and_a_bad_path_is_told(tmp_path: Path) -> None:
     image = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
     save_png(tmp_path / "a.png", image)
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], image)
-    with pytest.raises(EpisodeError, match="choose another folder with --pictures"):
+    with pytest.raises(EpisodeError, match="Choose another folder with --pictures"):
         save_png(tmp_path / "a.png" / "b.png", image)
