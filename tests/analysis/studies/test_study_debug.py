@@ -130,14 +130,14 @@ def test_killed_anywhere_it_ends_in_the_same_videos_and_scores(place: Place, pri
     assert ADAPTED in made and len(made) > 1
     for variant in made:
         folders = (study / "rollouts" / variant for study in (place.study, killed.study))
-        assert different_files(*folders) == []
+        assert different_videos(*folders) == []
         rows = (table[table["variant"] == variant].reset_index(drop=True) for table in (expected, found))
         pd.testing.assert_frame_equal(*rows, check_categorical=False)
 
 
-def different_files(straight: Path, killed: Path) -> list[str]:
-    """Names of files that only one of two folders holds, or whose bytes differ."""
-    first, second = ({path.relative_to(top) for path in top.rglob("*") if path.is_file()} for top in (straight, killed))
+def different_videos(straight: Path, killed: Path) -> list[str]:
+    """Names of videos that only one of two folders of rollouts holds, or whose bytes differ."""
+    first, second = ({path.relative_to(top) for path in top.rglob("rgb.mkv")} for top in (straight, killed))
     assert first, f"{straight} is empty"
     shared = {file for file in first & second if not filecmp.cmp(straight / file, killed / file, shallow=False)}
     return sorted(map(str, (first ^ second) | shared))
