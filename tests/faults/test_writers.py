@@ -75,6 +75,7 @@ def test_latex_with_such_names_compiles(tmp_path: Path) -> None:
     head = r"\documentclass{article}\usepackage{booktabs,amssymb,adjustbox}\begin{document}"
     (tmp_path / "t.tex").write_text(f"{head}{formats.latex(table_of(LABELS))}\\end{{document}}")
     subprocess.run(["pdflatex", "-interaction=batchmode", "-halt-on-error", "t.tex"], cwd=tmp_path, check=True)
+    assert (tmp_path / "t.pdf").stat().st_size > 0
 
 
 def test_html_shows_them_as_text() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 from xew.config import digest
 from xew.dataset import Episode
-from xew.episode import Record, place_episode
+from xew.episode import Record, episode_folder
 from xew.model.settings.parts import Encoding
 
 CACHE_VERSION = 2
@@ -28,7 +28,7 @@ def stream_path(encoding: Encoding, codec_hash: str, record: Record, stream: str
         sources = (*sources, str(inputs.history))
     cut = digest(inputs.clip) if inputs.chunks == 1 else (digest(inputs.clip), "chunks")
     key = _hash((CACHE_VERSION, codec_hash, cut, name, *sources))
-    return place_episode(encoding.folder, record.task, record.seed, record.robot) / f"{name}-{key}.safetensors"
+    return episode_folder(encoding.folder, record.task, record.seed, record.robot) / f"{name}-{key}.safetensors"
 
 
 def codec_path(encoding: Encoding, episodes: Sequence[Episode]) -> Path:

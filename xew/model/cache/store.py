@@ -18,6 +18,7 @@ from xew.model.cache.keys import stream_path
 from xew.model.codecs.contract import Codec
 from xew.model.conditions import Condition
 from xew.model.settings.parts import Encoding
+from xew.names import path_below
 
 CLIPS = "clips"
 """Name of the one array of a cached stream. Safetensors and not .npy, whose headers no two threads may read at once."""
@@ -69,9 +70,14 @@ class LatentCache:
 
         Args:
             clips: latents [clips t h w c], stored as float16, or numbers [clips t n], stored as float32.
+
+        Raises:
+            EpisodeError: a link leads out of the cache.
         """
         clips = clips.astype(np.float32 if clips.ndim == 3 else np.float16)
-        with replacing(self.path(record, stream)) as temporary:
+        path = self.path(record, stream)
+        path_below(self.encoding.folder, *path.relative_to(self.encoding.folder).parts)
+        with replacing(path) as temporary:
             save_file({CLIPS: clips}, temporary)
         return clips.nbytes
 
