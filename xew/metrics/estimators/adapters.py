@@ -7,6 +7,7 @@ is unpickled freely.
 import importlib
 import pickle
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -71,7 +72,7 @@ def torch_device() -> str:
     return "cuda" if importlib.import_module("torch").cuda.is_available() else "cpu"
 
 
-class PointTracker:
+class PointTracker(ABC):
     """What trackers share that are given each point at one frame (`query_frames`) and then follow it in both directions."""
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
@@ -93,6 +94,7 @@ class PointTracker:
         tracks[:, asked] = np.where(seen[..., None], found, np.nan)
         return tracks
 
+    @abstractmethod
     def follow(self, video: np.ndarray, frames: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find points again in all frames of a video.
 
@@ -104,7 +106,6 @@ class PointTracker:
         Returns:
             Tracks [t n 2] float32 in the same pixels, and bool [t n] where they hold.
         """
-        raise NotImplementedError
 
 
 def query_frames(visible: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 import functools
 import hashlib
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -48,7 +49,7 @@ class OfSize:
         return self.size.channels
 
 
-class AutoencoderCodec(OfSize, BatchCodec):  # type: ignore[override]
+class AutoencoderCodec(OfSize, BatchCodec, ABC):  # type: ignore[override]
     """What the codecs of autoencoders share: the network, and that its weights are written once."""
 
     fitted: ClassVar[bool] = False
@@ -65,9 +66,9 @@ class AutoencoderCodec(OfSize, BatchCodec):  # type: ignore[override]
         """The autoencoder itself."""
         return nnx.merge(self.graph, self.params)
 
+    @abstractmethod
     def write_weights(self, path: Path) -> None:
         """Write the weights as .safetensors."""
-        raise NotImplementedError
 
     def describe(self) -> dict[str, Any]:
         """What `load` needs beside the weights."""
