@@ -220,6 +220,16 @@ def test_clips_are_of_the_videos_and_regions_of_the_robots(world: Path) -> None:
     assert gather_pictures(episodes, ["rgb"], CUT, 1.0).regions is None
 
 
+def test_streams_that_are_drawn_may_be_of_fewer_episodes(world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(pictures_module.DRAWN, "mask", lambda command: np.full((13, 240, 320, 3), 7, np.uint8))
+    episodes = select_episodes(read_dataset(world / "data"), SEEN_ROBOTS, "train")
+    found = gather_pictures(episodes, ["rgb", "mask"], replace(CUT, drawn_every=2), 1.0)
+    counts = [len(CUT.starts(record)) for _, record in episodes]
+    assert len(episodes) == 3 and len(found.streams["rgb"]) == sum(counts)
+    assert len(found.streams["mask"]) == counts[0] + counts[2]
+    assert (found.clips[list(found.streams["mask"])] == 7).all()
+
+
 def test_a_short_video_is_continued_by_its_last_frame(world: Path) -> None:
     episodes = select_episodes(read_dataset(world / "data"), ("piper",), "train")
     found = gather_pictures(episodes, ["rgb"], Cut(17, 1, 64, 96), 1.0)

@@ -18,7 +18,17 @@ from xew.episode import EpisodeError, Record, episode_folder, verify_episode, wr
 from xew.protocol import TEST_SEED_START
 from xew.sim_warp import generate as command
 from xew.sim_warp.devices.workers import Workers
-from xew.sim_warp.generate import Args, Family, generate, main, yield_table
+from xew.sim_warp.generate import (
+    MOST_UNPAIRED,
+    SEEDS_OF_ROBOT,
+    Args,
+    Family,
+    generate,
+    main,
+    plan_families,
+    yield_table,
+)
+from xew.sim_warp.manifest import Manifest
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import produce
 from xew.sim_warp.rendering.render import Renderer
@@ -226,6 +236,35 @@ def test_as_many_seeds_are_tried_as_could_be_accepted() -> None:
     assert tried.accepted == 1 and tried.next_jobs() == [Job("task", 12, ("a", "b"))]
 
 
+def test_unpaired_robots_share_no_seed(tmp_path: Path) -> None:
+    """Each robot's seeds are its own however many are tried, and it waits for no other."""
+    args = Args(tasks=("grab_roller",), robots=("a", "b"), train_seeds=MOST_UNPAIRED, test_seeds=1, unpaired=True)
+    families = plan_families(args, ("a", "b"), Manifest())
+    assert [(f.robots, f.wanted) for f in families] == [
+        (("a",), MOST_UNPAIRED),
+        (("b",), MOST_UNPAIRED),
+        (("a",), 1),
+        (("b",), 1),
+    ]
+    tried = [set(f.tries) for f in families]
+    assert len(set.union(*tried)) == sum(map(len, tried))
+    assert families[1].first_seed == SEEDS_OF_ROBOT and families[3].first_seed == TEST_SEED_START + SEEDS_OF_ROBOT
+    paired = plan_families(replace(args, unpaired=False), ("a", "b"), Manifest())
+    assert [(f.robots, f.first_seed) for f in paired] == [(("a", "b"), 0), (("a", "b"), TEST_SEED_START)]
+
+
+def test_unpaired_episodes_are_made_once_and_for_their_robot_alone(tmp_path: Path) -> None:
+    args = replace(arguments(tmp_path), unpaired=True, train_seeds=1, test_seeds=0, robots=(SLOW, "franka_panda"))
+    expected = [(0, SLOW), (SEEDS_OF_ROBOT, "franka_panda")]
+    assert [(record.seed, record.robot) for _, record in made(args)] == expected
+    assert [(record.seed, record.robot) for _, record in made(args)] == expected
+
+
+def made(args: Args) -> list[tuple[Path, Record]]:
+    assert all(family.accepted == family.wanted for family in generate(args))
+    return sorted(find_records(args.out))
+
+
 def test_only_what_is_missing_is_made() -> None:
     assert family(1, outcome(10, "a")).next_jobs() == [Job("task", 10, ("b",))]
     rejected = family(1, outcome(10, "a", success=False))
@@ -250,7 +289,7 @@ def test_a_hopeless_task_gives_up_and_says_so() -> None:
             hopeless.add(outcome(job.seed, "a", success=False))
             hopeless.add(outcome(job.seed, "b", pictures=False))
     assert rounds == len(hopeless.tries) == 23
-    with pytest.raises(EpisodeError, match="task: only 0 of 1 seeds were accepted in 23 tries"):
+    with pytest.raises(EpisodeError, match="task with a, b: only 0 of 1 seeds were accepted in 23 tries"):
         command._demand_enough([family(0), hopeless])
 
 

@@ -40,6 +40,10 @@ from xew.sim_warp.tasks import TASKS, get_task
 TRIES_PER_SEED = 3
 SPARE_TRIES = 20
 """Numbers of seeds after which a task gives up: 3 n + 20 have been tried and fewer than n accepted."""
+SEEDS_OF_ROBOT = 1000
+"""Number of seeds from the first of one robot to the first of the next where robots share no scenes."""
+MOST_UNPAIRED = (SEEDS_OF_ROBOT - SPARE_TRIES) // TRIES_PER_SEED
+"""Largest number of accepted seeds that fit between them."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +57,9 @@ class Args:
     robot: Path | None = None
     """Path of a robot of your own, then the only one: a URDF, a folder with a robot.yaml, or a RoboTwin embodiment folder."""
     train_seeds: int = TRAIN_SEEDS_PER_TASK
-    """Number of accepted training seeds a task."""
+    """Number of accepted training seeds a task, or with --unpaired a task and robot."""
     test_seeds: int = TEST_SEEDS_PER_TASK
-    """Number of accepted test seeds a task; they count from where no training seed comes."""
+    """Number of accepted test seeds, likewise; they count from where no training seed comes."""
     out: Path = Path("data")
     batch: int = 256
     """Number of worlds that a GPU steps together. A CPU steps each by itself, as many at a time as there are workers."""
@@ -63,6 +67,9 @@ class Args:
     """Number of processes; by default one a core, on a GPU one for two cores."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
     """Default: a GPU if Warp finds one."""
+    unpaired: bool = False
+    """Each robot gets seeds of its own, and no scene waits for another robot to succeed: more scenes for a codec to learn
+    from, nothing to compare robots by."""
     states_only: bool = False
     """Store no videos, only states and all hashes; `python -m xew.sim_warp.inspect DATA --render` makes them on demand."""
     manifest: Path = PACKAGED
@@ -84,14 +91,14 @@ class Family:
     done: dict[int, dict[str, Record]] = field(default_factory=lambda: defaultdict(dict))
 
     def add(self, record: Record) -> None:
+        """Take a cell into account."""
         self.done[record.seed][record.robot] = record
 
     @property
     def tries(self) -> list[int]:
         """The seeds that may be tried."""
-        count = TRIES_PER_SEED * self.wanted + SPARE_TRIES
         candidates = (seed for seed in itertools.count(self.first_seed) if seed not in self.failing)
-        return list(itertools.islice(candidates, count))
+        return list(itertools.islice(candidates, TRIES_PER_SEED * self.wanted + SPARE_TRIES))
 
     @property
     def accepted(self) -> int:
@@ -123,6 +130,18 @@ class Family:
         return all(record.success for record in self.done[seed].values())
 
 
+def plan_families(args: Args, robots: Sequence[str], manifest: Manifest) -> list[Family]:
+    """The families of all tasks: one of all robots together, or one a robot, each with seeds that no other has."""
+    teams = [(robot,) for robot in robots] if args.unpaired else [tuple(robots)]
+    families = []
+    for task in dict.fromkeys(args.tasks):
+        for first, wanted in ((0, args.train_seeds), (TEST_SEED_START, args.test_seeds)):
+            for number, team in enumerate(teams):
+                first_seed = first + number * SEEDS_OF_ROBOT
+                families.append(Family(task, first_seed, wanted, team, manifest.failing(task, team)))
+    return families
+
+
 Made = tuple[list[Record], float]
 """Headers of one job's cells, and the seconds spent on it."""
 
@@ -131,7 +150,8 @@ Made = tuple[list[Record], float]
 def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Callable[[Sequence[Job]], Iterator[Made]]]:
     """Start worker processes; what is given runs jobs in them, one at a time on a CPU, in large batches on a GPU."""
     device = find_device(args.device)
-    size = max(1, args.batch // len(robots)) if device.is_cuda else 1
+    together = 1 if args.unpaired else len(robots)
+    size = max(1, args.batch // together) if device.is_cuda else 1
     make = partial(_make, robots=robots, out=args.out, device=device.alias, batch=args.batch, videos=not args.states_only)
     with Workers(args.workers or worker_count(device), first_alone=not has_kernels(device)) as workers:
 
@@ -164,11 +184,7 @@ def generate(args: Args) -> list[Family]:
     _check(args)
     robots = _find_robots(args.robots, args.out)
     manifest = Manifest() if args.search else read_manifest(args.manifest)
-    families = [
-        Family(task, first, wanted, tuple(robots), manifest.failing(task, tuple(robots)))
-        for task in dict.fromkeys(args.tasks)
-        for first, wanted in ((0, args.train_seeds), (TEST_SEED_START, args.test_seeds))
-    ]
+    families = plan_families(args, tuple(robots), manifest)
     _read_existing(families, args)
     spent: dict[str, float] = defaultdict(float)
     frames: Counter[str] = Counter()
@@ -198,6 +214,11 @@ def _check(args: Args) -> None:
         raise EpisodeError(
             f"nothing to make of {len(args.tasks)} tasks, {len(args.robots)} robots, {args.train_seeds} training and "
             f"{args.test_seeds} test seeds in batches of {args.batch}; name tasks and robots, seeds from 0 and batches from 1."
+        )
+    if args.unpaired and max(args.train_seeds, args.test_seeds) > MOST_UNPAIRED:
+        raise EpisodeError(
+            f"{max(args.train_seeds, args.test_seeds)} seeds a robot are asked for by --unpaired, which has room for"
+            f" {MOST_UNPAIRED}; ask for fewer, or name more robots."
         )
 
 
@@ -240,6 +261,8 @@ def _read_existing(families: list[Family], args: Args) -> None:
                 "--render`, or choose another --out."
             )
         for family in families:
+            if args.unpaired and record.robot not in family.robots:
+                continue
             same_side = (record.seed >= TEST_SEED_START) == (family.first_seed >= TEST_SEED_START)
             if record.task == family.task and same_side:
                 if folder != episode_folder(out, record.task, record.seed, record.robot):
@@ -283,7 +306,8 @@ def yield_table(records: Sequence[Record]) -> str:
 def _demand_enough(families: Sequence[Family]) -> None:
     """Raise EpisodeError where the tries of a task are used up."""
     short = [
-        f"{family.task}: only {family.accepted} of {family.wanted} seeds were accepted in {len(family.tries)} tries."
+        f"{family.task} with {', '.join(family.robots)}: only {family.accepted} of {family.wanted} seeds were accepted in"
+        f" {len(family.tries)} tries."
         for family in families
         if family.accepted < family.wanted
     ]

@@ -15,7 +15,7 @@ from typing import Any
 
 import av
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Integer, UInt8
 from tqdm import tqdm
 
 from xew.concurrency import map_in_order
@@ -54,6 +54,8 @@ class Cut:
     height: int
     """Height to which frames are brought."""
     width: int
+    drawn_every: int = 1
+    """Number of episodes of which one's DRAWN streams are taken."""
 
     def starts(self, record: Record) -> list[int]:
         """First frames of an episode's clips; where the first of them lies differs from episode to episode."""
@@ -103,8 +105,8 @@ def gather_pictures(
     """
     aligned = [name for name in streams if name in ALIGNED]
     short = _cut_descriptions(episodes, [name for name in streams if name in UNALIGNED], cut)
-    firsts = np.cumsum([0, *(len(cut.starts(record)) for _, record in episodes)])
-    counts = {name: int(firsts[-1]) for name in aligned} | {name: len(clips) for name, clips in short.items()}
+    firsts = {name: _first_clips(episodes, cut, cut.drawn_every if name in DRAWN else 1) for name in aligned}
+    counts = {name: int(found[-1]) for name, found in firsts.items()} | {name: len(clips) for name, clips in short.items()}
     total = sum(counts.values())
     if total * cut.clip_bytes > host_gb * 1e9:
         raise ConfigError(
@@ -126,12 +128,13 @@ def gather_pictures(
         folder, record = episodes[number]
         starts = cut.starts(record)
         times = np.minimum(np.add.outer(starts, np.arange(cut.frames)), record.frame_count - 1)
-        read = read_aligned(folder, record, aligned, times.ravel().tolist(), regions=regions)
+        wanted = [name for name in aligned if firsts[name][number + 1] > firsts[name][number]]
+        read = read_aligned(folder, record, wanted, times.ravel().tolist(), regions=regions)
         for name, (video, mask) in read.items():
             shape = len(starts), cut.frames, cut.height, cut.width
             found = to_model_size(video, cut.height, cut.width).reshape(*shape, 3)
             masks = None if mask is None else mask_to_model_size(mask, cut).reshape(shape)
-            put(name, int(firsts[number]), found, masks)
+            put(name, int(firsts[name][number]), found, masks)
 
     for name, found in short.items():
         masks = differs_from_corner(found.reshape(-1, *found.shape[2:])).reshape(found.shape[:-1]) if regions else None
@@ -141,6 +144,12 @@ def gather_pictures(
         for _ in tqdm(loaded, desc="pictures", total=len(episodes), unit="episode"):
             pass
     return Pictures(clips, bits, ranges)
+
+
+def _first_clips(episodes: Sequence[Episode], cut: Cut, every: int) -> Integer[np.ndarray, " n"]:
+    """Number of a stream's first clip of each episode, and their count at the end, where every `every`-th episode is taken."""
+    counts = (len(cut.starts(record)) if number % every == 0 else 0 for number, (_, record) in enumerate(episodes))
+    return np.cumsum([0, *counts])
 
 
 def read_aligned(

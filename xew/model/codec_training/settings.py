@@ -24,6 +24,8 @@ class PictureSettings:
 
     every: int = 3
     """Clips are taken one after another, each `every`-th of them; 1 takes all of a video."""
+    drawn_every: int = 1
+    """Number of episodes of which one's drawn streams (optical flow, mask, ray map) are taken; drawing is slow."""
     frames: int = 17
     """Number of frames of a clip of wan_vae, 4 k + 1; conv_autoencoder takes groups of four. Latents further on than any that
     were trained lose 5 dB with clips of 5 frames."""
@@ -136,7 +138,7 @@ class CodecExperiment:
     def cut(self) -> Cut:
         """What is cut out of a video."""
         frames = self.autoencoder.clip_frames(self.pictures.frames)
-        return Cut(frames, self.pictures.every, self.clip.height, self.clip.width)
+        return Cut(frames, self.pictures.every, self.clip.height, self.clip.width, self.pictures.drawn_every)
 
 
 LEAST = LEAST_OF_STEPS | {
@@ -155,6 +157,7 @@ LEAST = LEAST_OF_STEPS | {
     "train.crop": 0,
     "train.statistics_clips": 1,
     "pictures.every": 1,
+    "pictures.drawn_every": 1,
     "pictures.device_share": 0,
     "pictures.host_gb": 0,
     "report.clips": 1,

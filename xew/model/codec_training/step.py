@@ -99,7 +99,7 @@ def codec_losses(
     if settings.lpips:
         made, true = (_some_frames(x, frame_key, settings.lpips_frames) for x in (decoded, clips))
         at_once = len(made) if jax.default_backend() == "gpu" else max(len(made) // len(clips), 1)
-        perceptual = lpips(made, true, chunk=at_once).mean()
+        perceptual = lpips(made, true, chunk=at_once, exact=False).mean()
     psnr = -10 * jnp.log10(jnp.square((jnp.clip(decoded, -1, 1) - clips) / 2).mean() + 1e-10)
     total = settings.l1 * l1 + settings.mse * mse + settings.lpips * perceptual + settings.penalty * penalty
     return Losses(total, l1, mse, perceptual, penalty, psnr, jnp.float32(0), jnp.isfinite(total))
