@@ -217,13 +217,15 @@ def cut_description(video: Video, frames: int) -> UInt8[np.ndarray, "n f h w 3"]
 
 def differs_from_corner(video: Video) -> Masks:
     """Pixels [t h w] bool of a drawn video [t h w 3] that are not the background, which is the color of its first pixel."""
-    return (video != video[:1, :1, :1]).any(axis=-1)
+    # Channel by channel: `any` over an axis of three takes ten times as long.
+    red, green, blue = (video[..., channel] != video[0, 0, 0, channel] for channel in range(3))
+    return red | green | blue
 
 
 def mask_to_model_size(mask: Masks, cut: Cut) -> Bool[np.ndarray, "t y x"]:
     """Masks [t 240 320] bool as the model sees them: [t height width]."""
-    pictures = np.repeat(mask[..., None], 3, axis=-1).astype(np.uint8) * 255
-    return to_model_size(pictures, cut.height, cut.width)[..., 0] > 127
+    pictures = to_model_size(mask[..., None].astype(np.uint8) * 255, cut.height, cut.width)
+    return pictures.reshape(len(mask), cut.height, cut.width) > 127
 
 
 def read_frames(path: Path, wanted: set[int]) -> dict[int, np.ndarray]:
