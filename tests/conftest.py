@@ -59,6 +59,7 @@ SLOW = (
     "tests/sim_warp/test_scene.py",
     "tests/test_adding.py",
     "tests/test_docs.py::test_a_page_does_what_it_says",
+    "tests/test_wheel.py",
 )
 """Beginnings of the names of tests that make test-fast leaves out: whole commands, trainings, simulations, and parity with
 other people's networks. Taken from --durations; a test is slow, too, when it bears the mark."""

@@ -33,6 +33,10 @@ from xew.names import EpisodeError
 T = TypeVar("T")
 
 
+CONFIGS = Path(__file__).parent / "configs"
+"""Folder of the configs that come with xew; in the repository a link to the folder at its root."""
+PACKAGED = "xew:"
+"""Beginning of the names of configs that come with xew."""
 LARGEST = 2**63 - 1
 """Largest whole number of a config."""
 IMPORT_PATH = re.compile(r"([^\W\d]\w*(?:\.[^\W\d]\w*)*):[^\W\d]\w*")
@@ -68,9 +72,31 @@ def load(cls: type[T], path: Path | str, overrides: Sequence[str] = ()) -> T:
     return tyro.cli(cls, args=list(overrides), default=loaded, prog=f"… {path}")
 
 
-def read_yaml(path: Path | str) -> Any:
-    """The content of a YAML file. Raises ConfigError if it is missing or not YAML."""
+def find_config(path: Path | str) -> Path:
+    """Where a config lies: `xew:NAME` is the one that comes with xew, and so is `configs/NAME.yaml` where no such file is.
+
+    Raises:
+        ConfigError: xew has no config of that name.
+    """
     path = Path(path)
+    if is_packaged(path):
+        name = str(path).removeprefix(PACKAGED)
+        known = sorted(str(file.relative_to(CONFIGS).with_suffix("")) for file in CONFIGS.rglob("*.yaml"))
+        if name not in known:
+            raise ConfigError(f"xew has no config {name!r};{suggestion(name, known)} known: {', '.join(known)}.")
+        return CONFIGS / f"{name}.yaml"
+    packaged = CONFIGS.joinpath(*path.parts[1:])
+    return packaged if path.parts[:1] == ("configs",) and not path.exists() and packaged.is_file() else path
+
+
+def is_packaged(path: Path) -> bool:
+    """Whether a path is the name of a config that comes with xew, such as xew:fixed."""
+    return str(path).startswith(PACKAGED)
+
+
+def read_yaml(path: Path | str) -> Any:
+    """The content of a YAML file, which may be one that comes with xew. Raises ConfigError if it is missing or not YAML."""
+    path = find_config(path)
     try:
         return yaml.safe_load(demand_regular(path).read_text())
     except OSError as error:
@@ -281,7 +307,7 @@ def _silence_closed_pipes() -> bool:
 
 
 def _has_no_reader(stream: TextIO) -> bool:
-    """Whether a stream writes into a pipe that nobody reads; asked of the system, since a failed write may hold nothing back."""
+    """Whether a stream writes into a pipe that nobody reads; a failed write may have left nothing to flush."""
     poller = select.poll()
     try:
         poller.register(stream.fileno(), 0)

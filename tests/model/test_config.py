@@ -13,6 +13,7 @@ from xew import config
 from xew.config import ConfigError
 from xew.model import train
 from xew.model.experiment import beside, load_experiment
+from xew.model.rollout import default_name, is_config
 
 REPOSITORY = Path(__file__).parents[2]
 CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
@@ -85,6 +86,19 @@ def test_unknown_override_exits_2(tmp_path: Path, capsys: pytest.CaptureFixture[
         config.load(Outer, write(tmp_path, "name: x"), ["--inner.dpeth", "5"])
     assert stop.value.code == 2
     assert "--inner.depth" in capsys.readouterr().err
+
+
+def test_configs_come_with_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    packaged = load_experiment("xew:fixed")
+    assert packaged == load_experiment("configs/fixed.yaml") == load_experiment(REPOSITORY / "configs" / "fixed.yaml")
+    assert default_name(Path("xew:wan5b/fixed")) == "fixed" and is_config(Path("xew:wan5b/fixed"))
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs" / "fixed.yaml").write_text("mine: 1")
+    assert config.read_yaml("configs/fixed.yaml") == {"mine": 1}, "a file that is there goes before"
+    for name, said in (("xew:fixd", "did you mean 'fixed'.* known: baselines/bwm"), ("xew:../protocol", "has no config")):
+        with pytest.raises(ConfigError, match=said):
+            config.read_yaml(name)
 
 
 @pytest.mark.parametrize("lines", [1, 100_000])
