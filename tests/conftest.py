@@ -36,6 +36,8 @@ SLOW = (
     "tests/metrics/test_page.py::test_examples_print_what_they_say",
     "tests/metrics/test_perceptual.py",
     "tests/metrics/test_states.py",
+    "tests/metrics/test_transforms.py::test_bfloat16_is_computed_with_in_float32",
+    "tests/metrics/test_transforms.py::test_nan_goes_through",
     "tests/model/codecs/",
     "tests/model/devices/test_many_devices.py",
     "tests/model/network/test_dit.py",
