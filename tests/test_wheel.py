@@ -71,16 +71,26 @@ def test_distributions_hold_what_they_need(distributions: Path) -> None:
     assert configs | helpers | {"docs/metrics.md", "docs/glossary.md", "examples/own_model.py", "CHANGELOG.md"} <= held
 
 
-def test_the_wheel_works_in_an_empty_folder(distributions: Path, tmp_path: Path) -> None:
-    """In an environment that has its own site-packages and, behind them, the libraries of this one."""
-    home, empty = tmp_path / "environment", tmp_path / "empty"
-    empty.mkdir()
+@pytest.fixture(scope="module")
+def python(distributions: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel in an environment that has its own site-packages and, behind them, the libraries of this one."""
+    home = tmp_path_factory.mktemp("environment")
     venv.create(home, symlinks=True)
-    python = home / "bin" / "python"
     (wheel,) = distributions.glob("*.whl")
-    run(sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", "-q", wheel, folder=empty)
+    install = ("install", "--no-deps", "--no-index", "-q", wheel)
+    run(sys.executable, "-m", "pip", "--python", home / "bin" / "python", *install, folder=home)
     (site,) = home.glob("lib/python*/site-packages")
     (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    assert "--train.steps" in run(python, "-c", FIRST_STEPS, ROOT, folder=empty)
-    plan = run(python, "-m", "xew.analysis.study", "configs/study_debug.yaml", "--dry-run", "--out", "study", folder=empty)
+    return home / "bin" / "python"
+
+
+def test_functions_and_configs_work_in_an_empty_folder(python: Path, tmp_path: Path) -> None:
+    assert "--train.steps" in run(python, "-c", FIRST_STEPS, ROOT, folder=tmp_path)
+    plan = run(python, "-m", "xew.analysis.study", "configs/study_debug.yaml", "--dry-run", "--out", "study", folder=tmp_path)
     assert "with 1 at once" in plan
+
+
+def test_the_first_command_of_the_readme_makes_an_episode_in_an_empty_folder(python: Path, tmp_path: Path) -> None:
+    few = ("--tasks", "press_stapler", "--robots", "piper", "--train-seeds", "1", "--test-seeds", "0")
+    run(python, "-m", "xew.sim_warp.generate", *few, "--out", "data", folder=tmp_path)
+    assert (tmp_path / "data" / "press_stapler" / "0000000" / "piper" / "episode.json").is_file()
