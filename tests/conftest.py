@@ -36,6 +36,8 @@ SLOW = (
     "tests/metrics/test_page.py::test_examples_print_what_they_say",
     "tests/metrics/test_perceptual.py",
     "tests/metrics/test_states.py",
+    "tests/metrics/test_transforms.py::test_bfloat16_is_computed_with_in_float32",
+    "tests/metrics/test_transforms.py::test_nan_goes_through",
     "tests/model/codecs/",
     "tests/model/devices/test_many_devices.py",
     "tests/model/network/test_dit.py",
@@ -59,6 +61,7 @@ SLOW = (
     "tests/sim_warp/test_scene.py",
     "tests/test_adding.py",
     "tests/test_docs.py::test_a_page_does_what_it_says",
+    "tests/test_wheel.py",
 )
 """Beginnings of the names of tests that make test-fast leaves out: whole commands, trainings, simulations, and parity with
 other people's networks. Taken from --durations; a test is slow, too, when it bears the mark."""

@@ -17,10 +17,11 @@ import json
 import math
 import os
 import re
+import select
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TextIO, TypeVar, cast
 
 import cattrs
 import tyro
@@ -32,6 +33,10 @@ from xew.names import EpisodeError
 T = TypeVar("T")
 
 
+CONFIGS = Path(__file__).parent / "configs"
+"""Folder of the configs that come with xew; in the repository a link to the folder at its root."""
+PACKAGED = "xew:"
+"""Beginning of the names of configs that come with xew."""
 LARGEST = 2**63 - 1
 """Largest whole number of a config."""
 IMPORT_PATH = re.compile(r"([^\W\d]\w*(?:\.[^\W\d]\w*)*):[^\W\d]\w*")
@@ -40,6 +45,8 @@ TRUST = "XEW_TRUST"
 """Name of the environment variable that lists admitted modules, separated by commas; processes inherit it."""
 
 
+PIPE_CLOSED = 141
+"""Exit code of a command whose output nobody reads any longer: 128 and the number of SIGPIPE, as shells have it."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
 """Numbers of errors of the system that are no mistake of this program, also where they name no file."""
 
@@ -65,9 +72,31 @@ def load(cls: type[T], path: Path | str, overrides: Sequence[str] = ()) -> T:
     return tyro.cli(cls, args=list(overrides), default=loaded, prog=f"… {path}")
 
 
-def read_yaml(path: Path | str) -> Any:
-    """The content of a YAML file. Raises ConfigError if it is missing or not YAML."""
+def find_config(path: Path | str) -> Path:
+    """Where a config lies: `xew:NAME` is the one that comes with xew, and so is `configs/NAME.yaml` where no such file is.
+
+    Raises:
+        ConfigError: xew has no config of that name.
+    """
     path = Path(path)
+    if is_packaged(path):
+        name = str(path).removeprefix(PACKAGED)
+        known = sorted(str(file.relative_to(CONFIGS).with_suffix("")) for file in CONFIGS.rglob("*.yaml"))
+        if name not in known:
+            raise ConfigError(f"xew has no config {name!r};{suggestion(name, known)} known: {', '.join(known)}.")
+        return CONFIGS / f"{name}.yaml"
+    packaged = CONFIGS.joinpath(*path.parts[1:])
+    return packaged if path.parts[:1] == ("configs",) and not path.exists() and packaged.is_file() else path
+
+
+def is_packaged(path: Path) -> bool:
+    """Whether a path is the name of a config that comes with xew, such as xew:fixed."""
+    return str(path).startswith(PACKAGED)
+
+
+def read_yaml(path: Path | str) -> Any:
+    """The content of a YAML file, which may be one that comes with xew. Raises ConfigError if it is missing or not YAML."""
+    path = find_config(path)
     try:
         return yaml.safe_load(demand_regular(path).read_text())
     except OSError as error:
@@ -230,13 +259,21 @@ def suggestion(name: str, known: Iterable[str]) -> str:
 def user_errors(main: Callable[..., T]) -> Callable[..., T]:
     """Decorate a command: a user's mistake prints its message on stderr and exits with code 2, without a traceback.
 
-    So does Ctrl-C, with code 130.
+    So does Ctrl-C, with code 130. Where the reader of a pipe goes away, as `| head` does, the command ends quietly with
+    PIPE_CLOSED.
     """
 
     @functools.wraps(main)
     def guarded(*args: Any, **kwargs: Any) -> T:
         try:
-            return main(*args, **kwargs)
+            try:
+                return main(*args, **kwargs)
+            finally:
+                _flush(sys.stdout)  # here, because at the end of the process nobody can catch what a closed pipe raises
+        except BrokenPipeError:
+            if not _silence_closed_pipes():
+                raise
+            raise SystemExit(PIPE_CLOSED) from None
         except (ConfigError, EpisodeError) as error:
             print(f"error: {error}", file=sys.stderr)
             raise SystemExit(2) from None
@@ -251,6 +288,32 @@ def user_errors(main: Callable[..., T]) -> Callable[..., T]:
             raise SystemExit(130) from None
 
     return guarded
+
+
+def _flush(stream: TextIO | None) -> None:
+    """Write out what a stream holds back; a process may have none, or have closed it."""
+    if stream is not None and not stream.closed:
+        stream.flush()
+
+
+def _silence_closed_pipes() -> bool:
+    """Send what is still held back for a pipe without a reader to nowhere. Was there such a pipe?"""
+    closed = [stream for stream in (sys.stdout, sys.stderr) if stream is not None and _has_no_reader(stream)]
+    for stream in closed:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
+    return bool(closed)
+
+
+def _has_no_reader(stream: TextIO) -> bool:
+    """Whether a stream writes into a pipe that nobody reads; a failed write may have left nothing to flush."""
+    poller = select.poll()
+    try:
+        poller.register(stream.fileno(), 0)
+    except (OSError, ValueError):  # a stream without a file, as tests and notebooks have
+        return False
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poller.poll(0))
 
 
 def _exact(kind: type, accepts: tuple[type, ...]) -> Callable[[Any, type], Any]:

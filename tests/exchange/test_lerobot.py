@@ -61,24 +61,37 @@ def test_numbers_come_back_exactly(data: Path, exported: Path) -> None:
 
 def test_pictures_come_back_where_the_table_says(data: Path, exported: Path) -> None:
     table = parquet.read_table(exported / "meta/episodes").to_pylist()
-    frames, times = decoded(exported / "videos/observation.images.head/chunk-000/file-000.mp4")
+    key = "videos/observation.images.head"
     for row, (record, states, rgb) in zip(table, episodes(data), strict=True):
-        begin, end = row["videos/observation.images.head/from_timestamp"], row["videos/observation.images.head/to_timestamp"]
-        mine = (times > begin - 1e-6) & (times < end - 1e-6)
-        assert mine.sum() == row["length"] == states.frame_count
-        assert np.abs(times[mine] - begin - np.arange(states.frame_count) * 0.06).max() < 1e-6
-        error = np.abs(frames[mine].astype(int) - rgb)
+        frames, times = decoded(
+            exported / key / f"chunk-{row[f'{key}/chunk_index']:03d}/file-{row[f'{key}/file_index']:03d}.mp4"
+        )
+        assert len(frames) == row["length"] == states.frame_count
+        assert np.abs(times - np.arange(states.frame_count) * 0.06).max() < 1e-6
+        assert row[f"{key}/from_timestamp"] == 0 and row[f"{key}/to_timestamp"] == pytest.approx(len(frames) * 0.06)
+        error = np.abs(frames.astype(int) - rgb)
         assert error.mean() < 2.5, "lossy, but the same pictures in the same colors"
         assert (row["xew/robot"], row["xew/task"], row["xew/seed"]) == (record.robot, record.task, record.seed)
-    assert len(frames) == table[-1]["dataset_to_index"]
+    assert table[-1]["dataset_to_index"] == sum(row["length"] for row in table)
+
+
+def test_an_episode_has_files_of_its_own(exported: Path) -> None:
+    """`lerobot-edit-dataset` copies such files, and encodes others anew, at a rate rounded down to 16 a second."""
+    table = parquet.read_table(exported / "meta/episodes").to_pylist()
+    for name in ("head", "robot"):
+        key = f"videos/observation.images.{name}"
+        places = [(row[f"{key}/chunk_index"], row[f"{key}/file_index"]) for row in table]
+        files = list((exported / key).rglob("*.mp4"))
+        assert len(set(places)) == len(files) == len(table)
+        with av.open(str(files[0])) as container:
+            assert container.streams.video[0].average_rate == lerobot.RATE
 
 
 def test_a_red_block_stays_red(tmp_path: Path) -> None:
     video = np.full((4, HEIGHT, WIDTH, 3), 255, np.uint8)
     video[:, 80:160, 100:200] = (200, 30, 20)
     film = lerobot._Films(tmp_path / "observation.images.head")
-    with film:
-        film.add(video)
+    film.add(video)
     frames, _ = decoded(tmp_path / "observation.images.head/chunk-000/file-000.mp4")
     assert np.abs(frames[:, 90:150, 110:190].reshape(-1, 3).astype(int) - (200, 30, 20)).max() <= 8
 
@@ -116,7 +129,6 @@ def test_quantiles_of_colors() -> None:
 
 def test_files_are_closed_as_they_fill(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lerobot, "LARGEST_DATA", 0)
-    monkeypatch.setattr(lerobot, "LARGEST_VIDEO", 0)
     monkeypatch.setattr(lerobot, "FILES_PER_CHUNK", 3)
     export(Args(data, tmp_path / "many", tasks=TASKS[:1]))
     tables = sorted(str(path.relative_to(tmp_path / "many/data")) for path in (tmp_path / "many/data").rglob("*.parquet"))

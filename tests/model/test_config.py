@@ -1,6 +1,9 @@
 """Configs: strict, with errors that say what to do."""
 
+import errno
 import math
+import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +13,7 @@ from xew import config
 from xew.config import ConfigError
 from xew.model import train
 from xew.model.experiment import beside, load_experiment
+from xew.model.rollout import default_name, is_config
 
 REPOSITORY = Path(__file__).parents[2]
 CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
@@ -82,6 +86,39 @@ def test_unknown_override_exits_2(tmp_path: Path, capsys: pytest.CaptureFixture[
         config.load(Outer, write(tmp_path, "name: x"), ["--inner.dpeth", "5"])
     assert stop.value.code == 2
     assert "--inner.depth" in capsys.readouterr().err
+
+
+def test_configs_come_with_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    packaged = load_experiment("xew:fixed")
+    assert packaged == load_experiment("configs/fixed.yaml") == load_experiment(REPOSITORY / "configs" / "fixed.yaml")
+    assert default_name(Path("xew:wan5b/fixed")) == "fixed" and is_config(Path("xew:wan5b/fixed"))
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs" / "fixed.yaml").write_text("mine: 1")
+    assert config.read_yaml("configs/fixed.yaml") == {"mine": 1}, "a file that is there goes before"
+    for name, said in (("xew:fixd", "did you mean 'fixed'.* known: baselines/bwm"), ("xew:../protocol", "has no config")):
+        with pytest.raises(ConfigError, match=said):
+            config.read_yaml(name)
+
+
+@pytest.mark.parametrize("lines", [1, 100_000])
+def test_a_command_ends_quietly_when_its_reader_goes_away(lines: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `| head` does: few lines are held back until the end, many fail in the middle."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as stream, monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", stream)
+        with pytest.raises(SystemExit) as stop:
+            config.user_errors(lambda: print("line\n" * lines))()
+    assert stop.value.code == 141
+
+
+def test_other_broken_pipes_are_no_quiet_end() -> None:
+    def lose_a_worker() -> None:
+        raise BrokenPipeError(errno.EPIPE, "a worker is gone")
+
+    with pytest.raises(BrokenPipeError, match="a worker is gone"):
+        config.user_errors(lose_a_worker)()
 
 
 def test_user_errors_exit_2_without_traceback(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 """A run's checkpoint out to other projects, and back in as published weights."""
 
+import json
 from pathlib import Path
 
 import jax
@@ -13,7 +14,7 @@ from xew.config import ConfigError
 from xew.model import export
 from xew.model.devices.sharding import make_mesh
 from xew.model.experiment import create_model, load_experiment
-from xew.model.network.dit_layouts import load_dit
+from xew.model.network.dit_layouts import check_dit, load_dit
 from xew.model.runs.checkpoint import TrainState, open_checkpoints, save_state
 from xew.model.training.start import check_network, start_params
 from xew.model.training.step import make_learner
@@ -53,6 +54,26 @@ def test_network_goes_out_and_comes_back(naming: str, run: Path, tmp_path: Path,
     expected = jax.tree.map(lambda leaf: leaf + 2, nnx.state(model, nnx.Param))
     load_dit(model, tmp_path / "out")
     jax.tree.map(np.testing.assert_array_equal, nnx.state(model, nnx.Param), expected)
+
+
+def test_constants_of_a_checkpoint_are_those_of_the_model(run: Path, tmp_path: Path) -> None:
+    """What weights alone do not tell: the eps of norms, and the base of rotary positions, which diffusers cannot have."""
+    export.export(run, tmp_path / "out")
+    config = tmp_path / "out" / "config.json"
+    written, model = json.loads(config.read_text()), create_model(load_experiment(run / "config.yaml"))
+    assert written["eps"] == model.size.epsilon and written["_rope_base"] == model.size.rotary_base
+    for key, other, said in (
+        ("eps", 1e-5, "eps = 1e-05 .*has epsilon = 1e-06"),
+        ("eps", "small", "eps = 'small'"),
+        ("_rope_base", 3.0, "_rope_base = 3.0"),
+    ):
+        config.write_text(json.dumps(written | {key: other}))
+        for check in (load_dit, check_dit):
+            with pytest.raises(ConfigError, match=said):
+                check(model, tmp_path / "out")
+    config.write_text("[")
+    with pytest.raises(ConfigError, match=r"config\.json cannot be read"):
+        load_dit(model, tmp_path / "out")
 
 
 def test_one_file_of_an_earlier_step_rounded(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,6 +19,7 @@ from xew.analysis.statistics.grades import StudyGrades
 from xew.analysis.tables.claims import CLAIMS
 from xew.analysis.tables.comparisons import Claim
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, ask
+from xew.config import user_errors
 from xew.protocol import PAPER_PARTS, PARTS, ROBOT_NAMES, TEST_SEED_START
 from xew.statistics import Mean, bootstrap_means, combine, pool_trainings
 
@@ -218,4 +219,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, prog="python -m xew.analysis.null"))
+    user_errors(lambda: main(tyro.cli(Args, prog="python -m xew.analysis.null")))()

@@ -1,7 +1,7 @@
 """Export accepted episodes as a LeRobotDataset (codebase v3.0), which LeRobot and what is built on it read.
 
 Reads  DATA: a data set of ours
-Writes DIR: meta/ (info, tasks, episodes, statistics), data/ (parquet) and videos/ (H.264 in mp4), many episodes a file
+Writes DIR: meta/ (info, tasks, episodes, statistics), data/ (parquet, many episodes a file) and videos/ (H.264 in mp4, one)
 
     action, observation.state     the canonical 16 numbers, commanded and measured
     observation.tool_pose         14 numbers: left and right tool, x y z [m] and quaternion x y z w, world
@@ -15,7 +15,6 @@ Command: python -m xew.exchange.lerobot DATA --out DIR [--robots … --tasks …
 
 import json
 from collections.abc import Iterable, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -39,7 +38,7 @@ RATE = Fraction(50, 3)
 """Frames a second."""
 FILES_PER_CHUNK = 1000
 LARGEST_DATA, LARGEST_VIDEO = 100, 200
-"""Sizes at which a file is closed and the next begun [MB]."""
+"""Sizes at which LeRobot's own tools close a file and begin the next [MB]; here a video has one episode."""
 ENCODER = {"crf": "16", "g": "2", "bf": "0", "preset": "veryfast"}
 """Options of x264: every other frame is a key frame, so that single frames are read fast."""
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
@@ -134,9 +133,8 @@ def _write(
     tasks = {task: index for index, task in enumerate(dict.fromkeys(told))}
     episodes: list[dict[str, Any]] = []
     totals = _Totals()
-    with ExitStack() as stack:
-        table = stack.enter_context(_Tables(root / "data"))
-        films = {key: stack.enter_context(_Films(root / "videos" / key)) for key in videos}
+    with _Tables(root / "data") as table:
+        films = {key: _Films(root / "videos" / key) for key in videos}
         start = 0
         for number, (folder, record) in enumerate(tqdm(chosen, desc="exporting", unit="episode")):
             columns = _columns(read_states(folder), vectors, number, start, tasks[told[number]])
@@ -224,56 +222,29 @@ class _Tables:
 
 
 class _Films:
-    """H.264 files of frames, closed as they fill."""
+    """H.264 files of one episode each, so that whoever splits or filters the set copies files and encodes nothing anew."""
 
     def __init__(self, root: Path) -> None:
-        self.root, self.place = root, Place()
-        self.container: Any = None
-        self.bytes = self.frames = 0
-
-    def __enter__(self) -> "_Films":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._close()
+        self.root, self.next = root, Place()
 
     def add(self, video: np.ndarray) -> dict[str, Any]:
-        """Append the video of an episode [t h w 3] uint8 RGB; returns the columns that say where it is."""
-        if self.container is not None and self.bytes > LARGEST_VIDEO * 1e6:
-            self._close()
-            self.place = self.place.next_place()
-        if self.container is None:
-            self._open(video.shape[2], video.shape[1])
-        begin = self.frames
-        for image in video:
-            self._mux(_frame(image, self.frames))
-            self.frames += 1
+        """Write the video of an episode [t h w 3] uint8 RGB; returns the columns that say where it is."""
+        place, self.next = self.next, self.next.next_place()
+        path = place.path(self.root, "mp4")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream("libx264", rate=RATE, options=ENCODER)
+            stream.height, stream.width, stream.pix_fmt = *video.shape[1:3], "yuv420p"
+            for number, image in enumerate(video):
+                container.mux(stream.encode(_frame(image, number)))
+            container.mux(stream.encode(None))
         key = f"videos/{self.root.name}"
         return {
-            f"{key}/chunk_index": self.place.chunk,
-            f"{key}/file_index": self.place.file,
-            f"{key}/from_timestamp": float(begin / RATE),
-            f"{key}/to_timestamp": float(self.frames / RATE),
+            f"{key}/chunk_index": place.chunk,
+            f"{key}/file_index": place.file,
+            f"{key}/from_timestamp": 0.0,
+            f"{key}/to_timestamp": float(len(video) / RATE),
         }
-
-    def _open(self, width: int, height: int) -> None:
-        path = self.place.path(self.root, "mp4")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self.container = av.open(str(path), "w")
-        self.stream = self.container.add_stream("libx264", rate=RATE, options=ENCODER)
-        self.stream.width, self.stream.height, self.stream.pix_fmt = width, height, "yuv420p"
-        self.bytes = self.frames = 0
-
-    def _mux(self, frame: Any) -> None:
-        for packet in self.stream.encode(frame):
-            self.bytes += packet.size
-            self.container.mux(packet)
-
-    def _close(self) -> None:
-        if self.container is not None:
-            self._mux(None)
-            self.container.close()
-            self.container = None
 
 
 def _frame(image: np.ndarray, number: int) -> Any:

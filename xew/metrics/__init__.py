@@ -21,6 +21,7 @@ from xew.metrics.perceptual import (
     region_lpips_frames,
     robot_lpips,
     robot_lpips_frames,
+    robot_lpips_parts,
 )
 from xew.metrics.track import (
     TRAJECTORY_STATE,
@@ -62,7 +63,8 @@ METRICS = {
         "Region LPIPS", suites=PAPER),
     "robot_lpips": Metric(
         robot_lpips, robot_lpips_frames, "morphology", "", (0, INF), False, "robot",
-        "LPIPS's maps weighted by the share of the robot in each receptive field", "Robot LPIPS", suites=STRICT),
+        "LPIPS's maps weighted by the share of the robot in each receptive field", "Robot LPIPS",
+        parts=robot_lpips_parts, suites=STRICT),
     "pck": Metric(
         pck, None, "kinematics", "", (0, 1), True, "track", "share within 0.1 of the keypoints' box diagonal",
         "PCK", parts=hits, suites=PAPER),

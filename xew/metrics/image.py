@@ -21,8 +21,8 @@ SSIM_WINDOW = 7
 SSIM_C1, SSIM_C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
 
 
-@functools.partial(jax.jit, static_argnames="chunk")
 @check_first(check_videos)
+@functools.partial(jax.jit, static_argnames="chunk")
 def psnr(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFrame:
     """Peak signal-to-noise ratio of each frame [dB], higher is better.
 
@@ -37,18 +37,18 @@ def psnr(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFra
         chunk: most frames computed at once; by default 1 on a CPU, where that is fastest, and 64 elsewhere.
 
     Returns:
-        [t] float32.
+        [t] float32; NaN where a pixel of either frame is NaN.
     """
     error = mean_squared_error(prediction, target, chunk)
     finite = finite_psnr(error)
     largest = jnp.max(jnp.where(error > 0, finite, -jnp.inf))
     cap = jnp.where(jnp.isfinite(largest), largest, attainable_psnr(np.shape(target)))
-    return jnp.where(error > 0, finite, cap)
+    return jnp.where(error == 0, cap, finite)
 
 
 def finite_psnr(error: ByFrame) -> ByFrame:
     """[t] float32 [dB] of mean squared errors [t] in levels of 255; 48.13, of an error of 1, where there is none."""
-    return -10 * jnp.log10(jnp.where(error > 0, error, 1) / 255**2)
+    return -10 * jnp.log10(jnp.where(error == 0, 1, error) / 255**2)
 
 
 def attainable_psnr(shape: tuple[int, ...]) -> Scalar:
@@ -56,8 +56,8 @@ def attainable_psnr(shape: tuple[int, ...]) -> Scalar:
     return 10 * jnp.log10(jnp.float32(255**2 * math.prod(shape[1:])))
 
 
-@jax.jit
 @check_first(check_videos)
+@jax.jit
 def exact_frames(prediction: Video, target: Video) -> Bool[jax.Array, " t"]:
     """[t] bool, which frames equal the target in every pixel: those whose PSNR is a cap.
 
@@ -75,7 +75,7 @@ def mean_squared_error(prediction: Video, target: Video, chunk: int | None = Non
 
 def _frame_error(x: jax.Array, y: jax.Array) -> jax.Array:
     if x.dtype != jnp.uint8:
-        return jnp.mean(jnp.square((x - y) * 255), dtype=jnp.float32)
+        return jnp.mean(jnp.square((x.astype(jnp.float32) - y.astype(jnp.float32)) * 255))
     difference = x.astype(jnp.int32) - y.astype(jnp.int32)
     rows = jnp.sum(difference * difference, axis=(1, 2))
     # A frame's sum passes 2^31. Its high and low parts do not, and both are integers that float32 holds.
@@ -83,8 +83,8 @@ def _frame_error(x: jax.Array, y: jax.Array) -> jax.Array:
     return (high.astype(jnp.float32) * 4096 + low.astype(jnp.float32)) / x.size
 
 
-@functools.partial(jax.jit, static_argnames="chunk")
 @check_first(check_videos, smallest_side=SSIM_WINDOW)
+@functools.partial(jax.jit, static_argnames="chunk")
 def ssim(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFrame:
     """Structural similarity of each frame in [-1, 1], higher is better.
 
@@ -96,7 +96,7 @@ def ssim(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFra
         chunk: as in `psnr`.
 
     Returns:
-        [t] float32.
+        [t] float32; NaN where a pixel of either frame is NaN.
 
     Raises:
         ValueError: shapes differ or a side is under 7 pixels.
@@ -159,11 +159,12 @@ class CappedMean:
 
     @property
     def value(self) -> jax.Array:
-        """Mean of `psnr` over the frames [t] of the video, a float32 scalar [dB]."""
+        """Mean of `psnr` over the frames [t] of the video, a float32 scalar [dB]; NaN if one frame's is."""
         cap = jnp.where(self.finite.count > 0, self.largest, self.attainable)
         finite = jnp.where(self.finite.count > 0, to_float(self.finite.total), 0)
         exact = self.exact.astype(jnp.float32)
-        return (finite + jnp.where(self.exact > 0, exact * cap, 0)) / (self.finite.count.astype(jnp.float32) + exact)
+        mean = (finite + jnp.where(self.exact > 0, exact * cap, 0)) / (self.finite.count.astype(jnp.float32) + exact)
+        return jnp.where(self.finite.undefined > 0, jnp.nan, mean)
 
 
 def _empty_capped() -> CappedMean:
@@ -178,7 +179,7 @@ def _update_capped(state: CappedMean, prediction: Video, target: Video, *, chunk
     return _merge_capped(
         state,
         CappedMean(
-            finite=mean_of(values, error > 0),
+            finite=mean_of(values, error != 0),
             exact=jnp.sum(error == 0, dtype=jnp.int32),
             largest=jnp.max(jnp.where(error > 0, values, -jnp.inf)),
             attainable=attainable_psnr(np.shape(target)),

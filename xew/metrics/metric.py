@@ -23,7 +23,8 @@ Video: TypeAlias = UInt8[AnyArray, "t h w 3"] | Float[AnyArray, "t h w 3"]
 """RGB, uint8 or floating in [0, 1]."""
 Masks: TypeAlias = Bool[AnyArray, "t h w"]
 Tracks: TypeAlias = Float[AnyArray, "t k 2"]
-"""Points in pixels, x right, y down; NaN where a prediction lost one."""
+"""Points in pixels, x right, y down; NaN where a prediction lost one. A target's must be known where `valid`: if one is not,
+the score is NaN."""
 Valid: TypeAlias = Bool[AnyArray, "t k"]
 """Flags of the points that can be seen in the target."""
 Contacts: TypeAlias = Bool[AnyArray, "t c"]
@@ -48,6 +49,8 @@ SUITES = {
 POINTS = ("origins", "surfaces")
 """Kinds of points that tracks follow: origins of links and objects, or points on surfaces of links and of what moves."""
 
+OVERSHOOT = 0.25
+"""Amount by which floats may lie outside of [0, 1]: more than a decoder's overshoot, less than what [-1, 1] shows."""
 ACCELERATOR_CHUNK = 64
 """Number of frames computed at once on a GPU or TPU; one is fastest on a CPU, where a frame's intermediates then stay in its
 cache."""
@@ -101,7 +104,8 @@ class Metric:
 def check_first(check: Callable[..., None], **options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorate a metric with a check of its arguments, whose one-line message is what a user sees of a wrong array.
 
-    It stands above the function and so runs before anything that checks the function's annotations, as tests do.
+    It stands above jax.jit, which would turn lists into trees and values into tracers, and so runs before anything that checks
+    the function's annotations, as tests do.
 
     Args:
         check: takes some of the function's parameters, by the same names.
@@ -130,12 +134,13 @@ def check_videos(prediction: Any, target: Any, smallest_side: int = 1) -> None:
         prediction, target: the two videos.
         smallest_side: least side of a frame [pixels] for which the metric is defined.
     """
+    check_arrays(prediction=prediction, target=target)
     if np.shape(prediction) != np.shape(target):
         raise ValueError(
             f"prediction is {np.shape(prediction)}, target is {np.shape(target)}; they must have one shape [t h w 3]."
         )
     if np.ndim(target) != 4 or np.shape(target)[-1] != 3:
-        raise ValueError(f"videos are {np.shape(target)}, expected [t h w 3]; add the time axis, drop alpha.")
+        raise ValueError(f"videos are {np.shape(target)}, expected [t h w 3]; {_remedy_of_shape(np.shape(target))}.")
     if not np.shape(target)[0]:
         raise ValueError("the videos have no frames.")
     if min(np.shape(target)[1:3]) < smallest_side:
@@ -144,14 +149,59 @@ def check_videos(prediction: Any, target: Any, smallest_side: int = 1) -> None:
     if len(kinds) != 1 or not all(kind == jnp.uint8 or jnp.issubdtype(kind, jnp.floating) for kind in kinds):
         found = sorted(str(kind) for kind in kinds)
         raise TypeError(f"videos have dtype {' and '.join(found)}, expected both uint8, or both floating in [0, 1].")
+    for name, video in (("prediction", prediction), ("target", target)):
+        _check_range(name, video)
+
+
+def _remedy_of_shape(shape: tuple[int, ...]) -> str:
+    """What to do with a video of a wrong shape, in a few words."""
+    if len(shape) > 4:
+        return "of a batch take one video after another, or use jax.vmap"
+    if len(shape) == 4 and 3 in (shape[0], shape[1]):
+        return "move the channels last: np.moveaxis(video, 1, -1) of [t 3 h w], (video, 0, -1) of [3 t h w]"
+    return "add the time axis, drop alpha"
+
+
+def _check_range(name: str, video: Any) -> None:
+    """Raise ValueError if the first frame of a floating video [t h w 3] is clearly not in [0, 1], as far as that is known.
+
+    The frame alone, because a whole video would take longer than its PSNR. Networks overshoot, so OVERSHOOT is let pass.
+    """
+    if isinstance(video, jax.core.Tracer) or jnp.result_type(video) == jnp.uint8:
+        return
+    if isinstance(video, jax.Array) and not video.is_fully_addressable:
+        return
+    frame = np.asarray(video[0], np.float32)
+    low, high = float(frame.min()), float(frame.max())
+    if low < -OVERSHOOT or high > 1 + OVERSHOOT:
+        remedy = "divide by 255" if high > 2 else f"of [-1, 1] take ({name} + 1) / 2"
+        raise ValueError(f"the first frame of {name} goes from {low:.3g} to {high:.3g}, expected floats in [0, 1]; {remedy}.")
+
+
+def check_arrays(**arrays: Any) -> None:
+    """Raise TypeError unless all are arrays [...] of NumPy or JAX; the message says how to make one of what was found."""
+    for name, array in arrays.items():
+        if isinstance(array, np.ndarray | jax.Array) or hasattr(array, "__jax_array__"):
+            continue
+        kind = type(array)
+        remedy = f"{name}.numpy(force=True)" if kind.__module__.split(".")[0] == "torch" else f"np.asarray({name})"
+        raise TypeError(f"{name} is a {kind.__module__}.{kind.__qualname__}, expected an array of NumPy or JAX; pass {remedy}.")
 
 
 def check_masks(prediction: Any, target: Any) -> None:
     """Raise ValueError or TypeError unless both are bool [t h w] of one shape."""
-    if np.shape(prediction) != np.shape(target) or np.ndim(target) != 3:
-        raise ValueError(f"masks are {np.shape(prediction)} and {np.shape(target)}, expected one shape [t h w].")
+    check_arrays(prediction=prediction, target=target)
+    _check_shapes("masks", prediction, target, "[t h w]", np.ndim(target) == 3)
     for name, mask in (("prediction", prediction), ("target", target)):
         check_bool(name, mask)
+
+
+def _check_shapes(what: str, prediction: Any, target: Any, expected: str, fits: bool) -> None:
+    """Raise ValueError unless both arrays are of one shape, which fits what is expected, such as '[t h w]'."""
+    if np.shape(prediction) == np.shape(target) and fits:
+        return
+    batch = "; of a batch use jax.vmap" if np.ndim(target) > len(expected.split()) else ""
+    raise ValueError(f"{what} are {np.shape(prediction)} and {np.shape(target)}, expected one shape {expected}{batch}.")
 
 
 def check_bool(name: str, array: Any) -> None:
@@ -162,17 +212,20 @@ def check_bool(name: str, array: Any) -> None:
 
 def check_tracks(prediction: Any, target: Any, valid: Any) -> None:
     """Raise ValueError or TypeError unless tracks are floating [t k 2] of one shape and valid is bool [t k]."""
-    if np.shape(prediction) != np.shape(target) or np.ndim(target) != 3 or np.shape(target)[-1] != 2:
-        raise ValueError(f"tracks are {np.shape(prediction)} and {np.shape(target)}, expected one shape [t k 2].")
+    check_arrays(prediction=prediction, target=target, valid=valid)
+    _check_shapes("tracks", prediction, target, "[t k 2]", np.ndim(target) == 3 and np.shape(target)[-1] == 2)
     if np.shape(valid) != np.shape(target)[:2]:
         raise ValueError(f"valid is {np.shape(valid)}, expected {np.shape(target)[:2]}, a flag for each point and frame.")
+    for name, points in (("prediction", prediction), ("target", target)):
+        if not jnp.issubdtype(jnp.result_type(points), jnp.floating):
+            raise TypeError(f"{name} has dtype {jnp.result_type(points)}, expected floating pixels; use .astype(np.float32).")
     check_bool("valid", valid)
 
 
 def check_contacts(prediction: Any, target: Any) -> None:
     """Raise ValueError or TypeError unless both are bool [t c] of one shape."""
-    if np.shape(prediction) != np.shape(target) or np.ndim(target) != 2:
-        raise ValueError(f"contacts are {np.shape(prediction)} and {np.shape(target)}, expected one shape [t c].")
+    check_arrays(prediction=prediction, target=target)
+    _check_shapes("contacts", prediction, target, "[t c]", np.ndim(target) == 2)
     for name, contact in (("prediction", prediction), ("target", target)):
         check_bool(name, contact)
 

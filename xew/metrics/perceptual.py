@@ -5,7 +5,7 @@ float32 everywhere: TF32, the default of some GPUs, changes the fourth digit (`n
 """
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,8 +13,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Bool
 
-from xew.metrics.metric import AnyArray, ByFrame, Masks, Scalar, Video, check_first, check_masks, check_videos, map_chunks
+from xew.metrics.metric import (
+    AnyArray,
+    ByFrame,
+    Masks,
+    Scalar,
+    Video,
+    check_arrays,
+    check_bool,
+    check_first,
+    check_videos,
+    map_chunks,
+)
 from xew.metrics.networks.alexnet import read_alexnet
 from xew.metrics.networks.convolution import convolve, convolve_quickly
 
@@ -62,7 +74,7 @@ def lpips(prediction: Video, target: Video, *, chunk: int | None = None, exact: 
             TF32 on NVIDIA's GPUs: several times faster and about 1e-4 off, for a loss.
 
     Returns:
-        [t] float32.
+        [t] float32; NaN where a pixel of either frame is NaN.
 
     Raises:
         ValueError: shapes differ or a side is under 31 pixels.
@@ -124,18 +136,29 @@ def robot_lpips(prediction: Video, target: Video, target_mask: Masks, *, chunk: 
         chunk: as in `lpips`.
 
     Returns:
-        Scalar float32; NaN where no frame shows the robot.
+        Scalar float32; NaN where no frame shows the robot, or a pixel of one that does is NaN.
 
     Raises:
         ValueError: shapes differ or a side is under 31 pixels.
     """
-    return jnp.nanmean(robot_lpips_frames(prediction, target, target_mask, chunk=chunk))
+    values, shows = robot_lpips_parts(prediction, target, target_mask, chunk=chunk)
+    return jnp.sum(jnp.where(shows, values, 0)) / jnp.sum(shows, dtype=jnp.float32)
 
 
 @check_first(check_region)
 def robot_lpips_frames(prediction: Video, target: Video, target_mask: Masks, *, chunk: int | None = None) -> ByFrame:
     """`robot_lpips` before the mean, [t] float32, NaN where no pixel is the robot; of videos [t h w 3], masks [t h w] bool."""
-    return _weighted_distance(_weights(), prediction, target, jnp.asarray(target_mask), chunk)
+    values, shows = robot_lpips_parts(prediction, target, target_mask, chunk=chunk)
+    return jnp.where(shows, values, jnp.nan)
+
+
+@check_first(check_region)
+def robot_lpips_parts(
+    prediction: Video, target: Video, target_mask: Masks, *, chunk: int | None = None
+) -> tuple[ByFrame, Bool[jax.Array, " t"]]:
+    """What `robot_lpips` of videos [t h w 3] and masks [t h w] is the mean of: [t] float32, and [t] bool, which count."""
+    mask = jnp.asarray(target_mask)
+    return _weighted_distance(_weights(), prediction, target, mask, chunk), jnp.any(mask, axis=(1, 2))
 
 
 def check_target(target: Any, target_mask: Any = None) -> None:
@@ -195,7 +218,8 @@ def union_box(mask: Masks) -> Box:
     top, left = jnp.argmax(rows), jnp.argmax(columns)
     height = jnp.where(jnp.any(rows), len(rows) - jnp.argmax(rows[::-1]) - top, 0)
     width = jnp.where(jnp.any(columns), len(columns) - jnp.argmax(columns[::-1]) - left, 0)
-    return top, left, height, width
+    # In 64 bits argmax is of another type than the sizes of frames.
+    return top.astype(jnp.int32), left.astype(jnp.int32), height.astype(jnp.int32), width.astype(jnp.int32)
 
 
 def _whole_box(video: AnyArray) -> Box:
@@ -204,7 +228,10 @@ def _whole_box(video: AnyArray) -> Box:
 
 
 def _check_mask(target: Any, target_mask: Any) -> None:
-    check_masks(target_mask, np.zeros(np.shape(target)[:3], bool))
+    check_arrays(target_mask=target_mask)
+    if np.shape(target_mask) != np.shape(target)[:3]:
+        raise ValueError(f"target_mask is {np.shape(target_mask)}, expected {np.shape(target)[:3]}, as the video's [t h w].")
+    check_bool("target_mask", target_mask)
 
 
 def _mask_box(target_mask: AnyArray) -> Box:
@@ -234,27 +261,39 @@ def _box_distance(
     """LPIPS [t] of the same box of both videos."""
 
     def distances(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
-        layers = _features(weights, _input(jnp.concatenate(pair), box), *box[2:], exact=exact)
-        units, count = ((_unit(x), h, w) for x, h, w in layers), len(pair[0])
-        return _sum_of_layers(weights, [(both[:count], both[count:], h, w) for both, h, w in units])
+        image, count = _input(jnp.concatenate(pair), box), len(pair[0])
+        units = ((_unit(x), h, w) for x, h, w in _features(weights, image, *box[2:], exact=exact))
+        found = _sum_of_layers(weights, [(both[:count], both[count:], h, w) for both, h, w in units])
+        return jnp.where(_is_broken(image[:count], image[count:]), jnp.nan, found)
 
-    def of_frames(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
-        # Exactly 0 for equal frames: a convolution may round the two images of a pair differently.
-        equal = jnp.all(pair[0] == pair[1], axis=(1, 2, 3))
-        return jnp.where(equal, 0, lax.cond(jnp.all(equal), lambda _: jnp.zeros(len(equal), jnp.float32), distances, pair))
+    return map_chunks(lambda pair: _zero_where_equal(distances, pair), (prediction, target), chunk)
 
-    return map_chunks(of_frames, (prediction, target), chunk)
+
+def _zero_where_equal(distances: Callable[[Any], jax.Array], frames: tuple[jax.Array, ...]) -> jax.Array:
+    """Distances [n] of frames, whose first two arrays [n h w 3] are compared; exactly 0 where these are equal.
+
+    A convolution may round the two images of a pair differently.
+    """
+    equal = jnp.all(frames[0] == frames[1], axis=(1, 2, 3))
+    # Zeros that are made of the data lie where the data lie, as shard_map wants it of both branches.
+    return jnp.where(equal, 0, lax.cond(jnp.all(equal), lambda _: (~equal).astype(jnp.float32), distances, frames))
+
+
+def _is_broken(*images: jax.Array) -> jax.Array:
+    """[n] bool, whether a number in any of some images [n h w 3] is NaN, also where no unit of the network looks."""
+    return functools.reduce(jnp.logical_or, (jnp.any(jnp.isnan(image), axis=(1, 2, 3)) for image in images))
 
 
 @functools.partial(jax.jit, static_argnames="chunk")
 def _weighted_distance(
     weights: Weights, prediction: jax.Array, target: jax.Array, mask: jax.Array, chunk: int | None
 ) -> jax.Array:
-    """LPIPS [t] of whole frames, weighted by the share of the mask in each receptive field; NaN where there is no mask."""
+    """LPIPS [t] of whole frames, weighted by the share of the mask in each receptive field; 0 where there is no mask."""
     box = _whole_box(target)
 
     def distances(frames: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        features = _features(weights, _input(jnp.concatenate(frames[:2]), box), *box[2:])
+        image = _input(jnp.concatenate(frames[:2]), box)
+        features = _features(weights, image, *box[2:])
         count, total = len(frames[0]), jnp.zeros(len(frames[0]), jnp.float32)
         for i, ((x, _, _), field_of_unit) in enumerate(zip(features, _receptive_fields(weights), strict=True)):
             unit = _unit(x)
@@ -262,15 +301,9 @@ def _weighted_distance(
             weighted = jnp.sum(share * _layer_map(weights[f"head{i}"], unit[:count], unit[count:]), axis=(1, 2))
             weight = jnp.sum(share, axis=(1, 2))
             total = total + jnp.where(weight > 0, weighted / jnp.where(weight > 0, weight, 1), 0)
-        return total
+        return jnp.where(_is_broken(image[:count], image[count:]), jnp.nan, total)
 
-    def of_frames(frames: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        equal = jnp.all(frames[0] == frames[1], axis=(1, 2, 3))
-        none = jnp.zeros(len(equal), jnp.float32)
-        found = lax.cond(jnp.all(equal), lambda _: none, distances, frames)
-        return jnp.where(jnp.any(frames[2], axis=(1, 2)), jnp.where(equal, 0, found), jnp.nan)
-
-    return map_chunks(of_frames, (prediction, target, mask), chunk)
+    return map_chunks(lambda frames: _zero_where_equal(distances, frames), (prediction, target, mask), chunk)
 
 
 def _receptive_fields(weights: Weights) -> list[tuple[int, int, int]]:
@@ -314,8 +347,10 @@ def _distance_from_features(
     weights: Weights, prediction: jax.Array, target: tuple[jax.Array, ...], box: Box, chunk: int | None
 ) -> jax.Array:
     def of_frames(pair: tuple[jax.Array, tuple[jax.Array, ...]]) -> jax.Array:
-        layers = _features(weights, _input(pair[0], box), *box[2:])
-        return _sum_of_layers(weights, [(_unit(x), y, h, w) for (x, h, w), y in zip(layers, pair[1], strict=True)])
+        image = _input(pair[0], box)
+        units = zip(_features(weights, image, *box[2:]), pair[1], strict=True)
+        found = _sum_of_layers(weights, [(_unit(x), y, h, w) for (x, h, w), y in units])
+        return jnp.where(_is_broken(image), jnp.nan, found)
 
     return map_chunks(of_frames, (prediction, target), chunk)
 
@@ -352,7 +387,7 @@ def _features(
 
 def _keep(x: jax.Array, height: jax.Array, width: jax.Array) -> jax.Array:
     """Zero outside the upper left height x width of [n h w d]."""
-    rows, columns = jnp.arange(x.shape[1]) < height, jnp.arange(x.shape[2]) < width
+    rows, columns = (jnp.arange(x.shape[1 + i], dtype=side.dtype) < side for i, side in enumerate((height, width)))
     return jnp.where((rows[:, None] & columns[None, :])[None, :, :, None], x, 0)
 
 

@@ -9,10 +9,12 @@
 A state is a tree of integers; sums of floats are exact, so `merge` is associative and commutative to the last bit. Any split
 into batches, any number of hosts and any order give the same bits, as long as a frame's own value does not depend on the
 batch that it is computed in. On a CPU it does not; on a GPU, convolutions of other batch sizes may round a frame's LPIPS
-otherwise in its last digit. All functions are pure and work under jit; `lax.scan` can carry a state.
+otherwise in its last digit. NaN in any part makes the whole NaN, as it does for the function of the whole video. All functions
+are pure and work under jit; `lax.scan` can carry a state.
 """
 
 import jax
+import jax.numpy as jnp
 
 from xew.metrics import METRICS
 from xew.metrics.mergeable.sums import LIMBS, Mean, Mergeable, empty_mean, mean_of, mean_over, merge_means
@@ -40,5 +42,5 @@ and its state is the mean over keypoints of several such. States of several vide
 points; for the mean over videos, each counting the same, give one number a video to MEAN.
 """
 
-MEAN = mean_over(lambda values: (values, None))
+MEAN = mean_over(lambda values: (values, jnp.isfinite(values)))
 """States of the mean of numbers [n], such as a score for each video. NaN, the score without a valid point, is not counted."""

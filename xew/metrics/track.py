@@ -31,8 +31,8 @@ SIDE = math.sqrt(320 * 240)
 """Side [pixels] of the square with the area of an episode's image."""
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def pck(prediction: Tracks, target: Tracks, valid: Valid, alpha: float | jax.Array = 0.1) -> Scalar:
     """Percentage of correct keypoints: the share in [0, 1] that lie nearer than alpha x d_t, higher is better.
 
@@ -49,8 +49,8 @@ def pck(prediction: Tracks, target: Tracks, valid: Valid, alpha: float | jax.Arr
     return _masked_mean(*hits(prediction, target, valid, alpha))
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def pck_05(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
     """`pck` at alpha = 0.05, the second tolerance of the paper's evaluator.
 
@@ -63,8 +63,8 @@ def pck_05(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
     return pck(prediction, target, valid, alpha=0.05)
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def coverage(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
     """Share in [0, 1] of the valid points that the prediction has, higher is better.
 
@@ -79,8 +79,8 @@ def coverage(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
     return _masked_mean(*presence(prediction, target, valid))
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def keypoint_error(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
     """Mean distance [pixels] over the valid points that the prediction has, lower is better.
 
@@ -93,8 +93,8 @@ def keypoint_error(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
     return _masked_mean(*distances(prediction, target, valid))
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def trajectory_error(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
     """Distance [pixels] of tracked objects, mean over each object's valid frames, then over objects; lower is better.
 
@@ -108,8 +108,8 @@ def trajectory_error(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar
     return _masked_mean(_masked_mean(distance, tracked, axis=0), jnp.any(tracked, axis=0))
 
 
-@functools.partial(jax.jit, static_argnames="tolerance")
 @check_first(check_contacts)
+@functools.partial(jax.jit, static_argnames="tolerance")
 def contact_f1(prediction: Contacts, target: Contacts, tolerance: int = 0) -> Scalar:
     """F1 of frames in contact, over all pairs of bodies; a diagnostic outside the suite, higher is better.
 
@@ -138,8 +138,8 @@ def _widen(contact: AnyArray, frames: int) -> jax.Array:
     return functools.reduce(jnp.logical_or, (shifted[i : i + len(contact)] for i in range(2 * frames + 1)))
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def ndtw(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
     """Normalized dynamic time warping of each keypoint's path, mean over keypoints; lower is better, 0 is best.
 
@@ -155,8 +155,8 @@ def ndtw(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
     return _masked_mean(*warpings(prediction, target, valid))
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def pck_strict(prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE) -> Scalar:
     """Share in [0, 1] of the valid points nearer than a tolerance of the image, mean over `TOLERANCES`; higher is better.
 
@@ -172,8 +172,8 @@ def pck_strict(prediction: Tracks, target: Tracks, valid: Valid, side: float | j
     return _masked_mean(*strict_hits(prediction, target, valid, side))
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def keypoint_error_strict(prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE) -> Scalar:
     """Mean distance [pixels] over the valid points; a lost point has the distance of failure, and none has more.
 
@@ -187,8 +187,8 @@ def keypoint_error_strict(prediction: Tracks, target: Tracks, valid: Valid, side
     return _masked_mean(*strict_distances(prediction, target, valid, side))
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def trajectory_error_strict(prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE) -> Scalar:
     """`keypoint_error_strict` of points on objects: mean over frames and points, none is left out; lower is better.
 
@@ -202,8 +202,8 @@ def trajectory_error_strict(prediction: Tracks, target: Tracks, valid: Valid, si
     return keypoint_error_strict(prediction, target, valid, side)
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def ndtw_strict(prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE) -> Scalar:
     """Dynamic time warping of each point's path over its valid frames, mean over points; lower is better, 0 is best.
 
@@ -225,71 +225,78 @@ def failure_distance(side: float | jax.Array = SIDE) -> float | jax.Array:
     return FAILURE / TAPVID_SIDE * side
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def hits(prediction: Tracks, target: Tracks, valid: Valid, alpha: float | jax.Array = 0.1) -> tuple[PointValues, Valid]:
     """What `pck` of tracks [t k 2] is the mean of: [t k] float32, 1 where one is near enough, and [t k] bool, which count."""
     diagonal = box_diagonal(target, valid)
     correct = _distance(prediction, target) < alpha * diagonal[:, None]
-    return correct.astype(jnp.float32), valid & (diagonal > 0)[:, None]
+    return _break(correct.astype(jnp.float32), valid & (diagonal > 0)[:, None], target, valid)
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def presence(prediction: Tracks, target: Tracks, valid: Valid) -> tuple[PointValues, Valid]:
     """What `coverage` of tracks [t k 2] is the mean of: [t k] float32, 1 where one was found, and [t k] bool, which count."""
-    return _is_found(prediction).astype(jnp.float32), valid
+    return _break(_is_found(prediction).astype(jnp.float32), valid, target, valid)
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def distances(prediction: Tracks, target: Tracks, valid: Valid) -> tuple[PointValues, Valid]:
     """What errors of tracks [t k 2] are means of: [t k] float32 pixels, infinite where lost, and [t k] bool, which count."""
-    return _distance(prediction, target), valid & _is_found(prediction)
+    return _break(_distance(prediction, target), valid & _is_found(prediction), target, valid)
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def warpings(prediction: Tracks, target: Tracks, valid: Valid) -> tuple[Float32[jax.Array, " k"], Bool[jax.Array, " k"]]:
     """What `ndtw` of tracks [t k 2] is the mean of: [k] float32, and [k] bool, which count."""
     tracked = valid & _is_found(prediction)
     diagonal = jnp.broadcast_to(box_diagonal(target, valid)[:, None], valid.shape)
     scale = _masked_mean(diagonal, tracked, axis=0)
     length = jnp.sum(tracked, axis=0)
-    cost = jax.vmap(_path_cost, in_axes=1)(prediction, target, tracked)
+    cost = _path_costs(prediction, target, tracked)
     counts = (length > 0) & (scale > 0)
-    return cost / jnp.where(counts, 2 * length.astype(jnp.float32) * scale, 1), counts
+    return _break(cost / jnp.where(counts, 2 * length.astype(jnp.float32) * scale, 1), counts, target, valid)
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def strict_hits(prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE) -> tuple[PointValues, Valid]:
     """What `pck_strict` of tracks [t k 2] is the mean of: [t k] float32, share of the tolerances kept, and [t k] bool."""
     tolerances = jnp.asarray(TOLERANCES, jnp.float32) / TAPVID_SIDE * side
     near = _distance(prediction, target)[..., None] < tolerances.reshape(1, 1, -1)
-    return jnp.mean(near.astype(jnp.float32), axis=-1), jnp.asarray(valid)
+    return _break(jnp.mean(near.astype(jnp.float32), axis=-1), valid, target, valid)
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def strict_distances(
     prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE
 ) -> tuple[PointValues, Valid]:
     """What strict errors of tracks [t k 2] are means of: [t k] float32 pixels, never above failure, and [t k] bool."""
     failure = jnp.asarray(failure_distance(side), jnp.float32)
-    return jnp.minimum(_distance(prediction, target), failure), jnp.asarray(valid)
+    return _break(jnp.minimum(_distance(prediction, target), failure), valid, target, valid)
 
 
-@jax.jit
 @check_first(check_tracks)
+@jax.jit
 def strict_warpings(
     prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE
 ) -> tuple[Float32[jax.Array, " k"], Bool[jax.Array, " k"]]:
     """What `ndtw_strict` of tracks [t k 2] is the mean of: [k] float32, and [k] bool, which count."""
     failure = jnp.asarray(failure_distance(side), jnp.float32)
     length = jnp.sum(valid, axis=0)
-    cost = jax.vmap(functools.partial(_path_cost, most=failure), in_axes=1)(prediction, target, valid)
-    return cost / (2 * jnp.maximum(length, 1).astype(jnp.float32) * failure), length > 0
+    cost = _path_costs(prediction, target, valid, failure)
+    return _break(cost / (2 * jnp.maximum(length, 1).astype(jnp.float32) * failure), length > 0, target, valid)
+
+
+def _break(values: jax.Array, counts: AnyArray, target: Tracks, valid: Valid) -> tuple[jax.Array, jax.Array]:
+    """Values and which count, [t k] or [k], where a valid point of the target [t k 2] is not known: NaN, which counts."""
+    broken = valid & ~_is_found(target)
+    broken = broken if values.ndim == 2 else jnp.any(broken, axis=0)
+    return jnp.where(broken, jnp.nan, values), jnp.logical_or(counts, broken)
 
 
 def box_diagonal(points: Tracks, valid: Valid) -> ByFrame:
@@ -298,10 +305,18 @@ def box_diagonal(points: Tracks, valid: Valid) -> ByFrame:
     Args:
         points: [t k 2] pixels. valid: [t k] bool.
     """
-    low = jnp.min(jnp.where(valid[..., None], points, jnp.inf), axis=1)
-    high = jnp.max(jnp.where(valid[..., None], points, -jnp.inf), axis=1)
+    points = _in_float32(points)
+    low = jnp.min(jnp.where(valid[..., None], points, jnp.inf), axis=1, initial=jnp.inf)
+    high = jnp.max(jnp.where(valid[..., None], points, -jnp.inf), axis=1, initial=-jnp.inf)
     extent = jnp.where(jnp.any(valid, axis=1)[:, None], high - low, 0)
     return _norm(extent)
+
+
+def _path_costs(prediction: AnyArray, target: AnyArray, tracked: AnyArray, most: float | jax.Array = math.inf) -> jax.Array:
+    """`_path_cost` [k] of each of k paths [t k 2]; 0 where there is no frame."""
+    if 0 in tracked.shape:
+        return jnp.zeros(tracked.shape[1], jnp.float32)
+    return jax.vmap(functools.partial(_path_cost, most=most), in_axes=1)(prediction, target, tracked)
 
 
 def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray, most: float | jax.Array = math.inf) -> jax.Array:
@@ -312,7 +327,7 @@ def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray, most: 
     """
     order = jnp.argsort(~tracked, stable=True)
     keep = tracked[order][:, None]
-    a, b = jnp.where(keep, prediction[order], 0), jnp.where(keep, target[order], 0)
+    a, b = (jnp.where(keep, _in_float32(path)[order], 0) for path in (prediction, target))
     found = _is_found(a)
     a = jnp.where(found[:, None], a, 0)
     t = len(a)
@@ -328,7 +343,8 @@ def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray, most: 
         cells = jnp.where((columns >= 0) & (columns < t), cells, jnp.inf)
         return (last, cells), cells
 
-    nothing = jnp.full(t, jnp.inf, jnp.float32)
+    # Infinity that is made of the data lies where the data lie, as shard_map wants it of what a scan carries.
+    nothing = lax.stop_gradient(jnp.maximum(jnp.where(found, jnp.minimum(_norm(a - b), most), most), jnp.inf))
     _, table = lax.scan(fill, (nothing, nothing), jnp.arange(2 * t - 1))
     end = jnp.maximum(jnp.sum(tracked) - 1, 0)
     return table[2 * end, end]
@@ -337,11 +353,17 @@ def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray, most: 
 def _distance(prediction: AnyArray, target: AnyArray) -> jax.Array:
     """[t k] Euclidean distance; infinite where the prediction has no point."""
     found = _is_found(prediction)
+    prediction, target = _in_float32(prediction), _in_float32(target)
     return jnp.where(found, _norm(jnp.where(found[..., None], prediction, target) - target), jnp.inf)
 
 
 def _is_found(points: AnyArray) -> jax.Array:
     return jnp.all(jnp.isfinite(points), axis=-1)
+
+
+def _in_float32(points: AnyArray) -> jax.Array:
+    """Points [...] to compute with: bfloat16 has 8 bits, which is a pixel in a width of 256."""
+    return jnp.asarray(points, jnp.float32)
 
 
 def _norm(vector: jax.Array) -> jax.Array:

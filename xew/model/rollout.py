@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from xew.command_line import find_path, parse_command
 from xew.compilation import keep_compiled_programs
-from xew.config import CONVERTER, ConfigError, admit, parse, user_errors
+from xew.config import CONVERTER, ConfigError, admit, find_config, is_packaged, parse, user_errors
 from xew.dataset import Episode, read_dataset
 from xew.episode import Record, episode_folder, remove_left_overs
 from xew.files import checkpoint_time, hold_lock, read_json
@@ -86,12 +86,12 @@ def _make_predictor(
 
 def is_config(run: Path) -> bool:
     """Whether it is a config with published weights, and not the folder of a run."""
-    return run.suffix in (".yaml", ".yml")
+    return run.suffix in (".yaml", ".yml") or is_packaged(run)
 
 
 def default_name(run: Path) -> str:
     """Name of a run's rollouts where the command line gives none."""
-    run = run.resolve()
+    run = find_config(run).resolve()
     return run.stem if is_config(run) else run.name
 
 

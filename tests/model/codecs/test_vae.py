@@ -1,14 +1,20 @@
 """The autoencoder by itself: causal, the same in chunks, and as large as its config says."""
 
+import json
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
 
+from xew.config import ConfigError
 from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae
 from xew.model.codecs.vae_chunks import even_chunk
 from xew.model.codecs.vae_layers import double_sides, patchify, unpatchify
+from xew.model.codecs.vae_layouts import diffusers_layout, load_vae, save_vae
+from xew.model.weights.writing import save_weights
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 
@@ -121,6 +127,26 @@ def test_statistics(vae: VideoVae) -> None:
     normalized = encode(other, video)
     np.testing.assert_allclose(normalized, (latents - mean.reshape(row)) / std.reshape(row), atol=1e-5)
     np.testing.assert_allclose(decode(other, normalized), decode(vae, latents), atol=1e-5)
+
+
+def test_statistics_of_a_checkpoint_lie_in_its_config(vae: VideoVae, tmp_path: Path) -> None:
+    """diffusers keeps them beside the weights; a file of ours holds them, and then its own count."""
+    said = {"latents_mean": [0.5 + i for i in range(CHANNELS)], "latents_std": [2.0 + i for i in range(CHANNELS)]}
+    save_weights(vae, tmp_path / "theirs" / "vae.safetensors", diffusers_layout(vae))
+    save_vae(vae, tmp_path / "ours" / "vae.safetensors")
+    for name in ("theirs", "ours"):
+        (tmp_path / name / "config.json").write_text(json.dumps(said))
+    for path in (tmp_path / "theirs", tmp_path / "theirs" / "vae.safetensors"):
+        loaded = abstract_vae(VAES["tiny"])
+        load_vae(loaded, path)
+        np.testing.assert_array_equal(loaded.latents_mean[...], said["latents_mean"])
+        np.testing.assert_array_equal(loaded.latents_std[...], said["latents_std"])
+    load_vae(loaded, tmp_path / "ours")
+    np.testing.assert_array_equal(loaded.latents_std[...], vae.latents_std[...])
+    for wrong in ([1.0], "much", [0.0] * CHANNELS, [float("nan")] * CHANNELS):
+        (tmp_path / "theirs" / "config.json").write_text(json.dumps({"latents_std": wrong}))
+        with pytest.raises(ConfigError, match=f"latents_std of config.json .* no list of {CHANNELS} finite numbers"):
+            load_vae(loaded, tmp_path / "theirs")
 
 
 def test_published_statistics() -> None:

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams import metadata
 
 from xew.model.runs.log import RunLog
 
@@ -34,6 +35,27 @@ def test_a_run_that_goes_on_continues_both_curves(tmp_path: Path) -> None:
     log(tmp_path, 0, {10: 4.0, 20: 3.0})
     log(tmp_path, 20, {30: 2.0})
     assert curves(tmp_path) == ([(10, 4.0), (20, 3.0), (30, 2.0)],) * 2
+
+
+def test_a_run_begins_with_its_settings(tmp_path: Path) -> None:
+    """As TensorBoard's own readers of texts and HParams find them."""
+    (tmp_path / "config.yaml").write_text(
+        "data: data\nclip: {frames: 5}\ntrain: {rate: 1.0e-4, ema: true, of: [a, b], to: null}\n"
+    )
+    log(tmp_path, 0, {10: 4.0})
+    accumulator = EventAccumulator(str(tmp_path))
+    accumulator.Reload()
+    (page,) = accumulator.Tensors("config/text_summary" if "config/text_summary" in accumulator.Tags()["tensors"] else "config")
+    assert b"    clip: {frames: 5}" in page.tensor_proto.string_val[0]
+    content = accumulator.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    found = metadata.parse_session_start_info_plugin_data(content).hparams
+    assert {name: getattr(value, value.WhichOneof("kind")) for name, value in found.items()} == {
+        "data": "data",
+        "clip.frames": 5.0,
+        "train.rate": 1e-4,
+        "train.ema": True,
+        "train.of": "['a', 'b']",
+    }
 
 
 def test_steps_that_were_lost_are_taken_back(tmp_path: Path) -> None:

@@ -31,23 +31,25 @@ class Mergeable:
     """(state, *what the metric function takes, **its options) -> state."""
     merge: Callable[[Any, Any], Any]
     compute: Callable[[Any], jax.Array]
-    """state -> scalar float32; NaN where nothing was counted."""
+    """state -> scalar float32; NaN where nothing was counted, or where anything that counts is not a finite number."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Mean:
-    """The mean of finite float32 values, as their exact sum and their number."""
+    """The mean of float32 values, as the exact sum and the number of the finite ones, and the number of the others."""
 
     total: jax.Array
     """[... 20] int32, the sum in units of 2^-149: 16 bits each from the lowest, the last with the sign."""
     count: jax.Array
-    """[...] int32, number of values."""
+    """[...] int32, number of finite values."""
+    undefined: jax.Array
+    """[...] int32, number of values that are NaN or infinite."""
 
     @property
     def value(self) -> jax.Array:
-        """[...] float32, within 5e-7 of the true mean relative to it; NaN where nothing was counted."""
-        return to_float(self.total) / self.count.astype(jnp.float32)
+        """[...] float32, within 5e-7 of the true mean relative to it; NaN where nothing was counted, or what is not finite."""
+        return jnp.where(self.undefined > 0, jnp.nan, to_float(self.total) / self.count.astype(jnp.float32))
 
 
 def mean_over(values: Callable[..., tuple[jax.Array, jax.Array | None]]) -> Mergeable:
@@ -65,25 +67,27 @@ def mean_over(values: Callable[..., tuple[jax.Array, jax.Array | None]]) -> Merg
 
 
 def empty_mean(shape: tuple[int, ...] = ()) -> Mean:
-    """The mean of no values, or an array of such means of this shape: total [shape 20] int32, count [shape] int32."""
-    return Mean(jnp.zeros((*shape, LIMBS), jnp.int32), jnp.zeros(shape, jnp.int32))
+    """The mean of no values, or an array of such means of this shape: total [shape 20], count and undefined [shape] int32."""
+    return Mean(jnp.zeros((*shape, LIMBS), jnp.int32), jnp.zeros(shape, jnp.int32), jnp.zeros(shape, jnp.int32))
 
 
 @jax.jit
 def mean_of(values: jax.Array, keep: jax.Array | bool = True) -> Mean:
-    """The mean along the first axis of values [n ...] float32 where `keep` [n ...] bool; what is not finite is not counted."""
-    keep = jnp.isfinite(values) & keep
+    """The mean along the first axis of values [n ...] float32 where `keep` [n ...] bool; NaN if a kept one is not finite."""
+    finite = jnp.isfinite(values)
+    undefined = jnp.sum(~finite & keep, axis=0, dtype=jnp.int32)
+    keep = finite & keep
     limbs = jnp.where(keep[..., None], _limbs(values.astype(jnp.float32)), 0)
     block = max(1, min(BLOCK, len(limbs)))
     filled = jnp.pad(limbs, ((0, -len(limbs) % block), *[(0, 0)] * (limbs.ndim - 1)))
-    sums = _carry(jnp.sum(filled.reshape(-1, block, *limbs.shape[1:]), axis=1))
-    return Mean(_carry(jnp.sum(sums, axis=0)), jnp.sum(keep, axis=0, dtype=jnp.int32))
+    sums = _carry(jnp.sum(filled.reshape(-1, block, *limbs.shape[1:]), axis=1, dtype=jnp.int32))
+    return Mean(_carry(jnp.sum(sums, axis=0, dtype=jnp.int32)), jnp.sum(keep, axis=0, dtype=jnp.int32), undefined)
 
 
 @jax.jit
 def merge_means(a: Mean, b: Mean) -> Mean:
-    """The mean of the values of both, total [... 20] int32 and count [...] int32 each."""
-    return Mean(_carry(a.total + b.total), a.count + b.count)
+    """The mean of the values of both, total [... 20] int32, count and undefined [...] int32 each."""
+    return Mean(_carry(a.total + b.total), a.count + b.count, a.undefined + b.undefined)
 
 
 def _limbs(values: jax.Array) -> jax.Array:
@@ -95,7 +99,7 @@ def _limbs(values: jax.Array) -> jax.Array:
     first, shift = place // BITS, place % BITS
     low, high = (mantissa & 0xFFFF) << shift, (mantissa >> BITS) << shift
     parts = low & 0xFFFF, (low >> BITS) + (high & 0xFFFF), high >> BITS
-    places = np.arange(LIMBS).reshape((1,) * first.ndim + (LIMBS,))
+    places = np.arange(LIMBS, dtype=np.int32).reshape((1,) * first.ndim + (LIMBS,))
     limbs = sum(jnp.where(places == (first + i)[..., None], part[..., None], 0) for i, part in enumerate(parts))
     return jnp.where(bits < 0, -1, 1)[..., None] * limbs
 

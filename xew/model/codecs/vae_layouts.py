@@ -6,17 +6,20 @@ Ours is diffusers' and the two statistics of the latents, which theirs keeps in 
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
+import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 from xew.config import ConfigError
 from xew.model.codecs.vae import VideoVae
 from xew.model.weights.layout import Layout, Source
-from xew.model.weights.reading import Tensors, fill, read_tensors
+from xew.model.weights.reading import Tensors, fill, read_config, read_tensors
 from xew.model.weights.writing import save_weights
 
 STATISTICS = ("latents_mean", "latents_std")
-"""Leaves that only our own files hold."""
+"""Leaves that only our own files hold, and diffusers' config.json."""
 
 DIFFUSERS = {
     r"^(post_)?quant\.": r"\g<1>quant_conv.",
@@ -77,13 +80,31 @@ def own_layout(vae: VideoVae) -> Layout:
 
 
 def load_vae(vae: VideoVae, path: Path) -> None:
-    """Fill an autoencoder from a file of any of the three kinds; what a file lacks of the statistics keeps its value.
+    """Fill an autoencoder from a file of any of the three kinds.
+
+    The statistics of the latents come from the file, else from config.json beside it, as diffusers writes them; without
+    either they keep their values.
 
     Raises:
-        ConfigError: the file is none of the three, or of another size.
+        ConfigError: the file is none of the three, or of another size, or its config.json is damaged.
     """
     tensors = read_tensors(path)
     fill(vae, tensors, _layout_of(vae, tensors), optional=STATISTICS)
+    config = read_config(path)
+    for name in STATISTICS:
+        if name in config and name not in tensors:
+            getattr(vae, name).set_value(jnp.asarray(_read_statistic(path, name, config[name], vae.size.channels)))
+
+
+def _read_statistic(path: Path, name: str, values: Any, channels: int) -> np.ndarray:
+    """One statistic [c] float32 of config.json beside the weights."""
+    numbers = isinstance(values, list) and all(isinstance(value, int | float) for value in values)
+    array = np.asarray(values if numbers else [], np.float32)
+    if len(array) != channels or not np.isfinite(array).all() or (name == "latents_std" and not (array > 0).all()):
+        raise ConfigError(
+            f"{name} of config.json beside {path} is no list of {channels} finite numbers (deviations above 0); get it again."
+        )
+    return array
 
 
 def save_vae(vae: VideoVae, path: Path) -> None:

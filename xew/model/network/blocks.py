@@ -67,6 +67,8 @@ class ModelSize:
     rotary_base: float = WAVELENGTH_BASE
     """Ratio of the slowest to the fastest rotation of positions; Wan's serves clips of hundreds of positions a side, and
     a model of few positions tells them apart sooner with less."""
+    epsilon: float = EPSILON
+    """Number that all norms add to a mean square; Wan's, but for checkpoints whose config.json says otherwise."""
 
     @property
     def head_dim(self) -> int:
@@ -78,11 +80,11 @@ class Block(nnx.Module):
     """Self-attention over all streams, cross-attention to the text, feed-forward; modulated by the noise level."""
 
     def __init__(self, size: ModelSize, dtype: DTypeLike, attention: AttentionName, rngs: nnx.Rngs) -> None:
-        self.dtype = dtype
+        self.dtype, self.epsilon = dtype, size.epsilon
         self.modulation = nnx.Param(scaled_normal(rngs.params(), (1, 6, size.dim)))
         self.self_attn = Attention(size, dtype, attention, rngs)
         self.cross_attn = Attention(size, dtype, attention, rngs)
-        self.norm3 = nnx.LayerNorm(size.dim, epsilon=EPSILON, use_fast_variance=False, dtype=jnp.float32, rngs=rngs)
+        self.norm3 = nnx.LayerNorm(size.dim, epsilon=size.epsilon, use_fast_variance=False, dtype=jnp.float32, rngs=rngs)
         self.ffn = TwoLayer(size.dim, size.ffn_dim, size.dim, gelu, dtype, nnx.initializers.xavier_uniform(), rngs)
 
     def __call__(
@@ -110,13 +112,13 @@ class Block(nnx.Module):
             Tokens [b s d].
         """
         shift_sa, scale_sa, gate_sa, shift_ffn, scale_ffn, gate_ffn = self._chunks(modulation, levels)
-        modulated = modulate(tokens, shift_sa, scale_sa, self.dtype)
+        modulated = modulate(tokens, shift_sa, scale_sa, self.dtype, self.epsilon)
         attended = self.self_attn(modulated, rotary=rotary, condition_start=condition_start, cache=cache)
         tokens = add(tokens, attended, gate_sa)
         asked = self.norm3(tokens).astype(self.dtype)
         read = self.cross_attn.attend_by_frame(asked, text) if isinstance(text, FramedContext) else self.cross_attn(asked, text)
         tokens = add(tokens, read)
-        return add(tokens, self.ffn(modulate(tokens, shift_ffn, scale_ffn, self.dtype)), gate_ffn)
+        return add(tokens, self.ffn(modulate(tokens, shift_ffn, scale_ffn, self.dtype, self.epsilon)), gate_ffn)
 
     def keys_values(
         self, tokens: Float[Array, "b s d"], modulation: Float[Array, "b r 6 d"], levels: Levels, rotary: Rotary
@@ -130,7 +132,7 @@ class Block(nnx.Module):
             rotary: rotations of the tokens' positions.
         """
         shift, scale = self._chunks(modulation, levels)[:2]
-        return self.self_attn.keys_values(modulate(tokens, shift, scale, self.dtype), rotary)
+        return self.self_attn.keys_values(modulate(tokens, shift, scale, self.dtype, self.epsilon), rotary)
 
     def _chunks(self, modulation: Array, levels: np.ndarray) -> list[Array]:
         """Six [b s d]: shift, scale and gate of self-attention, then of the feed-forward; never formed at once."""
@@ -144,7 +146,7 @@ class Attention(nnx.Module):
     def __init__(self, size: ModelSize, dtype: DTypeLike, implementation: AttentionName, rngs: nnx.Rngs) -> None:
         self.heads, self.dtype, self.implementation = size.heads, dtype, implementation
         self.q, self.k, self.v, self.o = (linear(size.dim, size.dim, dtype, rngs) for _ in range(4))
-        self.norm_q, self.norm_k = (nnx.RMSNorm(size.dim, epsilon=EPSILON, dtype=jnp.float32, rngs=rngs) for _ in range(2))
+        self.norm_q, self.norm_k = (nnx.RMSNorm(size.dim, epsilon=size.epsilon, dtype=jnp.float32, rngs=rngs) for _ in range(2))
 
     def __call__(
         self,
@@ -215,7 +217,8 @@ class Attention(nnx.Module):
 class Head(nnx.Module):
     """Norm modulated by the time embedding itself (not by its projection), then one linear layer, zero at the start."""
 
-    def __init__(self, dim: int, features: int, rngs: nnx.Rngs) -> None:
+    def __init__(self, dim: int, features: int, rngs: nnx.Rngs, epsilon: float = EPSILON) -> None:
+        self.epsilon = epsilon
         self.modulation = nnx.Param(scaled_normal(rngs.params(), (1, 2, dim)))
         self.head = nnx.Linear(dim, features, dtype=jnp.float32, kernel_init=nnx.initializers.zeros_init(), rngs=rngs)
 
@@ -230,7 +233,8 @@ class Head(nnx.Module):
             levels: [s], which of them each token takes.
         """
         chunks = self.modulation[...][None] + time[:, :, None]
-        return self.head(modulate(tokens, select_levels(chunks[:, :, 0], levels), select_levels(chunks[:, :, 1], levels)))
+        shift, scale = (select_levels(chunks[:, :, part], levels) for part in (0, 1))
+        return self.head(modulate(tokens, shift, scale, epsilon=self.epsilon))
 
 
 class TwoLayer(nnx.Module):
@@ -256,7 +260,11 @@ class TwoLayer(nnx.Module):
 
 
 def modulate(
-    tokens: Float[Array, "b s d"], shift: Float[Array, "b s d"], scale: Float[Array, "b s d"], dtype: DTypeLike = jnp.float32
+    tokens: Float[Array, "b s d"],
+    shift: Float[Array, "b s d"],
+    scale: Float[Array, "b s d"],
+    dtype: DTypeLike = jnp.float32,
+    epsilon: float = EPSILON,
 ) -> Float[Array, "b s d"]:
     """LayerNorm of tokens without parameters in float32, then scale and shift, rounded to `dtype` once for all who read it.
 
@@ -264,7 +272,7 @@ def modulate(
     """
     tokens = tokens.astype(jnp.float32)
     centered = tokens - tokens.mean(-1, keepdims=True)
-    normed = centered * jax.lax.rsqrt(jnp.square(centered).mean(-1, keepdims=True) + EPSILON)
+    normed = centered * jax.lax.rsqrt(jnp.square(centered).mean(-1, keepdims=True) + epsilon)
     return (normed * (1 + scale) + shift).astype(dtype)
 
 

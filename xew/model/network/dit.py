@@ -146,7 +146,7 @@ class WorldModel(nnx.Module):
         self.time_embedding = TwoLayer(TIME_FREQUENCIES, size.dim, size.dim, nnx.silu, jnp.float32, EMBEDDING_INIT, rngs)
         self.time_projection = linear(size.dim, 6 * size.dim, jnp.float32, rngs)
         self.blocks = stacked_blocks(size, dtype, attention, rngs)
-        self.head = Head(size.dim, features, rngs)
+        self.head = Head(size.dim, features, rngs, size.epsilon)
         self.words = nnx.Embed(words, size.text_dim, embedding_init=nnx.initializers.normal(1.0), rngs=rngs) if words else None
         self.stream_embeddings = nnx.data({})
         self.stream_inputs = nnx.data({})

@@ -5,6 +5,7 @@ Names: Wan2.2's own `wan/modules/model.py`, diffusers' `WanTransformer3DModel`, 
 """
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -13,15 +14,17 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from xew.config import ConfigError
 from xew.files import write_text
-from xew.model.network.blocks import EPSILON
 from xew.model.network.dit import STREAMS, WorldModel
 from xew.model.network.tokens import PATCH, TIME_FREQUENCIES
 from xew.model.weights.layout import Layout, Source
-from xew.model.weights.reading import Tensors, check_fit, fill, read_tensors
+from xew.model.weights.reading import Tensors, check_fit, fill, read_config, read_tensors
 from xew.model.weights.writing import save_weights
 
 Naming = Literal["official", "diffusers"]
+ROPE_BASE = "_rope_base"
+"""Key of config.json for the base of rotary positions; diffusers passes over keys that begin so."""
 COLUMN = {"official": 0, "diffusers": 1}
 """Place of a project's name in the pairs below."""
 
@@ -121,9 +124,11 @@ def load_dit(model: WorldModel, path: Path) -> None:
         path: as for `reading.read_tensors`.
 
     Raises:
-        ConfigError: tensors are missing, left over or of another shape.
+        ConfigError: tensors are missing, left over or of another shape, or config.json beside them tells of other norms or
+            positions than the model's.
     """
     tensors = read_tensors(path)
+    _check_constants(model, path)
     layout = dit_layout(model, find_naming(tensors))
     fill(model, tensors, layout, optional=_optional_names(model, tensors))
     for name in model.condition_streams:
@@ -137,7 +142,20 @@ def load_dit(model: WorldModel, path: Path) -> None:
 def check_dit(model: WorldModel, path: Path) -> None:
     """Raise what `load_dit` would, without reading a tensor; `model` may be of `nnx.eval_shape`."""
     tensors = read_tensors(path)
+    _check_constants(model, path)
     check_fit(model, tensors, dit_layout(model, find_naming(tensors)), optional=_optional_names(model, tensors))
+
+
+def _check_constants(model: WorldModel, path: Path) -> None:
+    """Raise ConfigError if config.json beside the weights says another eps or base of positions than the model's."""
+    config, size = read_config(path), model.size
+    for key, field in (("eps", "epsilon"), (ROPE_BASE, "rotary_base")):
+        theirs, ours = config.get(key, getattr(size, field)), getattr(size, field)
+        if not isinstance(theirs, int | float) or not math.isclose(theirs, ours, rel_tol=1e-6):
+            raise ConfigError(
+                f"the weights {path} were made with {key} = {theirs!r} (config.json), the model's size has {field} = {ours:g}; "
+                f"choose a size with that {field} (MODELS in xew/model/network/dit.py)."
+            )
 
 
 def _optional_names(model: WorldModel, tensors: Tensors) -> tuple[str, ...]:
@@ -168,13 +186,13 @@ def save_dit(model: WorldModel, path: Path, naming: Naming = "diffusers") -> Non
 
 
 def diffusers_config(model: WorldModel) -> dict[str, Any]:
-    """Arguments of `WanTransformer3DModel`. (It has no other base of rotary positions than 10,000.)"""
+    """Arguments of `WanTransformer3DModel`, and under ROPE_BASE what it has no argument for: it turns with base 10,000."""
     size = model.size
     return {
         "_class_name": "WanTransformer3DModel",
         "attention_head_dim": size.head_dim,
         "cross_attn_norm": True,
-        "eps": EPSILON,
+        "eps": size.epsilon,
         "ffn_dim": size.ffn_dim,
         "freq_dim": TIME_FREQUENCIES,
         "in_channels": model.channels,
@@ -185,6 +203,7 @@ def diffusers_config(model: WorldModel) -> dict[str, Any]:
         "qk_norm": "rms_norm_across_heads",
         "rope_max_seq_len": 1024,
         "text_dim": size.text_dim,
+        ROPE_BASE: size.rotary_base,
     }
 
 

@@ -1,5 +1,7 @@
 """Training curves and sample videos: TensorBoard event files, and the same numbers as plain metrics.jsonl.
 
+Event files hold the run's config.yaml too, as text and as settings that TensorBoard's HParams page compares runs by.
+
 Only TensorBoard's own writer is used, so that neither TensorFlow nor PyTorch is needed.
 """
 
@@ -9,11 +11,15 @@ import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 from PIL import Image
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.plugins.hparams.summary_v2 import hparams_pb
+from tensorboard.plugins.text.summary_v2 import text_pb
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 from xew.files import demand_regular, replacing
@@ -36,6 +42,15 @@ class RunLog:
             _keep_until(path, step)
             self.events.add_event(Event(wall_time=time.time(), step=step + 1, session_log=SessionLog(status=SessionLog.START)))
         self.lines = path.open("a")
+        config = folder / "config.yaml"
+        if config.exists():
+            self._settings(step, demand_regular(config).read_text())
+
+    def _settings(self, step: int, text: str) -> None:
+        """Log a config, given as YAML, as text and as HParams."""
+        page = text_pb("config", "\n".join(f"    {line}" for line in text.splitlines()))  # indented, so that Markdown leaves it
+        settings = hparams_pb(flatten_settings(yaml.safe_load(text)), start_time_secs=time.time())
+        self._add(step, [*page.value, *settings.value])
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
         """Log numbers by name, such as train/loss."""
@@ -58,6 +73,22 @@ class RunLog:
     def _add(self, step: int, values: list[Summary.Value]) -> None:
         self.events.add_event(Event(wall_time=time.time(), step=step, summary=Summary(value=values)))
         self.events.flush()
+
+
+def flatten_settings(content: Any, path: str = "") -> dict[str, bool | float | str]:
+    """Settings of a config by their paths, such as train.steps: numbers, flags and texts, which is all that HParams take."""
+    if isinstance(content, Mapping):
+        parts = (flatten_settings(value, f"{path}.{key}" if path else str(key)) for key, value in content.items())
+        return {name: value for part in parts for name, value in part.items()}
+    if content is None:
+        return {}
+    return {
+        path: content
+        if isinstance(content, bool | str)
+        else float(content)
+        if isinstance(content, int | float)
+        else str(content)
+    }
 
 
 def _keep_until(path: Path, step: int) -> None:

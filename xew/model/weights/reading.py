@@ -88,6 +88,27 @@ def read_tensors(path: Path) -> Tensors:
         raise ConfigError(f"cannot read the weights {path}: {error.strerror or error}.") from error
 
 
+def read_config(path: Path) -> dict[str, Any]:
+    """What config.json beside a checkpoint says, as diffusers writes one; nothing where there is none.
+
+    Args:
+        path: as for `read_tensors`.
+
+    Raises:
+        ConfigError: it is broken.
+    """
+    config = (path if path.is_dir() else path.parent) / "config.json"
+    if not config.exists():
+        return {}
+    try:
+        content = read_json(config)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{config} cannot be read: {error}; get it again, or take it away.") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{config} holds a {type(content).__name__}, expected keys and values; get it again.")
+    return content
+
+
 def fill(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Collection[str] = ()) -> None:
     """Fill the leaves of a module in place from a checkpoint, in each leaf's own type and on its own devices.
 
