@@ -239,9 +239,9 @@ def _curves_by_shared_features(
 
     On other devices, where frames are computed many at once, `_curve` makes them.
     """
-    by_function = {METRICS[name].curve: name for name in metrics if name in METRICS and inputs[input_kind(name)] is not None}
     if jax.default_backend() != "cpu":
         return {}
+    by_function = {METRICS[name].curve: name for name in metrics if name in METRICS and inputs[input_kind(name)] is not None}
     features = comparison.truth.notes.setdefault(f"features from frame {comparison.first}", SharedFeatures())
     curves: dict[str, np.ndarray] = {}
     whole, robot, region = (by_function.get(curve) for curve in (lpips, robot_lpips_frames, region_lpips_frames))
@@ -252,7 +252,7 @@ def _curves_by_shared_features(
         curves |= {whole: plain} if whole else {}
         curves |= {robot: weighted} if robot and weighted is not None else {}
     arrays = inputs["region"] if region else None
-    if region and arrays is not None and not (OF_WHOLE_FRAMES[region] in curves and _touches_all_borders(arrays[-1][0])):
+    if region and arrays is not None and not (OF_WHOLE_FRAMES.get(region) in curves and _touches_all_borders(arrays[-1][0])):
         curves[region] = features.distances(*video, box=union_box(arrays[-1]))[0]
     return curves
 
