@@ -63,7 +63,7 @@ class Place:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
-    """A folder without data or weights; compiled programs are those of the session of tests, which compiles many of them too."""
+    """A folder without data or weights; compiled programs are those of the session, which compiles many of them too."""
     root = tmp_path_factory.mktemp("debug")
     own = {"PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
     yield Place(root, os.environ | own)

@@ -17,8 +17,15 @@ from xew.metrics.backends import Masker, Tracker
 from xew.metrics.estimators.adapters import use_torch_device
 
 MOST_WORKERS = 32
-"""Largest number of workers. At full length each holds an episode, a prediction and their optical flow, half a gigabyte, and on a
-CPU as much again of features (`perceptual.KEPT_FEATURES`)."""
+"""Largest number of workers. At full length each holds an episode, a prediction and their optical flow, half a gigabyte, and
+on a CPU as much again of features (`perceptual.KEPT_FEATURES`)."""
+
+
+def worker_count(asked: int) -> int:
+    """How many threads to use; 0 asks for one for each processor core. Raises ConfigError for a negative number."""
+    if asked < 0:
+        raise ConfigError(f"--workers is {asked}, expected a positive number, or 0 for one for each core.")
+    return asked or max(len(jax.local_devices()), min(os.cpu_count() or 1, MOST_WORKERS))
 
 
 class Bench(threading.local):
