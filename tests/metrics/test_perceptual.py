@@ -21,7 +21,7 @@ from xew.metrics import (
 from xew.metrics.networks import alexnet
 from xew.metrics.networks.alexnet import ADMITTED, _package_file, read_alexnet
 from xew.metrics.networks.pickles import read_arrays
-from xew.metrics.perceptual import SMALLEST_SIDE, _covered_share, _receptive_fields, _weights, union_box
+from xew.metrics.perceptual import SMALLEST_SIDE, SharedFeatures, _covered_share, _receptive_fields, _weights, union_box
 
 rng = np.random.default_rng(3)
 
@@ -124,6 +124,26 @@ def test_features_of_a_target_serve_all_its_predictions() -> None:
         expected = region_lpips_frames(prediction, target, mask)
         np.testing.assert_allclose(lpips_from_features(prediction, region), expected, atol=1e-6)
     np.testing.assert_allclose(lpips_from_features(target, whole), 0, atol=1e-7)
+
+
+@pytest.mark.parametrize("most_bytes", [10**9, 0])
+def test_features_shared_by_three_metrics_and_all_predictions_change_no_value(most_bytes: int) -> None:
+    target, mask = noise(4), np.zeros((4, 40, 56), bool)
+    mask[:3, 3:37, 9:50] = True
+    moving, standing = noise(4), np.repeat(noise(1), 4, axis=0)
+    moving[1], moving[3] = target[1], target[3]
+    features = SharedFeatures(most_bytes)
+    for prediction in (moving, standing, moving):
+        whole, robot = features.distances(prediction, target, mask)
+        region, none = features.distances(prediction, target, box=union_box(mask))
+        assert robot is not None and none is None
+        np.testing.assert_array_equal(whole == 0, np.all(prediction == target, axis=(1, 2, 3)))
+        for found, expected in (
+            (whole, lpips(prediction, target)),
+            (robot, robot_lpips_frames(prediction, target, mask)),
+            (region, region_lpips_frames(prediction, target, mask)),
+        ):
+            np.testing.assert_allclose(found, expected, rtol=1e-6, atol=0)
 
 
 def test_features_of_another_video_are_an_error() -> None:

@@ -21,7 +21,7 @@ from xew.metrics.estimators.flow import dis_flow, open_raft
 from xew.metrics.estimators.masks import Appearance, estimate_masks, learn_appearance
 from xew.metrics.estimators.sam2 import open_sam2
 from xew.metrics.estimators.tapir import open_tapir
-from xew.metrics.estimators.tracks import estimate_tracks
+from xew.metrics.estimators.tracks import ReferenceTracker
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -133,7 +133,7 @@ MASKERS: Mapping[str, Backend[Masker]] = {
     ),
 }
 TRACKERS: Mapping[str, Backend[Tracker]] = {
-    "default": Backend(lambda: estimate_tracks, None, "template search against the true video (xew.metrics.estimators.tracks)"),
+    "default": Backend(ReferenceTracker, None, "template search against the true video (xew.metrics.estimators.tracks)"),
     "cotracker3": Backend(
         open_cotracker,
         "scaled_offline.pth of Hugging Face's facebook/cotracker3; CC-BY-NC 4.0: not for commercial use",

@@ -17,7 +17,14 @@ from xew.metrics.backends import Masker, Tracker
 from xew.metrics.estimators.contact import predicted_contact
 from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.metric import ACCELERATOR_CHUNK, Metric
-from xew.metrics.perceptual import SMALLEST_SIDE, union_box
+from xew.metrics.perceptual import (
+    SMALLEST_SIDE,
+    SharedFeatures,
+    lpips,
+    region_lpips_frames,
+    robot_lpips_frames,
+    union_box,
+)
 from xew.metrics.truth import Points, Surfaces, Truth, is_inside
 
 FRAME_BLOCK = 16
@@ -109,6 +116,7 @@ def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
     inputs = {kind: INPUTS[kind](comparison) for kind in sorted({input_kind(name) for name in metrics})}
     values: dict[str, float] = {}
     curves: dict[str, np.ndarray] = {}
+    shared = _curves_by_shared_features(comparison, metrics, inputs)
     for name in metrics:
         arrays = inputs[input_kind(name)]
         if arrays is None:
@@ -121,7 +129,9 @@ def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
         else:
             whole = OF_WHOLE_FRAMES.get(name)
             known = curves.get(whole) if whole and _touches_all_borders(arrays[-1][0]) else None
-            curves[name] = _curve(name, arrays) if known is None else known
+            if known is None:
+                known = shared[name] if name in shared else _curve(name, arrays)
+            curves[name] = known
             values[name] = _mean_of_known(curves[name])
     prediction, target = _video(comparison)
     return Grades(values, curves, int(np.all(prediction == target, axis=(1, 2, 3)).sum()))
@@ -220,6 +230,31 @@ def _tracks(c: Comparison, points: np.ndarray, visible: np.ndarray) -> Arrays | 
     points, visible = np.nan_to_num(points[:, seen]), visible[:, seen]
     found = c.tracker(c.seen, c.truth.rgb, points, visible)
     return found[c.first :].astype(np.float32), points[c.first :], visible[c.first :]
+
+
+def _curves_by_shared_features(
+    comparison: Comparison, metrics: Collection[str], inputs: dict[str, Arrays | None]
+) -> dict[str, np.ndarray]:
+    """Curves [t] float32 by metric, of those that LPIPS's network makes, which is most of the work of grading on a CPU.
+
+    On other devices, where frames are computed many at once, `_curve` makes them.
+    """
+    if jax.default_backend() != "cpu":
+        return {}
+    by_function = {METRICS[name].curve: name for name in metrics if name in METRICS and inputs[input_kind(name)] is not None}
+    features = comparison.truth.notes.setdefault(f"features from frame {comparison.first}", SharedFeatures())
+    curves: dict[str, np.ndarray] = {}
+    whole, robot, region = (by_function.get(curve) for curve in (lpips, robot_lpips_frames, region_lpips_frames))
+    video = _video(comparison)
+    if whole or robot:
+        mask = comparison.truth.mask[comparison.first :] if robot else None
+        plain, weighted = features.distances(*video, mask)
+        curves |= {whole: plain} if whole else {}
+        curves |= {robot: weighted} if robot and weighted is not None else {}
+    arrays = inputs["region"] if region else None
+    if region and arrays is not None and not (OF_WHOLE_FRAMES.get(region) in curves and _touches_all_borders(arrays[-1][0])):
+        curves[region] = features.distances(*video, box=union_box(arrays[-1]))[0]
+    return curves
 
 
 def _touches_all_borders(mask: np.ndarray) -> bool:

@@ -43,6 +43,10 @@ CONVOLUTIONS = ((4, 2, False), (1, 2, True), (1, 1, True), (1, 1, False), (1, 1,
 Weights = Mapping[str, jax.Array]
 Box = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 """top, left, height, width; int32 [pixels]."""
+FrameLayers = tuple[tuple[jax.Array, jax.Array, jax.Array], ...]
+"""Five layers of a frame [1 h w d] float32, each with the height and width that are valid."""
+KEPT_FEATURES = 512_000_000
+"""Size [bytes] up to which `SharedFeatures` keeps features of a true video: 85 frames of 320x240 and of their box."""
 
 
 @jax.tree_util.register_dataclass
@@ -210,6 +214,81 @@ def lpips_from_features(prediction: Video, target: Features, *, chunk: int | Non
     return _distance_from_features(_weights(), prediction, target.layers, target.box, chunk)
 
 
+class SharedFeatures:
+    """Features of a true video's frames, made once for the LPIPS of whole frames, of the robot and of its box, and for all
+    predictions that are graded after one another.
+
+    For a CPU: there frames are computed one by one, and a frame's features have the same bits alone and beside another's, so
+    that the numbers are those of `lpips` and `region_lpips_frames`. Those of `robot_lpips_frames` may differ in the last bit:
+    the compiler adds what is weighted in another order.
+    """
+
+    def __init__(self, most_bytes: int = KEPT_FEATURES) -> None:
+        """Keep features of the true video up to this size [bytes]; those of further frames are made anew each time."""
+        self._left = most_bytes
+        self._true: dict[tuple[int, tuple[int, ...]], FrameLayers] = {}
+
+    def distances(
+        self, prediction: np.ndarray, target: np.ndarray, robot: np.ndarray | None = None, box: Box | None = None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """LPIPS [t] float32 inside a box, and weighted by the robot as `robot_lpips_frames` has it.
+
+        Args:
+            prediction: [t h w 3] uint8.
+            target: [t h w 3] uint8, the same video in every call.
+            robot: [t h w] bool, of whole frames only; None where the second answer is not asked for.
+            box: `union_box` of the region; whole frames where left out.
+        """
+        box = _whole_box(target) if box is None else box
+        plain: list[Any] = []
+        weighted: list[Any] = []
+        layers: FrameLayers | None = None
+        made_of = -1
+        for t, (frame, true) in enumerate(zip(prediction, target, strict=True)):
+            shown = None if robot is None else robot[t]
+            if np.array_equal(frame, true):
+                plain.append(np.float32(0))
+                weighted.append(np.float32(0 if shown is None or shown.any() else np.nan))
+                continue
+            if layers is None or not np.array_equal(frame, prediction[made_of]):
+                layers, made_of = _frame_layers(_weights(), frame, box), t
+            true_layers = self._of_target(t, true, box)
+            plain.append(_frame_distance(_weights(), layers, true_layers))
+            if shown is not None:
+                weighted.append(_frame_weighted_distance(_weights(), layers, true_layers, shown))
+        return np.asarray(jax.device_get(plain)), None if robot is None else np.asarray(jax.device_get(weighted))
+
+    def _of_target(self, t: int, frame: np.ndarray, box: Box) -> FrameLayers:
+        key = t, tuple(int(side) for side in box)
+        layers = self._true.get(key)
+        if layers is None:
+            layers = _frame_layers(_weights(), frame, box)
+            self._left -= sum(layer.nbytes for layer, _, _ in layers)
+            if self._left >= 0:
+                self._true[key] = layers
+        return layers
+
+
+@jax.jit
+def _frame_layers(weights: Weights, frame: jax.Array, box: Box) -> FrameLayers:
+    """The five layers of a frame's box [h w 3], each with its valid size."""
+    return tuple(_features(weights, _input(frame[None], box), *box[2:]))
+
+
+@jax.jit
+def _frame_distance(weights: Weights, prediction: FrameLayers, target: FrameLayers) -> jax.Array:
+    """LPIPS of a frame."""
+    layers = [(_unit(x), _unit(y), h, w) for (x, h, w), (y, _, _) in zip(prediction, target, strict=True)]
+    return _sum_of_layers(weights, layers)[0]
+
+
+@jax.jit
+def _frame_weighted_distance(weights: Weights, prediction: FrameLayers, target: FrameLayers, mask: jax.Array) -> jax.Array:
+    """LPIPS of a frame weighted by its mask [h w]; NaN where there is none."""
+    layers = [(_unit(x), _unit(y)) for (x, _, _), (y, _, _) in zip(prediction, target, strict=True)]
+    return jnp.where(jnp.any(mask), _weighted_sum_of_layers(weights, layers, mask[None])[0], jnp.nan)
+
+
 @jax.jit
 def union_box(mask: Masks) -> Box:
     """Bounding box (top, left, height, width) int32 [pixels] of all that [t h w] covers at any time; zeros if nothing."""
@@ -292,18 +371,23 @@ def _weighted_distance(
     box = _whole_box(target)
 
     def distances(frames: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        image = _input(jnp.concatenate(frames[:2]), box)
-        features = _features(weights, image, *box[2:])
-        count, total = len(frames[0]), jnp.zeros(len(frames[0]), jnp.float32)
-        for i, ((x, _, _), field_of_unit) in enumerate(zip(features, _receptive_fields(weights), strict=True)):
-            unit = _unit(x)
-            share = _covered_share(frames[2], field_of_unit, unit.shape[1:3])
-            weighted = jnp.sum(share * _layer_map(weights[f"head{i}"], unit[:count], unit[count:]), axis=(1, 2))
-            weight = jnp.sum(share, axis=(1, 2))
-            total = total + jnp.where(weight > 0, weighted / jnp.where(weight > 0, weight, 1), 0)
-        return jnp.where(_is_broken(image[:count], image[count:]), jnp.nan, total)
+        image, count = _input(jnp.concatenate(frames[:2]), box), len(frames[0])
+        units = [_unit(x) for x, _, _ in _features(weights, image, *box[2:])]
+        found = _weighted_sum_of_layers(weights, [(both[:count], both[count:]) for both in units], frames[2])
+        return jnp.where(_is_broken(image[:count], image[count:]), jnp.nan, found)
 
     return map_chunks(lambda frames: _zero_where_equal(distances, frames), (prediction, target, mask), chunk)
+
+
+def _weighted_sum_of_layers(weights: Weights, layers: list[tuple[jax.Array, jax.Array]], mask: jax.Array) -> jax.Array:
+    """LPIPS [n] from the layers' unit vectors of both videos [n h w d], weighted by the share of the mask [n h w]."""
+    total = jnp.zeros(len(mask), jnp.float32)
+    for i, ((x, y), field_of_unit) in enumerate(zip(layers, _receptive_fields(weights), strict=True)):
+        share = _covered_share(mask, field_of_unit, x.shape[1:3])
+        weighted = jnp.sum(share * _layer_map(weights[f"head{i}"], x, y), axis=(1, 2))
+        weight = jnp.sum(share, axis=(1, 2))
+        total = total + jnp.where(weight > 0, weighted / jnp.where(weight > 0, weight, 1), 0)
+    return total
 
 
 def _receptive_fields(weights: Weights) -> list[tuple[int, int, int]]:

@@ -4,8 +4,9 @@ Reads  <data>/<task>/<seed>/<robot>/ (xew.episode)
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -84,6 +85,8 @@ class Truth:
     """[t 2 o] bool, does any finger of the left, right arm touch the object."""
     surfaces: Surfaces | None = None
     """Points on surfaces; None where they were not asked for."""
+    notes: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """Notes of what all predictions of the episode share, by who keeps them (`grade`); a replaced truth begins with none."""
 
 
 def read_truth(folder: Path, frames: int, compared: Collection[str], keep: Path | None = None) -> Truth:

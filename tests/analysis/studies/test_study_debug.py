@@ -63,9 +63,9 @@ class Place:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
-    """A folder without data, weights or compiled programs."""
+    """A folder without data or weights; compiled programs are those of the session, which compiles many of them too."""
     root = tmp_path_factory.mktemp("debug")
-    own = {"PYTHONPATH": str(ROOT), "JAX_COMPILATION_CACHE_DIR": str(root / "jax"), "CUDA_VISIBLE_DEVICES": ""}
+    own = {"PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
     yield Place(root, os.environ | own)
     shutil.rmtree(root)
 

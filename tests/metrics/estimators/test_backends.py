@@ -13,6 +13,7 @@ from xew.files import digest_tree
 from xew.metrics import backends
 from xew.metrics.backends import FLOWS, MASKERS, TRACKERS, Backend, identity, open_flow, open_masker, open_tracker
 from xew.metrics.estimators.masks import estimate_masks
+from xew.metrics.estimators.tracks import estimate_tracks
 
 REGISTRIES = {"masker": (MASKERS, open_masker), "tracker": (TRACKERS, open_tracker), "optical flow": (FLOWS, open_flow)}
 NEEDY = [(open_, name) for registry, open_ in REGISTRIES.values() for name, backend in registry.items() if backend.needs]
@@ -88,6 +89,16 @@ def test_the_default_masker_learns_an_episode_once(monkeypatch: pytest.MonkeyPat
     assert len(learnt) == 1
     np.testing.assert_array_equal(masker(target, other, mask), estimate_masks(target, other, mask))
     assert len(learnt) == 2
+
+
+def test_the_default_tracker_gives_the_same_whatever_it_was_asked_before() -> None:
+    rng = np.random.default_rng(0)
+    videos = rng.integers(0, 255, (3, 4, 40, 50, 3), dtype=np.uint8)
+    points, visible = rng.uniform(8, 32, (2, 4, 3, 2)).astype(np.float32), np.ones((4, 3), bool)
+    tracker = open_tracker("default")
+    for prediction, target, kind in ((0, 1, 0), (0, 1, 1), (2, 1, 0), (2, 2, 0), (0, 0, 1), (0, 1, 0)):
+        asked = videos[prediction], videos[target], points[kind], visible
+        np.testing.assert_array_equal(tracker(*asked), estimate_tracks(*asked))
 
 
 def test_nobody_needs_pytorch_for_the_defaults() -> None:

@@ -73,6 +73,16 @@ def test_standing_still_does_not_win(episode: tuple[np.ndarray, np.ndarray]) -> 
     assert mean(mask_iou, estimate_masks(frozen, video, mask), mask) < 0.6
 
 
+def test_what_is_kept_while_a_video_stands_still_changes_nothing(
+    episode: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    video, mask = episode
+    shown = np.array([0, 0, 0, 1, 1, 0])
+    kept = estimate_masks(video[shown], video[:6], mask[:6])
+    monkeypatch.setattr(np, "array_equal", lambda *frames: False)
+    np.testing.assert_array_equal(kept, estimate_masks(video[shown], video[:6], mask[:6]))
+
+
 def test_without_a_robot_in_sight_nothing_is_found(episode: tuple[np.ndarray, np.ndarray]) -> None:
     video, mask = episode
     empty = np.repeat(learn_appearance(video, mask).background[None], FRAMES, axis=0)

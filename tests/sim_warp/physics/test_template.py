@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 
-import newton
 import numpy as np
 import pytest
 
 from xew.config import ConfigError
 from xew.sim_warp import objects
+from xew.sim_warp.devices.newton import newton
 from xew.sim_warp.physics.template import (
     ARM_JOINTS,
     FREE_SLOTS,

@@ -75,11 +75,18 @@ def estimate_masks(
     appearance = appearance or learn_appearance(target, target_mask)
     alike, _ = find_most_similar(prediction, target)
     masks: list[np.ndarray] = []
+    carriers: dict[int, Carrier] = {}
+    resting: Carrier | None = None
     for t, frame in enumerate(prediction):
+        stands = t > 0 and np.array_equal(frame, prediction[t - 1])
+        known = carriers if stands else {}
         # The mask of the frame itself comes first: where both explain a pixel equally well, it is the one that counts.
-        references = [(target[i], target_mask[i]) for i in dict.fromkeys((t, int(alike[t])))]
-        before = (prediction[t - 1], masks[-1]) if t else None
-        masks.append(_estimate_frame(appearance, frame, references, before))
+        carriers = {i: known.get(i) or _find_carrier(frame, target[i]) for i in dict.fromkeys((t, int(alike[t])))}
+        shapes = [carrier.carry(target_mask[i]) for i, carrier in carriers.items()]
+        resting = (resting or _find_carrier(frame, frame)) if stands else None
+        from_before = resting or (_find_carrier(frame, prediction[t - 1]) if t else None)
+        before = None if from_before is None else from_before.carry(masks[-1])
+        masks.append(_estimate_frame(appearance, frame, shapes, before))
     return np.stack(masks)
 
 
@@ -104,16 +111,28 @@ def learn_appearance(video: np.ndarray, mask: np.ndarray) -> Appearance:
     )
 
 
-Reference = tuple[np.ndarray, np.ndarray]
-"""A frame [h w 3] uint8 and its mask [h w] bool."""
+Shape = tuple[np.ndarray, np.ndarray]
+"""Weights [h w] from 0 to 1 of how well flow explains each pixel, and a mask carried by it [h w] from -1 (surely not) to 1."""
 
 
-def _estimate_frame(
-    appearance: Appearance, frame: np.ndarray, references: list[Reference], before: Reference | None
-) -> np.ndarray:
-    gate, shape = functools.reduce(_choose_better, (_carry_shape(frame, *reference) for reference in references))
+@dataclass(frozen=True)
+class Carrier:
+    """How another frame's pixels come to a predicted frame by flow."""
+
+    gate: np.ndarray
+    """[h w] from 0 to 1, how well flow explains each pixel."""
+    source: np.ndarray
+    """[h w 2] float32, where in the other frame each pixel comes from."""
+
+    def carry(self, mask: np.ndarray) -> Shape:
+        """The shape of the other frame's mask [h w] bool."""
+        return self.gate, np.tanh(_sample(_signed_distance(mask), self.source) / SHAPE_REACH)
+
+
+def _estimate_frame(appearance: Appearance, frame: np.ndarray, shapes: list[Shape], before: Shape | None) -> np.ndarray:
+    gate, shape = functools.reduce(_choose_better, shapes)
     if before is not None:
-        gate, shape = _fill_up((gate, shape), _carry_shape(frame, *before))
+        gate, shape = _fill_up((gate, shape), before)
     looks = (1 - SHAPE_TRUST * gate) * _looks(appearance, frame)
     return _drop_specks(cv2.medianBlur((looks + SHAPE_WEIGHT * gate * shape > 0).astype(np.uint8), 3))
 
@@ -125,10 +144,6 @@ def _looks(appearance: Appearance, frame: np.ndarray) -> np.ndarray:
     looks = np.clip(color, -EVIDENCE_LIMIT, EVIDENCE_LIMIT)
     looks += np.where(appearance.uncovered, np.clip(difference, -EVIDENCE_LIMIT, EVIDENCE_LIMIT), 0)
     return cv2.GaussianBlur(looks.astype(np.float32), (0, 0), 0.8)
-
-
-Shape = tuple[np.ndarray, np.ndarray]
-"""Weights [h w] from 0 to 1 of how well flow explains each pixel, and a mask carried by it [h w] from -1 (surely not) to 1."""
 
 
 def _choose_better(a: Shape, b: Shape) -> Shape:
@@ -155,8 +170,8 @@ def _drop_specks(mask: np.ndarray) -> np.ndarray:
     return large[pieces]
 
 
-def _carry_shape(frame: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> Shape:
-    """A true frame's mask carried onto a predicted frame by flow."""
+def _find_carrier(frame: np.ndarray, target: np.ndarray) -> Carrier:
+    """How a true frame, or the one before, comes to a predicted frame; both [h w 3] uint8."""
     gray, gray_target = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame, target))
     there, back = _flow(gray, gray_target), _flow(gray_target, gray)
     source = _grid(gray.shape) + there
@@ -164,7 +179,7 @@ def _carry_shape(frame: np.ndarray, target: np.ndarray, target_mask: np.ndarray)
     soft_frame, soft_target = (_soften(image, RESIDUAL_SOFTNESS).astype(np.float32) for image in (frame, target))
     residual = _difference(soft_frame, _sample(soft_target, source))
     gate = np.exp(-((residual / RESIDUAL_SCALE) ** 2) - (closure / CLOSURE_SCALE) ** 2)
-    return gate, np.tanh(_sample(_signed_distance(target_mask), source) / SHAPE_REACH)
+    return Carrier(gate, source)
 
 
 def _soften(image: np.ndarray, sigma: float) -> np.ndarray:

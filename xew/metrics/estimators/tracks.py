@@ -80,29 +80,82 @@ def estimate_tracks(prediction: np.ndarray, target: np.ndarray, points: np.ndarr
         [t k 2] float32 [pixels], NaN where a point is lost or the truth does not show it. A point can be outside the image
         where the predicted frame shows a moment of the truth that has it there.
     """
-    points = np.nan_to_num(points).astype(np.float32)
-    if points.shape[1] == 0:
-        return points
-    grays, true_grays = (np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in v]) for v in (prediction, target))
-    alike, difference = find_most_similar(prediction, target)
-    truth = [_TrueFrame(_soften(frame), *rest) for frame, *rest in zip(target, true_grays, points, visible, strict=True)]
+    return ReferenceTracker()(prediction, target, points, visible)
+
+
+class ReferenceTracker:
+    """`estimate_tracks`; what it knows of two videos is computed once while the same arrays follow each other.
+
+    A prediction is asked for several kinds of points, and an episode's true video stands beside several predictions.
+    """
+
+    def __init__(self) -> None:
+        self._seen: _Video | None = None
+        self._true: _Video | None = None
+        self._similar: tuple[np.ndarray, np.ndarray] | None = None
+
+    def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        """Tracks float32 [t k 2] of points [t k 2] where `visible` [t k], in a prediction [t h w 3] of a target [t h w 3]."""
+        points = np.nan_to_num(points).astype(np.float32)
+        if points.shape[1] == 0:
+            return points
+        if self._true is None or self._true.frames is not target:
+            self._true, self._similar = _Video(target), None
+        if self._seen is None or self._seen.frames is not prediction:
+            self._seen, self._similar = _Video(prediction), None
+        if self._similar is None:
+            self._similar = find_most_similar(prediction, target)
+        return _track(self._seen, self._true, self._similar, points, visible)
+
+
+class _Video:
+    """A video [t h w 3] uint8 and what the tracker makes of its frames, each when it is first asked for."""
+
+    def __init__(self, frames: np.ndarray) -> None:
+        self.frames = frames
+        self.grays = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
+        self._soft: dict[int, np.ndarray] = {}
+        self._flow: dict[int, np.ndarray] = {}
+
+    def soft(self, t: int) -> np.ndarray:
+        """[h w 3] uint8, frame t softened."""
+        if t not in self._soft:
+            self._soft[t] = _soften(self.frames[t])
+        return self._soft[t]
+
+    def follow(self, places: np.ndarray, t: int) -> np.ndarray:
+        """Places [... 2] of frame t - 1, carried to frame t by dense optical flow."""
+        if t not in self._flow:
+            flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+            self._flow[t] = flow.calc(self.grays[t - 1], self.grays[t], None)
+        return places + _sample(self._flow[t], places.reshape(1, -1, 2)).reshape(places.shape)
+
+
+def _track(
+    seen: _Video, true: _Video, similar: tuple[np.ndarray, np.ndarray], points: np.ndarray, visible: np.ndarray
+) -> np.ndarray:
+    """`estimate_tracks` of points without NaN; `similar` is `find_most_similar` of the two videos."""
+    alike, difference = similar
+    truth = [
+        _TrueFrame(true.soft(t), gray, *own) for t, (gray, *own) in enumerate(zip(true.grays, points, visible, strict=True))
+    ]
     paths = _Paths()
     carried = np.repeat(points[0][:, None], 3 + PEAKS, axis=1)
     inner = np.zeros_like(points[0])
-    for t, frame in enumerate(prediction):
+    for t, gray in enumerate(seen.grays):
         if t:
-            carried = _follow(paths.places[-1], grays[t - 1], grays[t])
-            inner = _inner_motion(truth[t - 1], truth[t])
+            carried = seen.follow(paths.places[-1], t)
+            inner = _inner_motion(truth[t - 1], truth[t], true.follow(points[t - 1], t))
         same, other = truth[t], truth[alike[t]] if alike[t] != t else None
-        place, cost = _propose(_soften(frame), grays[t], same, other, paths.cheapest(carried))
+        place, cost = _propose(seen.soft(t), gray, same, other, paths.cheapest(carried))
         if other is not None and difference[t] < SAME_MOMENT:
             hidden = ~other.visible
             place[hidden, 1], cost[hidden, 1] = other.points[hidden], HIDDEN
-        seen = visible[t]
-        place[~seen], cost[~seen] = carried[~seen], 0
-        known_before = seen & visible[max(t - 1, 0)]
-        step = np.where(known_before | ~seen, JUMP, 0)[:, None, None] * _straying(place, carried, inner)
-        paths.add(place, cost, step, lost=np.where(seen, LOST, 0))
+        now = visible[t]
+        place[~now], cost[~now] = carried[~now], 0
+        known_before = now & visible[max(t - 1, 0)]
+        step = np.where(known_before | ~now, JUMP, 0)[:, None, None] * _straying(place, carried, inner)
+        paths.add(place, cost, step, lost=np.where(now, LOST, 0))
     return np.where(visible[..., None], paths.best(), np.nan).astype(np.float32)
 
 
@@ -264,15 +317,10 @@ def _local_variance(image: np.ndarray, side: int) -> np.ndarray:
     return np.maximum(square - mean * mean, 0).mean(axis=-1)
 
 
-def _follow(places: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Places [... 2] of one gray image, carried to the next by dense optical flow."""
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(before, after, None)
-    return places + _sample(flow, places.reshape(1, -1, 2)).reshape(places.shape)
-
-
-def _inner_motion(before: _TrueFrame, after: _TrueFrame) -> np.ndarray:
-    """[k 2] how each true point moves otherwise than flow says; 0 where that is unknown or too much to be believed."""
-    inner = after.points - _follow(before.points, before.gray, after.gray)
+def _inner_motion(before: _TrueFrame, after: _TrueFrame, carried: np.ndarray) -> np.ndarray:
+    """[k 2] how each true point moves otherwise than flow, which carried it from before to here [k 2]; 0 where that is unknown
+    or too much to be believed."""
+    inner = after.points - carried
     sane = before.visible & after.visible & (np.linalg.norm(inner, axis=-1) < INNER_MOTION)
     return np.where(sane[:, None], inner, 0)
 

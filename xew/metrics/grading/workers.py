@@ -17,7 +17,8 @@ from xew.metrics.backends import Masker, Tracker
 from xew.metrics.estimators.adapters import use_torch_device
 
 MOST_WORKERS = 32
-"""Largest number of workers: each holds an episode and a prediction, a quarter of a gigabyte at full length."""
+"""Largest number of workers. At full length each holds an episode, a prediction and their optical flow, half a gigabyte, and
+on a CPU as much again of features (`perceptual.KEPT_FEATURES`)."""
 
 
 def worker_count(asked: int) -> int:

@@ -7,13 +7,12 @@ serves all robots. Both arms of a robot are alike and share a solver; only their
 from dataclasses import dataclass
 from functools import lru_cache
 
-import newton
-import newton.ik
 import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError
+from xew.sim_warp.devices.newton import newton
 from xew.sim_warp.devices.waiting import wait_for
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import load_urdf

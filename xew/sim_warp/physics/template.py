@@ -14,14 +14,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-import newton
 import numpy as np
 import trimesh
 import warp as wp
-from newton import JointTargetMode
 from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError
+from xew.sim_warp.devices.newton import newton
 from xew.sim_warp.embodiment.spec import Arm
 from xew.sim_warp.embodiment.urdf import Joint, Urdf
 from xew.sim_warp.geometry.poses import matrix_from_pose
@@ -223,7 +222,7 @@ def _add_arm_joint(
         target_kd=ARM_DAMPING,
         armature=ARM_ARMATURE,
         effort_limit=max(joint.effort, 50.0),
-        actuator_mode=JointTargetMode.POSITION_VELOCITY,
+        actuator_mode=newton.JointTargetMode.POSITION_VELOCITY,
         label=label,
     )
 
@@ -238,7 +237,7 @@ def _add_pin(builder: newton.ModelBuilder, label: str, parent: int, child: int) 
         target_ke=PIN_STIFFNESS,
         target_kd=PIN_DAMPING,
         armature=PIN_ARMATURE,
-        actuator_mode=JointTargetMode.POSITION_VELOCITY,
+        actuator_mode=newton.JointTargetMode.POSITION_VELOCITY,
         label=label,
     )
 
@@ -260,7 +259,7 @@ def _add_finger_joint(
         target_kd=FINGER_DAMPING,
         armature=FINGER_ARMATURE,
         effort_limit=FINGER_FORCE,
-        actuator_mode=JointTargetMode.POSITION_VELOCITY,
+        actuator_mode=newton.JointTargetMode.POSITION_VELOCITY,
         label=label,
     )
 

@@ -7,10 +7,10 @@ Writes the Newton model of the common template (template.py), actuator targets, 
 import warnings
 from dataclasses import dataclass
 
-import newton
 import numpy as np
 
 from xew.protocol import ARMS, FRAME_RATE
+from xew.sim_warp.devices.newton import newton
 from xew.sim_warp.physics.template import ARM_JOINTS, FREE_SLOTS, PARKED, add_world, new_builder
 from xew.sim_warp.robots import RobotSpec
 from xew.sim_warp.scene import Scene
