@@ -50,8 +50,7 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
-# Seed -> episodes -> latents -> checkpoint -> rollouts -> scores -> report. Each step skips what is done already. Half of the config's
-# training steps are enough to see unseen arms move, and 25 frames to go on from a predicted one (a chunk has 17). Six scenes, three a
+# Seed -> episodes -> latents -> checkpoint -> rollouts -> scores -> report. Each step skips what is done already. Six scenes, three a
 # task, are the fewest that have intervals; rolled out are the two unseen robots and one of the three that were trained on.
 TASKS ?= place_empty_cup beat_block_hammer
 ROLLED_OUT ?= ur5_wsg franka_panda piper
@@ -62,8 +61,8 @@ ROLLOUTS := $(DEMO)/rollouts
 demo: $(STAMP)
 	$(BIN)/python -m xew.sim_warp.generate --tasks $(TASKS) --train-seeds 3 --test-seeds 3 --out $(DATA)
 	$(BIN)/python -m xew.model.latents configs/debug.yaml --data $(DATA)
-	$(BIN)/python -m xew.model.train configs/debug.yaml --data $(DATA) --out $(RUN) --resume --train.steps 300 --train.sample_every 0
-	$(BIN)/python -m xew.model.rollout $(RUN) --data $(DATA) --split test --robots $(ROLLED_OUT) --out $(ROLLOUTS) --rollout.max_frames 25
+	$(BIN)/python -m xew.model.train configs/debug.yaml --data $(DATA) --out $(RUN) --resume
+	$(BIN)/python -m xew.model.rollout $(RUN) --data $(DATA) --split test --robots $(ROLLED_OUT) --out $(ROLLOUTS)
 	$(BIN)/python -m xew.metrics.evaluate $(ROLLOUTS) --data $(DATA) --out $(DEMO)/scores.parquet
 	$(BIN)/python -m xew.analysis.report $(DEMO)/scores.parquet --data $(DATA) --rollouts $(ROLLOUTS) --out $(DEMO)/report
 	@echo "The report is at $(DEMO)/report/index.html"
