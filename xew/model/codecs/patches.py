@@ -54,6 +54,7 @@ class PatchCodec(BatchCodec):
     """
 
     fitted: ClassVar[bool] = True
+    differences: ClassVar[bool] = True
     relative: ClassVar[bool] = True
 
     spatial_factor: int
