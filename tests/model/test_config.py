@@ -214,12 +214,6 @@ def test_experiment_mistakes(overrides: list[str], said: str) -> None:
         load_experiment(MODEL_CONFIGS[0], overrides)
 
 
-def test_changes_are_not_predicted_of_latents_that_are_changes() -> None:
-    codec = ["--codec.name", "patch_pca", "--codec.spatial-factor", "8", "--codec.channels", "48", "--clip.height", "64"]
-    with pytest.raises(ConfigError, match=r"codes differences from the first frame already.*write clean"):
-        load_experiment(MODEL_CONFIGS[0], [*codec, "--model.prediction", "change"])
-
-
 @pytest.mark.parametrize("arguments", [["--help"], [str(Path(__file__).parents[2] / "configs/debug.yaml"), "--help"]])
 def test_help_lists_what_may_be_overridden(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:

@@ -64,17 +64,6 @@ def test_velocity_follows_from_clean_latents(inputs: tuple[jax.Array, jax.Array,
     np.testing.assert_allclose(found, (latents - clean) / sigma[:, None, None, None, None], atol=TOLERANCE)
 
 
-def test_change_begins_with_a_video_that_stands_still(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
-    """The head is zero at the start, so the velocity leads from any noise straight to the reference; later it adds to it."""
-    latents, sigma, text = inputs
-    model = WorldModel(MODELS["tiny"], CHANNELS, prediction="change", rngs=nnx.Rngs(0))
-    level = sigma[:, None, None, None, None]
-    still = jnp.broadcast_to(latents[:, :1], latents.shape)
-    np.testing.assert_allclose(latents - level * model(latents, {}, sigma, text), still, atol=TOLERANCE)
-    changed, clean = (tiny(prediction=name)(latents, {}, sigma, text) for name in ("change", "clean"))
-    np.testing.assert_allclose(changed, clean - still / level, atol=TOLERANCE)
-
-
 def test_one_stream_is_the_plain_block_stack(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
     """Scan over stacked layers = calling each layer's block in turn."""
     latents, sigma, text = inputs

@@ -53,7 +53,6 @@ class AutoencoderCodec(OfSize, BatchCodec, ABC):  # type: ignore[override]
     """What the codecs of autoencoders share: the network, and that its weights are written once."""
 
     fitted: ClassVar[bool] = False
-    differences: ClassVar[bool] = False
     file: ClassVar[str]
     """Name of the files of the codec, without ending."""
 

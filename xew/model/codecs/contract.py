@@ -55,8 +55,6 @@ class Codec(Protocol):
 
     fitted: ClassVar[bool]
     """Whether it is fitted to the training episodes, and not read from weights."""
-    differences: ClassVar[bool]
-    """Whether later latents are of differences from the first frame, and not of the frames themselves."""
     relative: ClassVar[bool]
     """Whether later latents are coded relative to the first frame, so that another first frame changes them."""
 

@@ -54,7 +54,6 @@ class PatchCodec(BatchCodec):
     """
 
     fitted: ClassVar[bool] = True
-    differences: ClassVar[bool] = True
     relative: ClassVar[bool] = True
 
     spatial_factor: int

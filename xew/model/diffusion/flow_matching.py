@@ -67,10 +67,7 @@ def training_pair(
 
 
 def sample_losses(
-    predicted: Float[Array, "b t h w c"],
-    pair: TrainingPair,
-    valid: Num[Array, "b t"] | None = None,
-    clean_below: float = 0.0,
+    predicted: Float[Array, "b t h w c"], pair: TrainingPair, valid: Num[Array, "b t"] | None = None
 ) -> Float[Array, " b"]:
     """Mean squared error of the velocity of each sample, over latent frames 1 and on.
 
@@ -78,15 +75,11 @@ def sample_losses(
         predicted: [b t h w c] float32, velocity.
         pair: what it was predicted for.
         valid: [b t] float32, 1 for latent frames that show the episode and 0 past its end; all count if left out.
-        clean_below: noise level under which errors weigh (sigma / clean_below)^2, as those of clean latents do: there little
-            is left to predict, and a velocity computed from clean latents blows their errors up. 0 weighs all levels alike.
 
     Returns:
         [b] float32; 0 where no frame counts.
     """
     errors = jnp.square(predicted[:, 1:] - pair.velocity[:, 1:]).mean(axis=(2, 3, 4))
-    if clean_below:
-        errors = errors * jnp.square(jnp.minimum(pair.sigma / clean_below, 1))[:, None]
     if valid is None:
         return errors.mean(axis=1)
     return (errors * valid[:, 1:]).sum(axis=1) / jnp.maximum(valid[:, 1:].sum(axis=1), 1)

@@ -64,7 +64,7 @@ Text = Float[Array, "b l e"] | Int[Array, "b l"]
 TokenGrid = tuple[int, int, int]
 """Number of tokens in time, height and width."""
 Visibility = Literal["joint", "one_way"]
-Prediction = Literal["velocity", "clean", "change"]
+Prediction = Literal["velocity", "clean"]
 TimeEmbedding = Literal["exact", "flowwam"]
 
 MODELS = {
@@ -113,8 +113,7 @@ class WorldModel(nnx.Module):
         time: "exact", or "flowwam": the rounding with which FlowWAM's published weights were trained.
         history: when the frames of the stream history were, in latent frames from the clip's first (negative).
         words: rows of a learned table of words; text is then ids [b l] instead of embeddings. 0 has none.
-        prediction: what the head computes, from which the velocity follows: "velocity" itself, "clean" latents, or
-            their "change" from the reference, so that the network begins with a video that stands still.
+        prediction: what the head computes, from which the velocity follows: "velocity" itself, or "clean" latents.
     """
 
     def __init__(
@@ -192,10 +191,7 @@ class WorldModel(nnx.Module):
         context = self.framed_context(text, latents.shape, conditions)
         tokens = self.apply_blocks(tokens, self.modulation(time), levels, rotary, context, rgb, cache)
         predicted = unpatchify(self.head(tokens[:, :rgb].astype(jnp.float32), time, levels[:rgb]), latents.shape)
-        if self.prediction == "velocity":
-            return predicted
-        clean = predicted + latents[:, :1] if self.prediction == "change" else predicted
-        return velocity_of_clean(clean, latents, sigma)
+        return velocity_of_clean(predicted, latents, sigma) if self.prediction == "clean" else predicted
 
     def condition_cache(self, conditions: Conditions, text: Text) -> ConditionCache:
         """Keys and values of the condition tokens in every layer; they hold for all steps of sampling a clip.

@@ -47,7 +47,6 @@ LEAST = LEAST_OF_STEPS | {
     "train.epochs": 0,
     "train.accumulate": 1,
     "train.history_noise": 0,
-    "train.clean_below": 0,
     "adapt.lora_rank": 0,
     "rollout.steps": 1,
     "rollout.batch": 1,
@@ -92,13 +91,7 @@ def check_experiment(experiment: Settings, source: str) -> None:
 def _check_choices(experiment: Settings, source: str) -> None:
     check_finite(experiment, source)
     check_least(LEAST, experiment, source)
-    codec = codec_class(experiment.codec)
-    codec.check(experiment.codec)
-    if experiment.model.prediction == "change" and codec.differences:
-        raise ConfigError(
-            f"{source}: codec {experiment.codec.name} codes differences from the first frame already, so"
-            " model.prediction cannot be change; write clean."
-        )
+    codec_class(experiment.codec).check(experiment.codec)
     pick(SAMPLERS, experiment.rollout.sampler, "sampler")
     pick(SCHEDULES, experiment.rollout.grid, "noise schedule")
     _ = experiment.size, experiment.robots

@@ -57,8 +57,7 @@ class ModelSettings:
     time: TimeEmbedding = "exact"
     """flowwam: with the rounding under which FlowWAM's published weights were trained."""
     prediction: Prediction = "velocity"
-    """clean: the network predicts clean latents, and the velocity follows from them; change: by how much these differ from the
-    first frame's. Departures."""
+    """clean: the network predicts clean latents, and the velocity follows from them. A departure."""
     weights: Path | None = None
     """Published weights to start from: official Wan, diffusers, FlowWAM (dit_layouts.load_dit); from nothing if left out."""
 
@@ -102,9 +101,6 @@ class TrainSettings(StepSettings):
     """Type of AdamW's first moment; bfloat16 saves two bytes a parameter."""
     shift: float = 5.0
     """Shift of the noise levels, in training and in sampling."""
-    clean_below: float = 0.0
-    """Noise level under which errors of the velocity weigh as those of clean latents do, (sigma / clean_below)^2; 0 weighs all
-    levels alike. A departure."""
     history_noise: float = 0.0
     """Standard deviation of what is added to earlier frames' latents in training; Ctrl-World has 0.3."""
 

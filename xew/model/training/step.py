@@ -95,7 +95,7 @@ class Learner:
         """
         settings, graph, optimizer = self.learning.settings, self.graph, self.learning.optimizer
         places = list_shardings(self.network_shapes)
-        objective = Objective(graph, places, settings.shift, settings.accumulate, settings.history_noise, settings.clean_below)
+        objective = Objective(graph, places, settings.shift, settings.accumulate, settings.history_noise)
 
         def step(state: TrainState, batch: Batch, codec: Codec | None) -> tuple[TrainState, StepResult]:
             key = jax.random.fold_in(jax.random.key(settings.seed), state.step)
@@ -188,8 +188,6 @@ class Objective:
     """Number of parts of the batch that are computed one after another."""
     history_noise: float = 0.0
     """Standard deviation of the noise on earlier frames' latents."""
-    clean_below: float = 0.0
-    """See `sample_losses`."""
 
     def place(self, tree: Any) -> Any:
         """Keep a tree like that of the parameters cut along fsdp as they are: the compiler might gather it too soon."""
@@ -238,7 +236,7 @@ class Objective:
 
         def loss(params: Any) -> tuple[Array, tuple[Array, Array]]:
             predicted = nnx.merge(self.graph, gather_parameters(params))(pair.noisy, chunk.conditions, pair.sigma, chunk.text)
-            losses = sample_losses(predicted, pair, chunk.valid, self.clean_below)
+            losses = sample_losses(predicted, pair, chunk.valid)
             return (shares * losses).sum(), (losses, predicted)
 
         gradients, (losses, predicted) = jax.grad(loss, has_aux=True)(params)
