@@ -82,13 +82,9 @@ def flatten_settings(content: Any, path: str = "") -> dict[str, bool | float | s
         return {name: value for part in parts for name, value in part.items()}
     if content is None:
         return {}
-    return {
-        path: content
-        if isinstance(content, bool | str)
-        else float(content)
-        if isinstance(content, int | float)
-        else str(content)
-    }
+    if isinstance(content, bool | str):
+        return {path: content}
+    return {path: float(content) if isinstance(content, int | float) else str(content)}
 
 
 def _keep_until(path: Path, step: int) -> None:
