@@ -1,5 +1,6 @@
 """Streams from commands, keypoints from states: for every robot of the registry."""
 
+import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
@@ -16,6 +17,7 @@ from xew.sim_warp.kinematics import forward_kinematics, joint_positions, tool_po
 from xew.sim_warp.rendering.bodies import body_names, keypoint_links, robot_bodies, robot_pose
 from xew.sim_warp.rendering.observe import Recording, keypoint_names, keypoint_positions, observe, scene_things
 from xew.sim_warp.rendering.render import Body, Renderer
+from xew.sim_warp.rendering import streams
 from xew.sim_warp.rendering.streams import (
     AXIS_COLORS,
     CLIP_FRAMES,
@@ -288,3 +290,22 @@ def test_threads_that_share_the_renderer_get_what_one_alone_gets():
     for one, other in zip(alone, together, strict=True):
         assert one.render.tobytes() == other.render.tobytes()
         assert one.optical_flow.tobytes() == other.optical_flow.tobytes()
+
+
+def test_threads_share_one_renderer_and_wait_until_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Warp hands out a GPU before its streams are there, so that a second renderer at that moment ends in an error."""
+    made: list[object] = []
+
+    def make() -> object:
+        time.sleep(0.02)
+        made.append(object())
+        return made[-1]
+
+    monkeypatch.setattr(streams, "Renderer", make)
+    streams._make_default_renderer.cache_clear()
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            found = list(pool.map(lambda _: default_renderer(), range(4)))
+    finally:
+        streams._make_default_renderer.cache_clear()
+    assert len(made) == 1 and set(found) == set(made)

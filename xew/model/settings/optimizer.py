@@ -1,11 +1,15 @@
-"""The optimizer: AdamW with clipping, as in the paper (its section on optimization), and how many steps a run takes."""
+"""The optimizer: AdamW with clipping, as in the paper (its section on optimization), or Muon; and how many steps a run takes."""
 
 import math
 from dataclasses import replace
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import optax
+from optax.contrib import MuonDimensionNumbers, muon
 
+from xew.model.devices.sharding import path_names
 from xew.model.settings.settings import TrainSettings, count_replayed
 
 
@@ -20,10 +24,40 @@ def learning_rate(settings: TrainSettings) -> optax.Schedule:
     return schedule
 
 
+RMS_OF_ADAM = 0.2
+"""Root mean square to which Muon's updates are scaled, that of AdamW's: one learning rate then serves both (Moonlight, Liu et
+al. 2025, arXiv:2502.16982, equation 4)."""
+
+
 def make_optimizer(settings: TrainSettings) -> optax.GradientTransformation:
-    """Make AdamW after clipping by the global norm; moments in float32, the first in `mu_dtype`."""
-    adamw = optax.adamw(learning_rate(settings), weight_decay=settings.weight_decay, mu_dtype=jnp.dtype(settings.mu_dtype))
-    return optax.chain(optax.clip_by_global_norm(settings.clip_norm), adamw)
+    """Make the optimizer of `train.optimizer` after clipping by the global norm; the first moments are in `mu_dtype`."""
+    rate, decay, mu_dtype = learning_rate(settings), settings.weight_decay, jnp.dtype(settings.mu_dtype)
+    if settings.optimizer == "muon":
+        update = muon(
+            rate,
+            weight_decay=decay,
+            adam_weight_decay=decay,
+            mu_dtype=mu_dtype,
+            consistent_rms=RMS_OF_ADAM,
+            muon_weight_dimension_numbers=find_matrices,
+        )
+    else:
+        update = optax.adamw(rate, weight_decay=decay, mu_dtype=mu_dtype)
+    return optax.chain(optax.clip_by_global_norm(settings.clip_norm), update)
+
+
+def find_matrices(params: Any) -> Any:
+    """The tree of parameters with their axes for Muon where they are the blocks' stacked matrices [layers in out], else None.
+
+    Embeddings, the head, norms and modulations are AdamW's, as Muon's author has it (Jordan 2024).
+    """
+
+    def axes(path: tuple[Any, ...], leaf: Any) -> MuonDimensionNumbers | None:
+        names = path_names(path)
+        is_matrix = leaf.ndim == 3 and names[0] == "blocks" and names[-1] == "kernel"
+        return MuonDimensionNumbers(1, 2) if is_matrix else None
+
+    return jax.tree_util.tree_map_with_path(axes, params)
 
 
 def set_steps(settings: TrainSettings, samples: int, replay: float = 0.0) -> TrainSettings:

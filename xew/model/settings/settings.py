@@ -97,8 +97,10 @@ class TrainSettings(StepSettings):
     """Parts of the batch that are computed one after another: less memory, the same step."""
     chunks: Literal[1, 2] = 1
     """Consecutive clips of a sample; the second starts from the predicted, not the true, end of the first."""
+    optimizer: Literal["adamw", "muon"] = "adamw"
+    """AdamW as in the paper, or Muon for the matrices of the blocks and AdamW for the rest."""
     mu_dtype: Literal["float32", "bfloat16"] = "float32"
-    """Type of AdamW's first moment; bfloat16 saves two bytes a parameter."""
+    """Type of the optimizer's first moment; bfloat16 saves two bytes a parameter."""
     shift: float = 5.0
     """Shift of the noise levels, in training and in sampling."""
     history_noise: float = 0.0

@@ -12,6 +12,7 @@ from functools import cache
 import cv2
 import numpy as np
 
+from xew.concurrency import PARSING
 from xew.protocol import ARMS
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera, look_at, project
@@ -54,9 +55,17 @@ class CommandStreams:
     """[t h w 2] float32 motion from this frame to the next [pixels], see `Frames.optical_flow`."""
 
 
-@cache
 def default_renderer() -> Renderer:
-    """The process's renderer on Warp's default device, made at first use: its kernels and lit stages are shared."""
+    """The process's renderer on Warp's default device, made at first use: its kernels and lit stages are shared.
+
+    Threads wait for the one that makes it: Warp hands out a device before its streams are there, and `cache` has no lock.
+    """
+    with PARSING:
+        return _make_default_renderer()
+
+
+@cache
+def _make_default_renderer() -> Renderer:
     return Renderer()
 
 
