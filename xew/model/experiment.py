@@ -80,6 +80,12 @@ class Experiment:
         return Network(self.size, self.codec.channels, tuple(self.conditions), words, self.train.seed, self.model)
 
     @property
+    def sampling_network(self) -> Network:
+        """The network as rollouts and samples compile it; its parameters are those of `network`."""
+        unroll = self.rollout.unroll or self.model.unroll
+        return replace(self.network, settings=replace(self.model, unroll=unroll))
+
+    @property
     def inputs(self) -> ClipInputs:
         history, conditions, size = self.model.history, self.conditions, self.size
         shapes = {"rgb": _latent_shape(self.clip, self.codec)}

@@ -69,16 +69,15 @@ def load_predictor(run: Path, experiment: Experiment, step: int | None = None) -
     if is_config(run):
         return load_published(experiment, run), None
     mesh, codec = make_mesh(MeshSettings()), load_run_codec(run, experiment.codec)
-    graph, shapes = nnx.split(nnx.eval_shape(experiment.network.create), nnx.Param)
+    shapes = nnx.state(nnx.eval_shape(experiment.network.create), nnx.Param)
     like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=replicated_sharding(mesh)), shapes)
     params, step = restore_params(run, like, step)
     scales = load_run_scales(experiment.conditions, run)
-    return _make_predictor(experiment, codec, graph, params, mesh, scales), step
+    return _make_predictor(experiment, codec, params, mesh, scales), step
 
 
-def _make_predictor(
-    experiment: Experiment, codec: Codec, graph: nnx.GraphDef, params: Any, mesh: Mesh, scales: Mapping[str, Scale]
-) -> Predictor:
+def _make_predictor(experiment: Experiment, codec: Codec, params: Any, mesh: Mesh, scales: Mapping[str, Scale]) -> Predictor:
+    graph = experiment.sampling_network.structure
     params = jax.jit(cast_params, static_argnums=0)(graph, params)
     codec = jax.device_put(codec, replicated_sharding(mesh))
     return Predictor(experiment.inputs, experiment.instructions, experiment.sampling, codec, graph, params, scales)
@@ -112,7 +111,7 @@ def load_published(experiment: Experiment, source: Path) -> Predictor:
     episodes = (
         training_episodes(read_dataset(experiment.data), experiment.choice) if codec_class(experiment.codec).fitted else ()
     )
-    return _make_predictor(experiment, load_codec(experiment.encoding, episodes), graph, params, mesh, {})
+    return _make_predictor(experiment, load_codec(experiment.encoding, episodes), params, mesh, {})
 
 
 def check_out(out: Path, data: Path) -> None:
@@ -136,12 +135,12 @@ def rollout_header(experiment: Experiment, step: int | None, saved: int | None, 
         record,
         experiment.rollout.max_frames,
     )
-    made_by = {"checkpoint_step": step, "checkpoint_saved": saved, "config": CONVERTER.unstructure(_drop_batch(experiment))}
+    made_by = {"checkpoint_step": step, "checkpoint_saved": saved, "config": CONVERTER.unstructure(_drop_speed(experiment))}
     return header | made_by
 
 
-def _drop_batch(experiment: Experiment) -> Experiment:
-    return replace(experiment, rollout=replace(experiment.rollout, batch=0))
+def _drop_speed(experiment: Experiment) -> Experiment:
+    return replace(experiment, rollout=replace(experiment.rollout, batch=0, unroll=0))
 
 
 def common_header(model: str, condition: str, record: Record, max_frames: int = 0) -> dict[str, Any]:

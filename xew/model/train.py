@@ -126,9 +126,8 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
 
     begin_run(experiment, source.cache.codec, resume=resume, overwrite=overwrite)
     source.scales = share_scales(out, encoding.inputs.conditions, source.scales)
-    predictor = Predictor(
-        encoding.inputs, experiment.instructions, experiment.sampling, source.cache.codec, learner.graph, None, source.scales
-    )
+    graph, codec = experiment.sampling_network.structure, source.cache.codec
+    predictor = Predictor(encoding.inputs, experiment.instructions, experiment.sampling, codec, graph, None, source.scales)
     timetable = Timetable(settings.steps, settings.log_every, settings.save_every, settings.sample_every, rates)
     batches = iter(dataset)
     with open_session(out, settings.keep_checkpoints) as session:

@@ -18,14 +18,14 @@ from tests import synthetic
 from xew.config import ConfigError, save
 from xew.dataset import read_dataset
 from xew.model import latents, train
-from xew.model.devices.sharding import AXES, make_mesh, path_names, place_batch, place_shapes
+from xew.model.devices.sharding import AXES, make_mesh, place_batch, place_shapes
 from xew.model.diffusion.flow_matching import put_first, sample_losses
 from xew.model.episodes.choice import first_of_each, replay_episodes, sample_episodes, training_episodes
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs import checkpoint
 from xew.model.runs.checkpoint import TrainState
-from xew.model.settings.optimizer import RMS_OF_ADAM, learning_rate, make_optimizer, set_steps
+from xew.model.settings.optimizer import learning_rate, set_steps
 from xew.model.training import data, memory
 from xew.model.training.data import Batch, ClipSource, fake_batch, make_dataset
 from xew.model.training.flops import flops_of_step
@@ -159,29 +159,6 @@ class LastFrame:
 
 
 SEEN: list[np.ndarray] = []
-
-
-def test_muon_has_one_moment_for_the_matrices_of_blocks_and_two_for_the_rest(experiment: Experiment) -> None:
-    """Its update of a matrix is orthogonal: all its singular values are about alike."""
-    params = nnx.state(experiment.network.create(), nnx.Param)
-    optimizer = make_optimizer(replace(experiment.train, optimizer="muon", learning_rate=1.0, weight_decay=0.0))
-    moments = optimizer.init(params)
-    matrices = [leaf.size for path, leaf in jax.tree_util.tree_leaves_with_path(params) if is_matrix(path, leaf)]
-    everything = sum(leaf.size for leaf in jax.tree.leaves(params))
-    kept = sum(leaf.size for leaf in jax.tree.leaves(moments) if leaf.ndim and leaf.shape != (3,))  # without the coefficients
-    assert matrices and kept == 2 * everything - sum(matrices)
-    random = jax.tree.map(lambda leaf: jax.random.normal(jax.random.key(leaf.size), leaf.shape), params)
-    updates, _ = optimizer.update(random, moments, params)
-    update = updates["blocks"]["ffn"]["first"]["kernel"].get_value()[0]
-    values = np.linalg.svd(update, compute_uv=False)
-    assert values.min() > 0.5 * values.max()
-    assert np.sqrt(np.square(update).mean()) == pytest.approx(RMS_OF_ADAM, rel=0.3)
-
-
-def is_matrix(path: Any, leaf: Any) -> bool:
-    """Whether a parameter is a stack of the blocks' matrices."""
-    names = path_names(path)
-    return names[0] == "blocks" and names[-1] == "kernel" and leaf.ndim == 3
 
 
 @pytest.fixture(scope="module")

@@ -59,6 +59,12 @@ def save_state(checkpoints: ocp.CheckpointManager, state: TrainState, data_posit
     checkpoints.save(step, args=ocp.args.Composite(data=ocp.args.JsonSave(data_position), **saves))
 
 
+def save_params(checkpoints: ocp.CheckpointManager, step: int, params: Any) -> None:
+    """Write a checkpoint of parameters alone, in the types that they have, and wait for it: rollouts can read it."""
+    checkpoints.save(step, args=ocp.args.Composite(params=ocp.args.StandardSave(params)))
+    checkpoints.wait_until_finished()
+
+
 def restore_state(checkpoints: ocp.CheckpointManager, like: TrainState) -> tuple[TrainState, dict[str, Any]]:
     """Restore the latest state and the position of the data.
 

@@ -50,6 +50,7 @@ LEAST = LEAST_OF_STEPS | {
     "adapt.lora_rank": 0,
     "rollout.steps": 1,
     "rollout.batch": 1,
+    "rollout.unroll": 0,
     "rollout.max_frames": 0,
     "rollout.guidance": 0,
     "rollout.seed": 0,

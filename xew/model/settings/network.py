@@ -27,6 +27,11 @@ class Network:
     seed: int
     settings: ModelSettings
 
+    @property
+    def structure(self) -> nnx.GraphDef:
+        """The network without its parameters, made without computing anything."""
+        return nnx.split(nnx.eval_shape(self.create), nnx.Param)[0]
+
     def create(self) -> WorldModel:
         """Make the network at its random start; wrap in `nnx.eval_shape` for shapes only."""
         settings = self.settings

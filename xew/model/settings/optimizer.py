@@ -1,4 +1,4 @@
-"""The optimizer: AdamW with clipping, as in the paper (its section on optimization), or Muon; and how many steps a run takes."""
+"""The optimizer: AdamW with clipping, as in the paper (its section on optimization), or Muon; and the number of steps."""
 
 import math
 from dataclasses import replace

@@ -1,0 +1,131 @@
+"""A trained run made ready to be handed on: the network alone, in bfloat16, with a model card.
+
+Reads  a run, the episodes that it was trained on and, for the card, a summary of its scores
+Writes a run's folder with config, codec, scales and one checkpoint, without what only training needs; README.md, the card.
+       `rollout`, `export` and `adapt.start_from` take it as any run
+Command: python -m xew.model.release RUN --out FOLDER [--scores scores.summary.md]
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+import tyro
+from flax import nnx
+from jinja2 import Environment, PackageLoader
+
+from xew.config import ConfigError, admit, user_errors
+from xew.dataset import read_dataset
+from xew.episode import Record
+from xew.files import read_text, write_text
+from xew.model.cache.scales import load_run_scales, share_scales
+from xew.model.episodes.choice import training_episodes
+from xew.model.experiment import Experiment
+from xew.model.runs.checkpoint import open_checkpoints, restore_params, save_params
+from xew.model.runs.folder import load_run, prepare_run
+from xew.model.runs.sums import note_sums
+from xew.model.settings.settings import AdaptSettings
+
+CARD = "README.md"
+"""Name of the model card."""
+
+
+def release(run: Path, out: Path, data: Path | None = None, scores: Path | None = None, step: int | None = None) -> int:
+    """Write the network of a run in bfloat16 as a run of its own, with its card, and return the step that it is of.
+
+    Args:
+        run: folder of the run; corrections of an adaptation are added to its network.
+        out: folder to write.
+        data: the episodes that it was trained on; those of its config where left out.
+        scores: a summary in Markdown that `xew.metrics.evaluate` wrote; the card has it whole.
+        step: of the checkpoint; the latest where left out.
+
+    Raises:
+        ConfigError: there is no such run, checkpoint or summary, or the place is taken.
+        EpisodeError: the data has no training episodes.
+    """
+    experiment, codec = load_run(run)
+    if experiment.out.resolve() != run.resolve():
+        experiment = replace(experiment, out=run)
+    seen = list_training(replace(experiment, data=data or experiment.data))
+    summary = read_text(scores) if scores else ""
+    shapes = nnx.state(nnx.eval_shape(experiment.network.create), nnx.Param)
+    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), shapes)
+    params, step = restore_params(run, like, step)
+    released = replace(experiment, out=out, data=Path("data"), cache=None, adapt=AdaptSettings())
+    prepare_run(released, codec, resume=False, overwrite=False)
+    share_scales(out, experiment.conditions, load_run_scales(experiment.conditions, run))
+    with open_checkpoints(out) as checkpoints:
+        save_params(checkpoints, step, jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), params))
+    note_sums(out)
+    size = sum(leaf.size for leaf in jax.tree.leaves(params))
+    write_text(out / CARD, write_card(experiment, step, size, seen, summary))
+    return step
+
+
+def list_training(experiment: Experiment) -> dict[str, tuple[int, int]]:
+    """Numbers of training seeds and episodes of each task that an experiment reads, robots together, in order of tasks."""
+    episodes = training_episodes(read_dataset(experiment.data), experiment.choice)
+    return count_by_task(record for _, record in episodes)
+
+
+def count_by_task(records: Iterable[Record]) -> dict[str, tuple[int, int]]:
+    """Numbers of distinct seeds and of episodes of each task, in order of tasks."""
+    seeds: dict[str, list[int]] = defaultdict(list)
+    for record in records:
+        seeds[record.task].append(record.seed)
+    return {task: (len(set(found)), len(found)) for task, found in sorted(seeds.items())}
+
+
+def write_card(experiment: Experiment, step: int, size: int, seen: dict[str, tuple[int, int]], summary: str) -> str:
+    """The model card in Markdown: what the model is, what it was trained on, how good it is and what it is not for.
+
+    Args:
+        step: number of training steps.
+        size: number of parameters.
+        seen: numbers of seeds and episodes by task.
+        summary: table of scores in Markdown, '' where there is none.
+    """
+    template = Environment(loader=PackageLoader("xew.model", "templates"), trim_blocks=True, lstrip_blocks=True)
+    robots = experiment.adapt.robots or experiment.robots.train_robots
+    facts = {"step": step, "size": size, "seen": seen, "robots": robots, "summary": summary.strip()}
+    return template.get_template("model_card.md").render(experiment=experiment, **facts).rstrip() + "\n"
+
+
+@dataclass(frozen=True)
+class Args:
+    """Which run to release, and where to."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Folder of a trained run."""
+    out: Path
+    """Folder to write; it must be empty or not there."""
+    data: Path | None = None
+    """Episodes that it was trained on, for the card; those of the run's config where left out."""
+    scores: Path | None = None
+    """Summary of its scores, as scores.summary.md of `python -m xew.metrics.evaluate`."""
+    checkpoint: int | None = None
+    """Step of the checkpoint; the latest where left out."""
+    trust: tuple[str, ...] = ()
+    """Modules of your own, such as my_lab.models, that the run may name."""
+
+
+@user_errors
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write a run's network and its card."""
+    args = tyro.cli(Args, args=arguments, prog="python -m xew.model.release", description=__doc__)
+    admit(args.trust)
+    if args.scores and not args.scores.is_file():
+        raise ConfigError(f"--scores {args.scores} is no file; expected scores.summary.md of `python -m xew.metrics.evaluate`.")
+    step = release(args.run, args.out, args.data, args.scores, args.checkpoint)
+    megabytes = sum(file.stat().st_size for file in args.out.rglob("*") if file.is_file()) / 1e6
+    print(f"{args.out}: step {step} in bfloat16, {megabytes:.0f} MB; its card is {args.out / CARD}")
+
+
+if __name__ == "__main__":
+    main()
