@@ -108,16 +108,19 @@ SHOTS = (1, 2, 3)
 """Numbers of training episodes of each task that a model is adapted with (M); they are of the first accepted seeds."""
 FORGETTING_ROBOT = "ur5_wsg"
 """Robot whose test episodes measure forgetting, the same for every adapted model."""
-COPY_FIRST_FRAME, PASTED_RENDER, OTHER_ROBOT, GROUND_TRUTH = "copy_first_frame", "pasted_render", "other_robot", "ground_truth"
+COPY_FIRST_FRAME, PASTED_RENDER, OTHER_ROBOT = "copy_first_frame", "pasted_render", "other_robot"
+CODEC_TRUTH, GROUND_TRUTH = "codec_truth", "ground_truth"
 BASELINES = {
     COPY_FIRST_FRAME: "frozen first frame",
     PASTED_RENDER: "pasted render",
     OTHER_ROBOT: "another robot's episode",
+    CODEC_TRUTH: "truth through the codec",
     GROUND_TRUTH: "ground truth",
 }
 """Titles of the predictions that no model made, by name; they have the empty variant in a score table. The frozen first frame;
 the first frame with the robot's render pasted in, which is as good as one can be without learning; the true episode of
-another robot; and the true video, whose score shows the estimators' own error."""
+another robot; the true video through a model's codec, of which the condition says which; and the true video. The scores of the
+last two show the estimators' own error."""
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,12 @@ from xew.analysis.tables.builder import Builder, paired_verdict
 from xew.metrics import METRICS
 from xew.metrics.grading.scores import describe
 from xew.metrics.grading.summary import Summary, summarize
-from xew.protocol import ROBOT_NAMES, SEEN_ROBOTS, reference
+from xew.protocol import CODEC_TRUTH, ROBOT_NAMES, SEEN_ROBOTS, reference
 
 ROBOTS = ("ur5_wsg", "piper")
 JOINTS, FLOW = (reference(action=action).name for action in ("joints", "optical_flow"))
+KEY = "codec 0123abcd"
+"""Condition of the truth through the codec of the second model; the first has none."""
 BASE = {"psnr": 20.0, "ssim": 0.8, "mask_iou": 0.6, "keypoint_error": 6.0, "trajectory_error": 9.0}
 """Mean score of the worse model by metric; the second and third are estimated with the others."""
 
@@ -27,9 +29,16 @@ BASE = {"psnr": 20.0, "ssim": 0.8, "mask_iou": 0.6, "keypoint_error": 6.0, "traj
 def write_scores(path: Path, scenes: int, truth: bool, spread: float, missing: float) -> Scores:
     """Two models and the baselines on scenes of four tasks; scores are rounded, so that some are tied."""
     rng = np.random.default_rng(scenes)
-    gains = {JOINTS: 0.0, FLOW: 0.08, COPY: -0.02} | ({TRUTH: 0.3} if truth else {})
+    gains = {JOINTS: 0.0, FLOW: 0.08, COPY: -0.02} | ({TRUTH: 0.3, CODEC_TRUTH: 0.2} if truth else {})
     rows = [
-        {"model": model, "condition": "", "task": f"task{i % 4}", "seed": 1_000_000 + i // 4, "robot": robot, "metric": metric}
+        {
+            "model": model,
+            "condition": KEY * (model == CODEC_TRUTH),
+            "task": f"task{i % 4}",
+            "seed": 1_000_000 + i // 4,
+            "robot": robot,
+            "metric": metric,
+        }
         | {"value": _score(metric, base, gain + 0.05 * shared + spread * rng.normal())}
         for i, shared in enumerate(rng.normal(size=scenes))
         for robot in ROBOTS
@@ -39,6 +48,7 @@ def write_scores(path: Path, scenes: int, truth: bool, spread: float, missing: f
     ]
     table = pd.DataFrame(rows).assign(frames=5, exact_frames=0)
     table.attrs = describe({"protocol": 3, "estimators": {}, "frame_zero": "given", "allowed": []}, tuple(BASE))
+    table.attrs["codecs"] = {FLOW: [KEY]}
     table.to_parquet(path)
     table.to_parquet(path.with_suffix(".curves.parquet"))
     return read_scores(path)
@@ -95,7 +105,8 @@ def test_a_study_is_the_same_in_both(scores: Scores) -> None:
     summary = summarize(scores.rows)
     means = summary.means.set_index(["robot", "model", "metric"])
     variants = scores.rows["model"].where(scores.rows["model"].isin([JOINTS, FLOW]), "")
-    grades = StudyGrades(scores.rows.assign(variant=variants), scores.metrics, paper_axes(read_paper()))
+    rows = scores.rows.assign(variant=variants)
+    grades = StudyGrades(rows, scores.metrics, paper_axes(read_paper()), codecs=scores.codecs)
     builder = Builder(grades, None)
     found = dict(pairs_of(summary, JOINTS, FLOW))
     words = set()
@@ -105,7 +116,9 @@ def test_a_study_is_the_same_in_both(scores: Scores) -> None:
                 cell, mean = builder.cell("actions", row, robot, metric), means.loc[(robot, model, metric)]
                 np.testing.assert_array_equal([cell.value, cell.low, cell.high], mean[["mean", "low", "high"]].astype(float))
             assert paired_verdict(grades, "actions", "joints", "optical_flow", robot, metric) == found[robot, metric]
-            assert grades.floor(robot, metric) == pytest.approx(means.loc[(robot, JOINTS, metric), "noise"], abs=0, nan_ok=True)
+            for row, model in (("joints", JOINTS), ("optical_flow", FLOW)):
+                noise = means.loc[(robot, model, metric), "noise"]
+                assert grades.floor(robot, metric, ("actions", row)) == pytest.approx(noise, abs=0, nan_ok=True)
             words.add(found[robot, metric])
     if len(scores.rows["seed"].unique()) < 2:
         assert words == {"unresolved"}, "three scenes resolve nothing, in neither"
@@ -133,5 +146,6 @@ def test_robots_that_are_pooled_are_the_same_in_a_run_and_a_study(tmp_path: Path
     table = robot_table(Scores(rows, scores.curves, scores.metrics, {}), "seen", SEEN_ROBOTS, None)
     for row in table.rows:
         for metric, score in row.scores.items():
-            mean = grades.baseline(row.model, SEEN_ROBOTS, metric)
+            name = " ".join(filter(None, (row.model, row.condition)))
+            mean = grades.baseline(name, SEEN_ROBOTS, metric)
             assert mean and (mean.value, *mean.interval(), mean.count) == (score.mean, score.low, score.high, score.count)

@@ -229,7 +229,7 @@ def run_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> Table:
     return Table(
         "_".join(table.robots),
         table.title,
-        f"{of[0].upper()}{of[1:]}.",
+        " ".join(filter(None, (f"{of[0].upper()}{of[1:]}.", table.floors))),
         ("model",),
         metric_columns({metric.name: metric for metric in shown}, [metric.name for metric in shown]),
         (TableSection("", tuple(rows), "" if table.complete else f"Incomplete: {of} are scored."),),

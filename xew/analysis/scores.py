@@ -110,6 +110,11 @@ class Scores:
         return self.attributes.get("frame_zero", "given")
 
     @property
+    def codecs(self) -> dict[str, list[str]]:
+        """By model (of a study by variant): conditions of the truth through its codec, of which its noise floor is."""
+        return dict(self.attributes.get("codecs", {}))
+
+    @property
     def measured_by(self) -> dict[str, str]:
         """How the table was graded, as names and texts."""
         estimators = {f"estimator of {name}": str(used) for name, used in self.attributes.get("estimators", {}).items()}
@@ -189,6 +194,8 @@ def merge_scores(tables: Sequence[tuple[str, Path]], own_robots: Sequence[str] =
         attributes.append((path, scores.attributes))
         metrics = metrics or scores.metrics
     common = _merge_attributes(attributes)
+    if codecs := _merge_codecs([variant for variant, _ in tables], [attributes for _, attributes in attributes]):
+        common["codecs"] = codecs
     merged = pd.concat(rows, ignore_index=True)
     wrong = _find_wrong_rows(merged, metrics, set(merged["robot"]))
     if wrong:
@@ -293,6 +300,7 @@ class _Attributes:
     allowed: tuple[str, ...] = ()
     robots: tuple[str, ...] = ()
     study: dict[str, Any] = field(default_factory=dict)
+    codecs: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def _check_attributes(path: Path, attributes: Mapping[Hashable, Any]) -> None:
@@ -318,7 +326,7 @@ def _have_same_metrics(one: Mapping[str, Mapping[str, Any]], other: Mapping[str,
 def _find_wrong_rows(rows: pd.DataFrame, metrics: Sequence[MetricInfo], robots: set[str]) -> dict[str, pd.DataFrame]:
     """Rows that cannot be averaged over, by what is wrong with them."""
     # Of a variant, model and condition are no more than names; two of them would be two scores of one cell.
-    named = rows.assign(**{VARIANT: rows[VARIANT].where(rows[VARIANT] != "", rows["model"])}) if VARIANT in rows else rows
+    named = rows.assign(**{VARIANT: name_graded(rows)}) if VARIANT in rows else rows
     key = [*([VARIANT, *EPISODE] if VARIANT in rows else KEY), "metric", *([TRAINING] if TRAINING in rows else [])]
     value = pd.to_numeric(rows["value"], errors="coerce")
     low = rows["metric"].map({metric.name: -np.inf if metric.low is None else metric.low for metric in metrics})
@@ -356,6 +364,23 @@ def _merge_attributes(tables: Sequence[tuple[Path, Mapping[Hashable, Any]]]) -> 
     robots = sorted({robot for _, attributes in tables for robot in attributes.get("robots", ())})
     merged = {**first, "versions": {name: ", ".join(sorted(versions)) for name, versions in used.items()}}
     return merged | ({"robots": robots} if robots else {})
+
+
+def _merge_codecs(variants: Sequence[str], tables: Sequence[Mapping[Hashable, Any]]) -> dict[str, list[str]]:
+    """The attribute `codecs` by variant, of tables by model."""
+    found: dict[str, list[str]] = {}
+    for variant, attributes in zip(variants, tables, strict=True):
+        keys = [key for own in attributes.get("codecs", {}).values() for key in own]
+        if keys:
+            found[variant] = list(dict.fromkeys([*found.get(variant, []), *keys]))
+    return found
+
+
+def name_graded(rows: pd.DataFrame) -> pd.Series:
+    """The name of what each row of a study's table grades: its variant; of a baseline its model, and its condition if any."""
+    condition = rows["condition"] if "condition" in rows else pd.Series("", rows.index)
+    baseline = rows["model"].where((condition == "") | ~rows["model"].isin(BASELINES), rows["model"] + " " + condition)
+    return rows["variant"].where(rows["variant"] != "", baseline)
 
 
 def _drop_known_baselines(rows: pd.DataFrame, graded: set[tuple[object, ...]]) -> pd.DataFrame:

@@ -14,7 +14,6 @@ Predictors: videos made on purpose, from the true one to a gray one, and whether
     python -m xew.metrics.calibrate --data data --predictors --out calibration
 """
 
-import importlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, zip_longest
@@ -36,6 +35,7 @@ from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
 from xew.metrics.calibration.matrix import grade_predictors, matrix, to_markdown
 from xew.metrics.calibration.perturbations import Perturbation, render_perturbations
 from xew.metrics.grade import Comparison, Grades, grade, input_kind
+from xew.metrics.grading.codecs import OPENER, open_codec
 from xew.metrics.truth import NEEDS, Truth, read_truth
 
 LATE = 8
@@ -63,7 +63,7 @@ class Args:
     """Folder of the tables."""
     codec: Path | None = None
     """A run of `xew.model.train`, through whose codec the true videos go."""
-    codec_opener: str = "xew.model.runs.roundtrip:open_roundtrip"
+    codec_opener: str = OPENER
     """Function that opens it, as module:NAME: of the run's folder to a function of video to video, [t h w 3] uint8."""
     seeds: tuple[int, ...] = ()
     """Only episodes of these seeds; all others serve as another seed's."""
@@ -201,22 +201,6 @@ def find_another(episodes: Sequence[Episode], record: Record, differs: str) -> P
     own, others = getattr(record, differs), sorted(folders)
     following = others[(others.index(own) + 1) % len(others)]
     return None if following == own else folders[following]
-
-
-def open_codec(run: Path, opener: str) -> Callable[[np.ndarray], np.ndarray]:
-    """A function of video [t h w 3] uint8 to what a run's codec leaves of it.
-
-    The metrics do not know the model: the function that opens its runs is named, as anybody's can be.
-
-    Raises:
-        ConfigError: the run or the opener does not exist.
-    """
-    module, _, name = opener.partition(":")
-    try:
-        found: Callable[[Path], Callable[[np.ndarray], np.ndarray]] = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"cannot import the opener of codecs {opener!r}: {error}; expected module:NAME.") from error
-    return found(run)
 
 
 def true_grades(shown: Perturbation, truth: Truth) -> Grades:

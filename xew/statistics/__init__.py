@@ -23,7 +23,16 @@ from xew.statistics.bootstrap import (
     pool_trainings,
 )
 from xew.statistics.inference import LEVEL, SIGNIFICANCE, Drawn, holm
-from xew.statistics.verdicts import BETTER, UNRESOLVED, WORSE, noise_floor, verdict
+from xew.statistics.verdicts import (
+    BETTER,
+    UNRESOLVED,
+    WORSE,
+    describe_floors,
+    floor_sources,
+    largest_floor,
+    noise_floor,
+    verdict,
+)
 
 __all__ = [
     "BETTER",
@@ -39,11 +48,14 @@ __all__ = [
     "Units",
     "bootstrap_means",
     "combine",
+    "describe_floors",
     "draw_trainings",
     "draw_units",
     "every_draw",
     "find_strata",
+    "floor_sources",
     "holm",
+    "largest_floor",
     "noise_floor",
     "pool_trainings",
     "verdict",

@@ -23,8 +23,8 @@ from xew.dataset import find_accepted
 from xew.episode import read_video
 from xew.metrics import evaluate
 from xew.metrics.evaluate import Args, main
+from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.workers import Bench
-from xew.protocol import BASELINES
 from xew.rollout import write_rollout
 
 ROOT = Path(__file__).parents[3]

@@ -116,13 +116,13 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
     known = read_distances(distances) if distances else printed_distances(paper)
     strips = study_strips(scores, data, rollouts) if data and rollouts else {}
     axes, spreads = ({axis: known.of(axis, column) for axis in AXES} for column in ("value", "spread"))
-    grades = StudyGrades(scores.rows, scores.metrics, axes, known.measured, spreads)
+    grades = StudyGrades(scores.rows, scores.metrics, axes, known.measured, spreads, codecs=scores.codecs)
     printed = PaperGrades(paper, scores.metrics)
     planned = scores.attributes.get("study", {}).get("variants", {})
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
     note = trainings_note(grades)
     scored = [*build_tables(builder), *outside_tables(builder, scores.rows)]
-    tables = [replace(table, caption=" ".join(filter(None, (table.caption, note)))) for table in scored]
+    tables = [replace(table, caption=" ".join(filter(None, (table.caption, note, grades.floors)))) for table in scored]
     tables += [count_table(builder), *distance_tables(known)]
     if builder.has_results("loeo"):
         tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]

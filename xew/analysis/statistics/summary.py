@@ -10,7 +10,18 @@ import pandas as pd
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores
 from xew.protocol import BASELINES
 from xew.sim_warp.robots import ROBOTS
-from xew.statistics import MIN_SCENES, UNRESOLVED, Mean, Units, bootstrap_means, noise_floor, verdict
+from xew.statistics import (
+    MIN_SCENES,
+    UNRESOLVED,
+    Mean,
+    Units,
+    bootstrap_means,
+    describe_floors,
+    floor_sources,
+    largest_floor,
+    noise_floor,
+    verdict,
+)
 
 ROBOT_TITLES = {key: robot.title for key, robot in ROBOTS.items()}
 
@@ -38,7 +49,7 @@ class Row:
 
     @property
     def title(self) -> str:
-        return BASELINES.get(self.model) or (f"{self.model} · {self.condition}" if self.condition else self.model)
+        return " · ".join(filter(None, (BASELINES.get(self.model, self.model), self.condition)))
 
 
 @dataclass(frozen=True)
@@ -50,6 +61,8 @@ class RobotTable:
     rows: tuple[Row, ...]
     expected: int | None
     """Episodes that the protocol's data hold for a model; None where the data set was not given."""
+    floors: str = ""
+    """Sentence that says what the noise floors are of."""
 
     @property
     def counts(self) -> list[int]:
@@ -115,10 +128,12 @@ def robot_table(scores: Scores, title: str, robots: Sequence[str], expected: int
     by_model = {(str(model), str(condition)): group for (model, condition), group in groups}
     ends = [key for name in BASELINES for key in by_model if key[0] == name]
     order = [key for key in by_model if key[0] not in BASELINES] + ends
-    copy, truth = (next((by_model[key] for key in ends if key[0] == name), None) for name in (COPY, TRUTH))
     units = Units(scores.rows)
-    built = tuple(_row(key, by_model[key], copy, truth, scores.metrics, units) for key in order)
-    return RobotTable(title, tuple(robots), built, expected)
+    copy, truth = (by_model.get((name, "")) for name in (COPY, TRUTH))
+    truths = {key: [by_model[s] for s in floor_sources(key[0], scores.codecs) if s in by_model] for key in order}
+    built = tuple(_row(key, by_model[key], copy, truth, truths[key], scores.metrics, units) for key in order)
+    models = list(dict.fromkeys(model for model, _ in order if model not in BASELINES))
+    return RobotTable(title, tuple(robots), built, expected, describe_floors(models, scores.codecs))
 
 
 def _row(
@@ -126,18 +141,26 @@ def _row(
     group: pd.DataFrame,
     copy: pd.DataFrame | None,
     truth: pd.DataFrame | None,
+    truths: Sequence[pd.DataFrame],
     metrics: Sequence[MetricInfo],
     units: Units,
 ) -> Row:
+    """A row of a table; `truths` are the rows of the truth through its codec, `truth` those of the true video."""
     values = {metric.name: _by_episode(group, metric.name) for metric in metrics}
     verdicts = {}
     if copy is not None and key[0] not in BASELINES:
         for metric in metrics:
-            floor = _noise_floor(truth, metric, units)
+            floor = _pair_floor(truths, truth, metric, units)
             still = _by_episode(copy, metric.name)
             verdicts[metric.name] = verdict_on_copy(values[metric.name], still, metric.higher_is_better, floor, units)
     intervals = {name: mean_interval(series, units) for name, series in values.items() if len(series)}
     return Row(*key, intervals, verdicts)
+
+
+def _pair_floor(truths: Sequence[pd.DataFrame], truth: pd.DataFrame | None, metric: MetricInfo, units: Units) -> float:
+    """The floor of a difference of a model, whose codec's truth is in `truths`, from the frozen first frame."""
+    own = [rows for rows in truths if (rows["metric"] == metric.name).any()]
+    return largest_floor(_noise_floor(rows, metric, units) for rows in (*own, truth))
 
 
 def _noise_floor(truth: pd.DataFrame | None, metric: MetricInfo, units: Units) -> float:

@@ -93,7 +93,8 @@ class Reader:
         new, old = self.mean(part, after, robots, metric), self.mean(part, before, robots, metric)
         label = f"{SHORT_ROBOTS.get(robots, 'seen')} {PAPER_TITLES[metric]}"
         # Where a bound from above is asked for, smallness is the claim, and the floor does not speak against it.
-        doubt = self._doubt_of_few((new, old)) if below < np.inf else self._doubt((new, old), robots, metric)
+        rows = (part, after), (part, before)
+        doubt = self._doubt_of_few((new, old)) if below < np.inf else self._doubt((new, old), robots, metric, *rows)
         return Comparison(label, relative_gain(new, old, self.grades.metrics[metric]), above, below, doubt=doubt)
 
     def mean_of_seen(self, robot: str, metric: str) -> Mean | None:
@@ -116,7 +117,7 @@ class Reader:
             return self.worse_than_seen("fixed", "fixed", robot, metric)
         label = f"{SHORT_ROBOTS[robot]} {PAPER_TITLES[metric]}"
         unseen = self.mean("loeo", fold, robot, metric)
-        doubt = self._doubt((unseen, saw), robot, metric)
+        doubt = self._doubt((unseen, saw), robot, metric, ("loeo", fold))
         return Comparison(label, _loss(unseen, saw, self.grades, metric), above=0, doubt=doubt)
 
     def worse_than_seen(self, part: str, row: str, robot: str, metric: str, above: float = 0) -> Comparison:
@@ -130,10 +131,10 @@ class Reader:
         saw = [self.mean_of_seen(name, metric) for name in (robot, *SEEN_ROBOTS)]
         known = [mean for mean in saw if mean is not None]
         if len(known) < len(saw):
-            doubt = self._doubt((new, old), robot, metric) or OTHER_ROBOTS
+            doubt = self._doubt((new, old), robot, metric, (part, row)) or OTHER_ROBOTS
             return Comparison(label, _loss(new, old, self.grades, metric), above, doubt=doubt)
         expected = combine(lambda score, own, *others: score * own / _average(*others), old, *known)
-        doubt = self._doubt((new, expected), robot, metric)
+        doubt = self._doubt((new, expected), robot, metric, (part, row))
         return Comparison(label, _loss(new, expected, self.grades, metric), above, doubt=doubt)
 
     def share(self, start: Mean, after: Mean, end: Mean, metric: str) -> tuple[Mean, str]:
@@ -186,8 +187,8 @@ class Reader:
         few = any(mean.scenes is not None and mean.scenes < MIN_SCENES for mean in means)
         return f"fewer than {MIN_SCENES} scenes" if few else ""
 
-    def _doubt(self, means: tuple[Mean, Mean], robots: str, metric: str) -> str:
-        floor = self.grades.floor(robots, metric)
+    def _doubt(self, means: tuple[Mean, Mean], robots: str, metric: str, *rows: tuple[str, str]) -> str:
+        floor = self.grades.floor(robots, metric, *rows)
         inside = floor > 0 and abs(means[0].value - means[1].value) <= floor
         unknown = "no noise floor: the true video was not graded" if np.isnan(floor) else ""
         return self._doubt_of_few(means) or unknown or (f"inside the noise floor of {floor:.3g}" if inside else "")
