@@ -1,6 +1,7 @@
 """`evaluate` and `report` say the same of the same scores: means, intervals and verdicts, to the last digit."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,27 +10,37 @@ import pytest
 
 from tests.analysis.synthetic_study import paper_axes
 from xew.analysis.paper import read_paper
+from xew.analysis.report import run_table
 from xew.analysis.scores import COPY, TRUTH, Scores, read_scores
 from xew.analysis.statistics.grades import StudyGrades
-from xew.analysis.statistics.summary import robot_table
+from xew.analysis.statistics.summary import finding, flat_summary, robot_table
 from xew.analysis.tables.builder import Builder, paired_verdict
 from xew.metrics import METRICS
 from xew.metrics.grading.scores import describe
-from xew.metrics.grading.summary import Summary, summarize
-from xew.protocol import CODEC_TRUTH, ROBOT_NAMES, SEEN_ROBOTS, reference
+from xew.metrics.grading.summary import Summary, summarize, to_markdown
+from xew.protocol import CODEC_TRUTH, PASTED_RENDER, ROBOT_NAMES, SEEN_ROBOTS, reference
 
 ROBOTS = ("ur5_wsg", "piper")
 JOINTS, FLOW = (reference(action=action).name for action in ("joints", "optical_flow"))
 KEY = "codec 0123abcd"
 """Condition of the truth through the codec of the second model; the first has none."""
-BASE = {"psnr": 20.0, "ssim": 0.8, "mask_iou": 0.6, "keypoint_error": 6.0, "trajectory_error": 9.0}
-"""Mean score of the worse model by metric; the second and third are estimated with the others."""
+BASE = {
+    "psnr": 20.0,
+    "ssim": 0.8,
+    "mask_iou": 0.6,
+    "keypoint_error": 6.0,
+    "keypoint_error_strict": 8.0,
+    "trajectory_error": 9.0,
+}
+"""Mean score of the worse model by metric; all but the first two are estimated."""
+BESIDE = {"keypoint_error"}
+"""Metrics of the suite paper beside which one of the suite strict decides."""
 
 
 def write_scores(path: Path, scenes: int, truth: bool, spread: float, missing: float) -> Scores:
     """Two models and the baselines on scenes of four tasks; scores are rounded, so that some are tied."""
     rng = np.random.default_rng(scenes)
-    gains = {JOINTS: 0.0, FLOW: 0.08, COPY: -0.02} | ({TRUTH: 0.3, CODEC_TRUTH: 0.2} if truth else {})
+    gains = {JOINTS: 0.0, FLOW: 0.08, COPY: -0.02, PASTED_RENDER: 0.04} | ({TRUTH: 0.3, CODEC_TRUTH: 0.2} if truth else {})
     rows = [
         {
             "model": model,
@@ -90,15 +101,45 @@ def test_a_run_is_the_same_in_both(scores: Scores) -> None:
                 compared += 1
     assert compared == len(summary.means)
     for model in (JOINTS, FLOW):
-        found = dict(pairs_of(summary, model, COPY))
-        own = {
-            (robot, name): word
-            for robot, t in reported.items()
-            for r in t.rows
-            if r.model == model
-            for name, word in r.verdicts.items()
-        }
-        assert found == own and len(own) == len(ROBOTS) * len(BASE)
+        rows = {robot: next(row for row in table.rows if row.model == model) for robot, table in reported.items()}
+        for other, verdicts in ((COPY, "verdicts"), (PASTED_RENDER, "over_pasting")):
+            own = {(robot, name): word for robot, row in rows.items() for name, word in getattr(row, verdicts).items()}
+            assert dict(pairs_of(summary, model, other)) == own and len(own) == len(ROBOTS) * len(BASE)
+
+
+def test_which_suite_decides_and_where_they_part_is_the_same_in_both(tmp_path: Path) -> None:
+    """By the paper's metric the first model is worse than a frozen frame, and by that of the suite strict it is better."""
+    scores = write_scores(tmp_path / "scores.parquet", 12, True, 0.01, 0.0)
+    worse = (scores.rows["metric"] == "keypoint_error") & (scores.rows["model"] == JOINTS)
+    better = (scores.rows["metric"] == "keypoint_error_strict") & (scores.rows["model"] == JOINTS)
+    value = scores.rows["value"].where(~worse, 29.0).where(~better, 0.1)
+    rows = scores.rows.assign(value=value)
+    rows.attrs = scores.rows.attrs
+    summary = summarize(rows)
+    tables = [robot_table(replace(scores, rows=rows), robot, [robot], None) for robot in ROBOTS]
+    assert set(summary.pairs.loc[~summary.pairs["decides"], "metric"]) == BESIDE
+    flat = flat_summary(tables, scores.metrics)
+    assert set(flat.loc[~flat["decides"], "metric"]) == BESIDE
+    text = "The suites part on {} (better) and {} (worse); strict decides."
+    assert text.format("keypoint_error_strict", "keypoint_error") in to_markdown(replace(summary, pairs=two_models(summary)))
+    sentences = finding(tables, [], scores.metrics)
+    joints = [sentence for sentence in sentences if f": {JOINTS} " in sentence]
+    assert len(joints) == len(ROBOTS)
+    for sentence in joints:
+        assert sentence.endswith(text.format("Keypoint error, strict", "Keypoint error"))
+        decided = sentence[: sentence.index(" The suites part")]
+        assert "Keypoint error, strict" in decided and "Keypoint error" not in decided.replace("Keypoint error, strict", "")
+        assert "the pasted render" in decided
+    # A mark stands at the metric that decides.
+    (section,) = run_table(tables[0], scores.metrics).sections
+    row = next(row for row in section.rows if row.labels == (JOINTS,))
+    marks = dict(zip(tables[0].rows[0].scores, (cell.verdict for cell in row.cells), strict=True))
+    assert marks["keypoint_error_strict"] == "better" and marks["keypoint_error"] == ""
+
+
+def two_models(summary: Summary) -> pd.DataFrame:
+    """The pairs of the first model and the frozen frame, few enough to be printed."""
+    return summary.pairs[(summary.pairs["model"] == JOINTS) & (summary.pairs["other"] == COPY)]
 
 
 def test_a_study_is_the_same_in_both(scores: Scores) -> None:
@@ -119,6 +160,8 @@ def test_a_study_is_the_same_in_both(scores: Scores) -> None:
             for row, model in (("joints", JOINTS), ("optical_flow", FLOW)):
                 noise = means.loc[(robot, model, metric), "noise"]
                 assert grades.floor(robot, metric, ("actions", row)) == pytest.approx(noise, abs=0, nan_ok=True)
+            mark = builder.cell("actions", "joints", robot, metric, "optical_flow").verdict
+            assert mark == ("" if metric in BESIDE else found[robot, metric]), "the suite strict decides"
             words.add(found[robot, metric])
     if len(scores.rows["seed"].unique()) < 2:
         assert words == {"unresolved"}, "three scenes resolve nothing, in neither"

@@ -71,6 +71,10 @@ class MetricInfo:
     """Title in tables and charts; its name where the table gives none."""
     estimated: bool = False
     """Whether it needs an estimator, so that even the true video does not get the best score."""
+    suites: tuple[str, ...] = ()
+    """Suites that it belongs to; none in tables that were written before there were two."""
+    counterpart: str = ""
+    """Name of the metric of the suite paper in whose place it stands in the suite strict, and decides."""
     reported: bool = False
     """Whether a study's full tables show it beside the metrics of the paper."""
 

@@ -88,6 +88,8 @@ class Metric:
     """Function of the same inputs to the values that the metric is the mean of, and which of them count."""
     suites: tuple[str, ...] = tuple(SUITES)
     """Suites that it belongs to, keys of `SUITES`."""
+    counterpart: str = ""
+    """Name of the metric of the suite paper in whose place it stands in the suite strict, and decides."""
     points: str = "origins"
     """Points that a metric of tracks compares, one of `POINTS`."""
     by_image: bool = False

@@ -6,6 +6,7 @@ The package stands on the ground: it imports NumPy, SciPy and pandas, and nothin
     bootstrap.py   what is drawn (trainings, then scenes within tasks), how often, and the mean in every draw
     inference.py   intervals and p-values of what was drawn, Holm's correction for several tests
     verdicts.py    noise floors, and better, worse or unresolved
+    suites.py      which of two suites' metrics decides, and where they part
 """
 
 from xew.statistics.bootstrap import (
@@ -23,6 +24,7 @@ from xew.statistics.bootstrap import (
     pool_trainings,
 )
 from xew.statistics.inference import LEVEL, SIGNIFICANCE, Drawn, holm
+from xew.statistics.suites import describe_parting, find_parting, strict_metrics
 from xew.statistics.verdicts import (
     BETTER,
     UNRESOLVED,
@@ -49,14 +51,17 @@ __all__ = [
     "bootstrap_means",
     "combine",
     "describe_floors",
+    "describe_parting",
     "draw_trainings",
     "draw_units",
     "every_draw",
+    "find_parting",
     "find_strata",
     "floor_sources",
     "holm",
     "largest_floor",
     "noise_floor",
     "pool_trainings",
+    "strict_metrics",
     "verdict",
 ]

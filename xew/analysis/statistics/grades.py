@@ -67,6 +67,12 @@ class Grades(Protocol):
     def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
         """The mean paired difference of a row from another, over the cells that all rows of the part have."""
 
+    def against(self, part: str, row: str, baseline: str, robots: str, metric: str) -> tuple[Mean, Mean] | None:
+        """The means of a row and of a baseline, over the cells that all rows of the part and the baseline have.
+
+        None where one of both was not graded.
+        """
+
     def floor(self, robots: str, metric: str, *rows: tuple[str, str]) -> float:
         """The metric's noise floor on these robots for some rows, as (part, row); a difference that is no larger says nothing.
 
@@ -228,6 +234,17 @@ class StudyGrades:
         new, old = (self._scores(variant.name, pooled(variant, robots), metric) for variant in (after, before))
         return self._bootstrap(after.name, [np.where(shared, new - old, np.nan)])[0]
 
+    def against(self, part: str, row: str, baseline: str, robots: str, metric: str) -> tuple[Mean, Mean] | None:
+        variant = find_variant(part, row)
+        if not (self.has(variant.name) and self.has(baseline)):
+            return None
+        names = pooled(variant, robots)
+        scores = [self._scores(name, names, metric) for name in (variant.name, baseline)]
+        cells = self._shared(part, names, metric) & ~np.isnan(scores[1]).all(axis=0)
+        graded = zip((variant.name, baseline), scores, strict=True)
+        mean, other = (self._bootstrap(name, [np.where(cells, own, np.nan)])[0] for name, own in graded)
+        return None if mean is None or other is None else (mean, other)
+
     def floor(self, robots: str, metric: str, *rows: tuple[str, str]) -> float:
         info, names = self.metrics[metric], SPLITS["fixed"].train_robots if robots == SEEN else (robots,)
         truth = self.baseline(TRUTH, names, metric)
@@ -320,6 +337,9 @@ class PaperGrades:
     def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
         after, before = (self.mean(part, key, robots, metric) for key in (row, base))
         return None if after is None or before is None else combine(np.subtract, after, before)
+
+    def against(self, part: str, row: str, baseline: str, robots: str, metric: str) -> tuple[Mean, Mean] | None:
+        return None  # the paper prints no baseline
 
     def print(self, part: str, row: str, robots: str, metric: str) -> str:
         """A value with as many decimals as the paper prints; '' where it prints none."""

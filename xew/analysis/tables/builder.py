@@ -18,7 +18,7 @@ from xew.protocol import (
     expected_counts,
     reference,
 )
-from xew.statistics import Mean
+from xew.statistics import Mean, strict_metrics
 
 
 @dataclass(frozen=True)
@@ -65,12 +65,18 @@ class Builder:
             printed,
             text=format_number(mean.value, info),
             interval=format_interval(ends, info),
-            verdict=paired_verdict(self.ours, part, row, base, robots, metric) if base and base != row else "",
+            verdict=self._mark(part, row, base, robots, metric),
             value=mean.value,
             low=ends[0],
             high=ends[1],
             episodes=mean.count,
         )
+
+    def _mark(self, part: str, row: str, base: str, robots: str, metric: str) -> str:
+        """Verdict on the difference from the row `base`; none of a metric beside one of the suite strict, which decides."""
+        if not base or base == row or metric in strict_metrics(self.ours.metrics):
+            return ""
+        return paired_verdict(self.ours, part, row, base, robots, metric)
 
     def row(self, part: str, row: str, robots: str, metrics: Sequence[str], labels: Sequence[str], base: str = "") -> TableRow:
         """One cell for each metric."""

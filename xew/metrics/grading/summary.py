@@ -5,7 +5,7 @@ is of is graded softened, as any prediction is (`jobs.SOFTNESS`).
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, cast
@@ -25,9 +25,12 @@ from xew.statistics import (
     Units,
     bootstrap_means,
     describe_floors,
+    describe_parting,
+    find_parting,
     floor_sources,
     largest_floor,
     noise_floor,
+    strict_metrics,
     verdict,
 )
 
@@ -48,7 +51,8 @@ class Summary:
     means: pd.DataFrame
     """robot dimension metric unit model condition mean low high episodes truth noise versus_truth."""
     pairs: pd.DataFrame
-    """robot metric model condition other other_condition difference low high episodes noise verdict: model minus other."""
+    """robot metric model condition other other_condition difference low high episodes noise verdict decides: model minus other.
+    `decides` is False for a metric of the suite paper beside that of the suite strict which stands in its place."""
     unit: str
     """Unit that was resampled, a key of UNITS."""
     floors: str
@@ -65,10 +69,12 @@ def summarize(rows: pd.DataFrame, unit: str = "scene", robots_first: Sequence[st
         robots_first: robots that come before the others.
     """
     units, codecs = Units(rows, unit), cast(Codecs, rows.attrs.get("codecs", {}))
+    # Metrics of the suite paper that are shown beside those of the suite strict, as the report counts them.
+    beside = strict_metrics({name: METRICS[name] for name in rows.attrs.get("metrics", rows["metric"].unique())})
     means: list[dict[str, Any]] = []
     pairs: list[dict[str, Any]] = []
     for robot in sorted(rows["robot"].unique(), key=lambda robot: (robot not in robots_first, robot)):
-        found, compared = _summarize_robot(str(robot), _table(rows[rows["robot"] == robot]), units, codecs)
+        found, compared = _summarize_robot(str(robot), _table(rows[rows["robot"] == robot]), units, codecs, beside)
         means += found
         pairs += compared
     floors = describe_floors([model for model in rows["model"].unique() if model not in BASELINES], codecs)
@@ -78,7 +84,7 @@ def summarize(rows: pd.DataFrame, unit: str = "scene", robots_first: Sequence[st
 MEANS = ["robot", "dimension", "metric", "unit", "model", "condition", "mean", "low", "high", "episodes"]
 MEANS += ["truth", "noise", "versus_truth"]
 PAIRS = ["robot", "metric", "model", "condition", "other", "other_condition", "difference", "low", "high", "episodes"]
-PAIRS += ["noise", "verdict"]
+PAIRS += ["noise", "verdict", "decides"]
 
 
 def _table(rows: pd.DataFrame) -> pd.DataFrame:
@@ -114,13 +120,13 @@ def _find_floor(column: Column, means: Mapping[Column, Mean], codecs: Codecs) ->
 
 
 def _summarize_robot(
-    robot: str, table: pd.DataFrame, units: Units, codecs: Codecs
+    robot: str, table: pd.DataFrame, units: Units, codecs: Codecs, beside: Collection[str]
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Rows of the means and of the pairs of one robot."""
     means = dict(zip(_columns(table), _bootstrap(table.to_numpy(), table, units), strict=True))
     truths = {metric: means.get((metric, GROUND_TRUTH, "")) for metric, _, _ in means}
     floors = {column: _find_floor(column, means, codecs) for column in means}
-    pairs = _compare_pairs(robot, table, floors, units)
+    pairs = _compare_pairs(robot, table, floors, units, beside)
     verdicts = {(p["metric"], p["model"], p["condition"]): p["verdict"] for p in pairs if p["other"] == GROUND_TRUTH}
     rows = []
     for (metric, model, condition), mean in means.items():
@@ -132,7 +138,9 @@ def _summarize_robot(
     return rows, pairs
 
 
-def _compare_pairs(robot: str, table: pd.DataFrame, floors: dict[Column, float], units: Units) -> list[dict[str, Any]]:
+def _compare_pairs(
+    robot: str, table: pd.DataFrame, floors: dict[Column, float], units: Units, beside: Collection[str]
+) -> list[dict[str, Any]]:
     """Rows of the pairs of one robot: each model minus each that comes after it."""
     metrics = dict.fromkeys(metric for metric, _, _ in floors)
     columns = [pair for metric in metrics for pair in combinations([c for c in _columns(table) if c[0] == metric], 2)]
@@ -143,7 +151,8 @@ def _compare_pairs(robot: str, table: pd.DataFrame, floors: dict[Column, float],
     for (a, b), mean in zip(columns, _bootstrap(differences, table, units), strict=True):
         floor, ends = largest_floor((floors[a], floors[b])), mean.interval()
         found = verdict(mean.value, ends, floor, METRICS[a[0]].higher_is_better)
-        rows.append(dict(zip(PAIRS, (robot, *a, *b[1:], mean.value, *ends, mean.count, floor, found), strict=True)))
+        decides = a[0] not in beside
+        rows.append(dict(zip(PAIRS, (robot, *a, *b[1:], mean.value, *ends, mean.count, floor, found, decides), strict=True)))
     return rows
 
 
@@ -156,6 +165,7 @@ def to_markdown(summary: Summary, with_pairs: bool = True) -> str:
         f"Fewer than {MIN_SCENES} {summary.unit}s have no interval, and nothing is resolved by them.",
         "Noise: by how much the estimators miss the metric's best on the true video. ~ marks a mean that cannot be told from",
         "the true video's; a difference is unresolved where its interval holds 0 or it is no larger than the noise.",
+        "Metrics of the suite strict decide; verdicts of the paper's definitions beside them stand in parentheses.",
         *filter(None, [summary.floors]),
     ]
     for robot, means in summary.means.groupby("robot", sort=False):
@@ -203,7 +213,11 @@ def _pair_lines(pairs: pd.DataFrame) -> list[str]:
         row: Any
         for row in found.itertuples():
             interval = "" if math.isnan(row.low) else f" [{row.low:+.4g}, {row.high:+.4g}]"
-            lines.append(f"| {row.metric} | {row.difference:+.4g}{interval} | {row.verdict} |")
+            word = row.verdict if row.decides else f"({row.verdict})"
+            lines.append(f"| {row.metric} | {row.difference:+.4g}{interval} | {word} |")
+        verdicts = dict(zip(found["metric"], found["verdict"], strict=True))
+        if parting := find_parting(verdicts, {metric: METRICS[metric] for metric in verdicts}):
+            lines += ["", f"The suites part on {describe_parting(parting, verdicts)}; strict decides."]
     return lines
 
 
