@@ -40,7 +40,7 @@ BESIDE = {"keypoint_error"}
 def write_scores(path: Path, scenes: int, truth: bool, spread: float, missing: float) -> Scores:
     """Two models and the baselines on scenes of four tasks; scores are rounded, so that some are tied."""
     rng = np.random.default_rng(scenes)
-    gains = {JOINTS: 0.0, FLOW: 0.08, COPY: -0.02, PASTED_RENDER: 0.04} | ({TRUTH: 0.3, CODEC_TRUTH: 0.2} if truth else {})
+    gains = {JOINTS: 0.0, FLOW: 0.08, COPY: -0.02, PASTED_RENDER: 0.04} | ({TRUTH: 0.6, CODEC_TRUTH: 0.5} if truth else {})
     rows = [
         {
             "model": model,
@@ -135,6 +135,44 @@ def test_which_suite_decides_and_where_they_part_is_the_same_in_both(tmp_path: P
     row = next(row for row in section.rows if row.labels == (JOINTS,))
     marks = dict(zip(tables[0].rows[0].scores, (cell.verdict for cell in row.cells), strict=True))
     assert marks["keypoint_error_strict"] == "better" and marks["keypoint_error"] == ""
+
+
+def test_tasks_without_power_leave_the_means_of_the_suite_strict_in_both(tmp_path: Path) -> None:
+    """In one of four tasks the frozen first frame is hardly worse than the truth in one metric of each suite."""
+    scores = write_scores(tmp_path / "scores.parquet", 12, True, 0.01, 0.0)
+    at_rest = (scores.rows["task"] == "task2") & (scores.rows["model"] == COPY)
+    at_rest &= scores.rows["metric"].isin(["keypoint_error", "keypoint_error_strict"])
+    rows = scores.rows.assign(value=scores.rows["value"].where(~at_rest, 1.0))
+    rows.attrs = scores.rows.attrs
+    summary = summarize(rows)
+    power = summary.power.set_index(["metric", "task"])
+    assert set(power.index.get_level_values("metric")) == {"mask_iou", "keypoint_error_strict"}, "estimated, and strict"
+    assert not power.loc[("keypoint_error_strict", "task2"), "kept"] and power["kept"].sum() == 2 * 4 - 1
+    truth = rows[(rows["model"] == TRUTH) & (rows["metric"] == "keypoint_error_strict") & (rows["task"] == "task2")][
+        "value"
+    ].mean()
+    assert power.loc[("keypoint_error_strict", "task2"), "power"] == pytest.approx(1 / truth)
+    variants = rows["model"].where(rows["model"].isin([JOINTS, FLOW]), "")
+    grades = StudyGrades(rows.assign(variant=variants), scores.metrics, paper_axes(read_paper()), codecs=scores.codecs)
+    changed = replace(scores, rows=rows)
+    means = summary.means.set_index(["robot", "model", "metric"])
+    for robot in ROBOTS:
+        table = robot_table(changed, robot, [robot], None)
+        row = next(row for row in table.rows if row.model == JOINTS)
+        for metric, count in (("keypoint_error_strict", 9), ("keypoint_error", 12), ("psnr", 12)):
+            own = rows[(rows["robot"] == robot) & (rows["model"] == JOINTS) & (rows["metric"] == metric)]
+            own = own[own["task"] != "task2"] if count == 9 else own
+            study = grades.variant_mean(JOINTS, (robot,), metric)
+            found = means.loc[(robot, JOINTS, metric)]
+            assert study and study.count == found["episodes"] == row.scores[metric].count == len(own) == count
+            assert found["mean"] == row.scores[metric].mean == study.value == pytest.approx(own["value"].mean())
+            assert study.interval() == (row.scores[metric].low, row.scores[metric].high) == (found["low"], found["high"])
+        assert "leave the mean of Keypoint error, strict: task2." in table.notes
+        assert table.notes in run_table(table, scores.metrics).caption
+    assert "leave the mean of keypoint_error_strict: task2." in to_markdown(summary)
+    assert "leave the mean of Keypoint error, strict: task2." in grades.notes
+    alone = rows[rows["model"] != COPY]
+    assert summarize(alone).power.empty, "without the baseline nothing is known, and all tasks stay"
 
 
 def two_models(summary: Summary) -> pd.DataFrame:

@@ -234,7 +234,7 @@ def run_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> Table:
     return Table(
         "_".join(table.robots),
         table.title,
-        " ".join(filter(None, (f"{of[0].upper()}{of[1:]}.", table.floors))),
+        " ".join(filter(None, (f"{of[0].upper()}{of[1:]}.", table.notes))),
         ("model",),
         metric_columns({metric.name: metric for metric in shown}, [metric.name for metric in shown]),
         (TableSection("", tuple(rows), "" if table.complete else f"Incomplete: {of} are scored."),),

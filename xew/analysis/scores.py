@@ -19,6 +19,7 @@ from xew.config import IMPORT_PATH, ConfigError, parse
 from xew.files import demand_regular, replacing
 from xew.names import EpisodeError, check_label, check_name
 from xew.protocol import BASELINES, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES
+from xew.statistics import find_power
 
 VARIANT = "variant"
 TRAINING = "training"
@@ -81,6 +82,11 @@ class MetricInfo:
     def __post_init__(self) -> None:
         if not self.title:
             object.__setattr__(self, "title", EARLIER_TITLES.get(self.name, self.name))
+
+    @property
+    def leaves_tasks(self) -> bool:
+        """Do tasks without power leave its mean (`xew.statistics.find_power`)?"""
+        return self.estimated and "strict" in self.suites
 
     @property
     def best(self) -> float | None:
@@ -224,6 +230,11 @@ def write_scores(scores: Scores, path: Path) -> None:
                 frame.to_parquet(temporary, index=False)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error}. Free some space or choose another place.") from error
+
+
+def measure_power(rows: pd.DataFrame, metrics: Sequence[MetricInfo]) -> pd.DataFrame:
+    """The power of each task for each metric whose mean tasks may leave (`xew.statistics.find_power`)."""
+    return find_power(rows, {m.name: m.best for m in metrics if m.leaves_tasks and m.best is not None})
 
 
 def find_missing_scores(rows: pd.DataFrame) -> pd.DataFrame:

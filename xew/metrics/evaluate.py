@@ -3,7 +3,8 @@
 Reads  <rollouts>/<task>/<seed>/<robot>/ (xew.rollout) and the same folders of the data set
 Writes scores.parquet, one row per model, condition, task, seed, robot and metric; beside it
        scores.curves.parquet (the same by frame), scores.summary.md and .csv (means, intervals, noise), scores.pairs.csv
-       (differences between models), scores.bundle.json (what others need to check all this), scores.cells/ (to go on from);
+       (differences between models), scores.power.csv (which tasks tell a frozen frame from the truth), scores.bundle.json
+       (what others need to check all this), scores.cells/ (to go on from);
        <data>-baselines/, the baselines' scores, for every table on the same data
 
     python -m xew.metrics.evaluate demo/rollouts --data demo/data --out demo/scores.parquet
@@ -123,6 +124,7 @@ WRITTEN = {
     "summary.md": "means and differences between models",
     "summary.csv": "means, intervals, noise",
     "pairs.csv": "differences between models",
+    "power.csv": "which tasks tell the frozen first frame from the truth",
     "bundle.json": "for others to check",
 }
 """Files that are written beside each other, by the ending of the name, with what each holds."""
@@ -173,6 +175,7 @@ def _write_summary(args: Args, rows: pd.DataFrame) -> str:
     write_whole(path_beside(args.out, "summary.md"), to_markdown(summary).encode())
     write_whole(path_beside(args.out, "summary.csv"), csv_text(summary.means).encode())
     write_whole(path_beside(args.out, "pairs.csv"), csv_text(summary.pairs).encode())
+    write_whole(path_beside(args.out, "power.csv"), csv_text(summary.power).encode())
     written = "\n".join(f"{path_beside(args.out, ending)}  {what}" for ending, what in WRITTEN.items())
     return f"{to_markdown(summary, with_pairs=False)}\n{written}"
 

@@ -102,6 +102,11 @@ class Metric:
         """Does it need an estimator, so that even the true video does not get the best score?"""
         return self.inputs in ESTIMATED_INPUTS
 
+    @property
+    def leaves_tasks(self) -> bool:
+        """Do tasks without power leave its mean (`xew.statistics.find_power`)?"""
+        return self.estimated and "strict" in self.suites
+
 
 def check_first(check: Callable[..., None], **options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorate a metric with a check of its arguments, whose one-line message is what a user sees of a wrong array.

@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[3]
 ROBOTS = ("franka_panda", "piper")
 SEEDS = tuple(range(1_000_000, 1_000_003))
 METRICS = ("psnr", "mask_iou")
-WRITTEN = ("parquet", "curves.parquet", "summary.md", "summary.csv", "pairs.csv", "bundle.json")
+WRITTEN = ("parquet", "curves.parquet", "summary.md", "summary.csv", "pairs.csv", "power.csv", "bundle.json")
 EPISODES = len(SEEDS) * len(ROBOTS)
 CELLS = EPISODES * (1 + len(BASELINES))
 

@@ -127,7 +127,7 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
     note = trainings_note(grades)
     scored = [*build_tables(builder), *outside_tables(builder, scores.rows)]
-    tables = [replace(table, caption=" ".join(filter(None, (table.caption, note, grades.floors)))) for table in scored]
+    tables = [replace(table, caption=" ".join(filter(None, (table.caption, note, grades.notes)))) for table in scored]
     tables += [count_table(builder), *distance_tables(known)]
     if builder.has_results("loeo"):
         tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.paper import Paper
-from xew.analysis.scores import TRAINING, TRUTH, MetricInfo, name_graded
+from xew.analysis.scores import TRAINING, TRUTH, MetricInfo, measure_power, name_graded
 from xew.protocol import BASELINES, CODEC_TRUTH, MULTI_VIEW, PARTS, ROBOT_NAMES, SPLITS, Variant
 from xew.statistics import (
     DRAWS,
@@ -28,6 +28,8 @@ from xew.statistics import (
     bootstrap_means,
     combine,
     describe_floors,
+    describe_power,
+    find_powerless,
     find_strata,
     floor_sources,
     largest_floor,
@@ -159,6 +161,10 @@ class StudyGrades:
         named = named if TRAINING in named else named.assign(**{TRAINING: 0})
         columns = ["variant", "robot", "metric", TRAINING]
         self._cells = named.pivot(index=["task", "seed"], columns=columns, values="value").sort_index()
+        self.power = measure_power(rows, metrics)
+        tasks, names_of = self._cells.index.get_level_values("task"), self._cells.columns.get_level_values("metric")
+        for task, metric in find_powerless(self.power):
+            self._cells = self._cells.mask(np.outer(tasks == task, names_of == metric))
         self._strata = find_strata(self._cells.index.get_level_values("task").to_list())
         self._columns: dict[tuple[str, str, str, int], int] = {}
         trainings: dict[str, set[int]] = {}
@@ -181,9 +187,10 @@ class StudyGrades:
         return [name for name in self._trainings if name.partition(" ")[0] not in BASELINES]
 
     @property
-    def floors(self) -> str:
-        """Sentence that says what the noise floors of the variants are of."""
-        return describe_floors(self.variants, self._codecs)
+    def notes(self) -> str:
+        """Sentences that say what the noise floors of the variants are of, and which tasks left which means."""
+        titles = {name: info.title for name, info in self.metrics.items()}
+        return " ".join(filter(None, (describe_floors(self.variants, self._codecs), describe_power(self.power, titles))))
 
     @property
     def codec_truths(self) -> list[str]:

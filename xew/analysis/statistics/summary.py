@@ -7,7 +7,7 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores
+from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, measure_power
 from xew.protocol import BASELINES, PASTED_RENDER
 from xew.sim_warp.robots import ROBOTS
 from xew.statistics import (
@@ -18,6 +18,8 @@ from xew.statistics import (
     bootstrap_means,
     describe_floors,
     describe_parting,
+    describe_power,
+    drop_powerless,
     find_parting,
     floor_sources,
     largest_floor,
@@ -66,8 +68,8 @@ class RobotTable:
     rows: tuple[Row, ...]
     expected: int | None
     """Episodes that the protocol's data hold for a model; None where the data set was not given."""
-    floors: str = ""
-    """Sentence that says what the noise floors are of."""
+    notes: str = ""
+    """Sentences that say what the noise floors are of, and which tasks left which means."""
 
     @property
     def counts(self) -> list[int]:
@@ -128,7 +130,9 @@ def _bootstrap(scores: pd.Series, units: Units | None) -> Mean:
 
 def robot_table(scores: Scores, title: str, robots: Sequence[str], expected: int | None) -> RobotTable:
     """Rows for all models, then for the baselines."""
-    rows = scores.rows[scores.rows["robot"].isin(robots)]
+    power = measure_power(scores.rows, scores.metrics)
+    kept = drop_powerless(scores.rows, power)
+    rows = kept[kept["robot"].isin(robots)]
     groups = rows.groupby(["model", "condition"], sort=False)
     by_model = {(str(model), str(condition)): group for (model, condition), group in groups}
     ends = [key for name in BASELINES for key in by_model if key[0] == name]
@@ -138,7 +142,8 @@ def robot_table(scores: Scores, title: str, robots: Sequence[str], expected: int
     truths = {key: [by_model[s] for s in floor_sources(key[0], scores.codecs) if s in by_model] for key in order}
     built = tuple(_row(key, by_model[key], others, truth, truths[key], scores.metrics, units) for key in order)
     models = list(dict.fromkeys(model for model, _ in order if model not in BASELINES))
-    return RobotTable(title, tuple(robots), built, expected, describe_floors(models, scores.codecs))
+    notes = describe_floors(models, scores.codecs), describe_power(power, {m.name: m.title for m in scores.metrics})
+    return RobotTable(title, tuple(robots), built, expected, " ".join(filter(None, notes)))
 
 
 def _row(

@@ -26,7 +26,10 @@ from xew.statistics import (
     bootstrap_means,
     describe_floors,
     describe_parting,
+    describe_power,
+    drop_powerless,
     find_parting,
+    find_power,
     floor_sources,
     largest_floor,
     noise_floor,
@@ -57,6 +60,8 @@ class Summary:
     """Unit that was resampled, a key of UNITS."""
     floors: str
     """Sentence that says what the noise floors are of."""
+    power: pd.DataFrame
+    """Power of each task for each metric (`xew.statistics.find_power`); tasks without it are in no mean and no difference."""
 
 
 def summarize(rows: pd.DataFrame, unit: str = "scene", robots_first: Sequence[str] = ()) -> Summary:
@@ -68,17 +73,19 @@ def summarize(rows: pd.DataFrame, unit: str = "scene", robots_first: Sequence[st
         unit: what is resampled, a key of UNITS.
         robots_first: robots that come before the others.
     """
+    power = find_power(rows, {name: _best(name) for name in rows["metric"].unique() if METRICS[name].leaves_tasks})
     units, codecs = Units(rows, unit), cast(Codecs, rows.attrs.get("codecs", {}))
     # Metrics of the suite paper that are shown beside those of the suite strict, as the report counts them.
     beside = strict_metrics({name: METRICS[name] for name in rows.attrs.get("metrics", rows["metric"].unique())})
     means: list[dict[str, Any]] = []
     pairs: list[dict[str, Any]] = []
+    rows = drop_powerless(rows, power)
     for robot in sorted(rows["robot"].unique(), key=lambda robot: (robot not in robots_first, robot)):
         found, compared = _summarize_robot(str(robot), _table(rows[rows["robot"] == robot]), units, codecs, beside)
         means += found
         pairs += compared
     floors = describe_floors([model for model in rows["model"].unique() if model not in BASELINES], codecs)
-    return Summary(pd.DataFrame(means, columns=MEANS), pd.DataFrame(pairs, columns=PAIRS), unit, floors)
+    return Summary(pd.DataFrame(means, columns=MEANS), pd.DataFrame(pairs, columns=PAIRS), unit, floors, power)
 
 
 MEANS = ["robot", "dimension", "metric", "unit", "model", "condition", "mean", "low", "high", "episodes"]
@@ -166,7 +173,7 @@ def to_markdown(summary: Summary, with_pairs: bool = True) -> str:
         "Noise: by how much the estimators miss the metric's best on the true video. ~ marks a mean that cannot be told from",
         "the true video's; a difference is unresolved where its interval holds 0 or it is no larger than the noise.",
         "Metrics of the suite strict decide; verdicts of the paper's definitions beside them stand in parentheses.",
-        *filter(None, [summary.floors]),
+        *filter(None, [summary.floors, describe_power(summary.power, {})]),
     ]
     for robot, means in summary.means.groupby("robot", sort=False):
         lines += ["", f"## {robot}", "", *_mean_lines(means)]
