@@ -43,6 +43,11 @@ TEST_SEEDS_PER_TASK = 20
 
 TEST_SEED_START = 1_000_000
 """First test seed. Training seeds count up from 0 and never reach it."""
+VALIDATION_SEED_START = 800_000
+"""First validation seed. Validation seeds are of the training side, below TEST_SEED_START, and nothing is trained on them:
+samples while a model trains, logs, calibration and whatever is tuned read them. Test seeds are read for the results alone."""
+SEED_STARTS = {"train": 0, "validation": VALIDATION_SEED_START, "test": TEST_SEED_START}
+"""First seed of each family."""
 
 
 def body_key(number: int) -> str:
@@ -96,6 +101,13 @@ DISTANCE = Split(SEEN_ROBOTS, TRAINING_BODIES)
 """The distance protocol: one model of the three robots, tested on 64 bodies, error against distance."""
 VALIDATION = Split(SEEN_ROBOTS, VALIDATION_BODIES)
 """The fixed split's training robots, with the bodies by which choices are made in place of the held-out robots."""
+
+
+def validation_split(split: Split) -> Split:
+    """Robots by which choices about models of a split are made: its training robots, and bodies as those never seen."""
+    return Split(split.train_robots, VALIDATION_BODIES)
+
+
 SPLITS = (
     {"fixed": FIXED}
     | {f"loeo_{robot}": split for robot, split in LOEO.items()}
@@ -250,5 +262,5 @@ def split_counts(
 
 
 def seed_split(seed: int) -> str:
-    """The family that a scene seed belongs to, 'train' or 'test'."""
-    return "test" if seed >= TEST_SEED_START else "train"
+    """The family that a scene seed belongs to, a key of SEED_STARTS."""
+    return next(family for family, start in reversed(SEED_STARTS.items()) if seed >= start)

@@ -106,7 +106,7 @@ def test_run_folder_holds_what_a_rerun_needs(run: Path, experiment: Experiment) 
     assert sorted(path.name for path in (run / "checkpoints").iterdir() if path.is_dir()) == ["2", "4"]
     assert {path.name for path in (run / "checkpoints" / "4").iterdir()} >= {"params", "optimizer", "ema", "data"}
     assert list(run.glob("events.out.tfevents.*"))
-    assert lines(run, "sample/psnr/unseen/piper")
+    assert lines(run, "sample/psnr/seen/ur5_wsg") and not lines(run, "sample/psnr/unseen/piper")
 
 
 def test_existing_run_is_not_touched_unasked(world: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:

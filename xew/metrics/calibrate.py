@@ -37,6 +37,7 @@ from xew.metrics.calibration.perturbations import Perturbation, render_perturbat
 from xew.metrics.grade import Comparison, Grades, grade, input_kind
 from xew.metrics.grading.codecs import OPENER, open_codec
 from xew.metrics.truth import NEEDS, Truth, read_truth
+from xew.protocol import seed_split
 
 LATE = 8
 """Number of frames by which the true video is shifted, half a second."""
@@ -66,7 +67,8 @@ class Args:
     codec_opener: str = OPENER
     """Function that opens it, as module:NAME: of the run's folder to a function of video to video, [t h w 3] uint8."""
     seeds: tuple[int, ...] = ()
-    """Only episodes of these seeds; all others serve as another seed's."""
+    """Only episodes of these seeds; all others serve as another seed's. Left out: those of validation seeds, or where there are
+    none of training seeds; never of test seeds, since estimators are chosen and tuned by what comes out."""
     episodes: int = 0
     """At most so many, of as many robots and tasks as there are; 0: all."""
     masks: str = "default"
@@ -156,11 +158,19 @@ def calibrate(
 
 
 def choose(episodes: Sequence[Episode], args: Args) -> list[Episode]:
-    """Those to calibrate on. Raises ConfigError if the data does not hold a seed asked for."""
+    """Those to calibrate on. Raises ConfigError if the data does not hold a seed asked for, or test seeds alone and none is."""
+    if not args.seeds:
+        families = ([e for e in episodes if seed_split(e[1].seed) == family] for family in ("validation", "train"))
+        if not (chosen := next(filter(None, families), [])):
+            raise ConfigError(
+                f"{args.data} holds test seeds alone, by which nothing is tuned; make others: python -m xew.sim_warp.generate "
+                f"--out {args.data} --validation-seeds 4, or name seeds: --seeds."
+            )
+        return _take_turns(chosen)[: args.episodes or None]
     held = sorted({record.seed for _, record in episodes})
     if unknown := [seed for seed in args.seeds if seed not in held]:
         raise ConfigError(f"{args.data} holds no seed {unknown[0]}; it has {', '.join(map(str, held[:20]))}: --seeds.")
-    chosen = [episode for episode in episodes if not args.seeds or episode[1].seed in args.seeds]
+    chosen = [episode for episode in episodes if episode[1].seed in args.seeds]
     return _take_turns(chosen)[: args.episodes or None]
 
 
