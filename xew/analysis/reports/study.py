@@ -175,7 +175,7 @@ def _sentences(grades: Grades, distances: Distances, findings: Sequence[Finding]
     return [
         _answer_sentence(findings),
         *pasting_sentence(findings),
-        parting_sentence(findings, by_paper, bool(strict_metrics(grades.metrics))),
+        *parting_sentence(findings, by_paper, bool(strict_metrics(grades.metrics))),
         *asked,
     ]
 
@@ -199,23 +199,25 @@ def find_parting_claims(findings: Sequence[Finding], by_paper: Sequence[Finding]
     return [(ours, other) for ours, other in zip(findings, by_paper, strict=True) if ours.answer != other.answer]
 
 
-def parting_sentence(findings: Sequence[Finding], by_paper: Sequence[Finding], graded: bool) -> str:
-    """Sentence on the claims on which the suites part.
+def parting_sentence(findings: Sequence[Finding], by_paper: Sequence[Finding], graded: bool) -> Iterator[str]:
+    """Sentence on the claims on which the suites part; none where no claim could be asked.
 
     Args:
         findings: by the suite strict.
         by_paper: by the paper's definitions.
         graded: whether any metric of the suite strict was graded that stands in the place of one of the paper's.
     """
+    if all(finding.answer == UNMEASURED for finding in findings):
+        return
     if not graded:
-        return "The suite strict was not graded: all answers are by the paper's definitions."
+        yield "The suite strict was not graded: all answers are by the paper's definitions."
+        return
     parts = [
         f"{ours.claim.says.strip('… ').rstrip('.')} (strict: {ours.answer}, paper: {other.answer})"
         for ours, other in find_parting_claims(findings, by_paper)
     ]
-    if not parts:
-        return "The suite strict decides these answers; the paper's definitions give the same to every claim."
-    return f"The suite strict decides these answers. By the paper's definitions others would be: {'; '.join(parts)}."
+    others = f"By the paper's definitions others would be: {'; '.join(parts)}." if parts else ""
+    yield f"The suite strict decides these answers. {others or 'By the definitions of the paper each claim has the same.'}"
 
 
 def _answer_sentence(findings: Sequence[Finding]) -> str:
