@@ -9,7 +9,7 @@ import pytest
 
 from tests.analysis.synthetic_study import TASKS, attributes, paper_axes, write_study
 from xew.analysis.paper import read_paper
-from xew.analysis.reports.study import find_parting_claims, parting_sentence
+from xew.analysis.reports.study import find_parting_claims, parting_sentence, pasting_sentence
 from xew.analysis.scores import MetricInfo, Scores, read_scores
 from xew.analysis.statistics.grades import PaperGrades, StudyGrades
 from xew.analysis.statistics.suites import StrictGrades
@@ -265,6 +265,9 @@ def test_a_claim_about_a_rung_says_whether_it_beats_pasting(scores: Scores) -> N
     assert max(p) <= 0.05 and p == pytest.approx(holm([value / 2 for value in p])), "both are one family of two"
     assert ask_one(add_pasting(scores.rows, 2.0), "gap", scores.metrics).pasting == ""
     assert {f.pasting for f in ask(PaperGrades(read_paper(), scores.metrics))} == {"", "pasting was not graded"}
+    told = [next(pasting_sentence([found[name]])) for name in ("worse", "better", "none")]
+    assert "in 1 all models that it speaks for beat the pasted render" in told[0] and "in 1 one is worse" in told[1]
+    assert "it was not graded" in told[2] and not list(pasting_sentence([]))
     frame = findings_frame([found["better"]], "here")
     assert set(frame["pasting"]) == {"does not beat pasting"} and frame["comparison"].str.startswith("over pasting").sum() == 2
 
