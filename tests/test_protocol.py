@@ -15,20 +15,25 @@ from xew.protocol import (
     PARTS,
     ROBOT_NAMES,
     SCALING,
+    SEED_STARTS,
     SEEN_ROBOTS,
     SHOTS,
     SPLITS,
     TASK_COUNT,
+    TEST_SEED_START,
     TRAINING_BODIES,
     UNSEEN_BODIES,
     VALIDATION,
     VALIDATION_BODIES,
+    VALIDATION_SEED_START,
     VARIANTS,
     Variant,
     expected_counts,
     reference,
+    seed_split,
     split_counts,
     training_counts,
+    validation_split,
 )
 from xew.sim_warp.robots.procedural.bodies import read_catalog
 from xew.sim_warp.tasks import TASKS
@@ -105,6 +110,16 @@ def test_splits_with_bodies_count_what_they_should() -> None:
     assert split_counts(FIXED) == (3750, 1000)
     assert split_counts(DISTANCE) == (3750, 64 * 500) and split_counts(VALIDATION, tasks=2, test_seeds=1)[1] == 16
     assert split_counts(SCALING["scaling_bodies_16"], tasks=6, train_seeds=10)[0] == 960
+
+
+def test_validation_is_of_the_training_side_and_of_robots_that_train() -> None:
+    for family, start in SEED_STARTS.items():
+        assert seed_split(start) == seed_split(start + 99_999) == family
+    assert 0 < VALIDATION_SEED_START < TEST_SEED_START
+    for split in SPLITS.values():
+        validation = validation_split(split)
+        assert validation.train_robots == split.train_robots and validation.held_out_robots == VALIDATION_BODIES
+    assert validation_split(FIXED) == VALIDATION
 
 
 def test_no_body_has_two_roles() -> None:

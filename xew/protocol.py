@@ -43,6 +43,11 @@ TEST_SEEDS_PER_TASK = 20
 
 TEST_SEED_START = 1_000_000
 """First test seed. Training seeds count up from 0 and never reach it."""
+VALIDATION_SEED_START = 800_000
+"""First validation seed. Validation seeds are of the training side, below TEST_SEED_START, and nothing is trained on them:
+samples while a model trains, logs, calibration and whatever is tuned read them. Test seeds are read for the results alone."""
+SEED_STARTS = {"train": 0, "validation": VALIDATION_SEED_START, "test": TEST_SEED_START}
+"""First seed of each family."""
 
 
 def body_key(number: int) -> str:
@@ -96,6 +101,13 @@ DISTANCE = Split(SEEN_ROBOTS, TRAINING_BODIES)
 """The distance protocol: one model of the three robots, tested on 64 bodies, error against distance."""
 VALIDATION = Split(SEEN_ROBOTS, VALIDATION_BODIES)
 """The fixed split's training robots, with the bodies by which choices are made in place of the held-out robots."""
+
+
+def validation_split(split: Split) -> Split:
+    """Robots by which choices about models of a split are made: its training robots, and bodies as those never seen."""
+    return Split(split.train_robots, VALIDATION_BODIES)
+
+
 SPLITS = (
     {"fixed": FIXED}
     | {f"loeo_{robot}": split for robot, split in LOEO.items()}
@@ -108,16 +120,19 @@ SHOTS = (1, 2, 3)
 """Numbers of training episodes of each task that a model is adapted with (M); they are of the first accepted seeds."""
 FORGETTING_ROBOT = "ur5_wsg"
 """Robot whose test episodes measure forgetting, the same for every adapted model."""
-COPY_FIRST_FRAME, PASTED_RENDER, OTHER_ROBOT, GROUND_TRUTH = "copy_first_frame", "pasted_render", "other_robot", "ground_truth"
+COPY_FIRST_FRAME, PASTED_RENDER, OTHER_ROBOT = "copy_first_frame", "pasted_render", "other_robot"
+CODEC_TRUTH, GROUND_TRUTH = "codec_truth", "ground_truth"
 BASELINES = {
     COPY_FIRST_FRAME: "frozen first frame",
     PASTED_RENDER: "pasted render",
     OTHER_ROBOT: "another robot's episode",
+    CODEC_TRUTH: "truth through the codec",
     GROUND_TRUTH: "ground truth",
 }
 """Titles of the predictions that no model made, by name; they have the empty variant in a score table. The frozen first frame;
 the first frame with the robot's render pasted in, which is as good as one can be without learning; the true episode of
-another robot; and the true video, whose score shows the estimators' own error."""
+another robot; the true video through a model's codec, of which the condition says which; and the true video. The scores of the
+last two show the estimators' own error."""
 
 
 @dataclass(frozen=True)
@@ -247,5 +262,5 @@ def split_counts(
 
 
 def seed_split(seed: int) -> str:
-    """The family that a scene seed belongs to, 'train' or 'test'."""
-    return "test" if seed >= TEST_SEED_START else "train"
+    """The family that a scene seed belongs to, a key of SEED_STARTS."""
+    return next(family for family, start in reversed(SEED_STARTS.items()) if seed >= start)

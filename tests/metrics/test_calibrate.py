@@ -13,7 +13,7 @@ from tests.sim_warp.small import TASK
 from tests.synthetic import write_synthetic_data
 from xew.config import ConfigError
 from xew.dataset import find_accepted
-from xew.episode import read_record, read_states, read_video
+from xew.episode import Record, read_record, read_states, read_video
 from xew.metrics import METRICS
 from xew.metrics.calibrate import (
     ESTIMATED,
@@ -188,6 +188,17 @@ def test_a_seed_that_there_is_not_is_said(data: Path) -> None:
         choose(find_accepted(data), Args(data=data, seeds=(7,)))
     first = choose(find_accepted(data), Args(data=data, episodes=2))
     assert {(record.seed, record.robot) for _, record in first} == {(0, "franka_panda"), (1, "piper")}
+
+
+def test_calibration_reads_validation_seeds_and_no_test_seed_unless_it_is_named() -> None:
+    def chosen(*seeds: int, **named: tuple[int, ...]) -> set[int]:
+        episodes = [(Path(str(seed)), Record("lift_pot", seed, "piper", True)) for seed in seeds]
+        return {record.seed for _, record in choose(episodes, Args(**named))}
+
+    assert chosen(0, 800_000, 1_000_000) == {800_000} and chosen(0, 1_000_000) == {0}
+    assert chosen(0, 1_000_000, seeds=(1_000_000,)) == {1_000_000}
+    with pytest.raises(ConfigError, match=r"test seeds alone.*--validation-seeds 4"):
+        chosen(1_000_000)
 
 
 def test_the_command_loads_neither_simulation_nor_model() -> None:

@@ -20,11 +20,14 @@ from xew.metrics.estimators.contact import predicted_contact, touching_distance
 from xew.metrics.evaluate import Args, main
 from xew.metrics.grade import Comparison
 from xew.metrics.grade import grade as grade_one
+from xew.metrics.grading.baselines import BASELINES
+from xew.metrics.grading.summary import summarize
 from xew.metrics.track import failure_distance
 from xew.metrics.truth import Truth, _find_visible, read_truth
 from xew.projection import project
-from xew.protocol import BASELINES, OTHER_ROBOT
+from xew.protocol import CODEC_TRUTH, OTHER_ROBOT
 from xew.rollout import write_rollout
+from xew.statistics import describe_floors
 
 TASK, SEED, ROBOTS = "place_empty_cup", 1_000_000, ("franka_panda", "piper")
 FRAMES, ASKED = 9, 7
@@ -108,6 +111,42 @@ def test_points_on_surfaces_are_kept_beside_the_data(rollouts: Path, data: Path,
     monkeypatch.setattr("xew.metrics.evaluate.read_truth", read)
     grade(rollouts, data, metrics=("psnr",))
     assert folders == [data.with_name(f"{data.name}-surfaces")] * len(ROBOTS)
+
+
+class Halved:
+    """A codec for tests, which leaves every second pixel; the folder of its run has the name of the model."""
+
+    def __init__(self, run: Path) -> None:
+        self.model, self.digest = run.name, "halved"
+
+    def __call__(self, video: np.ndarray) -> np.ndarray:
+        return video[:, ::2, ::2].repeat(2, axis=1).repeat(2, axis=2)
+
+
+def test_the_floor_of_a_model_is_the_truth_through_its_codec(
+    rollouts: Path, data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    codec = {"codec_opener": f"{__name__}:Halved", "metrics": ("psnr", "mask_iou"), "baselines": True}
+    scores = grade(rollouts, data, codec=(Path("runs/late"),), **codec)
+    through = scores[scores["model"] == CODEC_TRUTH]
+    (key,) = set(through["condition"])
+    assert scores.attrs["codecs"] == {"late": [key]} and len(through) == 2 * len(ROBOTS)
+    for robot in ROBOTS:
+        target, mask = truth(data, robot)[:ASKED], read_states(episode_folder(data, TASK, SEED, robot)).robot_mask[:ASKED]
+        expected = float(np.mean(mask_iou(estimate_masks(Halved(Path("late"))(target), target, mask), mask)[1:]))
+        assert value(scores, CODEC_TRUTH, robot, "mask_iou") == pytest.approx(expected, rel=1e-5)
+    summary = summarize(scores)
+    means = summary.means.set_index(["robot", "model", "metric"])
+    for robot in ROBOTS:
+        through_codec, softened = (means.loc[(robot, model, "mask_iou"), "mean"] for model in (CODEC_TRUTH, "ground_truth"))
+        assert means.loc[(robot, "late", "mask_iou"), "noise"] == pytest.approx(1 - through_codec) != 1 - softened
+        assert means.loc[(robot, "ground_truth", "mask_iou"), "noise"] == pytest.approx(1 - softened)
+        assert means.loc[(robot, "late", "psnr"), "noise"] == 0
+    assert key in summary.floors and summary.floors in (rollouts.parent / "scores.summary.md").read_text()
+    assert "softened" in describe_floors(["late"], {})
+    with pytest.raises(SystemExit):
+        grade(rollouts, data, codec=(Path("runs/early"),), **codec)
+    assert "of 'early', of which no rollout is graded; graded are late" in capsys.readouterr().err
 
 
 def test_all_four_dimensions_with_baselines_by_default(rollouts: Path, data: Path) -> None:

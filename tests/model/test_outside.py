@@ -1,14 +1,16 @@
 """Models from outside: what they are told, how their rollouts are written and resumed, and what a wrong one is told."""
 
+import pickle
 import shutil
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests import synthetic
+from xew.config import ConfigError
 from xew.dataset import find_records
 from xew.episode import read_video
 from xew.model import outside
@@ -81,15 +83,32 @@ def test_a_model_is_told_commands_only(data: Path) -> None:
     assert not {"joint_pos", "object_pose", "states", "contact"} & set(dir(inputs))
 
 
-def test_masks_and_flow_are_rendered_from_the_commands(data: Path) -> None:
+def test_masks_and_flow_are_rendered_for_models_that_ask(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from xew.sim_warp.geometry.camera import HEAD_CAMERA
 
-    folder, record = next((f, r) for f, r in find_records(data) if r.robot == "arx_x5")
-    told = read_inputs((folder, record), max_frames=2)
-    real = replace(told.command, intrinsics=HEAD_CAMERA.intrinsics, extrinsics=HEAD_CAMERA.extrinsics)
-    inputs = replace(told, command=real)
+    episode = next((f, r) for f, r in find_records(data) if r.robot == "arx_x5")
+    camera = {"intrinsics": HEAD_CAMERA.intrinsics, "extrinsics": HEAD_CAMERA.extrinsics}
+    told = outside.episode_command(*episode)
+    monkeypatch.setattr(outside, "episode_command", lambda *_: replace(told, action=told.action[:2], **camera))
+    inputs = read_inputs(episode, max_frames=2, streams=True)
     assert inputs.robot_mask.shape == (2, 240, 320) and inputs.robot_mask.dtype == bool and inputs.robot_mask.any()
     assert inputs.optical_flow.shape == (2, 240, 320, 2)
+    with pytest.raises(ConfigError, match="needs_streams = True"):
+        _ = read_inputs(episode, max_frames=2).optical_flow
+
+
+def test_nothing_that_a_model_is_given_leads_to_the_truth(data: Path) -> None:
+    """No path, and no view: a frame of a video that is held leads to all its frames."""
+    for folder, record in find_records(data):
+        inputs = read_inputs((folder, record))
+        for field in fields(inputs):
+            given = getattr(inputs, field.name)
+            assert isinstance(given, (np.ndarray, str, int, float, type(None))), field.name
+            assert not isinstance(given, np.ndarray) or given.base is None, field.name
+        written = pickle.dumps(inputs)
+        assert str(data).encode() not in written and folder.name.encode() in written
+        later = truth(data, inputs)[1:]
+        assert all(frame.tobytes() not in written for frame in later)
 
 
 def test_rollouts_resume_in_the_models_own_size(data: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import shutil
 import signal
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from xew.model.cache.clips import clip_starts
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.log import RunLog
+from xew.model.runs.roundtrip import open_roundtrip
 from xew.model.training.data import ClipSource, fake_batch, make_dataset
 from xew.protocol import SEEN_ROBOTS
 from xew.rollout import find_rollouts, read_rollout_video
@@ -104,7 +106,7 @@ def test_run_folder_holds_what_a_rerun_needs(run: Path, experiment: Experiment) 
     assert sorted(path.name for path in (run / "checkpoints").iterdir() if path.is_dir()) == ["2", "4"]
     assert {path.name for path in (run / "checkpoints" / "4").iterdir()} >= {"params", "optimizer", "ema", "data"}
     assert list(run.glob("events.out.tfevents.*"))
-    assert lines(run, "sample/psnr/unseen/piper")
+    assert lines(run, "sample/psnr/seen/ur5_wsg") and not lines(run, "sample/psnr/unseen/piper")
 
 
 def test_existing_run_is_not_touched_unasked(world: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -211,6 +213,14 @@ def test_rollouts_cover_the_test_episodes(run: Path, world: Path) -> None:
         assert read_rollout_video(made).shape == (FRAMES, HEIGHT, WIDTH, 3)
         assert made.header["source_hash"] == tested[key].hashes["rgb"]
         assert made.condition == "joints+robot_render"
+    codec = open_roundtrip(run)  # whose truth is the floor of these rollouts' scores
+    assert {made.model for made in found.values()} == {codec.model}
+    true = read_video(world / "data" / "/".join(next(iter(found.values())).folder.parts[-3:]) / "rgb.mkv")
+    left = codec(true)
+    error, inverse = (np.abs(left.astype(int) - video).mean() for video in (true, 255 - true))
+    assert left.shape == true.shape and 0 < error < inverse / 2
+    smaller = replace(codec, experiment=replace(codec.experiment, clip=replace(codec.experiment.clip, height=32, width=40)))
+    assert smaller.digest != codec.digest
 
 
 def test_rollouts_resume_and_do_not_depend_on_the_batch(run: Path, world: Path, tmp_path: Path) -> None:

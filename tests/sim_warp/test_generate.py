@@ -15,7 +15,7 @@ from tests.sim_warp.small import SLOW, TASK, WITH_SLOW
 from xew.config import ConfigError
 from xew.dataset import find_accepted, find_records
 from xew.episode import EpisodeError, Record, episode_folder, verify_episode, write_episode
-from xew.protocol import TEST_SEED_START
+from xew.protocol import TEST_SEED_START, VALIDATION_SEED_START, seed_split
 from xew.sim_warp import generate as command
 from xew.sim_warp.devices.workers import Workers
 from xew.sim_warp.generate import (
@@ -234,6 +234,14 @@ def test_as_many_seeds_are_tried_as_could_be_accepted() -> None:
     assert family(0).next_jobs() == []
     tried = family(2, outcome(10, "a", pictures=False), outcome(10, "b", success=False), outcome(11, "a"), outcome(11, "b"))
     assert tried.accepted == 1 and tried.next_jobs() == [Job("task", 12, ("a", "b"))]
+
+
+def test_validation_seeds_are_a_family_of_their_own_that_is_made_when_asked_for() -> None:
+    args = Args(tasks=("grab_roller",), robots=("a", "b"), train_seeds=2, test_seeds=1, validation_seeds=3)
+    families = plan_families(args, ("a", "b"), Manifest())
+    assert [(f.first_seed, f.wanted) for f in families] == [(0, 2), (VALIDATION_SEED_START, 3), (TEST_SEED_START, 1)]
+    assert {seed_split(seed) for seed in families[1].tries} == {"validation"}
+    assert len(plan_families(replace(args, validation_seeds=0), ("a", "b"), Manifest())) == 2
 
 
 def test_unpaired_robots_share_no_seed(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from xew.config import IMPORT_PATH, ConfigError, parse
 from xew.files import demand_regular, replacing
 from xew.names import EpisodeError, check_label, check_name
 from xew.protocol import BASELINES, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES
+from xew.statistics import find_power
 
 VARIANT = "variant"
 TRAINING = "training"
@@ -71,12 +72,21 @@ class MetricInfo:
     """Title in tables and charts; its name where the table gives none."""
     estimated: bool = False
     """Whether it needs an estimator, so that even the true video does not get the best score."""
+    suites: tuple[str, ...] = ()
+    """Suites that it belongs to; none in tables that were written before there were two."""
+    counterpart: str = ""
+    """Name of the metric of the suite paper in whose place it stands in the suite strict, and decides."""
     reported: bool = False
     """Whether a study's full tables show it beside the metrics of the paper."""
 
     def __post_init__(self) -> None:
         if not self.title:
             object.__setattr__(self, "title", EARLIER_TITLES.get(self.name, self.name))
+
+    @property
+    def leaves_tasks(self) -> bool:
+        """Do tasks without power leave its mean (`xew.statistics.find_power`)?"""
+        return self.estimated and "strict" in self.suites
 
     @property
     def best(self) -> float | None:
@@ -108,6 +118,11 @@ class Scores:
     def frame_zero(self) -> str:
         """Treatment of frame 0: given (and not scored), absent from the videos, or predicted."""
         return self.attributes.get("frame_zero", "given")
+
+    @property
+    def codecs(self) -> dict[str, list[str]]:
+        """By model (of a study by variant): conditions of the truth through its codec, of which its noise floor is."""
+        return dict(self.attributes.get("codecs", {}))
 
     @property
     def measured_by(self) -> dict[str, str]:
@@ -189,6 +204,8 @@ def merge_scores(tables: Sequence[tuple[str, Path]], own_robots: Sequence[str] =
         attributes.append((path, scores.attributes))
         metrics = metrics or scores.metrics
     common = _merge_attributes(attributes)
+    if codecs := _merge_codecs([variant for variant, _ in tables], [attributes for _, attributes in attributes]):
+        common["codecs"] = codecs
     merged = pd.concat(rows, ignore_index=True)
     wrong = _find_wrong_rows(merged, metrics, set(merged["robot"]))
     if wrong:
@@ -213,6 +230,11 @@ def write_scores(scores: Scores, path: Path) -> None:
                 frame.to_parquet(temporary, index=False)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error}. Free some space or choose another place.") from error
+
+
+def measure_power(rows: pd.DataFrame, metrics: Sequence[MetricInfo]) -> pd.DataFrame:
+    """The power of each task for each metric whose mean tasks may leave (`xew.statistics.find_power`)."""
+    return find_power(rows, {m.name: m.best for m in metrics if m.leaves_tasks and m.best is not None})
 
 
 def find_missing_scores(rows: pd.DataFrame) -> pd.DataFrame:
@@ -293,6 +315,7 @@ class _Attributes:
     allowed: tuple[str, ...] = ()
     robots: tuple[str, ...] = ()
     study: dict[str, Any] = field(default_factory=dict)
+    codecs: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def _check_attributes(path: Path, attributes: Mapping[Hashable, Any]) -> None:
@@ -318,7 +341,7 @@ def _have_same_metrics(one: Mapping[str, Mapping[str, Any]], other: Mapping[str,
 def _find_wrong_rows(rows: pd.DataFrame, metrics: Sequence[MetricInfo], robots: set[str]) -> dict[str, pd.DataFrame]:
     """Rows that cannot be averaged over, by what is wrong with them."""
     # Of a variant, model and condition are no more than names; two of them would be two scores of one cell.
-    named = rows.assign(**{VARIANT: rows[VARIANT].where(rows[VARIANT] != "", rows["model"])}) if VARIANT in rows else rows
+    named = rows.assign(**{VARIANT: name_graded(rows)}) if VARIANT in rows else rows
     key = [*([VARIANT, *EPISODE] if VARIANT in rows else KEY), "metric", *([TRAINING] if TRAINING in rows else [])]
     value = pd.to_numeric(rows["value"], errors="coerce")
     low = rows["metric"].map({metric.name: -np.inf if metric.low is None else metric.low for metric in metrics})
@@ -356,6 +379,23 @@ def _merge_attributes(tables: Sequence[tuple[Path, Mapping[Hashable, Any]]]) -> 
     robots = sorted({robot for _, attributes in tables for robot in attributes.get("robots", ())})
     merged = {**first, "versions": {name: ", ".join(sorted(versions)) for name, versions in used.items()}}
     return merged | ({"robots": robots} if robots else {})
+
+
+def _merge_codecs(variants: Sequence[str], tables: Sequence[Mapping[Hashable, Any]]) -> dict[str, list[str]]:
+    """The attribute `codecs` by variant, of tables by model."""
+    found: dict[str, list[str]] = {}
+    for variant, attributes in zip(variants, tables, strict=True):
+        keys = [key for own in attributes.get("codecs", {}).values() for key in own]
+        if keys:
+            found[variant] = list(dict.fromkeys([*found.get(variant, []), *keys]))
+    return found
+
+
+def name_graded(rows: pd.DataFrame) -> pd.Series:
+    """The name of what each row of a study's table grades: its variant; of a baseline its model, and its condition if any."""
+    condition = rows["condition"] if "condition" in rows else pd.Series("", rows.index)
+    baseline = rows["model"].where((condition == "") | ~rows["model"].isin(BASELINES), rows["model"] + " " + condition)
+    return rows["variant"].where(rows["variant"] != "", baseline)
 
 
 def _drop_known_baselines(rows: pd.DataFrame, graded: set[tuple[object, ...]]) -> pd.DataFrame:

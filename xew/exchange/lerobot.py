@@ -66,7 +66,7 @@ class Args:
     """Robots to export; default: all in the data."""
     tasks: tuple[str, ...] = ()
     """Tasks to export; default: all in the data."""
-    split: Literal["train", "test"] | None = None
+    split: Literal["train", "validation", "test"] | None = None
     """Training seeds or test seeds; default: both. Export the training seeds if you train on the set and grade on our test
     seeds."""
     robot_video: bool = False

@@ -64,14 +64,14 @@ METRICS = {
     "robot_lpips": Metric(
         robot_lpips, robot_lpips_frames, "morphology", "", (0, INF), False, "robot",
         "LPIPS's maps weighted by the share of the robot in each receptive field", "Robot LPIPS",
-        parts=robot_lpips_parts, suites=STRICT),
+        parts=robot_lpips_parts, suites=STRICT, counterpart="region_lpips"),
     "pck": Metric(
         pck, None, "kinematics", "", (0, 1), True, "track", "share within 0.1 of the keypoints' box diagonal",
         "PCK", parts=hits, suites=PAPER),
     "pck_strict": Metric(
         pck_strict, None, "kinematics", "", (0, 1), True, "track",
         "TAP-Vid's position accuracy: share within 1 to 16 px of 256, lost points are misses",
-        "PCK, strict", parts=strict_hits, suites=STRICT, points="surfaces", by_image=True),
+        "PCK, strict", parts=strict_hits, suites=STRICT, counterpart="pck", points="surfaces", by_image=True),
     "pck_05": Metric(
         pck_05, None, "kinematics", "", (0, 1), True, "track", "share within 0.05 of that diagonal",
         "PCK at 0.05", reported=False, parts=functools.partial(hits, alpha=0.05), suites=PAPER),
@@ -81,33 +81,35 @@ METRICS = {
     "keypoint_error_strict": Metric(
         keypoint_error_strict, None, "kinematics", "px", (0, INF), False, "track",
         "mean distance of robot points; lost ones have 50 px of 256, PointOdyssey's failure",
-        "Keypoint error, strict", parts=strict_distances, suites=STRICT, points="surfaces", by_image=True),
+        "Keypoint error, strict", parts=strict_distances, suites=STRICT, counterpart="keypoint_error",
+        points="surfaces", by_image=True),
     "ndtw": Metric(
         ndtw, None, "kinematics", "", (0, INF), False, "track", "time warping / (lengths x mean box diagonal)",
         "nDTW", whole=True, parts=warpings, suites=PAPER),
     "ndtw_strict": Metric(
         ndtw_strict, None, "kinematics", "", (0, 0.5), False, "track",
         "time warping with the strict error as cost / (lengths x its maximum)",
-        "nDTW, strict", whole=True, parts=strict_warpings, suites=STRICT, points="surfaces", by_image=True),
+        "nDTW, strict", whole=True, parts=strict_warpings, suites=STRICT, counterpart="ndtw", points="surfaces", by_image=True),
     "coverage": Metric(
         coverage, None, "kinematics", "", (0, 1), True, "track", "share of visible keypoints that were found",
         "Keypoints found", reported=False, parts=presence, suites=PAPER),
     "coverage_strict": Metric(
         coverage, None, "kinematics", "", (0, 1), True, "track", "share of visible robot points that were found",
-        "Robot points found", reported=False, parts=presence, suites=STRICT, points="surfaces"),
+        "Robot points found", reported=False, parts=presence, suites=STRICT, counterpart="coverage", points="surfaces"),
     "trajectory_error": Metric(
         trajectory_error, None, "objects", "px", (0, INF), False, "track", "mean object distance",
         "Object error", state=TRAJECTORY_STATE, suites=PAPER),
     "trajectory_error_strict": Metric(
         trajectory_error_strict, None, "objects", "px", (0, INF), False, "track",
         "mean distance of points on objects that move; lost ones have 50 px of 256, PointOdyssey's failure",
-        "Object error, strict", parts=strict_distances, suites=STRICT, points="surfaces", by_image=True),
+        "Object error, strict", parts=strict_distances, suites=STRICT, counterpart="trajectory_error",
+        points="surfaces", by_image=True),
     "object_coverage": Metric(
         coverage, None, "objects", "", (0, 1), True, "track", "share of visible objects that were found",
         "Objects found", reported=False, parts=presence, suites=PAPER),
     "object_coverage_strict": Metric(
         coverage, None, "objects", "", (0, 1), True, "track", "share of visible points on objects that were found",
-        "Object points found", reported=False, parts=presence, suites=STRICT, points="surfaces"),
+        "Object points found", reported=False, parts=presence, suites=STRICT, counterpart="object_coverage", points="surfaces"),
 }  # fmt: skip
 """All metrics by name, in the order of the paper's dimensions."""
 

@@ -14,7 +14,6 @@ Predictors: videos made on purpose, from the true one to a gray one, and whether
     python -m xew.metrics.calibrate --data data --predictors --out calibration
 """
 
-import importlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, zip_longest
@@ -36,7 +35,9 @@ from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
 from xew.metrics.calibration.matrix import grade_predictors, matrix, to_markdown
 from xew.metrics.calibration.perturbations import Perturbation, render_perturbations
 from xew.metrics.grade import Comparison, Grades, grade, input_kind
+from xew.metrics.grading.codecs import OPENER, open_codec
 from xew.metrics.truth import NEEDS, Truth, read_truth
+from xew.protocol import seed_split
 
 LATE = 8
 """Number of frames by which the true video is shifted, half a second."""
@@ -63,10 +64,11 @@ class Args:
     """Folder of the tables."""
     codec: Path | None = None
     """A run of `xew.model.train`, through whose codec the true videos go."""
-    codec_opener: str = "xew.model.runs.roundtrip:open_roundtrip"
+    codec_opener: str = OPENER
     """Function that opens it, as module:NAME: of the run's folder to a function of video to video, [t h w 3] uint8."""
     seeds: tuple[int, ...] = ()
-    """Only episodes of these seeds; all others serve as another seed's."""
+    """Only episodes of these seeds; all others serve as another seed's. Left out: those of validation seeds, or where there are
+    none of training seeds; never of test seeds, since estimators are chosen and tuned by what comes out."""
     episodes: int = 0
     """At most so many, of as many robots and tasks as there are; 0: all."""
     masks: str = "default"
@@ -156,11 +158,19 @@ def calibrate(
 
 
 def choose(episodes: Sequence[Episode], args: Args) -> list[Episode]:
-    """Those to calibrate on. Raises ConfigError if the data does not hold a seed asked for."""
+    """Those to calibrate on. Raises ConfigError if the data does not hold a seed asked for, or test seeds alone and none is."""
+    if not args.seeds:
+        families = ([e for e in episodes if seed_split(e[1].seed) == family] for family in ("validation", "train"))
+        if not (chosen := next(filter(None, families), [])):
+            raise ConfigError(
+                f"{args.data} holds test seeds alone, by which nothing is tuned; make others: python -m xew.sim_warp.generate "
+                f"--out {args.data} --validation-seeds 4, or name seeds: --seeds."
+            )
+        return _take_turns(chosen)[: args.episodes or None]
     held = sorted({record.seed for _, record in episodes})
     if unknown := [seed for seed in args.seeds if seed not in held]:
         raise ConfigError(f"{args.data} holds no seed {unknown[0]}; it has {', '.join(map(str, held[:20]))}: --seeds.")
-    chosen = [episode for episode in episodes if not args.seeds or episode[1].seed in args.seeds]
+    chosen = [episode for episode in episodes if episode[1].seed in args.seeds]
     return _take_turns(chosen)[: args.episodes or None]
 
 
@@ -201,22 +211,6 @@ def find_another(episodes: Sequence[Episode], record: Record, differs: str) -> P
     own, others = getattr(record, differs), sorted(folders)
     following = others[(others.index(own) + 1) % len(others)]
     return None if following == own else folders[following]
-
-
-def open_codec(run: Path, opener: str) -> Callable[[np.ndarray], np.ndarray]:
-    """A function of video [t h w 3] uint8 to what a run's codec leaves of it.
-
-    The metrics do not know the model: the function that opens its runs is named, as anybody's can be.
-
-    Raises:
-        ConfigError: the run or the opener does not exist.
-    """
-    module, _, name = opener.partition(":")
-    try:
-        found: Callable[[Path], Callable[[np.ndarray], np.ndarray]] = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"cannot import the opener of codecs {opener!r}: {error}; expected module:NAME.") from error
-    return found(run)
 
 
 def true_grades(shown: Perturbation, truth: Truth) -> Grades:

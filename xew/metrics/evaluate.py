@@ -3,7 +3,8 @@
 Reads  <rollouts>/<task>/<seed>/<robot>/ (xew.rollout) and the same folders of the data set
 Writes scores.parquet, one row per model, condition, task, seed, robot and metric; beside it
        scores.curves.parquet (the same by frame), scores.summary.md and .csv (means, intervals, noise), scores.pairs.csv
-       (differences between models), scores.bundle.json (what others need to check all this), scores.cells/ (to go on from);
+       (differences between models), scores.power.csv (which tasks tell a frozen frame from the truth), scores.bundle.json
+       (what others need to check all this), scores.cells/ (to go on from);
        <data>-baselines/, the baselines' scores, for every table on the same data
 
     python -m xew.metrics.evaluate demo/rollouts --data demo/data --out demo/scores.parquet
@@ -13,7 +14,7 @@ Writes scores.parquet, one row per model, condition, task, seed, robot and metri
 import functools
 import itertools
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -34,7 +35,8 @@ from xew.metrics import METRICS
 from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, identity, open_masker, open_tracker
 from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, grade, input_kind
 from xew.metrics.grading.baselines import BASELINES
-from xew.metrics.grading.bundle import differences, disagreements, raise_if_any, read_bundle, write_bundle
+from xew.metrics.grading.bundle import Bundle, differences, disagreements, raise_if_any, read_bundle, write_bundle
+from xew.metrics.grading.codecs import OPENER, ModelCodec, open_codecs
 from xew.metrics.grading.jobs import Job, estimator_view, list_jobs, read_prediction
 from xew.metrics.grading.scores import (
     CellStore,
@@ -53,7 +55,7 @@ from xew.metrics.metric import SUITES
 from xew.metrics.truth import Truth, read_truth
 from xew.names import csv_text
 from xew.protocol import HELD_OUT_ROBOTS
-from xew.rollout import RolloutError
+from xew.rollout import RolloutError, find_rollouts
 
 PROTOCOL = 4
 """Version of the grading: it goes up when any score would change, and scores of another version are graded anew."""
@@ -93,6 +95,11 @@ class Args:
     baselines: bool = True
     """Also grade, as models of their own, the frozen first frame, the robot's render pasted into it, another robot's episode,
     and the true video itself: the noise floor of the scores."""
+    codec: tuple[Path, ...] = ()
+    """Runs of `xew.model.train` that made some of the rollouts: the truth is graded through the codec of each, and is the noise
+    floor of its model's scores. Other models have the floor of the true video."""
+    codec_opener: str = OPENER
+    """Function that opens these runs, as module:NAME (`xew.metrics.grading.codecs.open_codec`)."""
     diagnostics: bool = False
     """Also write scores.diagnostics.parquet: contact F1, which is too unreliable in predicted video to be reported."""
     resample: Literal["scene", "task"] = "scene"
@@ -117,6 +124,7 @@ WRITTEN = {
     "summary.md": "means and differences between models",
     "summary.csv": "means, intervals, noise",
     "pairs.csv": "differences between models",
+    "power.csv": "which tasks tell the frozen first frame from the truth",
     "bundle.json": "for others to check",
 }
 """Files that are written beside each other, by the ending of the name, with what each holds."""
@@ -142,7 +150,9 @@ def grade_tables(args: Args) -> None:
     attributes = describe(settings(args), metrics)
     store = CellStore(path_beside(args.out, "cells"), baselines_folder(args.data, args.out))
     errors: list[str] = []
-    jobs = find_jobs(args, tuple(BASELINES) if args.baselines else (), errors if args.keep_going else None)
+    codecs = find_codecs(args)
+    attributes |= {"codecs": {model: [codec.key] for model, codec in sorted(codecs.items())}} if codecs else {}
+    jobs = find_jobs(args, tuple(BASELINES) if args.baselines else (), errors if args.keep_going else None, codecs)
     total = len(jobs) + len(errors)
     diagnostics = tuple(DIAGNOSTICS) if args.diagnostics else ()
     errors += grade_all(jobs, (*metrics, *diagnostics), args, store)
@@ -165,6 +175,7 @@ def _write_summary(args: Args, rows: pd.DataFrame) -> str:
     write_whole(path_beside(args.out, "summary.md"), to_markdown(summary).encode())
     write_whole(path_beside(args.out, "summary.csv"), csv_text(summary.means).encode())
     write_whole(path_beside(args.out, "pairs.csv"), csv_text(summary.pairs).encode())
+    write_whole(path_beside(args.out, "power.csv"), csv_text(summary.power).encode())
     written = "\n".join(f"{path_beside(args.out, ending)}  {what}" for ending, what in WRITTEN.items())
     return f"{to_markdown(summary, with_pairs=False)}\n{written}"
 
@@ -214,11 +225,27 @@ def _identity(name: str, checkpoint: Path | None, option: str) -> str:
     return identity(name, checkpoint)
 
 
-def find_jobs(args: Args, baselines: Sequence[str], problems: list[str] | None = None) -> list[Job]:
-    """All that is to be graded, with the baselines of these names. Raises, or tells the problems, as `list_jobs`."""
-    if args.frame_zero == "predicted" and baselines:
-        raise ConfigError("frame 0 of the frozen first frame is the truth: with --frame-zero predicted say --no-baselines.")
-    return list_jobs(args.rollouts, args.data, str(settings(args)), baselines, worker_count(args.workers), problems)
+def find_codecs(args: Args) -> dict[str, ModelCodec]:
+    """Codecs of the runs that are named, by model. Raises ConfigError as `open_codecs`."""
+    if not args.codec:
+        return {}
+    models = {rollout.model for root in args.rollouts for rollout in find_rollouts(root, [])}
+    return open_codecs(args.codec, args.codec_opener, models)
+
+
+def find_jobs(
+    args: Args, baselines: Sequence[str], problems: list[str] | None = None, codecs: Mapping[str, ModelCodec] | None = None
+) -> list[Job]:
+    """All that is to be graded, with the baselines of these names and the truth through these models' codecs.
+
+    Raises, or tells the problems, as `list_jobs`.
+    """
+    if args.frame_zero == "predicted" and (baselines or codecs):
+        raise ConfigError(
+            "frame 0 of the frozen first frame is the truth: with --frame-zero predicted say --no-baselines, and no --codec."
+        )
+    workers = worker_count(args.workers)
+    return list_jobs(args.rollouts, args.data, str(settings(args)), baselines, workers, problems, codecs)
 
 
 def open_bench(args: Args, metrics: Sequence[str]) -> Bench:
@@ -302,6 +329,14 @@ def _grade_job(job: Job, truth: Truth, metrics: tuple[str, ...], args: Args, ben
         return grade(Comparison(prediction, truth, bench.masker, bench.tracker, first, estimator_view(job, truth)), metrics)
 
 
+def _demand_codecs(path: Path, bundle: Bundle, args: Args) -> None:
+    """Raise ConfigError where a bundle has the truth through codecs of runs that are not named."""
+    if bundle.get("codecs") and not args.codec:
+        raise ConfigError(
+            f"{path} has the truth through the codecs of {', '.join(sorted(bundle['codecs']))}; name these runs: --codec RUN."
+        )
+
+
 def check(args: Args, path: Path) -> None:
     """Check a bundle against itself, against rollouts and data where they are named, and against scores graded anew.
 
@@ -313,7 +348,8 @@ def check(args: Args, path: Path) -> None:
     if not args.rollouts:
         return
     held = {sample["model"] for sample in bundle["samples"]}  # a bundle of an earlier version has fewer baselines
-    jobs = find_jobs(args, [name for name in BASELINES if name in held])
+    _demand_codecs(path, bundle, args)
+    jobs = find_jobs(args, [name for name in BASELINES if name in held], codecs=find_codecs(args))
     raise_if_any(path, differences(bundle, settings(args), [job.cell for job in jobs]))
     print("made from these rollouts and this data, by their digests")
     picked = [jobs[i] for i in np.unique(np.linspace(0, len(jobs) - 1, args.regrade).astype(int))]

@@ -88,6 +88,8 @@ class Metric:
     """Function of the same inputs to the values that the metric is the mean of, and which of them count."""
     suites: tuple[str, ...] = tuple(SUITES)
     """Suites that it belongs to, keys of `SUITES`."""
+    counterpart: str = ""
+    """Name of the metric of the suite paper in whose place it stands in the suite strict, and decides."""
     points: str = "origins"
     """Points that a metric of tracks compares, one of `POINTS`."""
     by_image: bool = False
@@ -99,6 +101,11 @@ class Metric:
     def estimated(self) -> bool:
         """Does it need an estimator, so that even the true video does not get the best score?"""
         return self.inputs in ESTIMATED_INPUTS
+
+    @property
+    def leaves_tasks(self) -> bool:
+        """Do tasks without power leave its mean (`xew.statistics.find_power`)?"""
+        return self.estimated and "strict" in self.suites
 
 
 def check_first(check: Callable[..., None], **options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:

@@ -25,6 +25,7 @@ from xew.model.codecs.ceiling import choose_evenly, measure_ceiling
 from xew.model.episodes.choice import replay_episodes, training_episodes
 from xew.model.experiment import Experiment, parse_experiment
 from xew.model.video.pixels import PixelSource, rendered_pixels, stored_pixels
+from xew.protocol import validation_split
 
 CEILING_CLIPS = 8
 """Number of clips that the codec's reconstruction is measured on."""
@@ -76,12 +77,13 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
 def report_ceiling(
     experiment: Experiment, cache: LatentCache, dataset: Dataset, episodes: Sequence[Episode], source: PixelSource
 ) -> dict[str, Any]:
-    """Measure the codec's reconstruction on test seeds of held-out robots, or on training data where there are none."""
-    held_out = dataset.select(robots=experiment.robots.held_out_robots, split="test")
-    chosen = choose_evenly(held_out or episodes, CEILING_CLIPS)
+    """Measure the codec's reconstruction on validation seeds, or on training data where there are none; never on test seeds."""
+    robots = validation_split(experiment.robots)
+    validation = dataset.select(robots=(*robots.train_robots, *robots.held_out_robots), split="validation")
+    chosen = choose_evenly(validation or episodes, CEILING_CLIPS)
     videos = (source(folder, record, ("rgb",))["rgb"] for folder, record in chosen)
     measured = measure_ceiling(cache.codec, videos, **asdict(experiment.clip))
-    on = "held-out robots" if held_out else "training episodes, for there are none of held-out robots"
+    on = "validation seeds" if validation else "training episodes, for there are no validation seeds"
     print(f"codec ceiling: {measured}, of {on}")
     return {**asdict(measured), "of": on, "robots": sorted({record.robot for _, record in chosen})}
 

@@ -14,7 +14,6 @@ import importlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal, Protocol
 
@@ -24,7 +23,7 @@ from tqdm import tqdm
 
 from xew.config import ConfigError, admit, user_errors
 from xew.dataset import Episode
-from xew.episode import Record, read_video, remove_left_overs
+from xew.episode import read_video, remove_left_overs
 from xew.files import hold_lock
 from xew.model.conditions import Command
 from xew.model.episodes.choice import select_episodes
@@ -37,54 +36,32 @@ from xew.protocol import LEFT_GRIPPER, RIGHT_GRIPPER
 class EpisodeInputs:
     """What a model may know of an episode: its first frame, the instruction, the commands and the camera; nothing measured.
 
-    Arrays are made when they are first asked for. Whatever a system wants to be told (relative poses, deltas, trajectory maps,
-    ray maps) follows from these.
+    It holds arrays of its own, numbers and words, and no path: nothing in it leads to the true video or the recorded states.
+    Whatever a system wants to be told (relative poses, deltas, trajectory maps, ray maps) follows from these.
     """
 
-    episode: Episode
-    command: Command
+    task: str
+    seed: int
+    robot: str
+    instruction: str
+    frame_rate: float
+    """Number of frames a second."""
     frame_count: int
     """Frames to predict, the given first one included."""
-
-    @property
-    def record(self) -> Record:
-        return self.episode[1]
-
-    @property
-    def task(self) -> str:
-        return self.record.task
-
-    @property
-    def seed(self) -> int:
-        return self.record.seed
-
-    @property
-    def robot(self) -> str:
-        return self.record.robot
-
-    @property
-    def instruction(self) -> str:
-        return self.record.instruction
-
-    @property
-    def frame_rate(self) -> float:
-        """Frames a second."""
-        return self.record.frame_rate
-
-    @cached_property
-    def first_frame(self) -> np.ndarray:
-        """uint8 [240 320 3], the head camera's."""
-        return read_video(self.episode[0] / "rgb.mkv")[0]
-
-    @property
-    def joints(self) -> np.ndarray:
-        """float32 [t 16], commanded joints [rad] and grippers [0 closed, 1 open] (`xew.protocol`)."""
-        return self.command.action[: self.frame_count]
-
-    @property
-    def tool_poses(self) -> np.ndarray:
-        """float64 [t 2 7], commanded world poses of the left and right tool: x y z [m] and quaternion x y z w."""
-        return self.command.tools[: self.frame_count]
+    first_frame: np.ndarray
+    """Picture of the head camera, uint8 [240 320 3]."""
+    joints: np.ndarray
+    """Commanded joints [rad] and grippers [0 closed, 1 open], float32 [t 16] (`xew.protocol`)."""
+    tool_poses: np.ndarray
+    """Commanded world poses of the left and right tool, float64 [t 2 7]: x y z [m] and quaternion x y z w."""
+    intrinsics: np.ndarray
+    """Matrix K of the camera, float64 [3 3] [pixels of 320x240]."""
+    extrinsics: np.ndarray
+    """Matrix from the world to the camera (x right, y down, z forward), float64 [4 4]."""
+    robot_render: np.ndarray
+    """Robot alone on white, posed by the commands: uint8 [t 240 320 3]."""
+    streams: tuple[np.ndarray, np.ndarray] | None = None
+    """Mask and optical flow of that robot, where the model asks for them (`OutsideModel`)."""
 
     @property
     def grippers(self) -> np.ndarray:
@@ -92,33 +69,26 @@ class EpisodeInputs:
         return self.joints[:, [LEFT_GRIPPER, RIGHT_GRIPPER]]
 
     @property
-    def intrinsics(self) -> np.ndarray:
-        """float64 [3 3], the camera's K [pixels of 320x240]."""
-        return self.command.intrinsics
-
-    @property
-    def extrinsics(self) -> np.ndarray:
-        """float64 [4 4], world to camera (x right, y down, z forward)."""
-        return self.command.extrinsics
-
-    @property
-    def robot_render(self) -> np.ndarray:
-        """uint8 [t 240 320 3], the robot alone on white, posed by the commands."""
-        return self.command.render[: self.frame_count]
-
-    @property
     def robot_mask(self) -> np.ndarray:
-        """bool [t 240 320], where that robot is; rendered here (needs Warp)."""
-        return self.command.streams.mask[: self.frame_count]
+        """bool [t 240 320], where that robot is. Raises ConfigError where the model does not ask for it."""
+        return self._stream(0)
 
     @property
     def optical_flow(self) -> np.ndarray:
-        """float32 [t 240 320 2], that robot's exact motion to the next frame [pixels]; rendered here (needs Warp)."""
-        return self.command.streams.optical_flow[: self.frame_count]
+        """float32 [t 240 320 2], that robot's exact motion to the next frame [pixels]. Raises ConfigError as `robot_mask`."""
+        return self._stream(1)
+
+    def _stream(self, number: int) -> np.ndarray:
+        if self.streams is None:
+            raise ConfigError(
+                "the mask and the optical flow are rendered for models that ask for them alone, since that takes time; give "
+                "the model the attribute `needs_streams = True`."
+            )
+        return self.streams[number]
 
 
 class OutsideModel(Protocol):
-    """What an outside model is to this room."""
+    """What an outside model is to this room. One with the attribute `needs_streams = True` is also given mask and flow."""
 
     def __call__(self, inputs: EpisodeInputs) -> np.ndarray:
         """uint8 [t h w 3] with t = inputs.frame_count, frame 0 the given one as the model sees it; any h and w of 4:3."""
@@ -139,11 +109,37 @@ def load_model(name: str) -> OutsideModel:
     return model
 
 
-def read_inputs(episode: Episode, max_frames: int = 0) -> EpisodeInputs:
-    """What a model may know of an episode, or of its first `max_frames` frames."""
+def read_inputs(episode: Episode, max_frames: int = 0, streams: bool = False) -> EpisodeInputs:
+    """What a model may know of an episode, or of its first `max_frames` frames.
+
+    Args:
+        episode: folder and header.
+        max_frames: number of frames; 0 for all.
+        streams: whether mask and optical flow are rendered too (needs Warp).
+    """
     folder, record = episode
     frames = min(record.frame_count, max_frames) if max_frames else record.frame_count
-    return EpisodeInputs(episode, episode_command(folder, record), frames)
+    command = episode_command(folder, record)
+    # Each is copied: an array that is a view leads to all that it is a view of, as the first frame to the true video.
+    return EpisodeInputs(
+        record.task,
+        record.seed,
+        record.robot,
+        record.instruction,
+        record.frame_rate,
+        frames,
+        first_frame=np.array(read_video(folder / "rgb.mkv")[0]),
+        joints=np.array(command.action[:frames]),
+        tool_poses=np.array(command.tools[:frames]),
+        intrinsics=np.array(command.intrinsics),
+        extrinsics=np.array(command.extrinsics),
+        robot_render=np.array(command.render[:frames]),
+        streams=_render_streams(command, frames) if streams else None,
+    )
+
+
+def _render_streams(command: Command, frames: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.array(command.streams.mask[:frames]), np.array(command.streams.optical_flow[:frames])
 
 
 def predict(model: OutsideModel, name: str, inputs: EpisodeInputs) -> np.ndarray:
@@ -165,8 +161,8 @@ class Args:
     """A function or class, such as examples.own_model:freeze."""
     data: Path
     """Episodes."""
-    split: Literal["test", "train"] = "test"
-    """Seed family."""
+    split: Literal["test", "validation", "train"] = "test"
+    """Seed family. Whatever is tuned is tuned on validation seeds."""
     robots: tuple[str, ...] = ()
     """Robots to predict; all of the data where left out."""
     max_frames: int = 0
@@ -193,6 +189,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     items = [(e, common_header(name, args.condition, e[1], args.max_frames) | {"outside": args.model}) for e in episodes]
     pending = [item for item in items if not is_done(out, *item)]
     model = load_model(args.model)
+    streams = bool(getattr(model, "needs_streams", False))
     with (
         hold_lock(out),
         tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
@@ -200,7 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ):
         remove_left_overs(out)
         for episode, header in pending:
-            writer.write(episode[1], predict(model, args.model, read_inputs(episode, args.max_frames)), header)
+            writer.write(episode[1], predict(model, args.model, read_inputs(episode, args.max_frames, streams)), header)
     print(f"{out}: {len(pending)} rollouts new, {len(items) - len(pending)} there before, {args.model}")
 
 

@@ -251,8 +251,8 @@ class Flags:
     """Step of the run's checkpoint; the latest where left out."""
     data: Path | None = None
     """Episodes; those of the run's config where left out."""
-    split: Literal["test", "train"] = "test"
-    """Seed family."""
+    split: Literal["test", "validation", "train"] = "test"
+    """Seed family. Whatever is tuned is tuned on validation seeds."""
     robots: tuple[str, ...] = ()
     """Robots to predict; all of the data where left out."""
     out: Path | None = None

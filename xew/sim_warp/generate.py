@@ -7,7 +7,8 @@ Seeds are tried in order until enough of them are accepted, that is, until all r
 the manifest (manifest.py) knows to fail are left out. What is on disk is not made again: stop the command at any time, give
 it again, and the result is the same.
 
-Command: python -m xew.sim_warp.generate --batch 256 [--tasks … --robots … --train-seeds 50 --test-seeds 20 --out data]
+Command: python -m xew.sim_warp.generate --batch 256 [--tasks … --robots … --train-seeds 50 --test-seeds 20
+    --validation-seeds 4 --out data]
 """
 
 import itertools
@@ -28,7 +29,7 @@ from xew.config import user_errors
 from xew.dataset import find_records
 from xew.episode import EpisodeError, Record, episode_folder, remove_left_overs
 from xew.files import hold_lock
-from xew.protocol import TEST_SEED_START, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expand_robots
+from xew.protocol import SEED_STARTS, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expand_robots, seed_split
 from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
@@ -60,6 +61,8 @@ class Args:
     """Number of accepted training seeds a task, or with --unpaired a task and robot."""
     test_seeds: int = TEST_SEEDS_PER_TASK
     """Number of accepted test seeds, likewise; they count from where no training seed comes."""
+    validation_seeds: int = 0
+    """Number of accepted validation seeds, likewise: for samples while models train, for calibration and whatever is tuned."""
     out: Path = Path("data")
     batch: int = 256
     """Number of worlds that a GPU steps together. A CPU steps each by itself, as many at a time as there are workers."""
@@ -80,7 +83,7 @@ class Args:
 
 @dataclass
 class Family:
-    """The seeds of one task, training or test, and how far they are."""
+    """The seeds of one task and family (`xew.protocol.seed_split`), and how far they are."""
 
     task: str
     first_seed: int
@@ -135,7 +138,9 @@ def plan_families(args: Args, robots: Sequence[str], manifest: Manifest) -> list
     teams = [(robot,) for robot in robots] if args.unpaired else [tuple(robots)]
     families = []
     for task in dict.fromkeys(args.tasks):
-        for first, wanted in ((0, args.train_seeds), (TEST_SEED_START, args.test_seeds)):
+        wanted_seeds = {"train": args.train_seeds, "validation": args.validation_seeds, "test": args.test_seeds}
+        asked = [(SEED_STARTS[name], count) for name, count in wanted_seeds.items() if count or name != "validation"]
+        for first, wanted in asked:
             for number, team in enumerate(teams):
                 first_seed = first + number * SEEDS_OF_ROBOT
                 families.append(Family(task, first_seed, wanted, team, manifest.failing(task, team)))
@@ -263,8 +268,8 @@ def _read_existing(families: list[Family], args: Args) -> None:
         for family in families:
             if args.unpaired and record.robot not in family.robots:
                 continue
-            same_side = (record.seed >= TEST_SEED_START) == (family.first_seed >= TEST_SEED_START)
-            if record.task == family.task and same_side:
+            same_family = seed_split(record.seed) == seed_split(family.first_seed)
+            if record.task == family.task and same_family:
                 if folder != episode_folder(out, record.task, record.seed, record.robot):
                     raise EpisodeError(f"{folder} holds {record.task}/{record.seed}/{record.robot}; move or delete it.")
                 if record.source:

@@ -25,7 +25,7 @@ from xew.dataset import explain_missing, find_records
 from xew.episode import EpisodeError, Record
 from xew.files import read_json, replacing
 from xew.names import check_name
-from xew.protocol import TEST_SEED_START
+from xew.protocol import TEST_SEED_START, seed_split
 
 PACKAGED = Path(__file__).with_name("seeds.json")
 
@@ -132,8 +132,8 @@ def _task_seeds(seeds: dict[int, dict[str, Record]], robots: set[str]) -> TaskSe
         if seed not in accepted
     }
     return TaskSeeds(
-        tuple(seed for seed in accepted if seed < TEST_SEED_START),
-        tuple(seed for seed in accepted if seed >= TEST_SEED_START),
+        tuple(seed for seed in accepted if seed_split(seed) == "train"),
+        tuple(seed for seed in accepted if seed_split(seed) == "test"),
         rejected,
     )
 

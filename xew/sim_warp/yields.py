@@ -35,6 +35,8 @@ from xew.sim_warp.tasks import TASKS, Task, get_task
 PARAGRAPHS = ("Task", "Randomization", "Success", "After")
 """Words with which the paragraphs of a task's module docstring begin."""
 COMMAND = "python -m xew.sim_warp.yields"
+KEPT = "## What the metrics can tell"
+"""Heading of the part of the page that this command keeps: it is measured by the metrics, of which this room knows nothing."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,14 @@ def main() -> None:
             bar.update()
     print(markdown(records))
     if args.page:
-        write_page(args.page, page(records, args))
+        write_page(args.page, page(records, args) + find_kept(args.page))
+
+
+def find_kept(path: Path) -> str:
+    """The end of a page that this command does not write: from the heading KEPT on; '' where there is none."""
+    text = path.read_text() if path.exists() else ""
+    start = text.find(f"\n{KEPT}\n")
+    return text[start:] if start >= 0 else ""
 
 
 def write_page(path: Path, text: str) -> None:

@@ -6,6 +6,8 @@ The package stands on the ground: it imports NumPy, SciPy and pandas, and nothin
     bootstrap.py   what is drawn (trainings, then scenes within tasks), how often, and the mean in every draw
     inference.py   intervals and p-values of what was drawn, Holm's correction for several tests
     verdicts.py    noise floors, and better, worse or unresolved
+    suites.py      which of two suites' metrics decides, and where they part
+    power.py       which tasks say nothing about a metric, and leave its mean
 """
 
 from xew.statistics.bootstrap import (
@@ -23,11 +25,23 @@ from xew.statistics.bootstrap import (
     pool_trainings,
 )
 from xew.statistics.inference import LEVEL, SIGNIFICANCE, Drawn, holm
-from xew.statistics.verdicts import BETTER, UNRESOLVED, WORSE, noise_floor, verdict
+from xew.statistics.power import LEAST_POWER, describe_power, drop_powerless, find_power, find_powerless
+from xew.statistics.suites import describe_parting, find_parting, strict_metrics
+from xew.statistics.verdicts import (
+    BETTER,
+    UNRESOLVED,
+    WORSE,
+    describe_floors,
+    floor_sources,
+    largest_floor,
+    noise_floor,
+    verdict,
+)
 
 __all__ = [
     "BETTER",
     "DRAWS",
+    "LEAST_POWER",
     "LEVEL",
     "MIN_SCENES",
     "SIGNIFICANCE",
@@ -39,12 +53,22 @@ __all__ = [
     "Units",
     "bootstrap_means",
     "combine",
+    "describe_floors",
+    "describe_parting",
+    "describe_power",
     "draw_trainings",
     "draw_units",
+    "drop_powerless",
     "every_draw",
+    "find_parting",
+    "find_power",
+    "find_powerless",
     "find_strata",
+    "floor_sources",
     "holm",
+    "largest_floor",
     "noise_floor",
     "pool_trainings",
+    "strict_metrics",
     "verdict",
 ]

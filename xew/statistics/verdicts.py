@@ -2,13 +2,15 @@
 
 A metric that needs an estimator does not give even the true video its best score. By how much it misses its best there, on the
 mean over the same robots' episodes, is the metric's noise floor, and a difference that is no larger is unresolved, whatever its
-interval says. Metrics that compare pixels directly have a floor of 0. An estimated metric whose ground truth was not graded has
-no floor (NaN), and nothing is resolved by it.
-
-Corrections for several comparisons (Holm) and tests of equivalence belong here.
+interval says. What a model shows has gone through its codec: where the true video was graded through that, as the baseline
+CODEC_TRUTH, it takes the true video's place. Metrics that compare pixels directly have a floor of 0. An estimated metric whose
+ground truth was not graded has no floor (NaN), and nothing is resolved by it.
 """
 
 import math
+from collections.abc import Iterable, Mapping, Sequence
+
+from xew.protocol import CODEC_TRUTH, GROUND_TRUTH
 
 BETTER, WORSE, UNRESOLVED = "better", "worse", "unresolved"
 
@@ -42,3 +44,34 @@ def noise_floor(truth: float | None, best: float | None, estimated: bool) -> flo
     if truth is None or best is None or not math.isfinite(best):
         return math.nan
     return abs(truth - best)
+
+
+def floor_sources(model: str, codecs: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
+    """Baselines, as model and condition, of which the noise floor of a model or variant is.
+
+    Args:
+        model: its name.
+        codecs: attribute `codecs` of a score table: by model or variant, the conditions of the truth through its codec.
+    """
+    return [(CODEC_TRUTH, key) for key in codecs.get(model, ())] or [(GROUND_TRUTH, "")]
+
+
+def largest_floor(floors: Iterable[float]) -> float:
+    """The largest of several floors, which counts where two models are compared; NaN where one is not known."""
+    known = list(floors)
+    return math.nan if any(map(math.isnan, known)) else max(known, default=0.0)
+
+
+def describe_floors(models: Sequence[str], codecs: Mapping[str, Sequence[str]]) -> str:
+    """Sentence that says what the noise floors of some models are of: the note of a table."""
+    by_key: dict[tuple[str, ...], list[str]] = {}
+    for model in models:
+        by_key.setdefault(tuple(codecs.get(model, ())), []).append(model)
+    without = by_key.pop((), [])
+    softened = "of the true video, softened by a blur, since the truth was not graded through a codec"
+    if not by_key:
+        return f"Noise floors are {softened}." if without else ""
+    if not without and len(by_key) == 1:
+        return f"Noise floors are of the truth through the models' {' and '.join(next(iter(by_key)))}."
+    parts = [f"{', '.join(names)}: of the truth through {' and '.join(key)}" for key, names in by_key.items()]
+    return f"Noise floors are, of {'; '.join(parts)}" + (f"; {', '.join(without)}: {softened}." if without else ".")

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from xew.analysis.scores import MetricInfo
-from xew.analysis.statistics.summary import Interval, RobotTable, Row, finding, mean_interval, progress, verdict_on_copy
+from xew.analysis.statistics.summary import Interval, RobotTable, Row, finding, mean_interval, progress, verdict_on
 from xew.analysis.tables.table import format_number
 
 rng = np.random.default_rng(0)
@@ -42,16 +42,16 @@ def test_verdicts_are_paired(shift: float, higher: bool, expected: str) -> None:
     """Episodes differ by far more than the models do, so that only pairing can tell them apart."""
     copy = episodes(rng.normal(0, 50, 20))
     model = copy + shift + np.tile([-0.5, 0.5], 10)
-    assert verdict_on_copy(model.sample(frac=1, random_state=1), copy, higher) == expected
+    assert verdict_on(model.sample(frac=1, random_state=1), copy, higher) == expected
 
 
 def test_fewer_than_six_scenes_resolve_nothing() -> None:
     """Of five all differences have one sign by chance in 6 % of cases; a study's tables ask for as many."""
     high, low, pooled = [9.0, 8.0, 9.5, 8.5, 9.1, 8.9], [1.0, 2.0, 1.5, 1.2, 1.8, 1.1], ("aloha_agilex", "arx_x5", "ur5_wsg")
-    assert verdict_on_copy(episodes(high), episodes(low), True) == "better"
-    assert verdict_on_copy(episodes(high[:5]), episodes(low[:5]), True) == "unresolved"
-    assert verdict_on_copy(episodes(high), episodes(low).iloc[1:], True) == "unresolved"
-    assert verdict_on_copy(episodes(high, pooled), episodes(low, pooled), True) == "unresolved"  # three robots in two scenes
+    assert verdict_on(episodes(high), episodes(low), True) == "better"
+    assert verdict_on(episodes(high[:5]), episodes(low[:5]), True) == "unresolved"
+    assert verdict_on(episodes(high), episodes(low).iloc[1:], True) == "unresolved"
+    assert verdict_on(episodes(high, pooled), episodes(low, pooled), True) == "unresolved"  # three robots in two scenes
     assert np.isnan(mean_interval(episodes(high[:5])).low) and mean_interval(episodes(high)).low < 8.9
 
 
@@ -64,14 +64,8 @@ def test_robots_in_one_scene_are_resampled_together() -> None:
 
 def test_a_difference_inside_the_noise_floor_is_not_resolved() -> None:
     model, copy = episodes(0.53 + 0.001 * np.arange(8)), episodes(0.5 + 0.001 * np.arange(8))
-    assert (
-        verdict_on_copy(model, copy, True, floor=0.02) == "better"
-        and verdict_on_copy(model, copy, True, floor=0.04) == "unresolved"
-    )
-    assert (
-        verdict_on_copy(copy, model, True, floor=0.02) == "worse"
-        and verdict_on_copy(copy, model, True, floor=0.04) == "unresolved"
-    )
+    assert verdict_on(model, copy, True, floor=0.02) == "better" and verdict_on(model, copy, True, floor=0.04) == "unresolved"
+    assert verdict_on(copy, model, True, floor=0.02) == "worse" and verdict_on(copy, model, True, floor=0.04) == "unresolved"
 
 
 def table(title: str, model: float, copy: float = 0.4) -> RobotTable:

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 import xew
-from xew.analysis.studies.config import Study, build_experiment, load_study, merge_settings
+from xew.analysis.studies.config import Study, build_experiment, load_study, merge_settings, run_folder
 from xew.analysis.studies.cost import (
     correct_by_ledger,
     count_optimizer_steps,
@@ -94,6 +94,9 @@ def test_every_training_seed_is_a_training_of_every_variant(study: Study) -> Non
     assert settings["-seed_7"]["adapt"]["start_from"] == "studies/debug/runs/fixed-optical_flow-nine_views-seed_7"
     assert (runs["fixed-irasim-seed_7"].of, runs["fixed-irasim"].of) == ("fixed-irasim", "fixed-irasim")
     assert [step.name for step in steps.values() if "--baselines" in step.command] == ["evaluate/fixed-optical_flow-none"]
+    for name, run in runs.items():
+        command = steps[f"evaluate/{name}"].command
+        assert command[command.index("--codec") + 1] == str(run_folder(study, run)), "the floor is of its own codec"
     costs = estimate(study, steps)
     assert costs["train/fixed-irasim-seed_7"] == costs["train/fixed-irasim"]
     # One training has the experiment's own seed, as studies had before there were several.

@@ -1,5 +1,6 @@
 """Claims asked of the paper's own figures, and of scores of which the answer is known."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +9,14 @@ import pytest
 
 from tests.analysis.synthetic_study import TASKS, attributes, paper_axes, write_study
 from xew.analysis.paper import read_paper
+from xew.analysis.reports.study import find_parting_claims, parting_sentence, pasting_sentence
 from xew.analysis.scores import MetricInfo, Scores, read_scores
 from xew.analysis.statistics.grades import PaperGrades, StudyGrades
+from xew.analysis.statistics.suites import StrictGrades
 from xew.analysis.tables.claims import CLAIMS
 from xew.analysis.tables.comparisons import Reader
 from xew.analysis.tables.findings import Finding, ask, findings_frame
-from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS
+from xew.protocol import HELD_OUT_ROBOTS, PASTED_RENDER, ROBOT_NAMES, SHOTS
 from xew.statistics import holm
 
 UNRESOLVED_BY_ROUNDING = {"views saturate"}
@@ -235,3 +238,56 @@ def test_every_claim_says_what_it_tests_and_the_table_holds_every_number(scores:
     frame = frame.dropna(subset="value")
     assert (frame["low"] <= frame["value"] + 1e-9).all() and (frame["value"] <= frame["high"] + 1e-9).all()
     assert set(attributes()["metrics"]) <= {metric.name for metric in scores.metrics}
+
+
+def add_pasting(rows: pd.DataFrame, factor: float) -> pd.DataFrame:
+    """The same scores with those of a pasted render: those of flow only, times a factor."""
+    like = rows[rows["variant"] == "fixed-optical_flow-none"]
+    return pd.concat([rows, like.assign(variant="", model=PASTED_RENDER, condition="", value=like["value"] * factor)])
+
+
+def test_a_claim_about_a_rung_says_whether_it_beats_pasting(scores: Scores) -> None:
+    """Flow's LPIPS is below that of joints either way; whether it is worth anything is another question."""
+    found = {
+        name: ask_one(rows, "flow looks best", scores.metrics)
+        for name, rows in {
+            "worse": add_pasting(scores.rows, 2.0),
+            "better": add_pasting(scores.rows, 0.5),
+            "none": scores.rows,
+        }.items()
+    }
+    assert {finding.answer for finding in found.values()} == {"holds"}
+    assert found["worse"].pasting == "beats pasting" and found["better"].pasting == "does not beat pasting"
+    assert found["none"].pasting == "pasting was not graded" and found["none"].over_pasting == ()
+    gains = {one.label: one.value for one in found["worse"].over_pasting}
+    assert gains == pytest.approx({"optical flow, Franka LPIPS": 0.5, "optical flow, Piper LPIPS": 0.5})
+    p = [one.p_holds for one in found["worse"].over_pasting]
+    assert max(p) <= 0.05 and p == pytest.approx(holm([value / 2 for value in p])), "both are one family of two"
+    assert ask_one(add_pasting(scores.rows, 2.0), "gap", scores.metrics).pasting == ""
+    assert {f.pasting for f in ask(PaperGrades(read_paper(), scores.metrics))} == {"", "pasting was not graded"}
+    told = [next(pasting_sentence([found[name]])) for name in ("worse", "better", "none")]
+    assert "in 1 all models that it speaks for beat the pasted render" in told[0] and "in 1 one is worse" in told[1]
+    assert "it was not graded" in told[2] and not list(pasting_sentence([]))
+    frame = findings_frame([found["better"]], "here")
+    assert set(frame["pasting"]) == {"does not beat pasting"} and frame["comparison"].str.startswith("over pasting").sum() == 2
+
+
+def test_the_suite_strict_decides_and_the_suites_may_part(scores: Scores) -> None:
+    """By the paper's region a first image helps; on the robot itself it harms."""
+    strict = next(info for info in scores.metrics if info.name == "region_lpips")
+    strict = replace(strict, name="robot_lpips", title="Robot LPIPS", counterpart="region_lpips")
+    own = scores.rows[scores.rows["metric"] == "region_lpips"].assign(metric="robot_lpips")
+    own = scale_scores(own, "fixed-optical_flow-reference_image", "robot_lpips", 3.0)
+    grades = StudyGrades(pd.concat([scores.rows, own]), (*scores.metrics, strict), paper_axes(read_paper()))
+    by_strict, by_paper = ask(StrictGrades(grades)), ask(grades)
+    answers = {ours.claim.name: (ours.answer, other.answer) for ours, other in zip(by_strict, by_paper, strict=True)}
+    assert answers["one image helps"] == ("fails", "holds")
+    assert [one.label for one in by_strict[7].comparisons] == ["Franka Robot LPIPS", "Piper Robot LPIPS"]
+    parting = {ours.claim.name for ours, _ in find_parting_claims(by_strict, by_paper)}
+    assert parting == {name for name, (ours, other) in answers.items() if ours != other} and "flow looks best" not in parting
+    (sentence,) = parting_sentence(by_strict, by_paper, True)
+    assert "A first reference image helps a little (strict: fails, paper: holds)" in sentence
+    assert "each claim has the same" in next(parting_sentence(by_paper, by_paper, True))
+    assert "not graded" in next(parting_sentence(by_paper, by_paper, False)) and not list(parting_sentence([], [], True))
+    alone = StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper()))
+    assert [f.answer for f in ask(StrictGrades(alone))] == [f.answer for f in by_paper], "without it the paper's decide"

@@ -23,15 +23,15 @@ from xew.dataset import find_accepted
 from xew.episode import read_video
 from xew.metrics import evaluate
 from xew.metrics.evaluate import Args, main
+from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.workers import Bench
-from xew.protocol import BASELINES
 from xew.rollout import write_rollout
 
 ROOT = Path(__file__).parents[3]
 ROBOTS = ("franka_panda", "piper")
 SEEDS = tuple(range(1_000_000, 1_000_003))
 METRICS = ("psnr", "mask_iou")
-WRITTEN = ("parquet", "curves.parquet", "summary.md", "summary.csv", "pairs.csv", "bundle.json")
+WRITTEN = ("parquet", "curves.parquet", "summary.md", "summary.csv", "pairs.csv", "power.csv", "bundle.json")
 EPISODES = len(SEEDS) * len(ROBOTS)
 CELLS = EPISODES * (1 + len(BASELINES))
 

@@ -39,7 +39,7 @@ from xew.model.training.step import (
     make_learner,
     sample_pairs,
 )
-from xew.protocol import HELD_OUT_ROBOTS
+from xew.protocol import HELD_OUT_ROBOTS, seed_split
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 
@@ -484,7 +484,8 @@ def test_samples_of_an_adapted_run_are_named_by_role(experiment: Experiment) -> 
     adapted = replace(experiment, adapt=replace(experiment.adapt, start_from=Path("runs/x"), robots=("piper",)))
     names = sample_episodes(read_dataset(adapted.data), adapted.choice)
     seen = {"seen/aloha_agilex", "seen/arx_x5", "seen/ur5_wsg"}
-    assert set(names) == seen | {"target/piper", "unseen/franka_panda"}
+    assert set(names) == seen | {"target/piper"}
+    assert {seed_split(record.seed) for _, record in names.values()} == {"train"}, "no test seed is looked at"
 
 
 def test_adapting_another_network_is_told(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -119,9 +119,9 @@ def labeled_picture(source: str, caption: str, columns: Sequence[str], rows: Seq
     return _render("figures.html", "labeled_picture", source, title, caption, columns, rows)
 
 
-def claims(findings: Sequence[Finding], papers: Sequence[Finding] | None) -> Markup:
-    """Each claim with its answer here and, where given, on the paper's own figures."""
-    return _render("claims.html", "claims", findings, papers)
+def claims(findings: Sequence[Finding], papers: Sequence[Finding] | None, by_paper: Sequence[Finding] | None = None) -> Markup:
+    """Each claim with its answer here and, where given, on the paper's own figures and by the paper's definitions."""
+    return _render("claims.html", "claims", findings, papers, by_paper or findings)
 
 
 def _render(template: str, macro: str, *values: Any) -> Markup:

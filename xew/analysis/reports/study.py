@@ -19,6 +19,7 @@ from xew.analysis.reports.study_charts import study_charts
 from xew.analysis.reports.study_strips import Strip, study_strips
 from xew.analysis.scores import Scores, describe_scores, find_missing_scores
 from xew.analysis.statistics.grades import Grades, PaperGrades, StudyGrades, relative_gain
+from xew.analysis.statistics.suites import StrictGrades
 from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables import formats
 from xew.analysis.tables.builder import Builder
@@ -34,13 +35,14 @@ from xew.analysis.tables.distances import (
     printed_distances,
     read_distances,
 )
-from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask, findings_frame
+from xew.analysis.tables.findings import BEATS, FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask, findings_frame
 from xew.analysis.tables.labels import ACTIONS, LADDER, SHORT_ROBOTS
 from xew.analysis.tables.layouts import build_tables, count_table
 from xew.analysis.tables.outside import outside_tables
 from xew.analysis.tables.table import MARKS, Table
 from xew.names import csv_text, plain_markdown
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
+from xew.statistics import strict_metrics
 
 TITLE = "Can the model render a robot that it has never seen?"
 PART_TITLES = {
@@ -86,6 +88,9 @@ class Content:
 
     sentences: Sequence[str]
     findings: Sequence[Finding]
+    """Answers to the claims, by the suite strict."""
+    by_paper: Sequence[Finding]
+    """Answers by the paper's definitions; the same where no metric of the suite strict was graded."""
     printed: Sequence[Finding]
     """Answers to the same claims on the paper's own figures."""
     tables: Mapping[str, Table]
@@ -116,22 +121,23 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
     known = read_distances(distances) if distances else printed_distances(paper)
     strips = study_strips(scores, data, rollouts) if data and rollouts else {}
     axes, spreads = ({axis: known.of(axis, column) for axis in AXES} for column in ("value", "spread"))
-    grades = StudyGrades(scores.rows, scores.metrics, axes, known.measured, spreads)
+    grades = StudyGrades(scores.rows, scores.metrics, axes, known.measured, spreads, codecs=scores.codecs)
     printed = PaperGrades(paper, scores.metrics)
     planned = scores.attributes.get("study", {}).get("variants", {})
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
     note = trainings_note(grades)
     scored = [*build_tables(builder), *outside_tables(builder, scores.rows)]
-    tables = [replace(table, caption=" ".join(filter(None, (table.caption, note)))) for table in scored]
+    tables = [replace(table, caption=" ".join(filter(None, (table.caption, note, grades.notes)))) for table in scored]
     tables += [count_table(builder), *distance_tables(known)]
     if builder.has_results("loeo"):
         tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
         tables.append(certainty_table(grades, known, paper))
-    findings = ask(grades)
+    findings, by_paper = ask(StrictGrades(grades)), ask(grades)
     missing = find_missing_scores(scores.rows)
     content = Content(
-        _sentences(grades, known, findings),
+        _sentences(grades, known, findings, by_paper),
         findings,
+        by_paper,
         ask(printed),
         {table.name: table for table in tables},
         study_charts(builder, known, scores.curves),
@@ -158,7 +164,7 @@ def trainings_note(grades: StudyGrades) -> str:
     return f"Intervals are over scenes and the trainings of {named}{ending}."
 
 
-def _sentences(grades: Grades, distances: Distances, findings: Sequence[Finding]) -> list[str]:
+def _sentences(grades: Grades, distances: Distances, findings: Sequence[Finding], by_paper: Sequence[Finding]) -> list[str]:
     """The results in sentences, one for each question that was asked."""
     asked = [
         *_gap_sentence(grades),
@@ -166,7 +172,52 @@ def _sentences(grades: Grades, distances: Distances, findings: Sequence[Finding]
         *_adaptation_sentences(grades),
         *_distance_sentence(grades, distances),
     ]
-    return [_answer_sentence(findings), *asked]
+    return [
+        _answer_sentence(findings),
+        *pasting_sentence(findings),
+        *parting_sentence(findings, by_paper, bool(strict_metrics(grades.metrics))),
+        *asked,
+    ]
+
+
+def pasting_sentence(findings: Sequence[Finding]) -> Iterator[str]:
+    """Sentence on how many claims about a rung or a stream speak of models that beat the pasted render."""
+    counts = {answer: [f.claim.name for f in findings if f.pasting == text] for answer, text in BEATS.items()}
+    asked = sum(len(names) for answer, names in counts.items() if answer != UNMEASURED)
+    if asked:
+        yield (
+            f"Of {asked} claims about what a model is told, in {len(counts[HOLDS]) or 'none'} all models that it speaks for "
+            f"beat the pasted render, which learned nothing; in {len(counts[FAILS]) or 'none'} one is worse than that, and "
+            f"{len(counts[UNRESOLVED]) or 'none'} cannot be told."
+        )
+    elif counts[UNMEASURED]:
+        yield "Whether models beat the pasted render, which learned nothing, cannot be told: it was not graded."
+
+
+def find_parting_claims(findings: Sequence[Finding], by_paper: Sequence[Finding]) -> list[tuple[Finding, Finding]]:
+    """Claims of which the two suites give another answer, with that of strict and that of the paper's definitions."""
+    return [(ours, other) for ours, other in zip(findings, by_paper, strict=True) if ours.answer != other.answer]
+
+
+def parting_sentence(findings: Sequence[Finding], by_paper: Sequence[Finding], graded: bool) -> Iterator[str]:
+    """Sentence on the claims on which the suites part; none where no claim could be asked.
+
+    Args:
+        findings: by the suite strict.
+        by_paper: by the paper's definitions.
+        graded: whether any metric of the suite strict was graded that stands in the place of one of the paper's.
+    """
+    if all(finding.answer == UNMEASURED for finding in findings):
+        return
+    if not graded:
+        yield "The suite strict was not graded: all answers are by the paper's definitions."
+        return
+    parts = [
+        f"{ours.claim.says.strip('… ').rstrip('.')} (strict: {ours.answer}, paper: {other.answer})"
+        for ours, other in find_parting_claims(findings, by_paper)
+    ]
+    others = f"By the paper's definitions others would be: {'; '.join(parts)}." if parts else ""
+    yield f"The suite strict decides these answers. {others or 'By the definitions of the paper each claim has the same.'}"
 
 
 def _answer_sentence(findings: Sequence[Finding]) -> str:
@@ -280,11 +331,16 @@ def _claims_section(content: Content) -> Markup:
         "every number lies on its side of the bound, and fails where one lies on the other side, each at 5 % after Holm's "
         "correction for the comparisons of the claim (for the paper: with all that prints the same); anything else is "
         "unresolved. “Among all claims” corrects once more, for all of them. That something saturates or is alike is an "
-        "equivalence: two one-sided tests with the margins that the claim names. The last ones, “ours”, ask more than the "
-        "paper claims."
+        "equivalence: two one-sided tests with the margins that the claim names. Metrics of the suite strict decide, in which "
+        "what is lost is an error; where the paper's definitions give another answer, it stands beside. Claims about what a "
+        "model is told also say whether these models beat the first frame with the robot's render pasted in. The last ones, "
+        "“ours”, ask more than the paper claims."
     )
     return page.section(
-        "Claims", page.paragraph(text), page.paragraph(content.trainings), page.claims(content.findings, content.printed)
+        "Claims",
+        page.paragraph(text),
+        page.paragraph(content.trainings),
+        page.claims(content.findings, content.printed, content.by_paper),
     )
 
 
@@ -333,7 +389,13 @@ def _write_markdown(content: Content) -> str:
         "",
         *(f"> {note}\n" for note in content.lacks),
     ]
-    lines += ["## Claims", "", content.trainings, "", formats.findings_markdown(content.findings, content.printed)]
+    lines += [
+        "## Claims",
+        "",
+        content.trainings,
+        "",
+        formats.findings_markdown(content.findings, content.printed, content.by_paper),
+    ]
     for part, (charts, shown, folded) in SECTIONS.items():
         if not any(name in content.tables for name in shown):
             continue
@@ -362,8 +424,9 @@ def _files(content: Content) -> Iterator[tuple[str, bytes]]:
             yield f"figures/{name}", data
     for part, strip in content.strips.items():
         yield f"figures/strip_{part}.png", strip.image
-    both = pd.concat([findings_frame(content.findings, "here"), findings_frame(content.printed, "paper")])
+    sources = {"here": content.findings, "here, paper's definitions": content.by_paper, "paper": content.printed}
+    both = pd.concat([findings_frame(found, of) for of, found in sources.items()])
     if len(content.missing):
         yield "missing.csv", csv_text(content.missing).encode()
     yield "findings.csv", csv_text(both).encode()
-    yield "tables/findings.tex", formats.findings_latex(content.findings, content.printed).encode()
+    yield "tables/findings.tex", formats.findings_latex(content.findings, content.printed, content.by_paper).encode()

@@ -19,9 +19,23 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.paper import Paper
-from xew.analysis.scores import TRAINING, TRUTH, MetricInfo
-from xew.protocol import BASELINES, MULTI_VIEW, PARTS, ROBOT_NAMES, SPLITS, Variant
-from xew.statistics import DRAWS, LEVEL, Mean, bootstrap_means, combine, find_strata, noise_floor, pool_trainings
+from xew.analysis.scores import TRAINING, TRUTH, MetricInfo, measure_power, name_graded
+from xew.protocol import BASELINES, CODEC_TRUTH, MULTI_VIEW, PARTS, ROBOT_NAMES, SPLITS, Variant
+from xew.statistics import (
+    DRAWS,
+    LEVEL,
+    Mean,
+    bootstrap_means,
+    combine,
+    describe_floors,
+    describe_power,
+    find_powerless,
+    find_strata,
+    floor_sources,
+    largest_floor,
+    noise_floor,
+    pool_trainings,
+)
 
 TOGETHER = {
     "few_shot": ("few_shot", "remedies"),
@@ -55,8 +69,18 @@ class Grades(Protocol):
     def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
         """The mean paired difference of a row from another, over the cells that all rows of the part have."""
 
-    def floor(self, robots: str, metric: str) -> float:
-        """The metric's noise floor on these robots, NaN where it is not known; a difference that is no larger says nothing."""
+    def against(self, part: str, row: str, baseline: str, robots: str, metric: str) -> tuple[Mean, Mean] | None:
+        """The means of a row and of a baseline, over the cells that all rows of the part and the baseline have.
+
+        None where one of both was not graded.
+        """
+
+    def floor(self, robots: str, metric: str, *rows: tuple[str, str]) -> float:
+        """The metric's noise floor on these robots for some rows, as (part, row); a difference that is no larger says nothing.
+
+        It is the largest of theirs, each of the truth through the row's codec where that was graded, else of the true video, as
+        without any row; NaN where one is not known.
+        """
 
     def axis(self, name: str) -> np.ndarray:
         """Mean distance of each robot to the other four, 'appearance' or 'kinematic', in the order of ROBOT_NAMES: [5], or
@@ -114,6 +138,7 @@ class StudyGrades:
         own_distances: these were measured, and are not the paper's.
         spreads: standard deviation of the mean distances by axis, over which they are drawn as well; none where left out.
         draws: number of bootstrap draws.
+        codecs: conditions of the truth through the codec of each variant, of which its noise floors are.
     """
 
     level = LEVEL
@@ -126,15 +151,20 @@ class StudyGrades:
         own_distances: bool = False,
         spreads: Mapping[str, np.ndarray] | None = None,
         draws: int = DRAWS,
+        codecs: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         self.own_distances = own_distances
         self.metrics = {metric.name: metric for metric in metrics}
-        self._axes, self._spreads, self._draws = axes, spreads or {}, draws
+        self._axes, self._spreads, self._draws, self._codecs = axes, spreads or {}, draws, codecs or {}
         # Baselines belong to no variant; they are found by the model's name.
-        named = rows.assign(variant=rows["variant"].where(rows["variant"] != "", rows["model"]))
+        named = rows.assign(variant=name_graded(rows))
         named = named if TRAINING in named else named.assign(**{TRAINING: 0})
         columns = ["variant", "robot", "metric", TRAINING]
         self._cells = named.pivot(index=["task", "seed"], columns=columns, values="value").sort_index()
+        self.power = measure_power(rows, metrics)
+        tasks, names_of = self._cells.index.get_level_values("task"), self._cells.columns.get_level_values("metric")
+        for task, metric in find_powerless(self.power):
+            self._cells = self._cells.mask(np.outer(tasks == task, names_of == metric))
         self._strata = find_strata(self._cells.index.get_level_values("task").to_list())
         self._columns: dict[tuple[str, str, str, int], int] = {}
         trainings: dict[str, set[int]] = {}
@@ -154,7 +184,18 @@ class StudyGrades:
     @property
     def variants(self) -> list[str]:
         """Names of the variants that were graded, without the baselines."""
-        return [name for name in self._trainings if name not in BASELINES]
+        return [name for name in self._trainings if name.partition(" ")[0] not in BASELINES]
+
+    @property
+    def notes(self) -> str:
+        """Sentences that say what the noise floors of the variants are of, and which tasks left which means."""
+        titles = {name: info.title for name, info in self.metrics.items()}
+        return " ".join(filter(None, (describe_floors(self.variants, self._codecs), describe_power(self.power, titles))))
+
+    @property
+    def codec_truths(self) -> list[str]:
+        """Names of the truth through each codec that was graded, as `variant_mean` takes them."""
+        return [name for name in self._trainings if name.startswith(f"{CODEC_TRUTH} ")]
 
     def trainings(self, variant: str) -> int:
         """Number of trainings of a variant that were graded."""
@@ -200,10 +241,27 @@ class StudyGrades:
         new, old = (self._scores(variant.name, pooled(variant, robots), metric) for variant in (after, before))
         return self._bootstrap(after.name, [np.where(shared, new - old, np.nan)])[0]
 
-    def floor(self, robots: str, metric: str) -> float:
-        info = self.metrics[metric]
-        truth = self.baseline(TRUTH, SPLITS["fixed"].train_robots if robots == SEEN else (robots,), metric)
-        return noise_floor(truth.value if truth else None, info.best, info.estimated)
+    def against(self, part: str, row: str, baseline: str, robots: str, metric: str) -> tuple[Mean, Mean] | None:
+        variant = find_variant(part, row)
+        if not (self.has(variant.name) and self.has(baseline)):
+            return None
+        names = pooled(variant, robots)
+        scores = [self._scores(name, names, metric) for name in (variant.name, baseline)]
+        cells = self._shared(part, names, metric) & ~np.isnan(scores[1]).all(axis=0)
+        graded = zip((variant.name, baseline), scores, strict=True)
+        mean, other = (self._bootstrap(name, [np.where(cells, own, np.nan)])[0] for name, own in graded)
+        return None if mean is None or other is None else (mean, other)
+
+    def floor(self, robots: str, metric: str, *rows: tuple[str, str]) -> float:
+        info, names = self.metrics[metric], SPLITS["fixed"].train_robots if robots == SEEN else (robots,)
+        truth = self.baseline(TRUTH, names, metric)
+        floors = []
+        for variant in [find_variant(*row).name for row in rows] or [""]:
+            sources = [" ".join(filter(None, source)) for source in floor_sources(variant, self._codecs)]
+            graded = [self.baseline(source, names, metric) for source in sources]
+            known: list[Mean | None] = [mean for mean in graded if mean] or [truth]
+            floors += [noise_floor(mean.value if mean else None, info.best, info.estimated) for mean in known]
+        return largest_floor(floors)
 
     def axis(self, name: str) -> np.ndarray:
         """Mean distances to the other four robots, the paper's or the study's own (`own_distances`): [5] float64, or where they
@@ -228,7 +286,7 @@ class StudyGrades:
         for i in range(len(scores)):
             own = [mean for mean in found[i * trainings : (i + 1) * trainings] if mean is not None]
             mean = pool_trainings(own, variant, self._several) if own else None
-            means.append(replace(mean, trainings=0) if mean and variant in BASELINES else mean)
+            means.append(replace(mean, trainings=0) if mean and variant.partition(" ")[0] in BASELINES else mean)
         return means
 
     def _scores(self, variant: str, robots: tuple[str, ...], metric: str) -> np.ndarray:
@@ -287,6 +345,9 @@ class PaperGrades:
         after, before = (self.mean(part, key, robots, metric) for key in (row, base))
         return None if after is None or before is None else combine(np.subtract, after, before)
 
+    def against(self, part: str, row: str, baseline: str, robots: str, metric: str) -> tuple[Mean, Mean] | None:
+        return None  # the paper prints no baseline
+
     def print(self, part: str, row: str, robots: str, metric: str) -> str:
         """A value with as many decimals as the paper prints; '' where it prints none."""
         part, row = self.ALIASES.get((part, row), (part, row))
@@ -295,7 +356,7 @@ class PaperGrades:
             return ""
         return f"{printed:.{round(-np.log10(2 * self._paper.half_digit_of(part, metric)))}f}"
 
-    def floor(self, robots: str, metric: str) -> float:
+    def floor(self, robots: str, metric: str, *rows: tuple[str, str]) -> float:
         return 0.0  # the paper prints none
 
     def axis(self, name: str) -> np.ndarray:

@@ -1,16 +1,32 @@
 """The tables of one run: its scores as means, intervals and verdicts, robot by robot."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import cast
 
 import numpy as np
 import pandas as pd
 
-from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores
-from xew.protocol import BASELINES
+from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, measure_power
+from xew.protocol import BASELINES, PASTED_RENDER
 from xew.sim_warp.robots import ROBOTS
-from xew.statistics import MIN_SCENES, UNRESOLVED, Mean, Units, bootstrap_means, noise_floor, verdict
+from xew.statistics import (
+    MIN_SCENES,
+    UNRESOLVED,
+    Mean,
+    Units,
+    bootstrap_means,
+    describe_floors,
+    describe_parting,
+    describe_power,
+    drop_powerless,
+    find_parting,
+    floor_sources,
+    largest_floor,
+    noise_floor,
+    strict_metrics,
+    verdict,
+)
 
 ROBOT_TITLES = {key: robot.title for key, robot in ROBOTS.items()}
 
@@ -35,10 +51,12 @@ class Row:
     """Mean and interval of each metric."""
     verdicts: dict[str, str]
     """Verdict on each metric against the frozen first frame, paired by episode; empty for baselines."""
+    over_pasting: dict[str, str] = field(default_factory=dict)
+    """The same against the pasted render; empty where that was not graded, and for baselines."""
 
     @property
     def title(self) -> str:
-        return BASELINES.get(self.model) or (f"{self.model} · {self.condition}" if self.condition else self.model)
+        return " · ".join(filter(None, (BASELINES.get(self.model, self.model), self.condition)))
 
 
 @dataclass(frozen=True)
@@ -50,6 +68,8 @@ class RobotTable:
     rows: tuple[Row, ...]
     expected: int | None
     """Episodes that the protocol's data hold for a model; None where the data set was not given."""
+    notes: str = ""
+    """Sentences that say what the noise floors are of, and which tasks left which means."""
 
     @property
     def counts(self) -> list[int]:
@@ -82,18 +102,18 @@ def mean_interval(scores: pd.Series, units: Units | None = None) -> Interval:
     return Interval(mean.value, *mean.interval(), mean.count)
 
 
-def verdict_on_copy(
-    model: pd.Series, copy: pd.Series, higher_is_better: bool, floor: float = 0, units: Units | None = None
+def verdict_on(
+    model: pd.Series, baseline: pd.Series, higher_is_better: bool, floor: float = 0, units: Units | None = None
 ) -> str:
-    """Is a model better than the frozen first frame on the episodes that both have? See `xew.statistics.verdict`.
+    """Is a model better than a baseline on the episodes that both have? See `xew.statistics.verdict`.
 
     Args:
-        model, copy: their scores, indexed by task, seed and robot.
+        model, baseline: their scores, indexed by task, seed and robot.
         higher_is_better: of the metric.
         floor: its noise floor; NaN where it is not known.
         units: as of `mean_interval`.
     """
-    difference = (model - copy).dropna()
+    difference = (model - baseline).dropna()
     if difference.empty:
         return UNRESOLVED
     mean = _bootstrap(difference, units)
@@ -110,34 +130,54 @@ def _bootstrap(scores: pd.Series, units: Units | None) -> Mean:
 
 def robot_table(scores: Scores, title: str, robots: Sequence[str], expected: int | None) -> RobotTable:
     """Rows for all models, then for the baselines."""
-    rows = scores.rows[scores.rows["robot"].isin(robots)]
+    power = measure_power(scores.rows, scores.metrics)
+    kept = drop_powerless(scores.rows, power)
+    rows = kept[kept["robot"].isin(robots)]
     groups = rows.groupby(["model", "condition"], sort=False)
     by_model = {(str(model), str(condition)): group for (model, condition), group in groups}
     ends = [key for name in BASELINES for key in by_model if key[0] == name]
     order = [key for key in by_model if key[0] not in BASELINES] + ends
-    copy, truth = (next((by_model[key] for key in ends if key[0] == name), None) for name in (COPY, TRUTH))
     units = Units(scores.rows)
-    built = tuple(_row(key, by_model[key], copy, truth, scores.metrics, units) for key in order)
-    return RobotTable(title, tuple(robots), built, expected)
+    truth, others = by_model.get((TRUTH, "")), [by_model.get((name, "")) for name in (COPY, PASTED_RENDER)]
+    truths = {key: [by_model[s] for s in floor_sources(key[0], scores.codecs) if s in by_model] for key in order}
+    built = tuple(_row(key, by_model[key], others, truth, truths[key], scores.metrics, units) for key in order)
+    models = list(dict.fromkeys(model for model, _ in order if model not in BASELINES))
+    notes = describe_floors(models, scores.codecs), describe_power(power, {m.name: m.title for m in scores.metrics})
+    return RobotTable(title, tuple(robots), built, expected, " ".join(filter(None, notes)))
 
 
 def _row(
     key: tuple[str, str],
     group: pd.DataFrame,
-    copy: pd.DataFrame | None,
+    others: Sequence[pd.DataFrame | None],
     truth: pd.DataFrame | None,
+    truths: Sequence[pd.DataFrame],
     metrics: Sequence[MetricInfo],
     units: Units,
 ) -> Row:
+    """A row of a table.
+
+    `others` are the rows of the baselines that it is compared with, `truths` those of the truth through its codec, and `truth`
+    those of the true video.
+    """
     values = {metric.name: _by_episode(group, metric.name) for metric in metrics}
-    verdicts = {}
-    if copy is not None and key[0] not in BASELINES:
+    verdicts: list[dict[str, str]] = [{} for _ in others]
+    floors = {metric.name: _pair_floor(truths, truth, metric, units) for metric in metrics} if key[0] not in BASELINES else {}
+    for found, other in zip(verdicts, others, strict=True):
+        if other is None or not floors:
+            continue
         for metric in metrics:
-            floor = _noise_floor(truth, metric, units)
-            still = _by_episode(copy, metric.name)
-            verdicts[metric.name] = verdict_on_copy(values[metric.name], still, metric.higher_is_better, floor, units)
+            baseline = _by_episode(other, metric.name)
+            floor, own = floors[metric.name], values[metric.name]
+            found[metric.name] = verdict_on(own, baseline, metric.higher_is_better, floor, units)
     intervals = {name: mean_interval(series, units) for name, series in values.items() if len(series)}
-    return Row(*key, intervals, verdicts)
+    return Row(*key, intervals, *verdicts)
+
+
+def _pair_floor(truths: Sequence[pd.DataFrame], truth: pd.DataFrame | None, metric: MetricInfo, units: Units) -> float:
+    """The floor of a difference of a model, whose codec's truth is in `truths`, from the frozen first frame."""
+    own = [rows for rows in truths if (rows["metric"] == metric.name).any()]
+    return largest_floor(_noise_floor(rows, metric, units) for rows in (*own, truth))
 
 
 def _noise_floor(truth: pd.DataFrame | None, metric: MetricInfo, units: Units) -> float:
@@ -158,6 +198,7 @@ def finding(held_out: Sequence[RobotTable], seen: Sequence[RobotTable], metrics:
         episodes = f"{table.count} episode{'s' if table.count != 1 else ''}"
         sentences.append(
             f"{table.title} ({episodes}): {row.title} {_compare(row, metrics)}.{_distance_left((table, row), twins, metrics)}"
+            f"{_parting(row, metrics)}"
         )
     return sentences or ["No model has been compared with the frozen first frame yet: grade without --no-baselines."]
 
@@ -187,22 +228,39 @@ def progress(table: RobotTable, row: Row, metric: str) -> float | None:
 
 
 def _compare(row: Row, metrics: Sequence[MetricInfo]) -> str:
+    """What a model beats and what not, by the metrics that decide: of a frozen first frame, and of the pasted render."""
     if all(np.isnan(score.low) for score in row.scores.values()):
         return f"cannot be told from a frozen first frame by fewer than {MIN_SCENES} scenes"
-    parts = []
+    parts = _compare_with("a frozen first frame", row.verdicts, metrics)
+    return "; it ".join([*parts, *_compare_with("the pasted render, which learned nothing,", row.over_pasting, metrics)])
+
+
+def _compare_with(title: str, verdicts: Mapping[str, str], metrics: Sequence[MetricInfo]) -> list[str]:
+    parts, shown = [], strict_metrics({metric.name: metric for metric in metrics})
     for word, phrase in (("better", "beats"), ("worse", "falls behind"), ("unresolved", "cannot be told from")):
-        names = [m.title for m in metrics if row.verdicts.get(m.name) == word]
+        names = [m.title for m in metrics if verdicts.get(m.name) == word and m.name not in shown]
         if names:
-            parts.append(f"{phrase} a frozen first frame on {_join(names)}")
-    return "; it ".join(parts)
+            parts.append(f"{phrase} {title} on {_join(names)}")
+    return parts
+
+
+def _parting(row: Row, metrics: Sequence[MetricInfo]) -> str:
+    """Sentence on where the suites part against a frozen first frame, or ''; strict decides."""
+    named = {metric.name: metric for metric in metrics}
+    pairs = find_parting(row.verdicts, named)
+    titled = {named[name].title: word for name, word in row.verdicts.items()}
+    text = describe_parting([(named[strict].title, named[paper].title) for strict, paper in pairs], titled)
+    return f" The suites part on {text}; strict decides." if pairs else ""
 
 
 def _join(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def flat_summary(tables: Sequence[RobotTable]) -> pd.DataFrame:
-    """All tables as one tidy frame: robots model condition metric mean low high episodes expected versus_frozen."""
+def flat_summary(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> pd.DataFrame:
+    """All tables as one tidy frame: robots model condition metric mean low high episodes expected versus_frozen versus_pasted
+    decides."""
+    shown = strict_metrics({metric.name: metric for metric in metrics})
     return pd.DataFrame(
         {
             "robots": " ".join(table.robots),
@@ -215,6 +273,8 @@ def flat_summary(tables: Sequence[RobotTable]) -> pd.DataFrame:
             "episodes": score.count,
             "expected": table.expected,
             "versus_frozen": row.verdicts.get(name, ""),
+            "versus_pasted": row.over_pasting.get(name, ""),
+            "decides": name not in shown,
         }
         for table in tables
         for row in table.rows

@@ -164,13 +164,15 @@ def _plan_evaluate(study: Study, variant: Variant, baselines: bool) -> Step:
     """Grading of a variant. The first one covers all robots, so the baselines are graded with it and with no other."""
     out = _scores_path(study, variant.name)
     given = ("--data", str(study.data_folder), "--out", str(out))
-    asked = ("--baselines" if baselines else "--no-baselines", *study.evaluate)
+    # The truth through a codec is graded once for all variants that share it.
+    codec = ("--codec", str(run_folder(study, variant)))
+    asked = ("--baselines" if baselines else "--no-baselines", *codec, *study.evaluate)
     return Step(
         "evaluate",
         variant.name,
         ("xew.metrics.evaluate", str(_rollouts_path(study, variant.name)), *given, *asked),
         needs=("generate", f"rollout/{variant.name}"),
-        inputs=[asked, source_digest("metrics", "statistics")],
+        inputs=[asked[:1], study.evaluate, source_digest("metrics", "statistics")],
         product=out,
     )
 

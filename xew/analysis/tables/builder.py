@@ -12,12 +12,13 @@ from xew.analysis.tables.labels import PAPER_METRICS, TRUE
 from xew.analysis.tables.table import TableCell, TableRow, format_interval, format_number
 from xew.protocol import (
     BASELINES,
+    CODEC_TRUTH,
     PAPER_PARTS,
     PARTS,
     expected_counts,
     reference,
 )
-from xew.statistics import Mean
+from xew.statistics import Mean, strict_metrics
 
 
 @dataclass(frozen=True)
@@ -64,12 +65,18 @@ class Builder:
             printed,
             text=format_number(mean.value, info),
             interval=format_interval(ends, info),
-            verdict=paired_verdict(self.ours, part, row, base, robots, metric) if base and base != row else "",
+            verdict=self._mark(part, row, base, robots, metric),
             value=mean.value,
             low=ends[0],
             high=ends[1],
             episodes=mean.count,
         )
+
+    def _mark(self, part: str, row: str, base: str, robots: str, metric: str) -> str:
+        """Verdict on the difference from the row `base`; none of a metric beside one of the suite strict, which decides."""
+        if not base or base == row or metric in strict_metrics(self.ours.metrics):
+            return ""
+        return paired_verdict(self.ours, part, row, base, robots, metric)
 
     def row(self, part: str, row: str, robots: str, metrics: Sequence[str], labels: Sequence[str], base: str = "") -> TableRow:
         """One cell for each metric."""
@@ -80,18 +87,24 @@ class Builder:
         rows = [
             TableRow((title,), tuple(self.baseline(name, robots, m) for m in metrics), baseline=True)
             for name, title in BASELINES.items()
-            if name != TRUTH
+            if name not in (CODEC_TRUTH, TRUTH)
         ]
         return [*_keep_graded(rows), *self.truth((TRUE,), [(robots, metric) for metric in metrics])]
 
     def truth(self, labels: tuple[str, ...], places: Sequence[tuple[Sequence[str], str]]) -> list[TableRow]:
-        """A row of the true video, which shows the noise floor; none if it was not graded.
+        """Rows of the true video and of the truth through codecs, which show the noise floors; none that was not graded.
 
         Args:
             labels: of the row.
             places: robots, pooled, and metric of each column.
         """
-        return _keep_graded([TableRow(labels, tuple(self.baseline(TRUTH, *place) for place in places), baseline=True)])
+        rows = {TRUTH: labels}
+        for name in self.ours.codec_truths if isinstance(self.ours, StudyGrades) else ():
+            title = f"{BASELINES[CODEC_TRUTH]} ({name.partition(' ')[2]})"
+            shown = tuple(title if label == TRUE else label for label in labels)
+            rows[name] = shown if title in shown else (f"{labels[0]}, {title}", *labels[1:])
+        cells = {name: tuple(self.baseline(name, *place) for place in places) for name in rows}
+        return _keep_graded([TableRow(shown, cells[name], baseline=True) for name, shown in rows.items()])
 
     def note(self, part: str, rows: Iterable[tuple[str, str, str]]) -> str:
         """Note on what a section lacks, or ''; its rows are given as key, robots and label."""
@@ -154,7 +167,7 @@ def paired_verdict(grades: Grades, part: str, row: str, base: str, robots: str, 
     difference = grades.difference(part, row, base, robots, metric)
     if difference is None:
         return ""
-    floor, info = grades.floor(robots, metric), grades.metrics[metric]
+    floor, info = grades.floor(robots, metric, (part, row), (part, base)), grades.metrics[metric]
     return statistics.verdict(difference.value, difference.interval(grades.level), floor, info.higher_is_better)
 
 

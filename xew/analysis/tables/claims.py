@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 
 from xew.analysis.correlation import leave_one_out, pearson
-from xew.analysis.paper import PAPER_TITLES
 from xew.analysis.statistics.grades import REFERENCE
 from xew.analysis.tables.comparisons import Claim, Comparison, NotMeasuredError, Reader
 from xew.analysis.tables.labels import PAPER_METRICS, SHORT_ROBOTS, SYSTEMS
@@ -45,7 +44,8 @@ def _ray_map_share(reader: Reader) -> Iterator[Comparison]:
     for robot in HELD_OUT_ROBOTS:
         joints, rays, flow = (reader.mean("actions", row, robot, "lpips") for row in ("joints", "ray_map", "optical_flow"))
         share, doubt = reader.share(joints, rays, flow, "lpips")
-        yield Comparison(f"{SHORT_ROBOTS[robot]} LPIPS", share, above=1 / 3, doubt=doubt)
+        subject = ("actions", "ray_map", robot, "lpips")
+        yield Comparison(f"{SHORT_ROBOTS[robot]} LPIPS", share, above=1 / 3, doubt=doubt, subject=subject)
 
 
 def _against_others(winner: str, metrics: Sequence[str]) -> Callable[[Reader], Iterator[Comparison]]:
@@ -92,7 +92,8 @@ def _render_closes(reader: Reader) -> Iterator[Comparison]:
     for robot in HELD_OUT_ROBOTS:
         for row, title, above, below in (("robot_render", "render", 0.5, np.inf), ("nine_views", "nine views", -np.inf, 0.25)):
             share, doubt = reader.closed_share("ladder", row, "none", robot, "region_lpips", ("ladder", "none"))
-            yield Comparison(f"{title}, {SHORT_ROBOTS[robot]}", share, above, below, doubt=doubt)
+            subject = ("ladder", row, robot, "region_lpips")
+            yield Comparison(f"{title}, {SHORT_ROBOTS[robot]}", share, above, below, doubt=doubt, subject=subject)
 
 
 def _first_round(reader: Reader) -> Iterator[Comparison]:
@@ -183,7 +184,7 @@ def _appearance_first_always(reader: Reader) -> Iterator[Comparison]:
 
 def _appearance_everywhere(reader: Reader) -> Iterator[Comparison]:
     for metric in PAPER_METRICS:
-        yield reader.correlation(PAPER_TITLES[metric], metric, pearson, ("appearance",))
+        yield reader.correlation(reader.title(metric), metric, pearson, ("appearance",))
 
 
 def _appearance_significant(reader: Reader) -> Iterator[Comparison]:

@@ -9,8 +9,8 @@ from xew.analysis.correlation import exact_p
 from xew.analysis.paper import PAPER_TITLES
 from xew.analysis.statistics.grades import SEEN, Grades, relative_gain
 from xew.analysis.tables.labels import SHORT_ROBOTS
-from xew.protocol import ROBOT_NAMES, SEEN_ROBOTS
-from xew.statistics import MIN_SCENES, SIGNIFICANCE, Mean, combine
+from xew.protocol import BASELINES, HELD_OUT_ROBOTS, PASTED_RENDER, ROBOT_NAMES, SEEN_ROBOTS
+from xew.statistics import MIN_SCENES, SIGNIFICANCE, Mean, combine, largest_floor
 
 OTHER_ROBOTS = "measured on other robots: no model that saw this one was graded"
 """Doubt about a gap that is told from seen robots, which may be easier or harder to render."""
@@ -36,6 +36,8 @@ class Comparison:
     """Whether it is printed as a percentage, else with three decimals."""
     doubt: str = ""
     """Reason why it cannot be resolved whatever the interval says, or ''."""
+    subject: tuple[str, str, str, str] | None = None
+    """Part, row, robot and metric of the model of which something good is said, and which should therefore beat pasting."""
     exact: tuple[float, float] = (0.0, 0.0)
     """Exact p of the claim and of its opposite over pairings of robots, which have to be small too; 0 where none is asked."""
 
@@ -83,7 +85,7 @@ class Reader:
         mean = self.grades.mean(part, row, robots, metric, shared=True) if metric in self.grades.metrics else None
         if mean is None:
             name = SHORT_ROBOTS.get(robots, "seen robots")
-            raise NotMeasuredError(f"{PAPER_TITLES[metric]} of {row.replace('_', ' ')} ({part.replace('_', ' ')}) on {name}")
+            raise NotMeasuredError(f"{self.title(metric)} of {row.replace('_', ' ')} ({part.replace('_', ' ')}) on {name}")
         return mean
 
     def gain(
@@ -91,10 +93,33 @@ class Reader:
     ) -> Comparison:
         """The gain of one row over another, as a share of the value before; positive is better."""
         new, old = self.mean(part, after, robots, metric), self.mean(part, before, robots, metric)
-        label = f"{SHORT_ROBOTS.get(robots, 'seen')} {PAPER_TITLES[metric]}"
+        label = f"{SHORT_ROBOTS.get(robots, 'seen')} {self.title(metric)}"
         # Where a bound from above is asked for, smallness is the claim, and the floor does not speak against it.
-        doubt = self._doubt_of_few((new, old)) if below < np.inf else self._doubt((new, old), robots, metric)
-        return Comparison(label, relative_gain(new, old, self.grades.metrics[metric]), above, below, doubt=doubt)
+        rows = (part, after), (part, before)
+        doubt = self._doubt_of_few((new, old)) if below < np.inf else self._doubt((new, old), robots, metric, *rows)
+        subject = (part, after, robots, metric) if robots in HELD_OUT_ROBOTS else None
+        gain = relative_gain(new, old, self.grades.metrics[metric])
+        return Comparison(label, gain, above, below, doubt=doubt, subject=subject)
+
+    def over_pasting(self, subject: tuple[str, str, str, str]) -> Comparison:
+        """The gain of a model over the pasted render, which learned nothing, on the same episodes; positive is better.
+
+        Args:
+            subject: part, row, robot and metric.
+        """
+        part, row, robot, metric = subject
+        found = self.grades.against(part, row, PASTED_RENDER, robot, metric)
+        if found is None:
+            raise NotMeasuredError(f"{BASELINES[PASTED_RENDER]} on {SHORT_ROBOTS[robot]}")
+        floor = largest_floor((self.grades.floor(robot, metric, (part, row)), self.grades.floor(robot, metric)))
+        label = f"{row.replace('_', ' ')}, {SHORT_ROBOTS[robot]} {self.title(metric)}"
+        gain = relative_gain(*found, self.grades.metrics[metric])
+        return Comparison(label, gain, above=0, doubt=self._doubt_of_floor(found, floor))
+
+    def title(self, metric: str) -> str:
+        """Title of the metric that stands for a metric of the paper: its own, or that of the suite strict."""
+        info = self.grades.metrics.get(metric)
+        return info.title if info and info.name != metric else PAPER_TITLES[metric]
 
     def mean_of_seen(self, robot: str, metric: str) -> Mean | None:
         """Mean on a robot over the leave-one-embodiment-out folds that saw it; None where none was graded."""
@@ -114,9 +139,9 @@ class Reader:
         saw, fold = self.mean_of_seen(robot, metric), f"loeo_{robot}"
         if saw is None or self.grades.mean("loeo", fold, robot, metric) is None:
             return self.worse_than_seen("fixed", "fixed", robot, metric)
-        label = f"{SHORT_ROBOTS[robot]} {PAPER_TITLES[metric]}"
+        label = f"{SHORT_ROBOTS[robot]} {self.title(metric)}"
         unseen = self.mean("loeo", fold, robot, metric)
-        doubt = self._doubt((unseen, saw), robot, metric)
+        doubt = self._doubt((unseen, saw), robot, metric, ("loeo", fold))
         return Comparison(label, _loss(unseen, saw, self.grades, metric), above=0, doubt=doubt)
 
     def worse_than_seen(self, part: str, row: str, robot: str, metric: str, above: float = 0) -> Comparison:
@@ -126,14 +151,14 @@ class Reader:
         were not graded, it is its score on seen robots, in doubt.
         """
         new, old = self.mean(part, row, robot, metric), self.mean(part, row, SEEN, metric)
-        label = f"{SHORT_ROBOTS[robot]} {PAPER_TITLES[metric]}"
+        label = f"{SHORT_ROBOTS[robot]} {self.title(metric)}"
         saw = [self.mean_of_seen(name, metric) for name in (robot, *SEEN_ROBOTS)]
         known = [mean for mean in saw if mean is not None]
         if len(known) < len(saw):
-            doubt = self._doubt((new, old), robot, metric) or OTHER_ROBOTS
+            doubt = self._doubt((new, old), robot, metric, (part, row)) or OTHER_ROBOTS
             return Comparison(label, _loss(new, old, self.grades, metric), above, doubt=doubt)
         expected = combine(lambda score, own, *others: score * own / _average(*others), old, *known)
-        doubt = self._doubt((new, expected), robot, metric)
+        doubt = self._doubt((new, expected), robot, metric, (part, row))
         return Comparison(label, _loss(new, expected, self.grades, metric), above, doubt=doubt)
 
     def share(self, start: Mean, after: Mean, end: Mean, metric: str) -> tuple[Mean, str]:
@@ -186,8 +211,10 @@ class Reader:
         few = any(mean.scenes is not None and mean.scenes < MIN_SCENES for mean in means)
         return f"fewer than {MIN_SCENES} scenes" if few else ""
 
-    def _doubt(self, means: tuple[Mean, Mean], robots: str, metric: str) -> str:
-        floor = self.grades.floor(robots, metric)
+    def _doubt(self, means: tuple[Mean, Mean], robots: str, metric: str, *rows: tuple[str, str]) -> str:
+        return self._doubt_of_floor(means, self.grades.floor(robots, metric, *rows))
+
+    def _doubt_of_floor(self, means: tuple[Mean, Mean], floor: float) -> str:
         inside = floor > 0 and abs(means[0].value - means[1].value) <= floor
         unknown = "no noise floor: the true video was not graded" if np.isnan(floor) else ""
         return self._doubt_of_few(means) or unknown or (f"inside the noise floor of {floor:.3g}" if inside else "")

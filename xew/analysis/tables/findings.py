@@ -20,6 +20,9 @@ from xew.statistics import SIGNIFICANCE, holm
 
 HOLDS, FAILS, UNRESOLVED, UNMEASURED = "holds", "fails", "unresolved", "not measured"
 """The answers to a claim."""
+BEATS = {HOLDS: "beats pasting", FAILS: "does not beat pasting", UNRESOLVED: "unresolved against pasting"}
+BEATS[UNMEASURED] = "pasting was not graded"
+"""Texts of the answers to whether what a claim speaks of beats the pasted render: worse by one comparison is “does not”."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,11 @@ class Finding:
     """Name of what was not measured, if anything."""
     in_family: str = UNMEASURED
     """Answer where all claims that were measured count as one family of tests."""
+    over_pasting: tuple[AnsweredComparison, ...] = ()
+    """Gains over the pasted render of the models of which the claim says something good; empty where there is none, or where
+    the render was not graded."""
+    pasting: str = ""
+    """Whether all of these beat the pasted render, one of BEATS; '' where the claim speaks of no rung or stream."""
 
     @property
     def p_holds(self) -> float:
@@ -101,11 +109,34 @@ def _ask_claim(claim: Claim, reader: Reader) -> Finding:
         asked = list(claim.comparisons(reader))
     except NotMeasuredError as missing:
         return Finding(claim, UNMEASURED, (), str(missing))
+    comparisons = _answer_all(asked, level)
+    over, pasting = _ask_pasting(asked, reader)
+    return Finding(claim, _answer_of(comparisons), comparisons, over_pasting=over, pasting=pasting)
+
+
+def _ask_pasting(asked: Sequence[Comparison], reader: Reader) -> tuple[tuple[AnsweredComparison, ...], str]:
+    """Whether the models that comparisons speak of beat the pasted render: by the same tests, corrected among themselves."""
+    subjects = dict.fromkeys(comparison.subject for comparison in asked if comparison.subject)
+    if not subjects:
+        return (), ""
+    try:
+        over = _answer_all([reader.over_pasting(subject) for subject in subjects], reader.grades.level)
+    except NotMeasuredError:
+        return (), BEATS[UNMEASURED]
+    return over, BEATS[_answer_of(over)]
+
+
+def _answer_all(asked: Sequence[Comparison], level: float) -> tuple[AnsweredComparison, ...]:
+    """The answers to comparisons that are one family."""
     p_values = np.array([comparison.p_values(level) for comparison in asked])
     claims, opposites = holm(p_values[:, 0]), holm(p_values[:, 1])
-    comparisons = tuple(_answer_comparison(*each, level) for each in zip(asked, claims, opposites, strict=True))
+    return tuple(_answer_comparison(*each, level) for each in zip(asked, claims, opposites, strict=True))
+
+
+def _answer_of(comparisons: Sequence[AnsweredComparison]) -> str:
+    """The answer to a claim from those to its comparisons: it fails with one of them, and holds with all."""
     answers = {one.answer for one in comparisons}
-    return Finding(claim, next(answer for answer in (FAILS, UNRESOLVED, HOLDS) if answer in answers), comparisons)
+    return next(answer for answer in (FAILS, UNRESOLVED, HOLDS) if answer in answers)
 
 
 def _answer(p_holds: float, p_fails: float) -> str:
@@ -137,16 +168,20 @@ def _format_plain(value: float) -> str:
 def findings_frame(findings: Sequence[Finding], of: str) -> pd.DataFrame:
     """A tidy frame of claims, one row per comparison.
 
-    Columns: of claim where says test verdict verdict_in_family comparison value low high answer p_holds p_fails trainings.
-    `verdict` is the answer to the claim, `verdict_in_family` that where all claims are one family, `answer` that of the
-    comparison with its corrected p-values; `of` says whose numbers they are.
+    Columns: of claim where says test verdict verdict_in_family pasting comparison value low high answer p_holds p_fails
+    trainings. `verdict` is the answer to the claim, `verdict_in_family` that where all claims are one family, `answer` that of
+    the comparison with its corrected p-values; `pasting` says whether what the claim speaks of beats the pasted render, and its
+    gains over that are comparisons “over pasting: …”; `of` says whose numbers they are.
     """
-    columns = ["of", "claim", "where", "says", "test", "verdict", "verdict_in_family", "comparison", "value", "low", "high"]
-    columns += ["answer", "p_holds", "p_fails", "trainings"]
+    columns = ["of", "claim", "where", "says", "test", "verdict", "verdict_in_family", "pasting", "comparison", "value", "low"]
+    columns += ["high", "answer", "p_holds", "p_fails", "trainings"]
     rows = [
-        (of, f.claim.name, f.claim.where, f.claim.says, f.claim.test, f.answer, f.in_family, a.label, a.value, a.low, a.high,
-         a.answer, a.p_holds, a.p_fails, a.trainings)
+        (of, f.claim.name, f.claim.where, f.claim.says, f.claim.test, f.answer, f.in_family, f.pasting, a.label, a.value, a.low,
+         a.high, a.answer, a.p_holds, a.p_fails, a.trainings)
         for f in findings
-        for a in f.comparisons or (AnsweredComparison(f.missing, "", np.nan, np.nan, np.nan, UNMEASURED),)
+        for a in (
+            *(f.comparisons or (AnsweredComparison(f.missing, "", np.nan, np.nan, np.nan, UNMEASURED),)),
+            *(replace(one, label=f"over pasting: {one.label}") for one in f.over_pasting),
+        )
     ]  # fmt: skip
     return pd.DataFrame(rows, columns=columns)

@@ -1,6 +1,6 @@
 """A `Table` as Markdown, LaTeX (booktabs) and CSV. HTML is in `page`."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 
 import pandas as pd
@@ -151,22 +151,30 @@ def tables_frame(tables: Sequence[Table]) -> pd.DataFrame:
     return pd.concat([table_frame(table) for table in tables], ignore_index=True)
 
 
-def findings_markdown(findings: Sequence[Finding], papers: Sequence[Finding] = ()) -> str:
-    """A Markdown table of claims: test, both answers with numbers, and where given the answer on the paper's own figures."""
-    beside = [["the paper's own figures"], *([paper.answer] for paper in papers)] if papers else [[]] * (len(findings) + 1)
-    heads = ["claim", "test", "verdict", "among all claims", "numbers", *beside[0]]
+def findings_markdown(findings: Sequence[Finding], papers: Sequence[Finding] = (), by_paper: Sequence[Finding] = ()) -> str:
+    """A Markdown table of claims: test, both answers with numbers, and where given the answers by the paper's definitions and
+    on the paper's own figures."""
+    beside = _answers_beside({"by the paper's definitions": by_paper, "the paper's own figures": papers}, len(findings))
+    heads = ["claim", "test", "verdict", "among all claims", "pasted render", "numbers", *beside[0]]
     lines = [_markdown_line(heads), "|---" * len(heads) + "|"]
     for finding, last in zip(findings, beside[1:], strict=True):
         numbers = "; ".join(one.text for one in finding.comparisons) or f"missing: {finding.missing}"
         claim, basis = finding.claim, f" ({finding.basis})" if finding.basis else ""
-        cells = [f"{claim.says} ({claim.where})", claim.test, f"**{finding.answer}**{basis}", finding.in_family, numbers, *last]
+        cells = [f"{claim.says} ({claim.where})", claim.test, f"**{finding.answer}**{basis}", finding.in_family]
+        cells += [finding.pasting or "–", numbers, *last]
         lines.append(_markdown_line(cells))
     return "\n".join(lines)
 
 
-def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = ()) -> str:
-    """A LaTeX table of claims: test, both answers, and where given the answer on the paper's own figures."""
-    beside = [["paper"], *([paper.answer] for paper in papers)] if papers else [[]] * (len(findings) + 1)
+def _answers_beside(others: Mapping[str, Sequence[Finding]], count: int) -> list[list[str]]:
+    """Heads, and then answers to each of so many claims, of other sources that are given."""
+    given = {title: found for title, found in others.items() if found}
+    return [list(given), *([found[i].answer for found in given.values()] for i in range(count))]
+
+
+def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = (), by_paper: Sequence[Finding] = ()) -> str:
+    """A LaTeX table of claims: test, both answers, and where given those by the paper's definitions and on its figures."""
+    beside = _answers_beside({"by paper's": by_paper, "paper": papers}, len(findings))
     rows = [
         _latex_line([_escape(text) for text in (finding.claim.says, finding.claim.test, *_both_answers(finding), *last)])
         for finding, last in zip(findings, beside[1:], strict=True)
@@ -176,9 +184,9 @@ def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = ()) 
             r"% \usepackage{booktabs,amssymb}",
             r"\begin{table*}[t]",
             r"\centering\footnotesize",
-            rf"\begin{{tabular}}{{@{{}}p{{0.32\textwidth}}p{{0.32\textwidth}}ll{'l' * bool(papers)}@{{}}}}",
+            rf"\begin{{tabular}}{{@{{}}p{{0.32\textwidth}}p{{0.32\textwidth}}lll{'l' * len(beside[0])}@{{}}}}",
             r"\toprule",
-            _latex_line(["claim", "test", "verdict", "among all", *beside[0]]),
+            _latex_line(["claim", "test", "verdict", "among all", "pasting", *beside[0]]),
             r"\midrule",
             *rows,
             r"\bottomrule",
@@ -191,8 +199,8 @@ def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = ()) 
     )
 
 
-def _both_answers(finding: Finding) -> tuple[str, str]:
-    return finding.answer, finding.in_family
+def _both_answers(finding: Finding) -> tuple[str, str, str]:
+    return finding.answer, finding.in_family, finding.pasting or "–"
 
 
 def _findings_caption(findings: Sequence[Finding]) -> str:

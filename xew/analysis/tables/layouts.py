@@ -24,6 +24,7 @@ from xew.protocol import (
     SEEN_ROBOTS,
     SHOTS,
 )
+from xew.statistics import strict_metrics
 
 
 def build_tables(builder: Builder) -> list[Table]:
@@ -41,7 +42,10 @@ def build_tables(builder: Builder) -> list[Table]:
 
 
 def _keep_measured(builder: Builder, names: Sequence[str]) -> tuple[str, ...]:
-    return tuple(name for name in names if name in builder.ours.metrics)
+    """These metrics of the paper, as far as graded, each behind that of the suite strict which decides in its place."""
+    strict = strict_metrics(builder.ours.metrics)
+    both = (kept for name in names for kept in (strict.get(name, ""), name))
+    return tuple(name for name in both if name in builder.ours.metrics)
 
 
 def gap_table(builder: Builder) -> Table:

@@ -11,7 +11,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -121,11 +121,12 @@ class _Types:
     samples: tuple[_Sample, ...]
     means: tuple[dict[str, Any], ...]
     digest: str
+    codecs: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def _check_types(path: Path, bundle: Any) -> None:
     """Raise ConfigError for what is missing or of another type than a bundle has; ValueError if its table lies elsewhere."""
-    known = {field.name for field in fields(_Types)}
+    known = {entry.name for entry in fields(_Types)}
     found = {name: value for name, value in bundle.items() if name in known} if isinstance(bundle, dict) else bundle
     read = parse(_Types, found, f"{path} is no bundle of xew, or is damaged")
     if Path(read.table).name != read.table:

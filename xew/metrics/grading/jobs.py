@@ -1,6 +1,6 @@
 """What there is to grade: rollouts, the episodes that they predict, and the baselines on these episodes."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,9 +13,11 @@ from xew.config import ConfigError
 from xew.episode import EpisodeError, Record, episode_folder, read_record
 from xew.files import digest_files
 from xew.metrics.grading.baselines import BASELINES
+from xew.metrics.grading.codecs import ModelCodec
 from xew.metrics.grading.scores import Cell
 from xew.metrics.truth import Truth
-from xew.protocol import GROUND_TRUTH
+from xew.protocol import BASELINES as TITLES
+from xew.protocol import CODEC_TRUTH, GROUND_TRUTH
 from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video, resize_video
 
 SOFTNESS = 0.8
@@ -33,6 +35,8 @@ class Job:
     episode: Path
     frame_rate: float
     """The episode's."""
+    codec: ModelCodec | None = None
+    """Codec that the truth goes through, of the baseline CODEC_TRUTH alone."""
 
     @property
     def place(self) -> Path:
@@ -46,6 +50,7 @@ def list_jobs(
     baselines: Collection[str],
     workers: int,
     problems: list[str] | None = None,
+    codecs: Mapping[str, ModelCodec] | None = None,
 ) -> list[Job]:
     """All that is to be graded, each once, jobs of one episode together.
 
@@ -56,6 +61,7 @@ def list_jobs(
         baselines: keys of BASELINES to grade too.
         workers: threads that read.
         problems: where given, rollouts that cannot be graded are told here and left out.
+        codecs: by the model that each is of; the truth goes through them on the episodes that the model has predicted.
 
     Raises:
         EpisodeError: a rollout cannot be graded. ConfigError: none is named.
@@ -65,7 +71,7 @@ def list_jobs(
 
     def try_jobs(rollout: Rollout) -> list[Job] | EpisodeError:
         try:
-            return list(_jobs(rollout, data, settings, baselines))
+            return list(_jobs(rollout, data, settings, baselines, (codecs or {}).get(rollout.model)))
         except EpisodeError as error:
             return error
 
@@ -83,7 +89,7 @@ def list_jobs(
     return sorted(jobs.values(), key=lambda job: (job.episode, job.rollout is None, job.cell.key))
 
 
-def _jobs(rollout: Rollout, data: Path, settings: str, baselines: Collection[str]) -> Iterator[Job]:
+def _jobs(rollout: Rollout, data: Path, settings: str, baselines: Collection[str], codec: ModelCodec | None) -> Iterator[Job]:
     """The rollout's own job, then its baselines'."""
     episode = episode_folder(data, rollout.task, rollout.seed, rollout.robot)
     record = _find_record(rollout, episode, data)
@@ -105,6 +111,9 @@ def _jobs(rollout: Rollout, data: Path, settings: str, baselines: Collection[str
         source = BASELINES[name].source(episode, record)
         if source is not None:
             yield Job(replace(cell, model=name, condition="", prediction=source), None, episode, record.frame_rate)
+    if codec is not None:
+        through = replace(cell, model=CODEC_TRUTH, condition=codec.key, prediction=codec.digest)
+        yield Job(through, None, episode, record.frame_rate, codec)
 
 
 def _check_horizons(jobs: Iterable[Job]) -> None:
@@ -139,7 +148,7 @@ def _unique(roots: Sequence[Path], problems: list[str] | None) -> list[Rollout]:
     seen: dict[tuple[str, str, str, int, str], Rollout] = {}
     for rollout in (rollout for root in roots for rollout in find_rollouts(root, problems)):
         first = seen.setdefault((rollout.model, rollout.condition, rollout.task, rollout.seed, rollout.robot), rollout)
-        if rollout.model in BASELINES:
+        if rollout.model in TITLES:
             _raise_or_note(problems, f"{rollout.folder}: the name {rollout.model} is a baseline's; give the model another.")
         elif first is not rollout:
             _raise_or_note(
@@ -147,7 +156,7 @@ def _unique(roots: Sequence[Path], problems: list[str] | None) -> list[Rollout]:
                 f"{first.folder} and {rollout.folder} are both model {rollout.model!r}, condition {rollout.condition!r}; "
                 "give them different names in rollout.json.",
             )
-    return [rollout for rollout in seen.values() if rollout.model not in BASELINES]
+    return [rollout for rollout in seen.values() if rollout.model not in TITLES]
 
 
 def _raise_or_note(problems: list[str] | None, message: str) -> None:
@@ -169,6 +178,8 @@ def read_prediction(job: Job, truth: Truth, allow: Collection[str] = (), frame_z
     Raises:
         RolloutError: the video cannot be read, or is not of the truth's shape, and that is not allowed.
     """
+    if job.codec is not None:
+        return job.codec.reconstruct(truth.rgb)
     if job.rollout is None:
         return BASELINES[job.cell.model].make(job.episode, truth)
     video = read_rollout_video(job.rollout, None if "rate" in allow else job.frame_rate)

@@ -247,6 +247,7 @@ def describe(settings: dict[str, Any], metrics: tuple[str, ...]) -> dict[str, An
         low, high = (bound if math.isfinite(bound) else None for bound in metric.range)
         fields = {key: getattr(metric, key) for key in ("dimension", "unit", "higher_is_better", "reference")}
         fields |= {"low": low, "high": high, "suites": list(metric.suites)}
+        fields |= {"counterpart": metric.counterpart}
         described[name] = fields | {"title": metric.title or name, "estimated": metric.estimated, "reported": metric.reported}
     return settings | {"metrics": described, "versions": {"xew": xew.__version__, "jax": jax.__version__}}
 

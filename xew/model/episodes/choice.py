@@ -8,7 +8,7 @@ from xew.config import ConfigError, suggestion
 from xew.dataset import Dataset, Episode, read_dataset
 from xew.episode import EpisodeError
 from xew.model.settings.parts import EpisodeChoice
-from xew.protocol import expand_robots
+from xew.protocol import expand_robots, validation_split
 
 
 @dataclass(frozen=True)
@@ -82,14 +82,15 @@ def first_of_each(episodes: Sequence[Episode], count: int) -> list[Episode]:
 
 
 def sample_episodes(dataset: Dataset, choice: EpisodeChoice) -> dict[str, Episode]:
-    """An episode of each robot of the split by role and robot, of test seeds where there are any.
+    """An episode of each robot by which choices are made (`validation_split`), by role and robot, never of a test seed.
 
+    It is of a validation seed where there is one of that robot, else of a training seed, which a model of the robot has seen.
     In an adapted run the robots adapted to are the target, and seen are those of the run that it started from.
     """
-    split, targets = choice.split, choice.adapt.robots
+    split, targets = validation_split(choice.split), choice.adapt.robots
     roles = dict.fromkeys(split.train_robots, "seen") | dict.fromkeys(split.held_out_robots, "unseen")
     roles |= dict.fromkeys(targets, "target")
-    found = dataset.select(robots=tuple(roles), split="test") or training_episodes(dataset, choice)
+    found = [e for family in ("validation", "train") for e in dataset.select(robots=tuple(roles), split=family)]
     first = {record.robot: (folder, record) for folder, record in reversed(found)}
     return {f"{roles[robot]}/{robot}": first[robot] for robot in roles if robot in first}
 
@@ -104,5 +105,6 @@ def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None)
     chosen = dataset.select(robots=robots, split=split)
     if not chosen:
         asked = f"{split} episode of {', '.join(robots)}" if robots else f"{split} episode"
-        raise EpisodeError(f"{data} has no {asked}; run python -m xew.sim_warp.generate --out {data}")
+        seeds = " --validation-seeds 4" if split == "validation" else ""
+        raise EpisodeError(f"{data} has no {asked}; run python -m xew.sim_warp.generate --out {data}{seeds}")
     return chosen

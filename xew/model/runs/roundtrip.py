@@ -1,31 +1,50 @@
 """Video through a run's codec and back: what is left of true frames, for whoever measures it."""
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from xew.config import ConfigError
+from xew.model.codecs.contract import Codec
+from xew.model.experiment import Experiment
 from xew.model.runs.folder import load_run
 from xew.model.video.frames import to_camera_size, to_model_size
 
 
-def open_roundtrip(run: Path) -> Callable[[np.ndarray], np.ndarray]:
-    """A function of video [t h w 3] uint8 to what the codec of a run leaves of it, [t h w 3] uint8.
+@dataclass(frozen=True)
+class RunRoundtrip:
+    """The codec of a run, at the size of its clips."""
+
+    experiment: Experiment
+    codec: Codec
+
+    @property
+    def model(self) -> str:
+        """Name of the model, as its rollouts name it."""
+        return self.experiment.out.name
+
+    @property
+    def digest(self) -> str:
+        """Text that changes whenever the video would: the codec and the size at which it works."""
+        return f"{self.codec.hash} {self.experiment.clip.height}x{self.experiment.clip.width}"
+
+    def __call__(self, video: np.ndarray) -> np.ndarray:
+        """Video [t h w 3] uint8 to what the codec leaves of it, [t h w 3] uint8."""
+        filled = np.concatenate([video, np.repeat(video[-1:], -(len(video) - 1) % 4, axis=0)])  # it takes 4 k + 1 frames
+        small = to_model_size(filled, self.experiment.clip.height, self.experiment.clip.width)
+        return to_camera_size(self.codec.decode(self.codec.encode(small)))[: len(video)]
+
+
+def open_roundtrip(run: Path) -> RunRoundtrip:
+    """The codec of a run as a function of video to video.
 
     Raises:
         ConfigError: there is no such run.
     """
     try:
-        experiment, codec = load_run(run)
+        return RunRoundtrip(*load_run(run))
     except FileNotFoundError as error:
         raise ConfigError(
             f"{run} is no run with a codec ({error.filename}); name a folder that xew.model.train wrote."
         ) from error
-
-    def reconstruct(video: np.ndarray) -> np.ndarray:
-        filled = np.concatenate([video, np.repeat(video[-1:], -(len(video) - 1) % 4, axis=0)])  # it takes 4 k + 1 frames
-        small = to_model_size(filled, experiment.clip.height, experiment.clip.width)
-        return to_camera_size(codec.decode(codec.encode(small)))[: len(video)]
-
-    return reconstruct

@@ -1,0 +1,67 @@
+"""Which episodes a training looks at: nothing that is tuned reads test seeds."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from xew.dataset import Dataset
+from xew.episode import Record
+from xew.model import latents
+from xew.model.codecs.ceiling import Ceiling
+from xew.model.episodes.choice import sample_episodes, training_episodes
+from xew.model.settings.parts import EpisodeChoice
+from xew.model.settings.settings import Clip
+from xew.protocol import FIXED, HELD_OUT_ROBOTS, ROBOT_NAMES, SEEN_ROBOTS, TEST_SEED_START, VALIDATION_SEED_START, seed_split
+
+BODY, UNSEEN = "body_96", "body_64"
+FAMILIES = {"train": 0, "validation": VALIDATION_SEED_START, "test": TEST_SEED_START}
+
+
+def dataset(*families: str, robots: tuple[str, ...] = (*ROBOT_NAMES, BODY, UNSEEN)) -> Dataset:
+    """Two seeds of each family, of one task."""
+    seeds = [FAMILIES[family] + i for family in families for i in range(2)]
+    records = (Record("lift_pot", seed, robot, True, hashes={"rgb": "x"}) for seed in seeds for robot in robots)
+    return Dataset(Path("data"), tuple((Path("data") / str(record.seed) / record.robot, record) for record in records))
+
+
+def test_samples_are_of_validation_seeds_of_training_robots_and_of_a_body() -> None:
+    found = sample_episodes(dataset("train", "validation", "test"), EpisodeChoice(FIXED))
+    assert set(found) == {*(f"seen/{robot}" for robot in SEEN_ROBOTS), f"unseen/{BODY}"}
+    assert {record.seed for _, record in found.values()} == {VALIDATION_SEED_START}
+
+
+def test_without_validation_seeds_samples_are_of_training_seeds_and_never_of_test_seeds() -> None:
+    for families in (("train", "test"), ("train",)):
+        found = sample_episodes(dataset(*families, robots=ROBOT_NAMES), EpisodeChoice(FIXED))
+        assert set(found) == {f"seen/{robot}" for robot in SEEN_ROBOTS}
+        assert {record.seed for _, record in found.values()} == {0}
+    assert sample_episodes(dataset("test"), EpisodeChoice(FIXED)) == {}
+
+
+def test_nothing_is_trained_on_validation_or_test_seeds() -> None:
+    episodes = training_episodes(dataset("train", "validation", "test"), EpisodeChoice(FIXED))
+    assert {seed_split(record.seed) for _, record in episodes} == {"train"}
+
+
+@pytest.mark.parametrize("families", [("train", "validation", "test"), ("train", "test")])
+def test_the_ceiling_in_the_log_is_of_no_test_seed_and_of_no_held_out_robot(
+    families: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, read = dataset(*families), []
+
+    def measure(codec: object, videos: object, **clip: int) -> Ceiling:
+        return Ceiling(20.0, 0.1, len(list(videos)))
+
+    def source(folder: Path, record: Record, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+        read.append(record)
+        return {"rgb": np.zeros((1, 2, 2, 3), np.uint8)}
+
+    monkeypatch.setattr(latents, "measure_ceiling", measure)
+    experiment, cache = SimpleNamespace(robots=FIXED, clip=Clip(5, 48, 64)), SimpleNamespace(codec=None)
+    training = training_episodes(data, EpisodeChoice(FIXED))
+    said = latents.report_ceiling(experiment, cache, data, training, source)
+    expected = "validation" if "validation" in families else "train"
+    assert {seed_split(record.seed) for record in read} == {expected} and said["of"].startswith(expected)
+    assert not {record.robot for record in read} & {*HELD_OUT_ROBOTS, UNSEEN}

@@ -1,0 +1,47 @@
+"""A study's means by the suite strict, at the addresses of the paper's metrics.
+
+Claims are about metrics of the paper. Asked of `StrictGrades`, each is answered by the metric of the suite strict that stands
+in the place of the paper's, where the score table has one; asked of the means themselves, by the paper's definitions.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from xew.analysis.scores import MetricInfo
+from xew.analysis.statistics.grades import Grades
+from xew.statistics import Mean, strict_metrics
+
+
+class StrictGrades:
+    """The means of a study, by the metrics that decide.
+
+    Args:
+        grades: of both suites.
+    """
+
+    def __init__(self, grades: Grades) -> None:
+        self._grades, self._strict = grades, strict_metrics(grades.metrics)
+        self.level, self.own_distances = grades.level, grades.own_distances
+
+    @property
+    def metrics(self) -> Mapping[str, MetricInfo]:
+        """What the table says of the metric that decides, by the name of the paper's."""
+        known = self._grades.metrics
+        return {name: known[self._strict.get(name, name)] for name in known}
+
+    def mean(self, part: str, row: str, robots: str, metric: str, shared: bool = False) -> Mean | None:
+        return self._grades.mean(part, row, robots, self._strict.get(metric, metric), shared)
+
+    def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
+        return self._grades.difference(part, row, base, robots, self._strict.get(metric, metric))
+
+    def against(self, part: str, row: str, baseline: str, robots: str, metric: str) -> tuple[Mean, Mean] | None:
+        return self._grades.against(part, row, baseline, robots, self._strict.get(metric, metric))
+
+    def floor(self, robots: str, metric: str, *rows: tuple[str, str]) -> float:
+        return self._grades.floor(robots, self._strict.get(metric, metric), *rows)
+
+    def axis(self, name: str) -> np.ndarray:
+        """Mean distances of the robots, [5] float64 or a row of them for each of `Mean.values`."""
+        return self._grades.axis(name)

@@ -1,0 +1,98 @@
+"""Codecs of the models that are graded: what is left of true video after a model's codec is the floor of its scores.
+
+The room of metrics does not know the model: a function that opens a run's codec is named as module:NAME, and what it gives is
+a `Roundtrip`. The truth through a codec is graded like a prediction, as the baseline CODEC_TRUTH, once a codec and episode.
+"""
+
+import hashlib
+import importlib
+import threading
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from xew.config import ConfigError
+
+OPENER = "xew.model.runs.roundtrip:open_roundtrip"
+"""Function that opens the codec of a run of this project."""
+
+
+class Roundtrip(Protocol):
+    """True video through a codec and back."""
+
+    @property
+    def model(self) -> str:
+        """Name of the model whose codec it is, as its rollouts name it."""
+
+    @property
+    def digest(self) -> str:
+        """Text that changes whenever the video would."""
+
+    def __call__(self, video: np.ndarray) -> np.ndarray:
+        """Video [t h w 3] uint8 to what the codec leaves of it, of the same shape."""
+
+
+@dataclass(frozen=True)
+class ModelCodec:
+    """A codec, by the name that score tables give it."""
+
+    roundtrip: Roundtrip = field(compare=False, repr=False)
+    digest: str
+    _turn: threading.Lock = field(default_factory=threading.Lock, compare=False, repr=False)
+
+    @property
+    def key(self) -> str:
+        """Condition of its rows in score tables; two models with one codec share them."""
+        return f"codec {hashlib.sha256(self.digest.encode()).hexdigest()[:8]}"
+
+    def reconstruct(self, video: np.ndarray) -> np.ndarray:
+        """What the codec leaves of a video [t h w 3] uint8; for one thread at a time, since some take much memory."""
+        with self._turn:
+            return self.roundtrip(video)
+
+
+def open_codec(run: Path, opener: str = OPENER) -> Roundtrip:
+    """The codec of a run.
+
+    Args:
+        run: folder of the run.
+        opener: function that opens it, as module:NAME, of the folder to a `Roundtrip`; anybody's can be named.
+
+    Raises:
+        ConfigError: the run or the opener does not exist.
+    """
+    module, _, name = opener.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"cannot import the opener of codecs {opener!r}: {error}; expected module:NAME.") from error
+    roundtrip: Roundtrip = found(run)
+    return roundtrip
+
+
+def open_codecs(runs: Sequence[Path], opener: str, models: Collection[str]) -> dict[str, ModelCodec]:
+    """The codecs of runs by the names of the models that they are of.
+
+    Args:
+        runs: folders of the runs.
+        opener: as of `open_codec`.
+        models: names of all models that are graded.
+
+    Raises:
+        ConfigError: a run cannot be opened, is of a model that is not graded, or two are of one model.
+    """
+    codecs: dict[str, ModelCodec] = {}
+    for run in runs:
+        roundtrip = open_codec(run, opener)
+        if roundtrip.model not in models:
+            raise ConfigError(
+                f"--codec {run} is the run of {roundtrip.model!r}, of which no rollout is graded; graded are "
+                f"{', '.join(sorted(models))}. Name the runs that these rollouts were made by."
+            )
+        if roundtrip.model in codecs:
+            raise ConfigError(f"--codec names two runs of {roundtrip.model!r}, the second is {run}; name one.")
+        codecs[roundtrip.model] = ModelCodec(roundtrip, roundtrip.digest)
+    return codecs
