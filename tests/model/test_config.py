@@ -17,7 +17,7 @@ from xew.model.rollout import default_name, is_config
 
 REPOSITORY = Path(__file__).parents[2]
 CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
-MODEL_CONFIGS = [REPOSITORY / "configs" / name for name in ("debug.yaml", "fixed.yaml", "one_way.yaml")]
+MODEL_CONFIGS = [REPOSITORY / "configs" / name for name in ("debug.yaml", "fixed.yaml")]
 
 
 @dataclass(frozen=True)
