@@ -14,7 +14,6 @@ from xew.metrics import METRICS
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.loose_types("Optax raises its decays to an int32 count of steps"),
-    pytest.mark.usefixtures("quick_compile"),
 ]
 
 MODULE = '''"""One of each kind."""
