@@ -19,6 +19,7 @@ import pandas as pd
 import pytest
 import yaml
 
+from tests.metrics.quick import QUICK
 from tests.sim_warp.small import TASK
 from xew.protocol import BASELINES, PAPER_PARTS, PARTS, VARIANTS
 
@@ -69,6 +70,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     root = tmp_path_factory.mktemp("debug")
     settings = yaml.safe_load(CONFIG.read_text())
     del settings["step_environment"]  # XLA's options are those of the session
+    settings["evaluate"] = ["--masks", QUICK]  # the masker that finds masks is at work in tests/metrics/test_evaluate.py
     (root / "config.yaml").write_text(yaml.safe_dump(settings))
     own = {"PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
     yield Place(root, root / "config.yaml", os.environ | own)
