@@ -1,6 +1,7 @@
 """Running `python -m xew...` inside the process of a test: the same arguments and exit status, without a new interpreter."""
 
 import io
+import os
 import runpy
 import sys
 import warnings
@@ -21,3 +22,9 @@ def run_command(module: str, *arguments: str | Path) -> str:
         except SystemExit as stop:
             assert not stop.code, f"{module} ended with {stop.code}:\n{said.getvalue()}"
     return said.getvalue()
+
+
+def on_devices(count: int) -> dict[str, str]:
+    """Variables of a process that has so many CPU devices and compiles as the tests do."""
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={count}"
+    return {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}

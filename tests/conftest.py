@@ -69,6 +69,16 @@ SLOW = (
 )
 """Beginnings of the names of tests that make test-fast leaves out: whole commands, trainings, simulations, and parity with
 other people's networks. Taken from --durations; a test is slow, too, when it bears the mark."""
+XLA_FLAGS = (
+    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_backend_optimization_level=0",
+    "--xla_llvm_disable_expensive_passes=true",
+    "--xla_cpu_parallel_codegen_split_count=1",
+    "--xla_cpu_max_isa=AVX",
+)
+"""Options of XLA under test, for subprocesses too. Programs of tests run for milliseconds, and most of the time is compiling,
+which these make ten times faster (the gradient of the tiny network: 1.5 s instead of 14 s). AVX has no fused multiply-add:
+without XLA's fusion emitters, equal numbers would otherwise be computed in two ways, and their difference would not be zero."""
 CACHE_DAYS = 14
 """Number of days for which a compiled program that no session has written again is kept."""
 
@@ -82,6 +92,7 @@ def annotated_modules() -> list[str]:
 
 for pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(pool, "1")  # before NumPy loads: two workers with a pool of threads each only wait for one another
+os.environ.setdefault("XLA_FLAGS", " ".join(XLA_FLAGS))  # before JAX compiles anything
 if CHECK_SHAPES:
     install_import_hook(annotated_modules(), f"{tests.checking.__name__}.check_annotations")
 
@@ -136,18 +147,3 @@ def named_exceptions(request: pytest.FixtureRequest) -> Iterator[None]:
     yield
     for option, strict in loosened.items():
         jax.config.update(option, strict)
-
-
-@pytest.fixture(scope="module")
-def quick_compile() -> Iterator[None]:
-    """Leave out what makes programs fast, for modules most of whose time is compiling.
-
-    Programs of the two kinds may differ in the last bit, and JAX does not tell them apart in memory.
-    """
-    import jax
-
-    jax.clear_caches()
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-    jax.clear_caches()

@@ -9,12 +9,12 @@ import pandas as pd
 import pytest
 
 from tests.commands import run_command
+from tests.sim_warp.small import work_inline
 from xew.metrics import METRICS
 
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.loose_types("Optax raises its decays to an int32 count of steps"),
-    pytest.mark.usefixtures("quick_compile"),
 ]
 
 MODULE = '''"""One of each kind."""
@@ -74,6 +74,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path(__file__).parents[1]}")
+    work_inline(monkeypatch)
     monkeypatch.setitem(METRICS, "brightness_error", importlib.import_module("additions").METRIC)
     yield tmp_path
     sys.modules.pop("additions", None)

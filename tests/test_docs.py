@@ -4,11 +4,9 @@ import argparse
 import ast
 import importlib
 import io
-import os
 import re
 import runpy
 import shlex
-import subprocess
 import sys
 import warnings
 from contextlib import redirect_stderr, redirect_stdout
@@ -19,6 +17,8 @@ import numpy as np
 import pytest
 import tyro
 
+from tests.commands import run_command
+from tests.sim_warp.small import work_inline
 from tests.synthetic import write_synthetic_data
 from xew.episode import read_video
 from xew.model.experiment import load_experiment
@@ -30,6 +30,8 @@ WALKED = ("add_a_robot", "add_a_task")
 """Pages that are run as a whole, in a folder of their own."""
 WITH_ARRAYS = ("metrics",)
 """Pages whose snippets are run in order, and held against their comments, in tests/metrics/test_page.py."""
+KEPT = ("XEW_TRUST", "XEW_ROBOTS")
+"""Environment variables that a command or a block may set."""
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`([^`]+)`")
 OPTIONAL = re.compile(r"\[(--[^\]]+)\]")
@@ -42,33 +44,43 @@ def blocks(page: Path) -> list[tuple[str, str]]:
     return [(match[1], match[2]) for match in BLOCK.finditer(page.read_text())]
 
 
-def run_block(language: str, text: str, folder: Path) -> None:
-    """Write a `# file: NAME` block, run a `# run` block with Python, or each line of a bash block."""
+def run_block(language: str, text: str, folder: Path, patch: pytest.MonkeyPatch) -> None:
+    """Write a `# file: NAME` block, run a `# run` block with Python, or each line of a bash block, all in this process.
+
+    A new process would import for several seconds; that commands run in one is seen in tests/test_wheel.py.
+    """
     if text.startswith("# file: "):
         path = folder / text.split("\n", 1)[0].removeprefix("# file: ")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
         return
-    commands = [[sys.executable, "-c", text]]
-    if language == "bash":
-        assert all(line.startswith("python -m xew.") for line in text.splitlines())
-        commands = [[sys.executable, *line.split()[1:]] for line in text.splitlines()]
-    for command in commands:
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
-        run = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=600)
-        assert run.returncode == 0, f"{' '.join(command[1:])}\n{run.stdout}\n{run.stderr}"
-        assert " 0 (0 %)" not in run.stdout, f"a page shows what works:\n{run.stdout}"
+    if language != "bash":
+        exec(compile(text, "a page of the docs", "exec"), {"__name__": "page"})
+        return
+    for line in text.splitlines():
+        python, flag, module, *options = line.split()
+        assert (python, flag) == ("python", "-m") and module.startswith("xew.")
+        for variable in KEPT:
+            patch.setenv(variable, "")
+            patch.delenv(variable)  # what one command admits and finds, the next does not know of
+        said = run_command(module, *options)
+        assert " 0 (0 %)" not in said, f"a page shows what works:\n{said}"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", WALKED)
-def test_a_page_does_what_it_says(page: str, tmp_path: Path) -> None:
+def test_a_page_does_what_it_says(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    work_inline(monkeypatch)
     found = blocks(ROOT / "docs" / f"{page}.md")
     assert found and all(text.startswith(("# file: ", "# run\n")) for language, text in found if language != "bash")
     for language, text in found:
-        run_block(language, text, tmp_path)
+        run_block(language, text, tmp_path, monkeypatch)
     made = {"add_a_robot": "data/robots/embodiment/robot.yaml", "add_a_task": "data/my_tasks:TASK/0000000/piper/rgb.mkv"}
     assert (tmp_path / made[page]).is_file()
+    for name in [name for name, module in sys.modules.items() if str(tmp_path) in str(getattr(module, "__file__", ""))]:
+        del sys.modules[name]
 
 
 SNIPPETS = [

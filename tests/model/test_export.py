@@ -20,8 +20,6 @@ from xew.model.training.start import check_network, start_params
 from xew.model.training.step import make_learner
 from xew.model.weights.reading import read_tensors
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CONFIG = """
 data: data
 clip: {frames: 5, height: 64, width: 80}

@@ -18,8 +18,6 @@ from xew.model.conditions import Command
 from xew.model.experiment import load_experiment
 from xew.model.video.pixels import stored_pixels
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CONFIG = """
 clip: {frames: 17, height: 64, width: 80}
 codec: {spatial_factor: 8, channels: 4}

@@ -27,8 +27,6 @@ from xew.model.training.data import ClipSource, fake_batch, make_dataset
 from xew.protocol import SEEN_ROBOTS
 from xew.rollout import find_rollouts, read_rollout_video
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 FRAMES = 12
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}

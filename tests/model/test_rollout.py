@@ -14,6 +14,7 @@ import pytest
 from flax import nnx
 
 from tests import synthetic
+from tests.commands import on_devices
 from xew.dataset import Episode, read_dataset
 from xew.episode import EpisodeError, read_video
 from xew.model import latents, rollout
@@ -26,8 +27,6 @@ from xew.model.rollout import RolloutWriter
 from xew.model.sampling.predict import ChunkInputs, Predictor, guided_velocity
 from xew.protocol import ROBOT_NAMES
 from xew.rollout import find_rollouts, read_rollout_video
-
-pytestmark = pytest.mark.usefixtures("quick_compile")
 
 FRAMES = 12
 CONFIG = """
@@ -190,7 +189,7 @@ def test_two_devices_share_a_batch_and_give_the_same(predictor: Predictor, world
     """Three episodes on two devices: the batch is filled up, cut, and what filled it is left out."""
     path = [str(Path(__file__).parents[2])]
     script = DEVICES.format(path=path, config=str(world / "config.yaml"), out=str(tmp_path / "frames.npy"))
-    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    environment = os.environ | on_devices(2)
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     episodes = choose_tests(world / "data")[:3]

@@ -24,8 +24,6 @@ from xew.model.sampling.predict import Predictor
 from xew.model.training.data import ClipSource, fake_batch
 from xew.rollout import find_rollouts
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 FRAMES = 9
 ROBOTS = ("aloha_agilex", "arx_x5", "piper")
 SYSTEMS = [name for name, entry in ACTIONS.items() if isinstance(entry, System) and entry.conditions]

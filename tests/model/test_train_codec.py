@@ -40,8 +40,6 @@ from xew.model.training.loop import STOPPED
 from xew.model.video.frames import to_model_size
 from xew.protocol import HELD_OUT_ROBOTS, SEEN_ROBOTS, expand_robots
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CONFIG = """
 clip: {frames: 5, height: 64, width: 96}
 size: tiny

@@ -18,11 +18,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pytest
 import tyro
 
-from tests.sim_warp.small import SLOW, TASK
+from tests.sim_warp.small import SLOW, TASK, work_inline
 from xew.dataset import find_accepted
 from xew.episode import EpisodeError, Record, read_states, read_video, verify_episode
+from xew.sim_warp.generate import Args as GenerateArgs
+from xew.sim_warp.generate import generate
 
 ROOT = Path(__file__).parents[2]
 FLAGS = ("--tasks", TASK, "--robots", "franka_panda", SLOW, "--train-seeds", "2", "--test-seeds", "1", "--device", "cpu")
@@ -42,6 +45,16 @@ def finish(run: subprocess.Popen[str]) -> None:
     told, _ = run.communicate(timeout=600)
     if run.returncode:
         raise AssertionError(f"generate ended with {run.returncode}:\n{told}")
+
+
+def complete(out: Path) -> None:
+    """Make what is missing as the command would, in this process, which has imported everything."""
+    args = GenerateArgs(
+        tasks=(TASK,), robots=("franka_panda", SLOW), train_seeds=2, test_seeds=1, device="cpu", workers=1, out=out
+    )  # as FLAGS say
+    with pytest.MonkeyPatch.context() as patch:
+        work_inline(patch)
+        generate(args)
 
 
 def kill(run: subprocess.Popen[str], everybody: bool) -> None:
@@ -140,7 +153,7 @@ def kill_at_random(out: Path, files: int, rng: random.Random) -> str | None:
 
 def make_undisturbed(out: Path) -> dict[str, str]:
     """The files of a run without a kill."""
-    finish(start(out))
+    complete(out)
     return contents(out)
 
 
@@ -165,7 +178,7 @@ def main() -> None:
                     if told := kill_at_random(out, len(expected), rng):
                         kills += 1
                         print(f"{kills}: data set {sets}: {told}", flush=True)
-                finish(start(out))
+                complete(out)
             assert not reader.wrong, reader.wrong
             assert contents(out) == expected, f"data set {sets} has other bytes"
             rounds, episodes = rounds + reader.rounds, episodes + reader.episodes

@@ -1,9 +1,11 @@
-"""The smallest things that go the whole way: a task of twelve frames, and a robot that cannot do every seed of it.
+"""The smallest things that go the whole way: a task of twelve frames, a robot that cannot do every seed of it, no workers.
 
 Both are reached from outside the registries, as a user's own would be: TASK and SLOW name them.
 """
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +17,9 @@ from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks.task import Moment, Task
+
+if TYPE_CHECKING:  # workers import this file
+    import pytest
 
 TASK = "tests.sim_warp.small:CLOSE"
 SLOW = "tests.sim_warp.small:SLOW_PIPER"
@@ -42,6 +47,30 @@ CLOSE = Task("close", "close both hands", sample, plan, success)
 SLOW_PIPER = replace(ROBOTS["piper"], joint_velocity=(0.02,) * 6)
 WITH_SLOW = ROBOTS | {SLOW: SLOW_PIPER}
 """Robots of the registry and the slow one, by the names that jobs give."""
+WITH_WORKERS = ("devices.workers", "generate", "yields")
+"""Modules of the room that name Workers: where commands find them, and those that have imported them already."""
+
+
+class InlineWorkers:
+    """Workers that do their jobs in the test's own process: a process of their own imports for several seconds."""
+
+    def __init__(self, count: int, first_alone: bool = True) -> None:
+        pass
+
+    def __enter__(self) -> "InlineWorkers":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def run(self, function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterator[Any]:
+        return map(function, jobs)
+
+
+def work_inline(patch: "pytest.MonkeyPatch") -> None:
+    """Let commands that are called in this process start no workers."""
+    for module in WITH_WORKERS:
+        patch.setattr(f"xew.sim_warp.{module}.Workers", InlineWorkers)
 
 
 def at_home(robot: RobotSpec, frames: int) -> np.ndarray:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.sim_warp.small import SLOW, TASK, WITH_SLOW
+from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, work_inline
 from xew.config import ConfigError
 from xew.dataset import find_accepted, find_records
 from xew.episode import EpisodeError, Record, episode_folder, verify_episode, write_episode
@@ -42,8 +42,8 @@ ACCEPTED = (0, 2, 4, TEST_SEED_START)
 REJECTED = (1, 3)
 
 
-def arguments(out: Path, workers: int = 2) -> Args:
-    return Args(tasks=(TASK,), robots=ROBOTS, train_seeds=3, test_seeds=1, out=out, workers=workers, device="cpu")
+def arguments(out: Path) -> Args:
+    return Args(tasks=(TASK,), robots=ROBOTS, train_seeds=3, test_seeds=1, out=out, workers=2, device="cpu")
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_each_robot_is_found_once(undisturbed: Path, monkeypatch: pytest.MonkeyP
     assert found == list(ROBOTS)
 
 
-def test_what_is_deleted_is_made_again(undisturbed: Path, tmp_path: Path) -> None:
+def test_what_is_deleted_is_made_again(undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A cell of an accepted seed, the failed one of a rejected seed, and the good one of another."""
     out = tmp_path / "data"
     shutil.copytree(undisturbed, out)
@@ -114,11 +114,14 @@ def test_what_is_deleted_is_made_again(undisturbed: Path, tmp_path: Path) -> Non
         shutil.rmtree(episode_folder(out, TASK, seed, robot))
     left_over = episode_folder(out, TASK, 0, "franka_panda").with_name(".writing-abc")
     left_over.mkdir()
-    generate(arguments(out, workers=1))
+    work_inline(monkeypatch)
+    generate(arguments(out))
     assert contents(out) == contents(undisturbed)
 
 
-def test_a_run_killed_in_the_middle_is_taken_up_again(undisturbed: Path, tmp_path: Path) -> None:
+def test_a_run_killed_in_the_middle_is_taken_up_again(
+    undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = subprocess.Popen(
         [sys.executable, "-m", "xew.sim_warp.generate", *FLAGS, "--workers", "2", "--out", str(tmp_path)],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
@@ -134,7 +137,8 @@ def test_a_run_killed_in_the_middle_is_taken_up_again(undisturbed: Path, tmp_pat
         assert time.monotonic() < deadline, "workers outlive their parent"
         time.sleep(0.05)
     assert 0 < len(list(find_records(tmp_path))) < len(contents(undisturbed))
-    generate(arguments(tmp_path, workers=1))
+    work_inline(monkeypatch)
+    generate(arguments(tmp_path))
     assert contents(tmp_path) == contents(undisturbed)
 
 
@@ -261,7 +265,8 @@ def test_unpaired_robots_share_no_seed(tmp_path: Path) -> None:
     assert [(f.robots, f.first_seed) for f in paired] == [(("a", "b"), 0), (("a", "b"), TEST_SEED_START)]
 
 
-def test_unpaired_episodes_are_made_once_and_for_their_robot_alone(tmp_path: Path) -> None:
+def test_unpaired_episodes_are_made_once_and_for_their_robot_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    work_inline(monkeypatch)
     args = replace(arguments(tmp_path), unpaired=True, train_seeds=1, test_seeds=0, robots=(SLOW, "franka_panda"))
     expected = [(0, SLOW), (SEEDS_OF_ROBOT, "franka_panda")]
     assert [(record.seed, record.robot) for _, record in made(args)] == expected

@@ -7,7 +7,7 @@ import random
 import threading
 from pathlib import Path
 
-from tests.sim_warp.kill import contents, finish, kill_at_random, make_undisturbed, read_beside, start
+from tests.sim_warp.kill import complete, contents, kill_at_random, make_undisturbed, read_beside
 from xew.dataset import find_records
 from xew.episode import Record, complete_folder, episode_folder, write_episode
 
@@ -16,7 +16,7 @@ def test_kills_change_no_byte(tmp_path: Path) -> None:
     expected, out, rng = make_undisturbed(tmp_path / "undisturbed"), tmp_path / "killed", random.Random(0)
     with read_beside(out) as reader:
         told = [kill_at_random(out, len(expected), rng) for _ in range(2)]
-        finish(start(out))
+        complete(out)
     assert any(told), "both runs ended before they were killed"
     assert not reader.wrong and reader.episodes, reader.wrong
     assert contents(out) == expected

@@ -126,9 +126,9 @@ def test_which_suite_decides_and_where_they_part_is_the_same_in_both(tmp_path: P
     joints = [sentence for sentence in sentences if f": {JOINTS} " in sentence]
     assert len(joints) == len(ROBOTS)
     for sentence in joints:
-        assert sentence.endswith(text.format("Keypoint error, strict", "Keypoint error"))
+        assert sentence.endswith(text.format("Strict keypoint error", "Keypoint error"))
         decided = sentence[: sentence.index(" The suites part")]
-        assert "Keypoint error, strict" in decided and "Keypoint error" not in decided.replace("Keypoint error, strict", "")
+        assert "Strict keypoint error" in decided and "Keypoint error" not in decided
         assert "the pasted render" in decided
     # A mark stands at the metric that decides.
     (section,) = run_table(tables[0], scores.metrics).sections

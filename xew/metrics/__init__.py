@@ -71,7 +71,7 @@ METRICS = {
     "pck_strict": Metric(
         pck_strict, None, "kinematics", "", (0, 1), True, "track",
         "TAP-Vid's position accuracy: share within 1 to 16 px of 256, lost points are misses",
-        "PCK, strict", parts=strict_hits, suites=STRICT, counterpart="pck", points="surfaces", by_image=True),
+        "Strict PCK", parts=strict_hits, suites=STRICT, counterpart="pck", points="surfaces", by_image=True),
     "pck_05": Metric(
         pck_05, None, "kinematics", "", (0, 1), True, "track", "share within 0.05 of that diagonal",
         "PCK at 0.05", reported=False, parts=functools.partial(hits, alpha=0.05), suites=PAPER),
@@ -81,7 +81,7 @@ METRICS = {
     "keypoint_error_strict": Metric(
         keypoint_error_strict, None, "kinematics", "px", (0, INF), False, "track",
         "mean distance of robot points; lost ones have 50 px of 256, PointOdyssey's failure",
-        "Keypoint error, strict", parts=strict_distances, suites=STRICT, counterpart="keypoint_error",
+        "Strict keypoint error", parts=strict_distances, suites=STRICT, counterpart="keypoint_error",
         points="surfaces", by_image=True),
     "ndtw": Metric(
         ndtw, None, "kinematics", "", (0, INF), False, "track", "time warping / (lengths x mean box diagonal)",
@@ -89,7 +89,7 @@ METRICS = {
     "ndtw_strict": Metric(
         ndtw_strict, None, "kinematics", "", (0, 0.5), False, "track",
         "time warping with the strict error as cost / (lengths x its maximum)",
-        "nDTW, strict", whole=True, parts=strict_warpings, suites=STRICT, counterpart="ndtw", points="surfaces", by_image=True),
+        "Strict nDTW", whole=True, parts=strict_warpings, suites=STRICT, counterpart="ndtw", points="surfaces", by_image=True),
     "coverage": Metric(
         coverage, None, "kinematics", "", (0, 1), True, "track", "share of visible keypoints that were found",
         "Keypoints found", reported=False, parts=presence, suites=PAPER),
@@ -102,7 +102,7 @@ METRICS = {
     "trajectory_error_strict": Metric(
         trajectory_error_strict, None, "objects", "px", (0, INF), False, "track",
         "mean distance of points on objects that move; lost ones have 50 px of 256, PointOdyssey's failure",
-        "Object error, strict", parts=strict_distances, suites=STRICT, counterpart="trajectory_error",
+        "Strict object error", parts=strict_distances, suites=STRICT, counterpart="trajectory_error",
         points="surfaces", by_image=True),
     "object_coverage": Metric(
         coverage, None, "objects", "", (0, 1), True, "track", "share of visible objects that were found",

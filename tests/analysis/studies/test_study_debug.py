@@ -17,7 +17,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import yaml
 
+from tests.metrics.quick import QUICK
 from tests.sim_warp.small import TASK
 from xew.protocol import BASELINES, PAPER_PARTS, PARTS, VARIANTS
 
@@ -43,6 +45,7 @@ class Place:
     """Where a study of this file lies, and what it shares with others."""
 
     root: Path
+    config: Path
     environment: dict[str, str]
 
     @property
@@ -51,7 +54,7 @@ class Place:
 
     def command(self, *variants: str) -> list[str]:
         """Of a study of these variants (and of more choices after them)."""
-        files = [str(CONFIG), "--experiment", str(ROOT / "configs" / "debug.yaml")]
+        files = [str(self.config), "--experiment", str(ROOT / "configs" / "debug.yaml")]
         return [sys.executable, "-m", "xew.analysis.study", *files, "--out", "study", "--tasks", TASK, "--variants", *variants]
 
     def run(self, *variants: str) -> str:
@@ -65,8 +68,13 @@ class Place:
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     """A folder without data or weights; compiled programs are those of the session, which compiles many of them too."""
     root = tmp_path_factory.mktemp("debug")
+    settings = yaml.safe_load(CONFIG.read_text())
+    # XLA's options are those of the session, but not for grading, which computes for longer than it compiles.
+    settings["step_environment"] = {"evaluate": {"XLA_FLAGS": ""}}
+    settings["evaluate"] = ["--masks", QUICK]  # the masker that finds masks is at work in tests/metrics/test_evaluate.py
+    (root / "config.yaml").write_text(yaml.safe_dump(settings))
     own = {"PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
-    yield Place(root, os.environ | own)
+    yield Place(root, root / "config.yaml", os.environ | own)
     shutil.rmtree(root)
 
 
@@ -111,7 +119,7 @@ def test_an_adaptation_started_from_its_variant(place: Place, printed: str) -> N
 
 def test_killed_anywhere_it_ends_in_the_same_videos_and_scores(place: Place, printed: str) -> None:
     """A part of the study again from nothing but data and compiled programs, killed as it goes: the same bytes at the end."""
-    killed = Place(place.root / "killed", place.environment)
+    killed = Place(place.root / "killed", place.config, place.environment)
     shutil.copytree(place.study / "data", killed.study / "data")
     moments = random.Random(int(time.time()))
     for number in range(KILLS):

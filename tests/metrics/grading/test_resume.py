@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.commands import on_devices
 from tests.metrics.quick import QUICK
 from tests.metrics.small import write_many
 from tests.synthetic import write_synthetic_data
@@ -114,7 +115,7 @@ def test_killed_at_random_on_two_devices_it_ends_in_the_same_bytes(
     out = tmp_path / "scores.parquet"
     command = [sys.executable, "-m", "xew.metrics.evaluate", world / "rollouts", "--data", world / "data", "--out", out]
     command += ["--metrics", *METRICS, "--masks", QUICK, "--workers", "2"]
-    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    environment = os.environ | on_devices(2)
     environment["PYTHONPATH"] = str(ROOT)  # the masker
     run = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wanted = random.randrange(1, CELLS - 2)
@@ -182,7 +183,7 @@ assert not any(overlaps)
 
 
 def test_a_network_is_opened_once_on_each_device_and_used_in_turn() -> None:
-    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    environment = os.environ | on_devices(2)
     run = subprocess.run([sys.executable, "-c", SHARING], env=environment, capture_output=True, text=True, timeout=120)
     assert run.returncode == 0, run.stderr
 

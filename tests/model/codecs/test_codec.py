@@ -17,8 +17,6 @@ from xew.model.codecs.vae import VAES, abstract_vae
 from xew.model.codecs.vae_layouts import save_vae
 from xew.model.video.frames import to_camera_size, to_model_size
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 
 def smooth_clip(seed: int, frames: int = 9) -> np.ndarray:
     """A few moving plane waves, uint8 [t 32 48 3]."""

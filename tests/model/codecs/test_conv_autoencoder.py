@@ -23,8 +23,6 @@ from xew.model.codecs.conv_autoencoder import (
     save_autoencoder,
 )
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory, random_autoencoder: ConvAutoencoder) -> Path:

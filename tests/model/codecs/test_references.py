@@ -14,8 +14,6 @@ from xew.model.codecs.patches import PatchCodec
 from xew.model.diffusion.flow_matching import put_first
 from xew.model.training.step import estimate_clean, sample_pairs
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 
 @pytest.fixture(scope="module")
 def patches() -> PatchCodec:

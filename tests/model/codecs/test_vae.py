@@ -16,8 +16,6 @@ from xew.model.codecs.vae_layers import double_sides, patchify, unpatchify
 from xew.model.codecs.vae_layouts import diffusers_layout, load_vae, save_vae
 from xew.model.weights.writing import save_weights
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CHANNELS = VAES["tiny"].channels
 FOUR_STAGES = VaeSize(4, encoder_dim=8, decoder_dim=8, multipliers=(1, 2, 4, 4), halve_time=(False, True, True), blocks=1)
 

@@ -20,8 +20,6 @@ torch = pytest.importorskip("torch")
 operators = make_torchvision_importable()
 diffusers = pytest.importorskip("diffusers")
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 REFERENCE = Path(__file__).parents[1] / "reference"
 SIZE = VaeSize(4, encoder_dim=16, decoder_dim=16, multipliers=(1, 2, 4, 4), halve_time=(False, True, True), blocks=1)
 TOLERANCE = 1e-5

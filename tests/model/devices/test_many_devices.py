@@ -18,6 +18,7 @@ import pytest
 from jax.sharding import PartitionSpec
 
 from tests import synthetic
+from tests.commands import on_devices
 from xew.config import ConfigError
 from xew.model import latents
 from xew.model.cache.clips import clip_starts, sample_starts
@@ -52,11 +53,11 @@ def job(world: Path, out: str, devices: int, *overrides: str, kill: bool = False
 
 def begin(jobs: Sequence[dict[str, Any]], devices: int = 4, **environment: str) -> subprocess.Popen:
     """A process with so many CPU devices that does these jobs."""
-    quick = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"  # compiling is most of the time
-    flags = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices} {quick}", "JAX_PLATFORMS": "cpu"}
     paths = {"PYTHONPATH": str(HERE.parents[2]), "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir)}
     command = [sys.executable, str(HERE / "device_runs.py"), json.dumps(list(jobs))]
-    return subprocess.Popen(command, env=os.environ | flags | paths | environment, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command, env=os.environ | on_devices(devices) | paths | environment, stderr=subprocess.PIPE, text=True
+    )
 
 
 def end(process: subprocess.Popen, code: int = 0) -> str:

@@ -12,8 +12,6 @@ from xew.model.network import blocks, dit
 from xew.model.network.dit import MODELS, STREAMS, WorldModel
 from xew.model.training.memory import kept_bytes
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CHANNELS = 3
 SHAPE = (2, 3, 4, 6, CHANNELS)
 TOLERANCE = 2e-5

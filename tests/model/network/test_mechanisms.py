@@ -26,8 +26,6 @@ from xew.model.network.dit_layouts import dit_layout, load_dit
 from xew.model.network.mechanisms import MECHANISMS, frames_of_groups, ray_maps
 from xew.model.weights.layout import checkpoint_shapes
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 ROOT = Path(__file__).parents[3]
 CHANNELS = 3
 SHAPE = (2, 3, 4, 6, CHANNELS)

@@ -41,8 +41,6 @@ from xew.model.training.step import (
 )
 from xew.protocol import HELD_OUT_ROBOTS, seed_split
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 FRAMES = 12
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}

@@ -13,7 +13,7 @@ import trimesh
 import yaml
 
 from tests.sim_warp.robots.own_robot import STRIPES, robotwin_config, write_embodiment, write_urdf
-from tests.sim_warp.small import TASK
+from tests.sim_warp.small import TASK, work_inline
 from xew.config import ConfigError
 from xew.dataset import find_accepted
 from xew.episode import array_hash
@@ -138,8 +138,9 @@ def test_a_name_of_the_project_s_robots_is_set_apart(tmp_path: Path) -> None:
 # --- Kept beside the data.
 
 
-def test_data_keep_their_robot(embodiment: Path, tmp_path: Path) -> None:
+def test_data_keep_their_robot(embodiment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Made with a path, read elsewhere after the path has gone."""
+    work_inline(monkeypatch)
     source, data = tmp_path / "my-arm", tmp_path / "data"
     shutil.copytree(embodiment, source)
     args = Args(tasks=(TASK,), robot=source, train_seeds=1, test_seeds=0, out=data, workers=1, device="cpu")
