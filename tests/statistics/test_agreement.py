@@ -167,10 +167,10 @@ def test_tasks_without_power_leave_the_means_of_the_suite_strict_in_both(tmp_pat
             assert study and study.count == found["episodes"] == row.scores[metric].count == len(own) == count
             assert found["mean"] == row.scores[metric].mean == study.value == pytest.approx(own["value"].mean())
             assert study.interval() == (row.scores[metric].low, row.scores[metric].high) == (found["low"], found["high"])
-        assert "leave the mean of Keypoint error, strict: task2." in table.notes
+        assert "leave the mean of Strict keypoint error: task2." in table.notes
         assert table.notes in run_table(table, scores.metrics).caption
     assert "leave the mean of keypoint_error_strict: task2." in to_markdown(summary)
-    assert "leave the mean of Keypoint error, strict: task2." in grades.notes
+    assert "leave the mean of Strict keypoint error: task2." in grades.notes
     alone = rows[rows["model"] != COPY]
     assert summarize(alone).power.empty, "without the baseline nothing is known, and all tasks stay"
 
