@@ -236,18 +236,29 @@ def _compare(row: Row, metrics: Sequence[MetricInfo]) -> str:
 
 
 def _compare_with(title: str, verdicts: Mapping[str, str], metrics: Sequence[MetricInfo]) -> list[str]:
-    parts, shown = [], strict_metrics({metric.name: metric for metric in metrics})
-    for word, phrase in (("better", "beats"), ("worse", "falls behind"), ("unresolved", "cannot be told from")):
-        names = [m.title for m in metrics if verdicts.get(m.name) == word and m.name not in shown]
-        if names:
-            parts.append(f"{phrase} {title} on {_join(names)}")
+    """Phrases on one comparison, of reported metrics that decide: those that are resolved by name, the others by number."""
+    shown = strict_metrics({metric.name: metric for metric in metrics})
+    deciding = [metric for metric in _reported(metrics) if metric.name not in shown]
+    found = {word: [m.title for m in deciding if verdicts.get(m.name) == word] for word in ("better", "worse", "unresolved")}
+    phrases = (("better", "beats"), ("worse", "falls behind"))
+    parts = [f"{phrase} {title} on {_join(found[word])}" for word, phrase in phrases if found[word]]
+    unresolved = found["unresolved"]
+    if unresolved and not parts:
+        parts.append(f"cannot be told from {title} on any of {len(unresolved)} metrics")
+    elif unresolved:
+        parts[-1] += f" ({len(unresolved)} not resolved)"
     return parts
+
+
+def _reported(metrics: Sequence[MetricInfo]) -> Sequence[MetricInfo]:
+    """The metrics that sentences name: those that are reported, or all of a table that does not say which are."""
+    return [metric for metric in metrics if metric.reported] or metrics
 
 
 def _parting(row: Row, metrics: Sequence[MetricInfo]) -> str:
     """Sentence on where the suites part against a frozen first frame, or ''; strict decides."""
     named = {metric.name: metric for metric in metrics}
-    pairs = find_parting(row.verdicts, named)
+    pairs = find_parting(row.verdicts, {metric.name: metric for metric in _reported(metrics)})
     titled = {named[name].title: word for name, word in row.verdicts.items()}
     text = describe_parting([(named[strict].title, named[paper].title) for strict, paper in pairs], titled)
     return f" The suites part on {text}; strict decides." if pairs else ""
