@@ -1,7 +1,7 @@
 # The ground floor. A newcomer needs python3 (3.11 to 3.13) with venv, and make; everything else is set up here.
 #   make demo    the whole system at debug size, from a seed to a report page
 #   make test    every room's tests, with PyTorch, diffusers and transformers beside to compare with
-#   make test-fast   in three minutes, for the edit loop: no trainings, simulations or whole commands, no parity with others'
+#   make test-fast   in three to five minutes, for the edit loop: no trainings, simulations or whole commands, no parity with others'
 #                    networks (SLOW in tests/conftest.py lists what is left out); make test-fast TESTS=tests/metrics for one room
 #   make test-faults   hostile and broken inputs, kills, full disks: all of tests/faults, with the counts of what was tried
 #   make lint    ruff and mypy
