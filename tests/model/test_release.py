@@ -6,14 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import nnx
 
 from tests import synthetic
 from xew.episode import EpisodeError
 from xew.model import latents, release, train
-from xew.model.experiment import create_model
 from xew.model.rollout import load_predictor
-from xew.model.runs.checkpoint import restore_params
+from xew.model.runs.checkpoint import load_params
 from xew.model.runs.folder import load_run_config
 from xew.model.runs.sums import find_damage
 
@@ -46,11 +44,7 @@ def released(run: Path) -> Path:
 
 
 def test_the_network_is_the_average_of_the_run_rounded_once(run: Path, released: Path) -> None:
-    shapes = nnx.state(nnx.eval_shape(lambda: create_model(load_run_config(run))), nnx.Param)
-    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), shapes)
-    expected, step = restore_params(run, like)
-    found, same = restore_params(released, like)
+    (expected, step), (found, same) = (load_params(folder, load_run_config(folder).network) for folder in (run, released))
     assert step == same == 1
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a.astype(jnp.bfloat16).astype(jnp.float32), b), expected, found)
 

@@ -67,7 +67,7 @@ class Args:
     tasks: tuple[str, ...] = ()
     """Tasks to export; default: all in the data."""
     split: Literal["train", "validation", "test"] | None = None
-    """Training seeds or test seeds; default: both. Export the training seeds if you train on the set and grade on our test
+    """Family of seeds; default: all. Export the training seeds if you train on the set and grade on our test
     seeds."""
     robot_video: bool = False
     """Export the video of the robot alone too, as observation.images.robot."""

@@ -20,7 +20,7 @@ from xew.config import ConfigError, admit, user_errors
 from xew.model.network.dit import parameter_count
 from xew.model.network.dit_layouts import Naming, save_dit, wan_layout
 from xew.model.network.tokens import WAVELENGTH_BASE
-from xew.model.runs.checkpoint import restore_params
+from xew.model.runs.checkpoint import load_params
 from xew.model.runs.folder import load_run_config
 from xew.model.weights.layout import checkpoint_shapes
 
@@ -34,11 +34,8 @@ def export(run: Path, out: Path, naming: Naming = "diffusers", dtype: str = "flo
     experiment = load_run_config(run)
     if out.exists() and (out.is_file() or any(out.iterdir())):
         raise ConfigError(f"{out} exists already; choose another --out.")
-    graph, shapes = nnx.split(nnx.eval_shape(experiment.network.create), nnx.Param)
-    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), shapes)
-    params, step = restore_params(run, like, step)
-    model = nnx.merge(graph, jax.tree.map(lambda leaf: leaf.astype(jnp.dtype(dtype)), params))
+    params, step = load_params(run, experiment.network, step)
+    model = nnx.merge(experiment.network.structure, jax.tree.map(lambda leaf: leaf.astype(jnp.dtype(dtype)), params))
     save_dit(model, out, naming)
     total = parameter_count(model)
     added = total - sum(math.prod(shape) for shape in checkpoint_shapes(model, wan_layout(model, naming)).values())

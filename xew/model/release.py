@@ -15,8 +15,7 @@ from typing import Annotated
 import jax
 import jax.numpy as jnp
 import tyro
-from flax import nnx
-from jinja2 import Environment, PackageLoader
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from xew.config import ConfigError, admit, user_errors
 from xew.dataset import read_dataset
@@ -25,7 +24,7 @@ from xew.files import read_text, write_text
 from xew.model.cache.scales import load_run_scales, share_scales
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment
-from xew.model.runs.checkpoint import open_checkpoints, restore_params, save_params
+from xew.model.runs.checkpoint import load_params, open_checkpoints, save_params
 from xew.model.runs.folder import load_run, prepare_run
 from xew.model.runs.sums import note_sums
 from xew.model.settings.settings import AdaptSettings
@@ -51,12 +50,11 @@ def release(run: Path, out: Path, data: Path | None = None, scores: Path | None 
     experiment, codec = load_run(run)
     if experiment.out.resolve() != run.resolve():
         experiment = replace(experiment, out=run)
+    if scores and not scores.is_file():
+        raise ConfigError(f"{scores} is no file; expected scores.summary.md of `python -m xew.metrics.evaluate`: --scores.")
     seen = list_training(replace(experiment, data=data or experiment.data))
     summary = read_text(scores) if scores else ""
-    shapes = nnx.state(nnx.eval_shape(experiment.network.create), nnx.Param)
-    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), shapes)
-    params, step = restore_params(run, like, step)
+    params, step = load_params(run, experiment.network, step)
     released = replace(experiment, out=out, data=Path("data"), cache=None, adapt=AdaptSettings())
     prepare_run(released, codec, resume=False, overwrite=False)
     share_scales(out, experiment.conditions, load_run_scales(experiment.conditions, run))
@@ -91,7 +89,8 @@ def write_card(experiment: Experiment, step: int, size: int, seen: dict[str, tup
         seen: numbers of seeds and episodes by task.
         summary: table of scores in Markdown, '' where there is none.
     """
-    template = Environment(loader=PackageLoader("xew.model", "templates"), trim_blocks=True, lstrip_blocks=True)
+    loader = PackageLoader("xew.model", "templates")
+    template = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     robots = experiment.adapt.robots or experiment.robots.train_robots
     facts = {"step": step, "size": size, "seen": seen, "robots": robots, "summary": summary.strip()}
     return template.get_template("model_card.md").render(experiment=experiment, **facts).rstrip() + "\n"
@@ -120,8 +119,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Write a run's network and its card."""
     args = tyro.cli(Args, args=arguments, prog="python -m xew.model.release", description=__doc__)
     admit(args.trust)
-    if args.scores and not args.scores.is_file():
-        raise ConfigError(f"--scores {args.scores} is no file; expected scores.summary.md of `python -m xew.metrics.evaluate`.")
     step = release(args.run, args.out, args.data, args.scores, args.checkpoint)
     megabytes = sum(file.stat().st_size for file in args.out.rglob("*") if file.is_file()) / 1e6
     print(f"{args.out}: step {step} in bfloat16, {megabytes:.0f} MB; its card is {args.out / CARD}")

@@ -11,12 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+from flax import nnx
 
 from xew.config import ConfigError
 from xew.model.devices.sharding import place_like
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs.folder import KeptStep, trace_run
 from xew.model.runs.sums import damaged, find_damage, note_sums
+from xew.model.settings.network import Network
 
 SUMMING = ThreadPoolExecutor(1, "sums")
 """Thread in which checksums of earlier checkpoints are computed, beside the training."""
@@ -96,6 +98,20 @@ def restore_params(out: Path, like: Any, step: int | None = None) -> tuple[Any, 
         ConfigError: the run has no such checkpoint, or what it started from has gone.
     """
     return restore_sum(trace_run(out, step), like)
+
+
+def load_params(run: Path, network: Network, step: int | None = None) -> tuple[Any, int]:
+    """The parameters of a run's network on the first device, as `restore_params`, in the types of training; and their step.
+
+    Args:
+        run: folder of the run.
+        network: that of its config.
+        step: of the checkpoint; the latest where left out.
+    """
+    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    shapes = nnx.state(nnx.eval_shape(network.create), nnx.Param)
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), shapes)
+    return restore_params(run, like, step)
 
 
 def restore_sum(kept: Sequence[KeptStep], like: Any) -> tuple[Any, int]:
