@@ -91,7 +91,7 @@ def write_card(experiment: Experiment, step: int, size: int, seen: dict[str, tup
     """
     loader = PackageLoader("xew.model", "templates")
     template = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    robots = experiment.adapt.robots or experiment.robots.train_robots
+    robots = experiment.robots.train_robots
     facts = {"step": step, "size": size, "seen": seen, "robots": robots, "summary": summary.strip()}
     return template.get_template("model_card.md").render(experiment=experiment, **facts).rstrip() + "\n"
 

@@ -140,8 +140,8 @@ class RolloutSettings:
     batch: int = 4
     """Number of episodes at once over all devices."""
     unroll: int = 0
-    """Number of blocks compiled as one loop body; 0 takes the training's. What the backward pass gains by many, a sampler does
-    not: at 12 it compiles for a minute and a half on a GPU and is no faster."""
+    """Number of blocks compiled as one loop body; 0 takes the training's. Many spare the backward pass its stacked arrays,
+    which a sampler has not, and take long to compile: a minute and a half on a GPU at 12."""
     max_frames: int = 0
     """Number of frames of an episode that are predicted, from its first; 0 predicts all."""
     seed: int = 0
