@@ -14,7 +14,7 @@ Writes scores.parquet, one row per model, condition, task, seed, robot and metri
 import functools
 import itertools
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -27,7 +27,7 @@ import tyro
 from tqdm import tqdm
 
 from xew.compilation import keep_compiled_programs
-from xew.concurrency import map_in_order
+from xew.concurrency import map_in_order, map_in_processes
 from xew.config import ConfigError, admit, pick, suggestion, user_errors
 from xew.episode import EpisodeError, verify_episode
 from xew.files import hold_lock
@@ -110,12 +110,29 @@ class Args:
     """Grade everything anew."""
     workers: int = 0
     """Threads that read, estimate and grade, shared out to the devices; 0: one for each processor core."""
+    processes: int = 1
+    """Processes that episodes are shared out to, in place of threads. Threads wait for Python's lock in part of what the
+    default tracker does, so that only processes keep more than about six cores busy; each takes seconds to start."""
     check: Path | None = None
     """Grade nothing: check that a bundle is consistent, and, where rollouts are named, that it was made from them."""
     regrade: int = 0
     """With --check: grade so many of its videos anew and compare."""
     trust: tuple[str, ...] = ()
     """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
+
+
+Group = list[tuple[Job, tuple[str, ...]]]
+"""Jobs of one episode, each with the names of the metrics that are still to be graded."""
+
+
+@dataclass(frozen=True)
+class Graded:
+    """What came of grading a group, beside the scores in the store."""
+
+    errors: Sequence[str]
+    """Messages about videos that could not be graded."""
+    has_shapes: bool
+    """Whether the shapes of the episode's bodies were known where they were needed."""
 
 
 WRITTEN = {
@@ -133,15 +150,20 @@ WRITTEN = {
 @user_errors
 def main(args: Args) -> None:
     """Grade, write, and print what came out; or check a bundle."""
-    admit(args.trust)
-    keep_compiled_programs()
-    cv2.setNumThreads(1)  # episodes are shared out to threads; OpenCV's own would only get in their way
+    prepare_process(args)
     if args.check is not None:
         check(args, args.check)
         return
     check_out(args.out)
     with hold_lock(args.out):
         grade_tables(args)
+
+
+def prepare_process(args: Args) -> None:
+    """Settings of a process that grades."""
+    admit(args.trust)
+    keep_compiled_programs()
+    cv2.setNumThreads(1)  # episodes are shared out; OpenCV's own threads would only get in the way
 
 
 def grade_tables(args: Args) -> None:
@@ -263,7 +285,8 @@ def open_bench(args: Args, metrics: Sequence[str]) -> Bench:
 def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: CellStore) -> list[str]:
     """Grade what is not in the store yet, and return what went wrong.
 
-    Episodes are read and graded by worker threads, a few ahead of each other, so that memory does not grow with their number.
+    Episodes are read and graded by threads or processes, a few ahead of each other, so that memory does not grow with their
+    number.
 
     Raises:
         RolloutError: a video cannot be graded, unless args.keep_going; what was graded before stays in the store.
@@ -272,16 +295,13 @@ def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: Cell
     todo = [(job, names) for job, names in wanted if names]
     if len(todo) < len(jobs):
         print(f"{len(jobs) - len(todo)} of {len(jobs)} are graded already in {store.folder}")
-    bench = open_bench(args, metrics)
-    without_shapes: set[Path] = set()
     groups = [list(group) for _, group in itertools.groupby(todo, key=lambda pair: (pair[0].episode, pair[0].cell.frames))]
     errors: list[str] = []
-    stop = threading.Event()
+    without_shapes: list[Path] = []
     with tqdm(total=len(jobs), initial=len(jobs) - len(todo), desc="evaluate", unit="video", disable=None) as bar:
-        work = functools.partial(_grade_group, args=args, bench=bench, store=store, stop=stop, without_shapes=without_shapes)
-        results = map_in_order(work, groups, worker_count(args.workers), stop)
-        for group, problems in zip(groups, results, strict=True):
-            errors += problems
+        for group, graded in zip(groups, _grade_groups(groups, metrics, args, store), strict=True):
+            errors += graded.errors
+            without_shapes += [] if graded.has_shapes else [group[0][0].episode]
             bar.update(len(group))
     if without_shapes:
         print(
@@ -291,42 +311,69 @@ def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: Cell
     return errors
 
 
-def _grade_group(
-    group: list[tuple[Job, tuple[str, ...]]],
-    args: Args,
-    bench: Bench,
-    store: CellStore,
-    stop: threading.Event,
-    without_shapes: set[Path],
-) -> list[str]:
-    """Grade jobs of one episode, which is read once; return what went wrong, or raise it as `grade_all` does.
-
-    An episode whose shapes were needed and are not known is added to `without_shapes`.
-    """
-    errors: list[str] = []
-    truth: Truth | None = None
-    for job, metrics in group:
-        if stop.is_set():
-            break
-        try:
-            needed = {input_kind(name) for _, names in group for name in names}
-            truth = truth or read_truth(job.episode, job.cell.frames, needed, surfaces_folder(args.data, args.out))
-            if truth.surfaces is not None and not truth.surfaces.known:
-                without_shapes.add(job.episode)
-            store.write(job.cell, _grade_job(job, truth, metrics, args, bench))
-        except (EpisodeError, ValueError) as error:
-            message = str(error) if str(job.place) in str(error) else f"{job.place}: {error}"
-            if not args.keep_going:
-                raise RolloutError(message) from error
-            errors.append(message)
-    return errors
+def _grade_groups(groups: Sequence[Group], metrics: tuple[str, ...], args: Args, store: CellStore) -> Iterator[Graded]:
+    """What came out of each group, in their order, from threads of this process or from processes of their own."""
+    if args.processes > 1 and len(groups) > 1:
+        yield from map_in_processes(functools.partial(_open_in_process, args, metrics, store), groups, args.processes)
+        return
+    stop = threading.Event()
+    yield from map_in_order(open_grader(args, metrics, store, stop), groups, worker_count(args.workers), stop)
 
 
-def _grade_job(job: Job, truth: Truth, metrics: tuple[str, ...], args: Args, bench: Bench) -> Grades:
-    prediction = read_prediction(job, truth, args.allow, args.frame_zero)
-    first = 0 if args.frame_zero == "predicted" else 1
-    with jax.default_device(bench.device):
-        return grade(Comparison(prediction, truth, bench.masker, bench.tracker, first, estimator_view(job, truth)), metrics)
+def open_grader(args: Args, metrics: Sequence[str], store: CellStore, stop: threading.Event) -> "Grader":
+    """What this process grades with. Raises ConfigError if weights are missing or a run's codec cannot be opened."""
+    codecs = {codec.key: codec for codec in find_codecs(args).values()}
+    return Grader(args, open_bench(args, metrics), codecs, store, stop)
+
+
+def _open_in_process(args: Args, metrics: tuple[str, ...], store: CellStore) -> "Grader":
+    """What a process of its own grades with."""
+    prepare_process(args)
+    return open_grader(args, metrics, store, threading.Event())
+
+
+@dataclass(frozen=True)
+class Grader:
+    """What the threads of a process grade videos with."""
+
+    args: Args
+    bench: Bench
+    codecs: Mapping[str, ModelCodec]
+    """Codecs that the truth goes through, by key."""
+    store: CellStore
+    stop: threading.Event
+    """Signal that no further video is to be begun."""
+
+    def __call__(self, group: Group) -> Graded:
+        """Grade jobs of one episode, which is read once, and enter the scores.
+
+        Raises:
+            RolloutError: a video cannot be graded, unless args.keep_going.
+        """
+        errors: list[str] = []
+        truth: Truth | None = None
+        for job, metrics in group:
+            if self.stop.is_set():
+                break
+            try:
+                needed = {input_kind(name) for _, names in group for name in names}
+                surfaces = surfaces_folder(self.args.data, self.args.out)
+                truth = truth or read_truth(job.episode, job.cell.frames, needed, surfaces)
+                self.store.write(job.cell, self.grade(job, truth, metrics))
+            except (EpisodeError, ValueError) as error:
+                message = str(error) if str(job.place) in str(error) else f"{job.place}: {error}"
+                if not self.args.keep_going:
+                    raise RolloutError(message) from error
+                errors.append(message)
+        return Graded(errors, has_shapes=truth is None or truth.surfaces is None or truth.surfaces.known)
+
+    def grade(self, job: Job, truth: Truth, metrics: Sequence[str]) -> Grades:
+        """Scores of one video. Raises RolloutError, EpisodeError or ValueError where it cannot be graded."""
+        prediction = read_prediction(job, truth, self.codecs, self.args.allow, self.args.frame_zero)
+        first = 0 if self.args.frame_zero == "predicted" else 1
+        comparison = Comparison(prediction, truth, self.bench.masker, self.bench.tracker, first, estimator_view(job, truth))
+        with jax.default_device(self.bench.device):
+            return grade(comparison, metrics)
 
 
 def _demand_codecs(path: Path, bundle: Bundle, args: Args) -> None:
@@ -354,11 +401,12 @@ def check(args: Args, path: Path) -> None:
     print("made from these rollouts and this data, by their digests")
     picked = [jobs[i] for i in np.unique(np.linspace(0, len(jobs) - 1, args.regrade).astype(int))]
     metrics = tuple(name for name in bundle["metrics"] if name in METRICS)
-    bench, found = open_bench(args, metrics), list[str]()
+    store = CellStore(path_beside(args.out, "cells"), baselines_folder(args.data, args.out))
+    grader, found = open_grader(args, metrics, store, threading.Event()), list[str]()
     for job in tqdm(picked, desc="grade anew", unit="video", disable=None):
         verify_episode(job.episode)
         truth = read_truth(job.episode, job.cell.frames, {input_kind(name) for name in metrics})
-        found += disagreements(bundle, job.cell.key, _grade_job(job, truth, metrics, args, bench).values)
+        found += disagreements(bundle, job.cell.key, grader.grade(job, truth, metrics).values)
     raise_if_any(path, found)
     if picked:
         print(f"{len(picked)} videos graded anew: the same scores")

@@ -75,6 +75,9 @@ class Machine:
     """Number of steps at once where there is no GPU."""
     gpus_per_training: int = 1
     """Number of GPUs that a training takes at once."""
+    steps_per_gpu: int = 1
+    """Number of steps that share a GPU at once. More than one uses the time in which a step reads, compiles or writes; memory is
+    then taken as it is needed (XLA_PYTHON_CLIENT_PREALLOCATE), and must do for all."""
     train_launcher: str = ""
     """Launcher put before a training's command, such as srun --nodes=2; the processes it starts join by jax.distributed."""
     ray: str | None = None
@@ -128,6 +131,8 @@ class Study:
     """Number of test seeds of each task."""
     training_seeds: tuple[int, ...] = ()
     """Seeds of the trainings of every variant, each a training of its own; one, with the experiment's seed, where left out."""
+    repeated: tuple[str, ...] = ("*",)
+    """Patterns: variants whose names match one of them are trained with every one of these seeds, others with the first alone."""
     settings: Settings = field(default_factory=dict)
     """Settings laid over the experiment for every variant."""
     adaptation: Settings = field(default_factory=dict)
@@ -182,7 +187,17 @@ class Study:
             make_run(variant, seed, ending)
             for seed, ending in zip(seeds, endings, strict=True)
             for variant in self.planned_variants
+            if not ending or self._is_repeated(variant)
         )
+
+    def count_trainings(self, variant: Variant) -> int:
+        """Number of trainings of a variant."""
+        return max(len(self.training_seeds), 1) if self._is_repeated(variant) else 1
+
+    def _is_repeated(self, variant: Variant) -> bool:
+        """Whether a variant is trained with every seed: it is named, and so is what it starts from."""
+        named = any(fnmatch.fnmatch(variant.name, pattern) for pattern in self.repeated)
+        return named and (variant.start is None or self._is_repeated(variant.start))
 
     def _includes(self, variant: Variant) -> bool:
         """Whether a variant of a part is one of this study."""
@@ -222,8 +237,8 @@ def check_study(study: Study, path: Path) -> None:
         shlex.split(study.machine.train_launcher)
     except ValueError as error:
         raise ConfigError(f"{path}: machine.train_launcher is {study.machine.train_launcher!r}: {error}.") from error
-    if study.machine.workers < 1 or study.machine.gpus_per_training < 1:
-        raise ConfigError(f"{path}: machine.workers and machine.gpus_per_training must be at least 1.")
+    if min(study.machine.workers, study.machine.gpus_per_training, study.machine.steps_per_gpu) < 1:
+        raise ConfigError(f"{path}: machine.workers, machine.gpus_per_training and machine.steps_per_gpu must be at least 1.")
 
 
 def _check_names(study: Study, path: Path) -> None:
@@ -245,12 +260,13 @@ def _check_names(study: Study, path: Path) -> None:
         if len(set(names)) < len(names):
             raise ConfigError(f"{path}: a {kind} stands twice in {', '.join(names)}; name each once.")
     variants = list(dict.fromkeys(variant.name for part in study.parts for variant in PARTS[part]))
-    for pattern in study.variants:
-        if not fnmatch.filter(variants, pattern):
-            raise ConfigError(
-                f"{path}: variants {pattern!r} matches none of the parts {', '.join(study.parts)};"
-                f"{suggestion(pattern, variants)} there are {', '.join(variants)}."
-            )
+    for field_name, patterns in (("variants", study.variants), ("repeated", study.repeated)):
+        for pattern in patterns:
+            if not fnmatch.filter(variants, pattern):
+                raise ConfigError(
+                    f"{path}: {field_name} {pattern!r} matches none of the parts {', '.join(study.parts)};"
+                    f"{suggestion(pattern, variants)} there are {', '.join(variants)}."
+                )
 
 
 def build_experiment(study: Study, variant: Variant) -> Settings:

@@ -111,11 +111,15 @@ def estimate_wall_seconds(steps: Mapping[str, Step], seconds: Mapping[str, float
     return now
 
 
-def critical_paths(steps: Mapping[str, Step], seconds: Mapping[str, float]) -> dict[str, float]:
-    """Seconds from the start of each step to the end of the study if there were a slot for every step."""
+def critical_paths(steps: Mapping[str, Step], seconds: Mapping[str, float], own: bool = False) -> dict[str, float]:
+    """Seconds from the start of each step to the end of the study if there were a slot for every step.
+
+    With `own` to the end of the step's own variant: without the steps of others, and of a step that serves all, alone.
+    """
     paths: dict[str, float] = {}
     for step in reversed(sort_steps(steps)):
-        after = [paths[name] for name, other in steps.items() if step.name in other.needs]
+        followers = [other for other in steps.values() if step.name in other.needs]
+        after = [paths[other.name] for other in followers if not own or other.variant == step.variant]
         paths[step.name] = seconds[step.name] + max(after, default=0.0)
     return paths
 

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
@@ -58,7 +59,10 @@ def open_machines(study: Study) -> Machines:
     needed = study.machine.gpus_per_training
     if gpus and needed > len(gpus):
         raise ConfigError(f"machine.gpus_per_training is {needed}, there are {len(gpus)} GPUs ({', '.join(gpus)}); lower it.")
-    return ThisMachine(gpus, study.machine.workers, environment)
+    shared = study.machine.steps_per_gpu
+    if gpus and shared > 1:
+        environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | environment
+    return ThisMachine(gpus, study.machine.workers, environment, shared)
 
 
 def usable_gpus(study: Study) -> tuple[str, ...]:
@@ -84,24 +88,25 @@ class _Running:
 
 
 class ThisMachine:
-    """This machine: one step per GPU, or without a GPU as many steps at once as there are workers."""
+    """This machine: one step or a few per GPU, or without a GPU as many steps at once as there are workers."""
 
-    def __init__(self, gpus: tuple[str, ...], workers: int, environment: Mapping[str, str]) -> None:
+    def __init__(self, gpus: tuple[str, ...], workers: int, environment: Mapping[str, str], steps_per_gpu: int = 1) -> None:
         self.gpus, self.environment = gpus, dict(environment)
-        self.slots = len(gpus) or workers
-        self._free = list(gpus or map(str, range(workers)))
+        self._free = Counter(dict.fromkeys(gpus, steps_per_gpu) or {str(worker): 1 for worker in range(workers)})
+        self.slots = self._free.total()
         self._running: dict[str, _Running] = {}
         os.environ.update(environment)  # the fork server imports JAX, which reads some of it then
 
     def has_room_for(self, step: Step) -> bool:
-        return self._count_slots(step) <= len(self._free)
+        return self._count_slots(step) <= len(+self._free)
 
     def _count_slots(self, step: Step) -> int:
         """Number of slots that a step takes; without GPUs every step takes one."""
         return max(1, step.gpus) if self.gpus else 1
 
     def start(self, step: Step, command: tuple[str, ...], log: Path) -> None:
-        slots = tuple(self._free.pop(0) for _ in range(self._count_slots(step)))
+        slots = tuple(name for name, _ in self._free.most_common(self._count_slots(step)))  # the least busy GPUs
+        self._free.subtract(slots)
         own = {"CUDA_VISIBLE_DEVICES": ",".join(slots)} if self.gpus else {}
         process = start_step(command, log, {**self.environment, **step.environment, **own}, launcher=step.launcher)
         self._running[step.name] = _Running(process, slots)
@@ -114,7 +119,7 @@ class ThisMachine:
     def _settle(self, name: str) -> int:
         running = self._running.pop(name)
         running.process.join()
-        self._free = sorted([*self._free, *running.slots])
+        self._free.update(running.slots)
         return running.process.exitcode or 0
 
     def stop(self) -> None:
