@@ -58,7 +58,7 @@ class Args:
     redo: Annotated[tuple[str, ...], tyro.conf.arg(metavar="STEP [STEP ...]")] = ()
     """Steps to make anew, such as 'train/loeo_*'."""
     minutes: Annotated[float | None, tyro.conf.arg(metavar="{None}|FLOAT")] = None
-    """Time that this run may take: by the estimates nothing is begun that would not be graded by then. Run it again to go on."""
+    """Time that this run may take: by the estimates nothing is begun that would not be graded by then."""
     merge: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="PIECE [PIECE ...]")] = ()
     """Folders of the same study from other machines: what they have done is taken over, and nothing is run."""
 

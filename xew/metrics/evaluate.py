@@ -11,33 +11,30 @@ Writes scores.parquet, one row per model, condition, task, seed, robot and metri
     python -m xew.metrics.evaluate demo/rollouts --data demo/data --check demo/scores.bundle.json --regrade 5
 """
 
-import functools
 import itertools
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import cv2
-import jax
 import numpy as np
 import pandas as pd
 import tyro
 from tqdm import tqdm
 
-from xew.compilation import keep_compiled_programs
 from xew.concurrency import map_in_order, map_in_processes
-from xew.config import ConfigError, admit, pick, suggestion, user_errors
+from xew.config import ConfigError, pick, suggestion, user_errors
 from xew.episode import EpisodeError, verify_episode
 from xew.files import hold_lock
 from xew.metrics import METRICS
-from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, identity, open_masker, open_tracker
-from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, grade, input_kind
+from xew.metrics.backends import MASKERS, TRACKERS, identity
+from xew.metrics.grade import DIAGNOSTICS, input_kind
 from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.bundle import Bundle, differences, disagreements, raise_if_any, read_bundle, write_bundle
 from xew.metrics.grading.codecs import OPENER, ModelCodec, open_codecs
-from xew.metrics.grading.jobs import Job, estimator_view, list_jobs, read_prediction
+from xew.metrics.grading.grader import Graded, GraderOpener, Group, prepare_process
+from xew.metrics.grading.jobs import Job, list_jobs
 from xew.metrics.grading.scores import (
     CellStore,
     baselines_folder,
@@ -50,12 +47,12 @@ from xew.metrics.grading.scores import (
     write_whole,
 )
 from xew.metrics.grading.summary import summarize, to_markdown
-from xew.metrics.grading.workers import Bench, make_opener, open_nothing, worker_count
+from xew.metrics.grading.workers import worker_count
 from xew.metrics.metric import SUITES
-from xew.metrics.truth import Truth, read_truth
+from xew.metrics.truth import read_truth
 from xew.names import csv_text
 from xew.protocol import HELD_OUT_ROBOTS
-from xew.rollout import RolloutError, find_rollouts
+from xew.rollout import find_rollouts
 
 PROTOCOL = 4
 """Version of the grading: it goes up when any score would change, and scores of another version are graded anew."""
@@ -121,20 +118,6 @@ class Args:
     """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
-Group = list[tuple[Job, tuple[str, ...]]]
-"""Jobs of one episode, each with the names of the metrics that are still to be graded."""
-
-
-@dataclass(frozen=True)
-class Graded:
-    """What came of grading a group, beside the scores in the store."""
-
-    errors: Sequence[str]
-    """Messages about videos that could not be graded."""
-    has_shapes: bool
-    """Whether the shapes of the episode's bodies were known where they were needed."""
-
-
 WRITTEN = {
     "parquet": "scores",
     "curves.parquet": "the same by frame",
@@ -150,20 +133,13 @@ WRITTEN = {
 @user_errors
 def main(args: Args) -> None:
     """Grade, write, and print what came out; or check a bundle."""
-    prepare_process(args)
+    prepare_process(args.trust)
     if args.check is not None:
         check(args, args.check)
         return
     check_out(args.out)
     with hold_lock(args.out):
         grade_tables(args)
-
-
-def prepare_process(args: Args) -> None:
-    """Settings of a process that grades."""
-    admit(args.trust)
-    keep_compiled_programs()
-    cv2.setNumThreads(1)  # episodes are shared out; OpenCV's own threads would only get in the way
 
 
 def grade_tables(args: Args) -> None:
@@ -249,10 +225,12 @@ def _identity(name: str, checkpoint: Path | None, option: str) -> str:
 
 def find_codecs(args: Args) -> dict[str, ModelCodec]:
     """Codecs of the runs that are named, by model. Raises ConfigError as `open_codecs`."""
-    if not args.codec:
-        return {}
-    models = {rollout.model for root in args.rollouts for rollout in find_rollouts(root, [])}
-    return open_codecs(args.codec, args.codec_opener, models)
+    return open_codecs(args.codec, args.codec_opener, find_models(args)) if args.codec else {}
+
+
+def find_models(args: Args) -> frozenset[str]:
+    """Names of the models whose rollouts are graded."""
+    return frozenset(rollout.model for root in args.rollouts for rollout in find_rollouts(root, []))
 
 
 def find_jobs(
@@ -268,18 +246,6 @@ def find_jobs(
         )
     workers = worker_count(args.workers)
     return list_jobs(args.rollouts, args.data, str(settings(args)), baselines, workers, problems, codecs)
-
-
-def open_bench(args: Args, metrics: Sequence[str]) -> Bench:
-    """A bench with the chosen estimators, as far as these metrics need them. Raises ConfigError if weights are missing."""
-    kinds = {input_kind(name) for name in metrics}
-    masker: Callable[[jax.Device], Masker] = open_nothing
-    tracker: Callable[[jax.Device], Tracker] = open_nothing
-    if "mask" in kinds:
-        masker = make_opener(args.masks, MASKERS, open_masker, args.masks_checkpoint)
-    if kinds & {"keypoints", "objects", "robot_points", "object_points", "contact"}:
-        tracker = make_opener(args.tracks, TRACKERS, open_tracker, args.tracks_checkpoint)
-    return Bench(masker, tracker, itertools.cycle(jax.local_devices()))
 
 
 def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: CellStore) -> list[str]:
@@ -313,67 +279,30 @@ def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: Cell
 
 def _grade_groups(groups: Sequence[Group], metrics: tuple[str, ...], args: Args, store: CellStore) -> Iterator[Graded]:
     """What came out of each group, in their order, from threads of this process or from processes of their own."""
+    opener = make_grader_opener(args, metrics, store)
     if args.processes > 1 and len(groups) > 1:
-        yield from map_in_processes(functools.partial(_open_in_process, args, metrics, store), groups, args.processes)
+        yield from map_in_processes(opener.open_in_process, groups, args.processes)
         return
     stop = threading.Event()
-    yield from map_in_order(open_grader(args, metrics, store, stop), groups, worker_count(args.workers), stop)
+    yield from map_in_order(opener.open(stop), groups, worker_count(args.workers), stop)
 
 
-def open_grader(args: Args, metrics: Sequence[str], store: CellStore, stop: threading.Event) -> "Grader":
-    """What this process grades with. Raises ConfigError if weights are missing or a run's codec cannot be opened."""
-    codecs = {codec.key: codec for codec in find_codecs(args).values()}
-    return Grader(args, open_bench(args, metrics), codecs, store, stop)
-
-
-def _open_in_process(args: Args, metrics: tuple[str, ...], store: CellStore) -> "Grader":
-    """What a process of its own grades with."""
-    prepare_process(args)
-    return open_grader(args, metrics, store, threading.Event())
-
-
-@dataclass(frozen=True)
-class Grader:
-    """What the threads of a process grade videos with."""
-
-    args: Args
-    bench: Bench
-    codecs: Mapping[str, ModelCodec]
-    """Codecs that the truth goes through, by key."""
-    store: CellStore
-    stop: threading.Event
-    """Signal that no further video is to be begun."""
-
-    def __call__(self, group: Group) -> Graded:
-        """Grade jobs of one episode, which is read once, and enter the scores.
-
-        Raises:
-            RolloutError: a video cannot be graded, unless args.keep_going.
-        """
-        errors: list[str] = []
-        truth: Truth | None = None
-        for job, metrics in group:
-            if self.stop.is_set():
-                break
-            try:
-                needed = {input_kind(name) for _, names in group for name in names}
-                surfaces = surfaces_folder(self.args.data, self.args.out)
-                truth = truth or read_truth(job.episode, job.cell.frames, needed, surfaces)
-                self.store.write(job.cell, self.grade(job, truth, metrics))
-            except (EpisodeError, ValueError) as error:
-                message = str(error) if str(job.place) in str(error) else f"{job.place}: {error}"
-                if not self.args.keep_going:
-                    raise RolloutError(message) from error
-                errors.append(message)
-        return Graded(errors, has_shapes=truth is None or truth.surfaces is None or truth.surfaces.known)
-
-    def grade(self, job: Job, truth: Truth, metrics: Sequence[str]) -> Grades:
-        """Scores of one video. Raises RolloutError, EpisodeError or ValueError where it cannot be graded."""
-        prediction = read_prediction(job, truth, self.codecs, self.args.allow, self.args.frame_zero)
-        first = 0 if self.args.frame_zero == "predicted" else 1
-        comparison = Comparison(prediction, truth, self.bench.masker, self.bench.tracker, first, estimator_view(job, truth))
-        with jax.default_device(self.bench.device):
-            return grade(comparison, metrics)
+def make_grader_opener(args: Args, metrics: Sequence[str], store: CellStore) -> GraderOpener:
+    """What opens the graders that these arguments ask for."""
+    return GraderOpener(
+        metrics=tuple(metrics),
+        masks=(args.masks, args.masks_checkpoint),
+        tracks=(args.tracks, args.tracks_checkpoint),
+        codecs=tuple(args.codec),
+        codec_opener=args.codec_opener,
+        models=find_models(args) if args.codec else frozenset(),
+        surfaces=surfaces_folder(args.data, args.out),
+        store=store,
+        allow=args.allow,
+        frame_zero=args.frame_zero,
+        keep_going=args.keep_going,
+        trust=args.trust,
+    )
 
 
 def _demand_codecs(path: Path, bundle: Bundle, args: Args) -> None:
@@ -402,7 +331,7 @@ def check(args: Args, path: Path) -> None:
     picked = [jobs[i] for i in np.unique(np.linspace(0, len(jobs) - 1, args.regrade).astype(int))]
     metrics = tuple(name for name in bundle["metrics"] if name in METRICS)
     store = CellStore(path_beside(args.out, "cells"), baselines_folder(args.data, args.out))
-    grader, found = open_grader(args, metrics, store, threading.Event()), list[str]()
+    grader, found = make_grader_opener(args, metrics, store).open(threading.Event()), list[str]()
     for job in tqdm(picked, desc="grade anew", unit="video", disable=None):
         verify_episode(job.episode)
         truth = read_truth(job.episode, job.cell.frames, {input_kind(name) for name in metrics})

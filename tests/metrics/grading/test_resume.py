@@ -25,6 +25,7 @@ from xew.dataset import find_accepted
 from xew.episode import EpisodeError, read_video
 from xew.metrics import evaluate
 from xew.metrics.evaluate import Args, main
+from xew.metrics.grading import grader
 from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.workers import Bench
 from xew.rollout import write_rollout
@@ -258,13 +259,13 @@ def test_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path, monkey
     """300 episodes; what the process holds after 100 of them is what it holds after all, but for a few megabytes."""
     write_many(tmp_path, 300)
     held: list[float] = []
-    real = evaluate.Grader.__call__
+    real = grader.Grader.__call__
 
     def notes(*args: object, **settings: object) -> object:
         held.append(resident())
         return real(*args, **settings)
 
-    monkeypatch.setattr(evaluate.Grader, "__call__", notes)
+    monkeypatch.setattr(grader.Grader, "__call__", notes)
     args = Args((tmp_path / "rollouts",), tmp_path / "data", tmp_path / "scores.parquet", ("psnr", "mask_iou"), workers=2)
     main(args)
     assert len(held) == 300 and len(graded(args.out, args.data)) == 1200, "with three baselines: there is no other robot"

@@ -50,7 +50,7 @@ class Rates:
     rollout_s: float
     """Time to predict one episode."""
     grade_s: float
-    """Time to grade one predicted episode."""
+    """Time to grade one video: a predicted episode, or a baseline's."""
     start_s: float
     """Time from the start of a command to its first real work, compiling included."""
     episode_mb: float
@@ -75,9 +75,9 @@ class Machine:
     """Number of steps at once where there is no GPU."""
     gpus_per_training: int = 1
     """Number of GPUs that a training takes at once."""
-    steps_per_gpu: int = 1
-    """Number of steps that share a GPU at once. More than one uses the time in which a step reads, compiles or writes; memory is
-    then taken as it is needed (XLA_PYTHON_CLIENT_PREALLOCATE), and must do for all."""
+    beside: int = 0
+    """Number of steps of other kinds that share a GPU with a training at once: latents, rollouts and grading leave it idle
+    while they read and write. Memory is then taken as it is needed. With 0 a GPU has one step at a time."""
     train_launcher: str = ""
     """Launcher put before a training's command, such as srun --nodes=2; the processes it starts join by jax.distributed."""
     ray: str | None = None
@@ -132,7 +132,7 @@ class Study:
     training_seeds: tuple[int, ...] = ()
     """Seeds of the trainings of every variant, each a training of its own; one, with the experiment's seed, where left out."""
     repeated: tuple[str, ...] = ("*",)
-    """Patterns: variants whose names match one of them are trained with every one of these seeds, others with the first alone."""
+    """Patterns: variants whose names match one of them are trained with every one of these seeds, others with the first."""
     settings: Settings = field(default_factory=dict)
     """Settings laid over the experiment for every variant."""
     adaptation: Settings = field(default_factory=dict)
@@ -237,8 +237,10 @@ def check_study(study: Study, path: Path) -> None:
         shlex.split(study.machine.train_launcher)
     except ValueError as error:
         raise ConfigError(f"{path}: machine.train_launcher is {study.machine.train_launcher!r}: {error}.") from error
-    if min(study.machine.workers, study.machine.gpus_per_training, study.machine.steps_per_gpu) < 1:
-        raise ConfigError(f"{path}: machine.workers, machine.gpus_per_training and machine.steps_per_gpu must be at least 1.")
+    if study.machine.workers < 1 or study.machine.gpus_per_training < 1:
+        raise ConfigError(f"{path}: machine.workers and machine.gpus_per_training must be at least 1.")
+    if study.machine.beside < 0:
+        raise ConfigError(f"{path}: machine.beside is {study.machine.beside}, expected 0 or more.")
 
 
 def _check_names(study: Study, path: Path) -> None:

@@ -14,7 +14,7 @@ from xew.analysis.studies.config import KINDS, Settings, Study, build_experiment
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import usable_gpus
 from xew.analysis.studies.plan import Step, sort_steps
-from xew.protocol import Variant
+from xew.protocol import BASELINES, Variant
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,10 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     episodes = study.task_count * (study.train_seeds + study.test_seeds) * len(study.robots)
     costs["generate"] = Cost(episodes, "episodes", rates.start_s + episodes * rates.episode_s, episodes * rates.episode_mb)
     encoded: set[tuple[str, ...]] = set()
-    for variant in study.planned_runs:
+    for number, variant in enumerate(study.planned_runs):
         experiment = build_experiment(study, variant)
         streams = _count_new_streams(variant, experiment, encoded) * study.training_count(variant)
+        videos = sum(study.graded_counts(variant).values()) * (1 if number else 1 + len(BASELINES))
         updates, graded = count_optimizer_steps(study, variant, experiment), sum(study.graded_counts(variant).values())
         costs |= {
             f"latents/{variant.name}": Cost(
@@ -48,7 +49,7 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
             f"rollout/{variant.name}": Cost(
                 graded, "episodes", rates.start_s + graded * rates.rollout_s, graded * rates.rollout_mb
             ),
-            f"evaluate/{variant.name}": Cost(graded, "episodes", rates.start_s + graded * rates.grade_s),
+            f"evaluate/{variant.name}": Cost(videos, "videos", rates.start_s + videos * rates.grade_s),
         }
     costs |= {"distances": Cost(1, "table", 2 * rates.start_s), "analyse": Cost(1, "report", 2 * rates.start_s)}
     return {name: costs[name] for name in steps}

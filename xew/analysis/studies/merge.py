@@ -1,8 +1,8 @@
 """Pieces of a study that ran in folders of their own, on machines that share no disk, brought together.
 
-A piece is the folder that `xew.analysis.study` has written elsewhere, whole or without what is large: data, latents, checkpoints
-and rollouts need not come along. What a piece has done is taken over with its record, which says from which inputs it was made;
-whether it holds for this study is told by its key, never by times.
+A piece is the folder that `xew.analysis.study` has written elsewhere, whole or without what is large: data, latents,
+checkpoints and rollouts need not come along. What a piece has done is taken over with its record, which says from which inputs
+it was made; whether it holds for this study is told by its key, never by times.
 """
 
 import shutil
@@ -59,7 +59,7 @@ def _take_product(step: Step, out: Path, piece: Path, outcome: str) -> None:
         raise ConfigError(f"{source} is not what the records of {piece} say was made; bring the whole piece again.")
     if source.is_dir():
         shutil.copytree(source, step.product, dirs_exist_ok=True, ignore=shutil.ignore_patterns(".*"))
-    for path in sorted(source.parent.glob(f"{source.stem}.*")) if source.is_file() else ():
-        if path.is_file():
-            step.product.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(path, step.product.parent / path.name)
+    beside = [path for path in source.parent.glob(f"{source.stem}.*") if path.is_file()]
+    for path in {source, *beside} if source.is_file() else ():
+        step.product.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, step.product.parent / path.name)

@@ -39,6 +39,7 @@ class StudyRunner:
         """Run every step that can be run and for which there is time; returns those that failed, with the reason."""
         order = TopologicalSorter({name: step.needs for name, step in self.steps.items()})
         order.prepare()
+        self.ledger.find_all_done(self.steps)
         waiting: set[str] = set()
         try:
             while order.is_active():
@@ -115,7 +116,7 @@ class StudyRunner:
 
 
 class Budget:
-    """Time that a study may take now: whole cells first, and nothing is begun that would not be graded in time.
+    """Time that a study may take now: whole cells first, and nothing is trained that would not be graded in time.
 
     Args:
         study, steps: what is run.
@@ -140,8 +141,12 @@ class Budget:
         return self._seconds[name], self._order[name]
 
     def fits(self, name: str) -> bool:
-        """Whether a step and what follows it up to the grades of the same variant would end in time."""
-        return time.monotonic() + self._seconds[name] <= self._end
+        """Whether a step and what follows it up to the grades of the same variant would end in time.
+
+        What is trained is rolled out and graded while there is any time: otherwise the training was for nothing.
+        """
+        spent = name.partition("/")[0] in ("rollout", "evaluate")
+        return time.monotonic() + (0.0 if spent else self._seconds[name]) <= self._end
 
 
 def complete_command(step: Step, goes_on: bool, failed: Mapping[str, str]) -> tuple[str, ...]:
