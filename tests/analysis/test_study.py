@@ -116,7 +116,8 @@ def test_pieces_come_together(study: Study, tmp_path: Path, capsys: pytest.Captu
         "1 steps taken over",
     ]
     assert run(study, home) == {}
-    assert begun(study.out) == {"end": 1} and (study.out / "left").read_text() == "left"
+    assert begun(study.out) == {"left": 1, "right": 1, "end": 1}, "what lies beside a product comes along"
+    assert (study.out / "left").read_text() == "left" and not (study.out / "data").exists()
     assert "left" in (study.out / "logs" / "train" / "left.log").read_text()
     assert runner.merge_pieces(home, Ledger(study.out), pieces[:1]) == {}
     assert capsys.readouterr().out.splitlines()[-1].endswith("0 steps taken over"), "what is done here stays"
