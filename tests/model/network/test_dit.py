@@ -1,5 +1,8 @@
 """The block stack against what is known of Wan2.2-TI2V-5B and against naive forms of itself."""
 
+import functools
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -415,3 +418,21 @@ def test_what_blocks_keep_is_what_the_memory_estimate_says(remat: dit.RematName,
     of_tokens = sum(array.size * array.dtype.itemsize for array in kept if tokens in array.shape and array not in pairs)
     estimate = kept_bytes(size, remat, jnp.dtype(dtype).itemsize, jnp.dtype(residual).itemsize)
     assert of_tokens / size.depth / tokens == pytest.approx(estimate, rel=0.05)
+
+
+@pytest.mark.parametrize(("queries", "keys"), [(6, 7), (7, 6), (5, 5), (6, 8)])
+def test_odd_numbers_of_tokens_are_evened_out(queries: int, keys: int) -> None:
+    """Values and gradients equal those of plain attention: what is added has no part in either."""
+    q, k, v = (jax.random.normal(jax.random.key(number), (2, n, 3, 8)) for number, n in enumerate((queries, keys, keys)))
+    plain = functools.partial(jax.nn.dot_product_attention, implementation="xla")
+    even = functools.partial(blocks.attend_in_pairs, implementation="xla")
+
+    def total(attend: Callable[..., jax.Array], *arrays: jax.Array) -> jax.Array:
+        return jnp.sum(jnp.sin(attend(*arrays)))
+
+    np.testing.assert_allclose(even(q, k, v), plain(q, k, v), atol=1e-6)
+    gradients = [jax.grad(functools.partial(total, attend), argnums=(0, 1, 2))(q, k, v) for attend in (plain, even)]
+    for wanted, found in zip(*gradients, strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-6)
+    program = str(jax.make_jaxpr(even)(q, k, v))
+    assert f"{queries + queries % 2},{keys + keys % 2}" in program.replace(" ", ""), "the numbers that attention sees are even"

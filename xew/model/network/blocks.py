@@ -210,8 +210,9 @@ class Attention(nnx.Module):
 
     def _attend(self, q: Array, k: Array, v: Array) -> Array:
         chosen = choose_attention(self.implementation, q.shape[-1], self.dtype)
-        attended = jax.nn.dot_product_attention(q, k, v, implementation=chosen)
-        return attended if chosen == "cudnn" else checkpoint_name(attended, "attention")
+        if chosen == "cudnn":
+            return attend_in_pairs(q, k, v, chosen)
+        return checkpoint_name(jax.nn.dot_product_attention(q, k, v, implementation=chosen), "attention")
 
 
 class Head(nnx.Module):
@@ -352,8 +353,8 @@ def choose_attention(asked: AttentionName, head_dim: int, dtype: DTypeLike) -> L
     """The implementation of `jax.nn.dot_product_attention` on this machine.
 
     "auto" is cuDNN's on a CUDA GPU of compute capability 8.0 and up, in bfloat16 or float16, where the width of a head is
-    a multiple of 8 and at most 256 (128 before Hopper, 9.0); else XLA's, which forms [n s s]. cuDNN takes any number of
-    tokens, so nothing is padded. (The limits are those that jax itself checks.)
+    a multiple of 8 and at most 256 (128 before Hopper, 9.0); else XLA's, which forms [n s s]. (The limits are those that jax
+    itself checks; `attend_in_pairs` sees to the one on the number of tokens.)
 
     Raises:
         ConfigError: cuDNN was asked for and cannot do it.
@@ -364,6 +365,27 @@ def choose_attention(asked: AttentionName, head_dim: int, dtype: DTypeLike) -> L
     if reason and asked == "cudnn":
         raise ConfigError(f"attention: cudnn cannot be used: {reason}; set model.attention to auto or xla.")
     return "xla" if reason else "cudnn"
+
+
+def attend_in_pairs(
+    q: Float[Array, "b q heads k"],
+    k: Float[Array, "b s heads k"],
+    v: Float[Array, "b s heads k"],
+    implementation: Literal["xla", "cudnn"],
+) -> Float[Array, "b q heads k"]:
+    """Attention of any numbers of queries and keys by one that takes even numbers alone, as cuDNN's gradients do.
+
+    An odd number gets one more, which is masked and cut off again.
+    """
+    queries, keys = q.shape[1], k.shape[1]
+    if queries % 2 == 0 and keys % 2 == 0:
+        return jax.nn.dot_product_attention(q, k, v, implementation=implementation)
+    q, k, v = (jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, 0), (0, 0))) for x in (q, k, v))
+    lengths = {
+        "query_seq_lengths": jnp.full(len(q), queries, jnp.int32),
+        "key_value_seq_lengths": jnp.full(len(k), keys, jnp.int32),
+    }
+    return jax.nn.dot_product_attention(q, k, v, implementation=implementation, **lengths)[:, :queries]
 
 
 def _reason_against_cudnn(head_dim: int, dtype: np.dtype) -> str:
