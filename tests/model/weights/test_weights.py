@@ -27,8 +27,9 @@ from xew.model.network.dit_layouts import (
 )
 from xew.model.network.mechanisms import MECHANISMS
 from xew.model.weights import reading, writing
+from xew.model.weights.filling import fill
 from xew.model.weights.layout import Source, checkpoint_shapes
-from xew.model.weights.reading import fill, read_tensors
+from xew.model.weights.reading import read_tensors
 from xew.model.weights.writing import save_weights
 
 REFERENCE = Path(__file__).parents[1] / "reference"

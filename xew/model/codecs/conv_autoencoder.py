@@ -33,8 +33,9 @@ from xew.files import replacing
 from xew.model.codecs.vae import LatentStatistic
 from xew.model.codecs.vae_layers import Conv, Layers, RmsNorm, as_row, patchify, unpatchify
 from xew.model.video.frames import TEMPORAL_FACTOR
+from xew.model.weights.filling import fill
 from xew.model.weights.layout import Source
-from xew.model.weights.reading import fill, read_tensors
+from xew.model.weights.reading import read_tensors
 
 Groups = Float[Array, "n 4 h w 3"]
 Features = Float[Array, "n y x c"]
