@@ -25,7 +25,7 @@ from xew.model.network.mechanisms import MECHANISMS
 from xew.model.settings.checks import check_experiment
 from xew.model.settings.network import Network
 from xew.model.settings.optimizer import make_optimizer
-from xew.model.settings.parts import ClipInputs, Encoding, EpisodeChoice, Instructions, Learning, pick_conditions
+from xew.model.settings.parts import ClipInputs, Encoding, EpisodeChoice, Instructions, Learning, pick_conditions, sample_roles
 from xew.model.settings.settings import AdaptSettings, Clip, ModelSettings, RolloutSettings, TrainSettings
 from xew.model.text.instructions import TEXT_ENCODERS, VOCABULARY, TextEncoder, TextSource
 from xew.protocol import ACTION_DIM, SPLITS, Split, expand_robots
@@ -107,11 +107,14 @@ class Experiment:
     @property
     def choice(self) -> EpisodeChoice:
         """Which episodes are read. Raises ConfigError if the run that is replayed has gone."""
-        adapt, replay = replace(self.adapt, robots=expand_robots(self.adapt.robots)), tuple[str, ...]()
-        if adapt.start_from is not None and adapt.replay:
+        adapt, targets, replay = self.adapt, expand_robots(self.adapt.robots), tuple[str, ...]()
+        samples = sample_roles(self.robots, targets) if self.train.sample_every else {}
+        if adapt.start_from is None:
+            return EpisodeChoice(self.robots.train_robots, samples=samples)
+        if adapt.replay:
             source = load_recorded(adapt.start_from / "config.yaml").robots.train_robots
-            replay = tuple(robot for robot in source if robot not in adapt.robots)
-        return EpisodeChoice(self.robots, adapt, replay, samples=self.train.sample_every > 0)
+            replay = tuple(robot for robot in source if robot not in targets)
+        return EpisodeChoice(targets, adapt.episodes, replay, samples)
 
     @property
     def learning(self) -> Learning:

@@ -480,8 +480,9 @@ def test_adapted_run_starts_from_the_trained_weights(world: Path, tmp_path: Path
 
 
 def test_samples_of_an_adapted_run_are_named_by_role(experiment: Experiment) -> None:
-    adapted = replace(experiment, adapt=replace(experiment.adapt, start_from=Path("runs/x"), robots=("piper",)))
-    names = sample_episodes(read_dataset(adapted.data), adapted.choice)
+    adapt = replace(experiment.adapt, start_from=Path("runs/x"), robots=("piper",))
+    adapted = replace(experiment, adapt=adapt, train=replace(experiment.train, sample_every=1))
+    names = sample_episodes(read_dataset(adapted.data), adapted.choice.samples)
     seen = {"seen/aloha_agilex", "seen/arx_x5", "seen/ur5_wsg"}
     assert set(names) == seen | {"target/piper"}
     assert {seed_split(record.seed) for _, record in names.values()} == {"train"}, "no test seed is looked at"
