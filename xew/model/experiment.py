@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from xew.command_line import parse_command
 from xew.config import admit, demand_admitted, load, pick
+from xew.model.codecs.codec import codec_class
 from xew.model.codecs.contract import CodecSettings, latent_frames
 from xew.model.codecs.vae import VAES
 from xew.model.conditions import Condition
@@ -102,7 +103,8 @@ class Experiment:
     @property
     def encoding(self) -> Encoding:
         autoencoder = pick(VAES, self.codec.vae, "autoencoder") if self.codec.name == "wan_vae" else None
-        return Encoding(self.inputs, self.codec, self.cache_folder, self.data, self.adapt.start_from, autoencoder)
+        start_from, kind = self.adapt.start_from, codec_class(self.codec)
+        return Encoding(self.inputs, self.codec, kind, self.cache_folder, self.data, start_from, autoencoder)
 
     @property
     def choice(self) -> EpisodeChoice:

@@ -31,7 +31,6 @@ from xew.episode import Record, episode_folder, remove_left_overs
 from xew.files import checkpoint_time, hold_lock, read_json
 from xew.model.cache.codecs import load_codec
 from xew.model.cache.scales import Scale, load_run_scales
-from xew.model.codecs.codec import codec_class
 from xew.model.codecs.contract import Codec
 from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
 from xew.model.episodes.choice import select_episodes, training_episodes
@@ -108,9 +107,7 @@ def load_published(experiment: Experiment, source: Path) -> Predictor:
     mesh = make_mesh(MeshSettings())
     graph, params = make_learner(experiment.learning, mesh).random_network()
     params = load_dit_params(graph, params, experiment.model.weights)
-    episodes = (
-        training_episodes(read_dataset(experiment.data), experiment.choice) if codec_class(experiment.codec).fitted else ()
-    )
+    episodes = training_episodes(read_dataset(experiment.data), experiment.choice) if experiment.encoding.kind.fitted else ()
     return _make_predictor(experiment, load_codec(experiment.encoding, episodes), params, mesh, {})
 
 

@@ -16,15 +16,15 @@ from jax.experimental import multihost_utils
 from xew.config import ConfigError, parse
 from xew.dataset import Episode
 from xew.files import read_json, replacing
-from xew.model.cache.keys import scales_path
+from xew.model.cache.keys import RUN_SCALES, scales_path
 from xew.model.conditions import Command, Condition
 from xew.model.episodes.commands import episode_command
 from xew.model.settings.parts import Encoding
 
 PERCENTILES = (1, 99)
 """Percentiles that become -1 and 1, with clipping beyond, as in Ctrl-World and Boundless-World-Model."""
-SCALES = "scales.json"
-"""Name of the file in a run."""
+RUN_REMEDY = "train it again with --overwrite"
+"""Sentence on what to do where a run's scales are damaged or lost."""
 STILL = 1e-3
 """Least width [m, rad or 1]: a number that hardly moves over all training episodes is divided by this, so that its noise is
 not blown up."""
@@ -121,19 +121,18 @@ def read_scales(path: Path, conditions: Sequence[Condition], remedy: str) -> dic
 
 def load_run_scales(conditions: Mapping[str, Condition], run: Path) -> dict[str, Scale]:
     """The scales that a run was trained with. Raises ConfigError if it needs some and has none."""
-    return read_scales(run / SCALES, tuple(conditions.values()), "train it again with --overwrite")
+    return read_scales(run / RUN_SCALES, tuple(conditions.values()), RUN_REMEDY)
 
 
 def load_scales(encoding: Encoding, episodes: Sequence[Episode]) -> dict[str, Scale]:
     """The scales of these episodes' numbers, or in an adaptation those of the run that it starts from.
 
     Raises:
-        ConfigError: `latents` has not been run for them.
+        ConfigError: `latents` has not been run for them, or the run has lost them.
     """
-    conditions = encoding.inputs.conditions
-    if encoding.start_from is not None:
-        return load_run_scales(conditions, encoding.start_from)
-    return read_scales(scales_path(encoding, episodes), tuple(conditions.values()), encoding.remedy)
+    conditions = tuple(encoding.inputs.conditions.values())
+    remedy = encoding.remedy if encoding.start_from is None else RUN_REMEDY
+    return read_scales(scales_path(encoding, episodes), conditions, remedy)
 
 
 def keep_scales(encoding: Encoding, episodes: Sequence[Episode]) -> None:
@@ -145,7 +144,7 @@ def keep_scales(encoding: Encoding, episodes: Sequence[Episode]) -> None:
 
 def share_scales(out: Path, conditions: Mapping[str, Condition], found: Mapping[str, Scale]) -> dict[str, Scale]:
     """The scales that a run was begun with; those found in the data, which all processes wait for, if it is new."""
-    path = out / SCALES
+    path = out / RUN_SCALES
     if found and not path.exists() and jax.process_index() == 0:
         save_scales(path, found)
     if jax.process_count() > 1:

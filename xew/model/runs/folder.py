@@ -23,7 +23,7 @@ from jax.experimental import multihost_utils
 from xew import config
 from xew.config import ConfigError
 from xew.files import RUN_FILES, RUN_MARK, checkpoint_time, is_run, read_json, remove_written, write_text
-from xew.model.codecs.codec import codec_class
+from xew.model.codecs.codec import RUN_CODEC, RUN_REMEDY, codec_class, load_kept_codec
 from xew.model.codecs.contract import Codec, CodecSettings
 from xew.model.experiment import Experiment, load_recorded
 from xew.model.settings.settings import AdaptSettings
@@ -90,8 +90,8 @@ def prepare_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite
     claim_run(out, experiment, load_recorded, resume=resume, overwrite=overwrite)
     _check_same_codec(experiment.codec, codec, out)
     try:
-        (out / "codec").mkdir(exist_ok=True)
-        codec.save(out / "codec")
+        (out / RUN_CODEC).mkdir(exist_ok=True)
+        codec.save(out / RUN_CODEC)
     except OSError as error:
         raise ConfigError(f"cannot write the run {out}: {error}; choose another --out.") from error
 
@@ -147,7 +147,7 @@ def _remove_run(out: Path) -> None:
 
 def _check_same_codec(settings: CodecSettings, codec: Codec, out: Path) -> None:
     """Raise ConfigError where the codec is another. A file of weights may have moved, but must hold the same."""
-    if (out / "codec").exists() and load_run_codec(out, settings).hash != codec.hash:
+    if (out / RUN_CODEC).exists() and load_run_codec(out, settings).hash != codec.hash:
         raise ConfigError(f"{out} was begun with another codec than the config's now; set it back, or choose --out.")
 
 
@@ -245,26 +245,7 @@ def _demand_run(out: Path) -> None:
 
 def load_run_codec(out: Path, settings: CodecSettings) -> Codec:
     """The codec, of these settings, that a run was trained with. Raises ConfigError if the folder lacks it."""
-    try:
-        return load_kept_codec(settings, out / "codec", "copy the whole run again, or train again")
-    except FileNotFoundError as error:
-        raise ConfigError(f"{out} lacks its codec ({error.filename}); copy the whole run, or train again.") from error
-
-
-def load_kept_codec(settings: CodecSettings, folder: Path, remedy: str) -> Codec:
-    """The codec, of these settings, that is kept in a folder.
-
-    Raises:
-        FileNotFoundError: it lacks a file.
-        ConfigError: it is damaged; `remedy` says what to do.
-    """
-    try:
-        return codec_class(settings).load(folder)
-    except (FileNotFoundError, ConfigError):
-        raise
-    except Exception as error:  # zipfile, zlib, NumPy and safetensors each have their own
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ConfigError(f"{folder} is damaged ({reason}); {remedy}.") from error
+    return load_kept_codec(codec_class(settings), out / RUN_CODEC, RUN_REMEDY)
 
 
 def _check_same(saved: Any, asked: Any, out: Path) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import optax
@@ -64,6 +65,8 @@ class Encoding:
 
     inputs: ClipInputs
     codec: CodecSettings
+    kind: type[Any]
+    """Class of codec that the settings name, with what `Codec` asks."""
     folder: Path
     data: Path
     start_from: Path | None
