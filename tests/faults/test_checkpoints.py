@@ -12,9 +12,8 @@ import pytest
 from xew.config import ConfigError
 from xew.model.codecs.codec import load_kept_codec
 from xew.model.codecs.patches import PatchCodec
-from xew.model.runs.checkpoint import TrainState, open_checkpoints, restore_state, save_state
+from xew.model.runs.checkpoint import TrainState, note_sums, open_checkpoints, restore_state, save_state
 from xew.model.runs.log import RunLog
-from xew.model.runs.sums import note_sums
 
 
 def state(step: int, value: float = 1.0, width: int = 64) -> TrainState:
