@@ -25,7 +25,7 @@ from xew.config import ConfigError
 from xew.files import file_digest, read_json, write_text
 from xew.model.devices.sharding import place_like
 from xew.model.network.lora import apply_lora, init_lora
-from xew.model.runs.folder import KeptStep, trace_run
+from xew.model.runs.lineage import KeptStep, trace_run
 from xew.model.settings.network import Network
 
 SUMMING = ThreadPoolExecutor(1, "sums")

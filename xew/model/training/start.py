@@ -10,7 +10,7 @@ from flax import nnx
 from xew.model.network.blocks import choose_attention
 from xew.model.network.dit_layouts import check_dit, load_dit_params
 from xew.model.runs.checkpoint import TrainState, damaged, restore_state, restore_sum
-from xew.model.runs.folder import trace_start
+from xew.model.runs.lineage import trace_start
 from xew.model.runs.session import Session
 from xew.model.settings.network import Network
 from xew.model.training.step import Learner
