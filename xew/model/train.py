@@ -37,13 +37,15 @@ from xew.model.runs.begin import begin_run, check_one_of, check_start
 from xew.model.runs.checkpoint import TrainState
 from xew.model.runs.session import open_session
 from xew.model.sampling.predict import Predictor
+from xew.model.settings.network import check_network
 from xew.model.settings.optimizer import learning_rate, make_optimizer, set_steps
-from xew.model.training.data import ClipSource, make_dataset
+from xew.model.training.data import ClipSource
 from xew.model.training.flops import flops_of_step
 from xew.model.training.loop import STOPPED, Meter, Timetable, run_steps
 from xew.model.training.memory import check_memory, estimate_memory
+from xew.model.training.order import make_dataset
 from xew.model.training.samples import log_samples
-from xew.model.training.start import begin_state, check_network
+from xew.model.training.start import begin_state
 from xew.model.training.step import StepResult, abstract_state, make_learner
 
 NOISE_LEVEL_EDGES = (0.0, 0.5, 0.8, 0.95, 1.0)

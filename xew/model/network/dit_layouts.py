@@ -140,9 +140,8 @@ def load_dit(model: WorldModel, path: Path) -> None:
             embedding.set_value(jnp.zeros_like(embedding.get_value()))
 
 
-def check_dit(model: WorldModel, path: Path) -> None:
-    """Raise what `load_dit` would, without reading a tensor; `model` may be of `nnx.eval_shape`."""
-    tensors = read_tensors(path)
+def check_dit(model: WorldModel, tensors: Tensors) -> None:
+    """Raise what `load_dit` would of these tensors, without reading one; `model` may be of `nnx.eval_shape`."""
     _check_constants(model, tensors)
     layout, optional = _find_layout(model, tensors)
     check_fit(model, tensors, layout, optional=optional)
