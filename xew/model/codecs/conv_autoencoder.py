@@ -220,12 +220,6 @@ def abstract_autoencoder(size: AutoencoderSize, dtype: DTypeLike = jnp.float32) 
     return nnx.eval_shape(lambda: ConvAutoencoder(size, dtype=dtype, rngs=nnx.Rngs(0)))
 
 
-def count_parameters(size: AutoencoderSize) -> int:
-    """Number of parameters of an autoencoder of this size."""
-    params = nnx.state(abstract_autoencoder(size), nnx.Param)
-    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(params))
-
-
 class NamedLeaf(NamedTuple):
     """A leaf of an autoencoder under its name in a file of weights."""
 

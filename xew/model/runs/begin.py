@@ -1,4 +1,4 @@
-"""Beginning a run: whether its folder may be written, new, continued or replaced, and what is written there first.
+"""Beginning a run: whether its folder may be claimed, what a continued run may change, and what is written there first.
 
 Reads  the run that is continued, or adapted
 Writes <out>/config.yaml, codec/, scales.json and, of an adapted run, start.json, once all is checked

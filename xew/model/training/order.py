@@ -1,4 +1,4 @@
-"""The order of training samples: batches without end, shuffled, that a resumed run continues.
+"""The order of training samples: shuffled batches without end, read ahead in threads, which a resumed run continues.
 
 Reads  `ClipSource`
 Writes `Batch`
