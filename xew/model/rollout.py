@@ -19,7 +19,6 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
-from flax import nnx
 from jax.sharding import Mesh
 from tqdm import tqdm
 
@@ -37,7 +36,7 @@ from xew.model.episodes.choice import select_episodes, training_episodes
 from xew.model.experiment import Experiment, parse_experiment
 from xew.model.network.dit import cast_params
 from xew.model.network.dit_layouts import load_dit_params
-from xew.model.runs.checkpoint import restore_params
+from xew.model.runs.checkpoint import load_params
 from xew.model.runs.folder import load_run_codec, load_run_config
 from xew.model.sampling.predict import Prediction, Predictor
 from xew.model.settings.checks import check_experiment
@@ -68,9 +67,7 @@ def load_predictor(run: Path, experiment: Experiment, step: int | None = None) -
     if is_config(run):
         return load_published(experiment, run), None
     mesh, codec = make_mesh(MeshSettings()), load_run_codec(run, experiment.codec)
-    shapes = nnx.state(nnx.eval_shape(experiment.network.create), nnx.Param)
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=replicated_sharding(mesh)), shapes)
-    params, step = restore_params(run, like, step)
+    params, step = load_params(run, experiment.network, step, replicated_sharding(mesh))
     scales = load_run_scales(experiment.conditions, run)
     return _make_predictor(experiment, codec, params, mesh, scales), step
 

@@ -119,17 +119,20 @@ def restore_params(out: Path, like: Any, step: int | None = None) -> tuple[Any, 
     return restore_sum(trace_run(out, step), like)
 
 
-def load_params(run: Path, network: Network, step: int | None = None) -> tuple[Any, int]:
-    """The parameters of a run's network on the first device, as `restore_params`, in the types of training; and their step.
+def load_params(
+    run: Path, network: Network, step: int | None = None, sharding: jax.sharding.Sharding | None = None
+) -> tuple[Any, int]:
+    """The parameters of a run's network, as `restore_params`, in the types of training; and their step.
 
     Args:
         run: folder of the run.
         network: that of its config.
         step: of the checkpoint; the latest where left out.
+        sharding: where they are to lie; on the first device where left out.
     """
-    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    place = sharding or jax.sharding.SingleDeviceSharding(jax.devices()[0])
     shapes = nnx.state(nnx.eval_shape(network.create), nnx.Param)
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), shapes)
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), shapes)
     return restore_params(run, like, step)
 
 
