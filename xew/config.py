@@ -298,7 +298,7 @@ def _flush(stream: TextIO | None) -> None:
 
 
 def _silence_closed_pipes() -> bool:
-    """Send what is still held back for a pipe without a reader to nowhere. Was there such a pipe?"""
+    """Discard what is still to be written to a pipe without a reader, and return whether there was such a pipe."""
     closed = [stream for stream in (sys.stdout, sys.stderr) if stream is not None and _has_no_reader(stream)]
     for stream in closed:
         nowhere = os.open(os.devnull, os.O_WRONLY)
