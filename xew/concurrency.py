@@ -1,12 +1,14 @@
 """Threads and processes, for all rooms: work done ahead in order, one parser at a time, processes that end with others."""
 
+import functools
 import multiprocessing
 import os
+import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -44,6 +46,33 @@ def map_in_order(
             pool.shutdown(wait=False, cancel_futures=True)
             if stop is not None:
                 stop.set()
+
+
+def map_in_processes(opener: Callable[[], Callable[[Item], Result]], items: Sequence[Item], processes: int) -> Iterator[Result]:
+    """Results of a function over items, in their order, computed by processes of their own.
+
+    Args:
+        opener: gives the function; called once in each process, whose first item gets what it raises.
+        items: sent to the processes, as results and exceptions are sent back: all of them can be pickled.
+        processes: their number; no more are started than there are items.
+    """
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(processes, len(items)), context, _open_function, (opener,)) as pool:
+        yield from pool.map(_call_function, items)
+
+
+_opened: list[Callable[[], Any]] = []
+"""Function of this process, once `_open_function` has been called; it is made when it is first asked for."""
+
+
+def _open_function(opener: Callable[[], Callable[[Any], Any]]) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one stops the others
+    leave_with_parent(lambda: os._exit(1))
+    _opened[:] = [functools.cache(opener)]
+
+
+def _call_function(item: Any) -> Any:
+    return _opened[0]()(item)
 
 
 def leave_with_parent(leave: Callable[[], object]) -> None:

@@ -15,12 +15,14 @@ import pytest
 from tests.synthetic import write_synthetic_data
 from xew.analysis import study as runner
 from xew.analysis.studies import ledger as study_ledger
+from xew.analysis.studies import merge
 from xew.analysis.studies.config import Study, load_study
+from xew.analysis.studies.cost import critical_paths
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import Machines, RayCluster, ThisMachine, open_machines, visible_gpus
 from xew.analysis.studies.plan import Step
 from xew.analysis.studies.processes import last_lines, start_step
-from xew.analysis.studies.runner import StudyRunner, complete_command
+from xew.analysis.studies.runner import Budget, StudyRunner, complete_command
 from xew.analysis.studies.status import exit_with_failures
 from xew.config import ConfigError
 
@@ -38,7 +40,8 @@ def at_the_root(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def outcomes_of_files(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps here make one file each, whatever stage they claim to be."""
-    monkeypatch.setattr(study_ledger, "digest_product", lambda step: study_ledger._digest_file(step.product))
+    for module in (study_ledger, merge):
+        monkeypatch.setattr(module, "digest_product", lambda kind, product: study_ledger._digest_file(product))
 
 
 @pytest.fixture
@@ -84,9 +87,98 @@ def test_a_change_is_carried_on_and_no_further(study: Study) -> None:
     (study.out / "right").write_text("tampered with")
     run(study, changed)
     assert begun(study.out) == {"data": 1, "left": 2, "right": 2, "end": 1}
-    (study.out / "data").unlink()
-    run(study, changed)
-    assert begun(study.out) == {"data": 2, "left": 2, "right": 2, "end": 1}
+
+
+def test_what_was_removed_is_made_again_where_it_is_needed(study: Study) -> None:
+    run(study, chain(study.out))
+    for name in ("data", "left"):
+        (study.out / name).unlink()
+    run(study, chain(study.out))
+    assert begun(study.out) == dict.fromkeys(("data", "left", "right", "end"), 1), "all that needs them is done"
+    (study.out / "end").write_text("tampered with")
+    run(study, chain(study.out))
+    assert begun(study.out) == {"data": 2, "left": 2, "right": 1, "end": 2}, "left needs the data, and end needs left"
+
+
+def test_pieces_come_together(study: Study, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One machine makes the left step, another the right one, from the same data; here only the end is left to do."""
+    pieces = [study.out / name for name in ("first", "second")]
+    for piece, made in zip(pieces, ("left", "right"), strict=True):
+        steps = chain(piece)
+        steps.pop("train/end")
+        steps.pop("train/left" if made == "right" else "train/right")
+        run(replace(study, out=piece), steps)
+        (piece / "data").unlink()
+    home = chain(study.out)
+    assert runner.merge_pieces(home, Ledger(study.out), pieces) == {}
+    assert [line.split(": ")[1] for line in capsys.readouterr().out.splitlines()[-2:]] == [
+        "2 steps taken over",
+        "1 steps taken over",
+    ]
+    assert run(study, home) == {}
+    assert begun(study.out) == {"left": 1, "right": 1, "end": 1}, "what lies beside a product comes along"
+    assert (study.out / "left").read_text() == "left" and not (study.out / "data").exists()
+    assert "left" in (study.out / "logs" / "train" / "left.log").read_text()
+    assert runner.merge_pieces(home, Ledger(study.out), pieces[:1]) == {}
+    assert capsys.readouterr().out.splitlines()[-1].endswith("0 steps taken over"), "what is done here stays"
+
+
+def test_a_piece_from_other_data_or_with_another_product_is_not_taken(study: Study) -> None:
+    run(replace(study, out=study.out / "piece"), chain(study.out / "piece", data=("--wait", "0.01")))
+    home, ledger = chain(study.out), Ledger(study.out)
+    runner.merge_pieces(home, ledger, [study.out / "piece"])
+    assert not any(ledger.record(step) for step in home.values())
+    run(replace(study, out=study.out / "second"), chain(study.out / "second"))
+    (study.out / "second" / "right").write_text("tampered with")
+    with pytest.raises(ConfigError, match=r"second/right is not what the records of .*second say was made"):
+        runner.merge_pieces(home, ledger, [study.out / "second"])
+    with pytest.raises(ConfigError, match="no folder of a study"):
+        runner.merge_pieces(home, ledger, [study.out / "nothing"])
+
+
+def test_a_budget_begins_only_what_ends_in_time_and_ends_what_is_begun_first(
+    study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two variants, each trained and graded: there is time for one of them, and its grades come before the other's training."""
+    steps, ledger = chain(study.out), Ledger(study.out)
+    monkeypatch.setattr(Budget, "learn", lambda self, ledger: None)
+    budget = Budget(study, {}, ledger, 60.0)
+    budget._order = {name: place for place, name in enumerate(steps)}
+    budget._seconds = {"train/data": 30.0, "train/left": 61.0, "train/right": 20.0, "train/end": 10.0}
+    assert [budget.fits(name) for name in steps] == [True, False, True, True]
+    assert sorted(steps, key=budget.rank) == ["train/end", "train/right", "train/data", "train/left"]
+    assert StudyRunner(study, steps, ledger, ThisMachine((), 2, {}), dict.fromkeys(steps, 1.0), budget).run() == {}
+    assert begun(study.out) == {"data": 1, "right": 1}, "the end needs what there was no time for"
+    assert run(study, steps) == {} and begun(study.out)["data"] == 1
+
+
+def test_what_follows_is_counted_within_a_variant() -> None:
+    steps = {
+        name: Step(name.partition("/")[0], name.partition("/")[2], (), needs, None, Path(name))
+        for name, needs in (
+            ("generate", ()), ("train/a", ("generate",)), ("evaluate/a", ("train/a",)), ("adapt/b", ("train/a",)),
+        )
+    }  # fmt: skip
+    paths = critical_paths(steps, dict.fromkeys(steps, 1.0), own=True)
+    assert paths == {"generate": 1.0, "train/a": 2.0, "evaluate/a": 1.0, "adapt/b": 1.0}
+    assert critical_paths(steps, dict.fromkeys(steps, 1.0))["generate"] == 3.0
+
+
+def test_a_gpu_has_one_training_and_a_few_steps_beside(tmp_path: Path) -> None:
+    machine = ThisMachine(("4", "7"), 1, {}, beside=1)
+    shows = (sys.executable, "-c", "import os; print('on', os.environ['CUDA_VISIBLE_DEVICES'], flush=True)")
+    steps = [Step(kind, name, (), (), None, tmp_path / name, launcher=shows) for kind, name in
+             (("train", "a"), ("rollout", "b"), ("adapt", "c"), ("evaluate", "d"))]  # fmt: skip
+    for step in steps:
+        assert machine.has_room_for(step)
+        machine.start(step, (), tmp_path / f"{step.variant}.log")
+    assert not any(machine.has_room_for(step) for step in steps)
+    while machine._running:
+        machine.wait()
+    used = [next(line for line in (tmp_path / f"{step.variant}.log").read_text().splitlines() if line.startswith("on "))
+            for step in steps]  # fmt: skip
+    assert used == ["on 4", "on 7", "on 7", "on 4"], "the least busy GPU first, and never two trainings on one"
+    assert all(machine.has_room_for(step) for step in steps)
 
 
 def test_a_failing_cell_is_named_and_the_others_go_on(study: Study, capsys: pytest.CaptureFixture[str]) -> None:

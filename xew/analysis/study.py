@@ -26,8 +26,9 @@ from xew.analysis.studies.config import Study, check_study
 from xew.analysis.studies.cost import correct_by_ledger, critical_paths, estimate
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import open_machines, usable_gpus
+from xew.analysis.studies.merge import merge_piece
 from xew.analysis.studies.plan import Step, plan, write_configs
-from xew.analysis.studies.runner import StudyRunner
+from xew.analysis.studies.runner import Budget, StudyRunner
 from xew.analysis.studies.status import exit_with_failures, format_cost, format_status
 from xew.config import ConfigError, admit_named, load, read_yaml, save, user_errors
 from xew.files import write_text
@@ -56,6 +57,10 @@ class Args:
     """Show what is done, what is to do and what it takes, and do nothing."""
     redo: Annotated[tuple[str, ...], tyro.conf.arg(metavar="STEP [STEP ...]")] = ()
     """Steps to make anew, such as 'train/loeo_*'."""
+    minutes: Annotated[float | None, tyro.conf.arg(metavar="{None}|FLOAT")] = None
+    """Time that this run may take: by the estimates nothing is begun that would not be graded by then."""
+    merge: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="PIECE [PIECE ...]")] = ()
+    """Folders of the same study from other machines: what they have done is taken over, and nothing is run."""
 
 
 @user_errors
@@ -74,16 +79,30 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prepare(study)
         for step in select_steps(steps, args.redo):
             ledger.forget(step)
-        machines = open_machines(study)
-        print(format_status(study, steps, ledger), format_cost(study, steps, ledger, machines.slots), sep="\n\n", flush=True)
-        seconds = correct_by_ledger(estimate(study, steps), steps, ledger)
-        failed = StudyRunner(study, steps, ledger, machines, critical_paths(steps, seconds)).run()
+        failed = merge_pieces(steps, ledger, args.merge) if args.merge else run_steps(study, steps, ledger, args.minutes)
         table = format_status(study, steps, ledger, failed)
         write_text(study.out / "status.txt", table + "\n")
     print(table)
     if failed:
         exit_with_failures(failed, ledger, steps)
-    print(f"report: {study.out / 'report' / 'index.html'}")
+    left = [name for name in steps if not ledger.outcome(name)]
+    print(f"{len(left)} steps are left" if left else f"report: {study.out / 'report' / 'index.html'}")
+
+
+def run_steps(study: Study, steps: Mapping[str, Step], ledger: Ledger, minutes: float | None) -> dict[str, str]:
+    """Run what is left, within a time if there is one; returns the steps that failed, with the reason."""
+    machines = open_machines(study)
+    print(format_status(study, steps, ledger), format_cost(study, steps, ledger, machines.slots), sep="\n\n", flush=True)
+    seconds = correct_by_ledger(estimate(study, steps), steps, ledger)
+    budget = None if minutes is None else Budget(study, steps, ledger, 60 * minutes)
+    return StudyRunner(study, steps, ledger, machines, critical_paths(steps, seconds), budget).run()
+
+
+def merge_pieces(steps: Mapping[str, Step], ledger: Ledger, pieces: Sequence[Path]) -> dict[str, str]:
+    """Take over what pieces of the study have done and say how much; returns no failed steps. Raises ConfigError."""
+    for piece in pieces:
+        print(f"{piece}: {len(merge_piece(steps, ledger, piece))} steps taken over")
+    return {}
 
 
 def read_arguments(arguments: Sequence[str]) -> Args:

@@ -30,6 +30,10 @@ class Args:
     """Folder of the study."""
     variants: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Trainings of variants that are graded; all that have scores where left out."""
+    rollouts: Path | None = None
+    """Folder of rollouts by variant, for pictures; <study>/rollouts where left out. Some scenes are enough."""
+    data: Path | None = None
+    """Data set that holds these scenes; the study's where left out."""
     distances: Path | None = None
     """Folder of python -m xew.analysis.distance; without it the report has the paper's distances."""
     trust: tuple[str, ...] = ()
@@ -56,8 +60,8 @@ def main(args: Args) -> None:
     print(format_coverage(scores.attributes["study"]))
     # Strips show the first training of each variant.
     shown = [name for name in graded if name not in planned or planned[name].of == name]
-    rollouts = tuple(args.study / "rollouts" / name for name in shown)
-    table, data, out = args.study / "scores.parquet", study.data_folder, args.study / "report"
+    rollouts = tuple((args.rollouts or args.study / "rollouts") / name for name in shown)
+    table, data, out = args.study / "scores.parquet", args.data or study.data_folder, args.study / "report"
     remove_written(out, report.FILES)  # a larger study's figures would stay
     report.main(report.Args(scores=table, data=data, rollouts=rollouts, distances=args.distances, out=out))
 
@@ -73,7 +77,9 @@ def describe(study: Study, scores: Scores) -> dict[str, Any]:
     cell = [VARIANT, "task", "seed", "robot"]
     graded = scores.rows[[*cell, *([TRAINING] if TRAINING in scores.rows else [])]].drop_duplicates().groupby(cell).size()
     # An episode counts where all trainings of the variant were graded on it.
-    episodes = graded[graded >= max(len(study.training_seeds), 1)].reset_index()
+    trainings = {variant.name: study.count_trainings(variant) for variant in study.planned_variants}
+    wanted = graded.index.get_level_values(VARIANT).map(lambda name: trainings.get(name, 1))
+    episodes = graded[graded.to_numpy() >= wanted.to_numpy()].reset_index()
     found = episodes.groupby([VARIANT, "robot"]).size().to_dict()
     variants = {
         variant.name: {

@@ -11,33 +11,30 @@ Writes scores.parquet, one row per model, condition, task, seed, robot and metri
     python -m xew.metrics.evaluate demo/rollouts --data demo/data --check demo/scores.bundle.json --regrade 5
 """
 
-import functools
 import itertools
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import cv2
-import jax
 import numpy as np
 import pandas as pd
 import tyro
 from tqdm import tqdm
 
-from xew.compilation import keep_compiled_programs
-from xew.concurrency import map_in_order
-from xew.config import ConfigError, admit, pick, suggestion, user_errors
+from xew.concurrency import map_in_order, map_in_processes
+from xew.config import ConfigError, pick, suggestion, user_errors
 from xew.episode import EpisodeError, verify_episode
 from xew.files import hold_lock
 from xew.metrics import METRICS
-from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, identity, open_masker, open_tracker
-from xew.metrics.grade import DIAGNOSTICS, Comparison, Grades, grade, input_kind
+from xew.metrics.backends import MASKERS, TRACKERS, identity
+from xew.metrics.grade import DIAGNOSTICS, input_kind
 from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.bundle import Bundle, differences, disagreements, raise_if_any, read_bundle, write_bundle
 from xew.metrics.grading.codecs import OPENER, ModelCodec, open_codecs
-from xew.metrics.grading.jobs import Job, estimator_view, list_jobs, read_prediction
+from xew.metrics.grading.grader import Graded, GraderOpener, Group, prepare_process
+from xew.metrics.grading.jobs import Job, list_jobs
 from xew.metrics.grading.scores import (
     CellStore,
     baselines_folder,
@@ -50,12 +47,12 @@ from xew.metrics.grading.scores import (
     write_whole,
 )
 from xew.metrics.grading.summary import summarize, to_markdown
-from xew.metrics.grading.workers import Bench, make_opener, open_nothing, worker_count
+from xew.metrics.grading.workers import worker_count
 from xew.metrics.metric import SUITES
-from xew.metrics.truth import Truth, read_truth
+from xew.metrics.truth import read_truth
 from xew.names import csv_text
 from xew.protocol import HELD_OUT_ROBOTS
-from xew.rollout import RolloutError, find_rollouts
+from xew.rollout import find_rollouts
 
 PROTOCOL = 4
 """Version of the grading: it goes up when any score would change, and scores of another version are graded anew."""
@@ -110,6 +107,9 @@ class Args:
     """Grade everything anew."""
     workers: int = 0
     """Threads that read, estimate and grade, shared out to the devices; 0: one for each processor core."""
+    processes: int = 1
+    """Processes that episodes are shared out to, in place of threads. Threads wait for Python's lock in part of what the
+    default tracker does, so that only processes keep more than about six cores busy; each takes seconds to start."""
     check: Path | None = None
     """Grade nothing: check that a bundle is consistent, and, where rollouts are named, that it was made from them."""
     regrade: int = 0
@@ -133,9 +133,7 @@ WRITTEN = {
 @user_errors
 def main(args: Args) -> None:
     """Grade, write, and print what came out; or check a bundle."""
-    admit(args.trust)
-    keep_compiled_programs()
-    cv2.setNumThreads(1)  # episodes are shared out to threads; OpenCV's own would only get in their way
+    prepare_process(args.trust)
     if args.check is not None:
         check(args, args.check)
         return
@@ -227,10 +225,12 @@ def _identity(name: str, checkpoint: Path | None, option: str) -> str:
 
 def find_codecs(args: Args) -> dict[str, ModelCodec]:
     """Codecs of the runs that are named, by model. Raises ConfigError as `open_codecs`."""
-    if not args.codec:
-        return {}
-    models = {rollout.model for root in args.rollouts for rollout in find_rollouts(root, [])}
-    return open_codecs(args.codec, args.codec_opener, models)
+    return open_codecs(args.codec, args.codec_opener, find_models(args)) if args.codec else {}
+
+
+def find_models(args: Args) -> frozenset[str]:
+    """Names of the models whose rollouts are graded."""
+    return frozenset(rollout.model for root in args.rollouts for rollout in find_rollouts(root, []))
 
 
 def find_jobs(
@@ -248,22 +248,11 @@ def find_jobs(
     return list_jobs(args.rollouts, args.data, str(settings(args)), baselines, workers, problems, codecs)
 
 
-def open_bench(args: Args, metrics: Sequence[str]) -> Bench:
-    """A bench with the chosen estimators, as far as these metrics need them. Raises ConfigError if weights are missing."""
-    kinds = {input_kind(name) for name in metrics}
-    masker: Callable[[jax.Device], Masker] = open_nothing
-    tracker: Callable[[jax.Device], Tracker] = open_nothing
-    if "mask" in kinds:
-        masker = make_opener(args.masks, MASKERS, open_masker, args.masks_checkpoint)
-    if kinds & {"keypoints", "objects", "robot_points", "object_points", "contact"}:
-        tracker = make_opener(args.tracks, TRACKERS, open_tracker, args.tracks_checkpoint)
-    return Bench(masker, tracker, itertools.cycle(jax.local_devices()))
-
-
 def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: CellStore) -> list[str]:
     """Grade what is not in the store yet, and return what went wrong.
 
-    Episodes are read and graded by worker threads, a few ahead of each other, so that memory does not grow with their number.
+    Episodes are read and graded by threads or processes, a few ahead of each other, so that memory does not grow with their
+    number.
 
     Raises:
         RolloutError: a video cannot be graded, unless args.keep_going; what was graded before stays in the store.
@@ -272,16 +261,13 @@ def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: Cell
     todo = [(job, names) for job, names in wanted if names]
     if len(todo) < len(jobs):
         print(f"{len(jobs) - len(todo)} of {len(jobs)} are graded already in {store.folder}")
-    bench = open_bench(args, metrics)
-    without_shapes: set[Path] = set()
     groups = [list(group) for _, group in itertools.groupby(todo, key=lambda pair: (pair[0].episode, pair[0].cell.frames))]
     errors: list[str] = []
-    stop = threading.Event()
+    without_shapes: list[Path] = []
     with tqdm(total=len(jobs), initial=len(jobs) - len(todo), desc="evaluate", unit="video", disable=None) as bar:
-        work = functools.partial(_grade_group, args=args, bench=bench, store=store, stop=stop, without_shapes=without_shapes)
-        results = map_in_order(work, groups, worker_count(args.workers), stop)
-        for group, problems in zip(groups, results, strict=True):
-            errors += problems
+        for group, graded in zip(groups, _grade_groups(groups, metrics, args, store), strict=True):
+            errors += graded.errors
+            without_shapes += [] if graded.has_shapes else [group[0][0].episode]
             bar.update(len(group))
     if without_shapes:
         print(
@@ -291,42 +277,32 @@ def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: Cell
     return errors
 
 
-def _grade_group(
-    group: list[tuple[Job, tuple[str, ...]]],
-    args: Args,
-    bench: Bench,
-    store: CellStore,
-    stop: threading.Event,
-    without_shapes: set[Path],
-) -> list[str]:
-    """Grade jobs of one episode, which is read once; return what went wrong, or raise it as `grade_all` does.
-
-    An episode whose shapes were needed and are not known is added to `without_shapes`.
-    """
-    errors: list[str] = []
-    truth: Truth | None = None
-    for job, metrics in group:
-        if stop.is_set():
-            break
-        try:
-            needed = {input_kind(name) for _, names in group for name in names}
-            truth = truth or read_truth(job.episode, job.cell.frames, needed, surfaces_folder(args.data, args.out))
-            if truth.surfaces is not None and not truth.surfaces.known:
-                without_shapes.add(job.episode)
-            store.write(job.cell, _grade_job(job, truth, metrics, args, bench))
-        except (EpisodeError, ValueError) as error:
-            message = str(error) if str(job.place) in str(error) else f"{job.place}: {error}"
-            if not args.keep_going:
-                raise RolloutError(message) from error
-            errors.append(message)
-    return errors
+def _grade_groups(groups: Sequence[Group], metrics: tuple[str, ...], args: Args, store: CellStore) -> Iterator[Graded]:
+    """What came out of each group, in their order, from threads of this process or from processes of their own."""
+    opener = make_grader_opener(args, metrics, store)
+    if args.processes > 1 and len(groups) > 1:
+        yield from map_in_processes(opener.open_in_process, groups, args.processes)
+        return
+    stop = threading.Event()
+    yield from map_in_order(opener.open(stop), groups, worker_count(args.workers), stop)
 
 
-def _grade_job(job: Job, truth: Truth, metrics: tuple[str, ...], args: Args, bench: Bench) -> Grades:
-    prediction = read_prediction(job, truth, args.allow, args.frame_zero)
-    first = 0 if args.frame_zero == "predicted" else 1
-    with jax.default_device(bench.device):
-        return grade(Comparison(prediction, truth, bench.masker, bench.tracker, first, estimator_view(job, truth)), metrics)
+def make_grader_opener(args: Args, metrics: Sequence[str], store: CellStore) -> GraderOpener:
+    """What opens the graders that these arguments ask for."""
+    return GraderOpener(
+        metrics=tuple(metrics),
+        masks=(args.masks, args.masks_checkpoint),
+        tracks=(args.tracks, args.tracks_checkpoint),
+        codecs=tuple(args.codec),
+        codec_opener=args.codec_opener,
+        models=find_models(args) if args.codec else frozenset(),
+        surfaces=surfaces_folder(args.data, args.out),
+        store=store,
+        allow=args.allow,
+        frame_zero=args.frame_zero,
+        keep_going=args.keep_going,
+        trust=args.trust,
+    )
 
 
 def _demand_codecs(path: Path, bundle: Bundle, args: Args) -> None:
@@ -354,11 +330,12 @@ def check(args: Args, path: Path) -> None:
     print("made from these rollouts and this data, by their digests")
     picked = [jobs[i] for i in np.unique(np.linspace(0, len(jobs) - 1, args.regrade).astype(int))]
     metrics = tuple(name for name in bundle["metrics"] if name in METRICS)
-    bench, found = open_bench(args, metrics), list[str]()
+    store = CellStore(path_beside(args.out, "cells"), baselines_folder(args.data, args.out))
+    grader, found = make_grader_opener(args, metrics, store).open(threading.Event()), list[str]()
     for job in tqdm(picked, desc="grade anew", unit="video", disable=None):
         verify_episode(job.episode)
         truth = read_truth(job.episode, job.cell.frames, {input_kind(name) for name in metrics})
-        found += disagreements(bundle, job.cell.key, _grade_job(job, truth, metrics, args, bench).values)
+        found += disagreements(bundle, job.cell.key, grader.grade(job, truth, metrics).values)
     raise_if_any(path, found)
     if picked:
         print(f"{len(picked)} videos graded anew: the same scores")

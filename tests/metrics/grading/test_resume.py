@@ -10,6 +10,7 @@ import threading
 import time
 import types
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +22,10 @@ from tests.metrics.small import write_many
 from tests.synthetic import write_synthetic_data
 from xew import files
 from xew.dataset import find_accepted
-from xew.episode import read_video
+from xew.episode import EpisodeError, read_video
 from xew.metrics import evaluate
 from xew.metrics.evaluate import Args, main
+from xew.metrics.grading import grader
 from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.workers import Bench
 from xew.rollout import write_rollout
@@ -242,17 +244,28 @@ def test_a_damaged_cell_is_graded_anew(world: Path, whole: dict[str, bytes], tmp
     assert read_all(args.out) == whole
 
 
+def test_processes_write_the_same_bytes_and_tell_mistakes(world: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
+    several = replace(arguments(world, tmp_path / "scores.parquet"), processes=2)
+    main(several)
+    assert read_all(several.out) == whole
+    jobs = evaluate.find_jobs(several, ())
+    gone = [(replace(job, episode=tmp_path / "gone"), ("psnr",)) for job in jobs[:2]]
+    store = evaluate.CellStore(tmp_path / "cells", tmp_path / "baselines")
+    with pytest.raises(EpisodeError, match="gone"):
+        list(evaluate._grade_groups([[job] for job in gone], ("psnr",), several, store))
+
+
 def test_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """300 episodes; what the process holds after 100 of them is what it holds after all, but for a few megabytes."""
     write_many(tmp_path, 300)
     held: list[float] = []
-    real = evaluate._grade_group
+    real = grader.Grader.__call__
 
     def notes(*args: object, **settings: object) -> object:
         held.append(resident())
         return real(*args, **settings)
 
-    monkeypatch.setattr(evaluate, "_grade_group", notes)
+    monkeypatch.setattr(grader.Grader, "__call__", notes)
     args = Args((tmp_path / "rollouts",), tmp_path / "data", tmp_path / "scores.parquet", ("psnr", "mask_iou"), workers=2)
     main(args)
     assert len(held) == 300 and len(graded(args.out, args.data)) == 1200, "with three baselines: there is no other robot"

@@ -50,7 +50,7 @@ class Rates:
     rollout_s: float
     """Time to predict one episode."""
     grade_s: float
-    """Time to grade one predicted episode."""
+    """Time to grade one video: a predicted episode, or a baseline's."""
     start_s: float
     """Time from the start of a command to its first real work, compiling included."""
     episode_mb: float
@@ -75,6 +75,9 @@ class Machine:
     """Number of steps at once where there is no GPU."""
     gpus_per_training: int = 1
     """Number of GPUs that a training takes at once."""
+    beside: int = 0
+    """Number of steps of other kinds that share a GPU with a training at once: latents, rollouts and grading leave it idle
+    while they read and write. Memory is then taken as it is needed. With 0 a GPU has one step at a time."""
     train_launcher: str = ""
     """Launcher put before a training's command, such as srun --nodes=2; the processes it starts join by jax.distributed."""
     ray: str | None = None
@@ -128,6 +131,8 @@ class Study:
     """Number of test seeds of each task."""
     training_seeds: tuple[int, ...] = ()
     """Seeds of the trainings of every variant, each a training of its own; one, with the experiment's seed, where left out."""
+    repeated: tuple[str, ...] = ("*",)
+    """Patterns: variants whose names match one of them are trained with every one of these seeds, others with the first."""
     settings: Settings = field(default_factory=dict)
     """Settings laid over the experiment for every variant."""
     adaptation: Settings = field(default_factory=dict)
@@ -182,7 +187,17 @@ class Study:
             make_run(variant, seed, ending)
             for seed, ending in zip(seeds, endings, strict=True)
             for variant in self.planned_variants
+            if not ending or self._is_repeated(variant)
         )
+
+    def count_trainings(self, variant: Variant) -> int:
+        """Number of trainings of a variant."""
+        return max(len(self.training_seeds), 1) if self._is_repeated(variant) else 1
+
+    def _is_repeated(self, variant: Variant) -> bool:
+        """Whether a variant is trained with every seed: it is named, and so is what it starts from."""
+        named = any(fnmatch.fnmatch(variant.name, pattern) for pattern in self.repeated)
+        return named and (variant.start is None or self._is_repeated(variant.start))
 
     def _includes(self, variant: Variant) -> bool:
         """Whether a variant of a part is one of this study."""
@@ -224,6 +239,8 @@ def check_study(study: Study, path: Path) -> None:
         raise ConfigError(f"{path}: machine.train_launcher is {study.machine.train_launcher!r}: {error}.") from error
     if study.machine.workers < 1 or study.machine.gpus_per_training < 1:
         raise ConfigError(f"{path}: machine.workers and machine.gpus_per_training must be at least 1.")
+    if study.machine.beside < 0:
+        raise ConfigError(f"{path}: machine.beside is {study.machine.beside}, expected 0 or more.")
 
 
 def _check_names(study: Study, path: Path) -> None:
@@ -245,12 +262,13 @@ def _check_names(study: Study, path: Path) -> None:
         if len(set(names)) < len(names):
             raise ConfigError(f"{path}: a {kind} stands twice in {', '.join(names)}; name each once.")
     variants = list(dict.fromkeys(variant.name for part in study.parts for variant in PARTS[part]))
-    for pattern in study.variants:
-        if not fnmatch.filter(variants, pattern):
-            raise ConfigError(
-                f"{path}: variants {pattern!r} matches none of the parts {', '.join(study.parts)};"
-                f"{suggestion(pattern, variants)} there are {', '.join(variants)}."
-            )
+    for field_name, patterns in (("variants", study.variants), ("repeated", study.repeated)):
+        for pattern in patterns:
+            if not fnmatch.filter(variants, pattern):
+                raise ConfigError(
+                    f"{path}: {field_name} {pattern!r} matches none of the parts {', '.join(study.parts)};"
+                    f"{suggestion(pattern, variants)} there are {', '.join(variants)}."
+                )
 
 
 def build_experiment(study: Study, variant: Variant) -> Settings:

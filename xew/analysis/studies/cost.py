@@ -14,7 +14,7 @@ from xew.analysis.studies.config import KINDS, Settings, Study, build_experiment
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import usable_gpus
 from xew.analysis.studies.plan import Step, sort_steps
-from xew.protocol import Variant
+from xew.protocol import BASELINES, Variant
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,10 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     episodes = study.task_count * (study.train_seeds + study.test_seeds) * len(study.robots)
     costs["generate"] = Cost(episodes, "episodes", rates.start_s + episodes * rates.episode_s, episodes * rates.episode_mb)
     encoded: set[tuple[str, ...]] = set()
-    for variant in study.planned_runs:
+    for number, variant in enumerate(study.planned_runs):
         experiment = build_experiment(study, variant)
         streams = _count_new_streams(variant, experiment, encoded) * study.training_count(variant)
+        videos = sum(study.graded_counts(variant).values()) * (1 if number else 1 + len(BASELINES))
         updates, graded = count_optimizer_steps(study, variant, experiment), sum(study.graded_counts(variant).values())
         costs |= {
             f"latents/{variant.name}": Cost(
@@ -48,7 +49,7 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
             f"rollout/{variant.name}": Cost(
                 graded, "episodes", rates.start_s + graded * rates.rollout_s, graded * rates.rollout_mb
             ),
-            f"evaluate/{variant.name}": Cost(graded, "episodes", rates.start_s + graded * rates.grade_s),
+            f"evaluate/{variant.name}": Cost(videos, "videos", rates.start_s + videos * rates.grade_s),
         }
     costs |= {"distances": Cost(1, "table", 2 * rates.start_s), "analyse": Cost(1, "report", 2 * rates.start_s)}
     return {name: costs[name] for name in steps}
@@ -111,11 +112,15 @@ def estimate_wall_seconds(steps: Mapping[str, Step], seconds: Mapping[str, float
     return now
 
 
-def critical_paths(steps: Mapping[str, Step], seconds: Mapping[str, float]) -> dict[str, float]:
-    """Seconds from the start of each step to the end of the study if there were a slot for every step."""
+def critical_paths(steps: Mapping[str, Step], seconds: Mapping[str, float], own: bool = False) -> dict[str, float]:
+    """Seconds from the start of each step to the end of the study if there were a slot for every step.
+
+    With `own` to the end of the step's own variant: without the steps of others, and of a step that serves all, alone.
+    """
     paths: dict[str, float] = {}
     for step in reversed(sort_steps(steps)):
-        after = [paths[name] for name, other in steps.items() if step.name in other.needs]
+        followers = [other for other in steps.values() if step.name in other.needs]
+        after = [paths[other.name] for other in followers if not own or other.variant == step.variant]
         paths[step.name] = seconds[step.name] + max(after, default=0.0)
     return paths
 

@@ -3,11 +3,13 @@
 <out>/state/<kind>/<variant>.json   key, status (begun, done, failed), outcome, seconds, host
 
 A step is done when its record says so, its key is that of the study as it is now (its inputs and what it was made from), and
-its product still has the outcome that was noted. Anything else is made again, from where it was left if the key is the same.
+its product still has the outcome that was noted, or has been removed and no step that is left to do needs it. Anything else is
+made again, from where it was left if the key is the same. So data, checkpoints and rollouts of graded variants may be removed.
 """
 
 import hashlib
 import json
+import shutil
 import socket
 import time
 from collections.abc import Callable, Mapping
@@ -15,7 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from xew.analysis.studies.plan import Step, step_key
+from xew.analysis.studies.plan import Step, sort_steps, step_key
 from xew.config import ConfigError, parse
 from xew.dataset import find_accepted
 from xew.episode import EpisodeError
@@ -46,6 +48,8 @@ class Ledger:
     def __init__(self, out: Path) -> None:
         self.out = out
         self._outcomes: dict[str, str] = {}
+        self._removed: set[str] = set()
+        self._needed: set[str] = set()
 
     def outcome(self, name: str) -> str | None:
         """Digest of the product of a step that was found done or was done just now; None for others."""
@@ -67,16 +71,44 @@ class Ledger:
         """Key of a step whose needs are done as far as they will be."""
         return step_key(step, [self.outcome(name) for name in step.needs])
 
+    def find_all_done(self, steps: Mapping[str, Step]) -> None:
+        """Look at every step, and find out whose removed products are needed by a step that is left to do."""
+        order = sort_steps(steps)
+        self._needed.clear()
+        for step in order:
+            if all(self.outcome(name) for name in step.needs):
+                self.find_done(step)
+        for step in reversed(order):
+            if not self.outcome(step.name):
+                self._needed.update(self._removed.intersection(step.needs))
+                for name in self._needed:
+                    self._outcomes.pop(name, None)
+
     def find_done(self, step: Step) -> bool:
         """Whether a step needs no work; the steps that it needs must have been looked at before."""
-        record = self.record(step)
-        if record.get("status") != "done" or record["key"] != self.key(step):
+        noted = self.noted_outcome(step, self._outcomes)
+        if noted is None:
             return False
-        found = digest_product(step)
-        if found is None or found != record["outcome"]:
+        found = digest_product(step.kind, step.product)
+        if found is None:
+            self._removed.add(step.name)
+        if found != noted and (found is not None or step.name in self._needed):
             return False
-        self._outcomes[step.name] = found
+        self._outcomes[step.name] = noted
         return True
+
+    def noted_outcome(self, step: Step, outcomes: Mapping[str, str]) -> str | None:
+        """The outcome that is noted of a step made from these outcomes of other steps; None if it was not made from them."""
+        record = self.record(step)
+        key = step_key(step, [outcomes.get(name) for name in step.needs])
+        return record["outcome"] if record.get("status") == "done" and record["key"] == key else None
+
+    def take_record(self, step: Step, other: "Ledger") -> None:
+        """Note what another ledger has noted of a step, with its log."""
+        self._write(step, {name: value for name, value in other.record(step).items() if name != "at"})
+        if other.log(step).is_file():
+            self.log(step).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(other.log(step), self.log(step))
 
     def begin(self, step: Step) -> bool:
         """Note that a step is being made; returns whether it goes on from what an earlier try left.
@@ -99,7 +131,7 @@ class Ledger:
         found = None
         if not error:
             try:
-                found = digest_product(step)
+                found = digest_product(step.kind, step.product)
                 error = "" if found else f"it made no {step.product}"
             except EpisodeError as wrong:
                 error = str(wrong)
@@ -146,9 +178,9 @@ def _remove_product(step: Step, begun: bool) -> None:
         raise ConfigError(f"cannot replace {step.product}: {error}; remove it, or choose another --out.") from error
 
 
-def digest_product(step: Step) -> str | None:
-    """A digest of what a step has made, or None if it is not there. Quick: videos and weights are not read."""
-    return _DIGESTS[step.kind](step.product)
+def digest_product(kind: str, product: Path) -> str | None:
+    """A digest of what a step of a kind has made, or None if it is not there. Quick: videos and weights are not read."""
+    return _DIGESTS[kind](product)
 
 
 def _digest_episodes(data: Path) -> str | None:

@@ -22,6 +22,8 @@ from xew.analysis.studies.plan import Step
 from xew.analysis.studies.processes import start_step
 from xew.config import TRUST, ConfigError
 
+TRAININGS = ("train", "adapt")
+"""Kinds of steps that keep a GPU busy all the time."""
 PATIENCE_S = 120.0
 """Time that steps have to end after they were asked to [s]; training saves in that time."""
 
@@ -58,7 +60,9 @@ def open_machines(study: Study) -> Machines:
     needed = study.machine.gpus_per_training
     if gpus and needed > len(gpus):
         raise ConfigError(f"machine.gpus_per_training is {needed}, there are {len(gpus)} GPUs ({', '.join(gpus)}); lower it.")
-    return ThisMachine(gpus, study.machine.workers, environment)
+    if gpus and study.machine.beside:
+        environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | environment
+    return ThisMachine(gpus, study.machine.workers, environment, study.machine.beside)
 
 
 def usable_gpus(study: Study) -> tuple[str, ...]:
@@ -80,31 +84,41 @@ def visible_gpus() -> tuple[str, ...]:
 @dataclass(frozen=True)
 class _Running:
     process: BaseProcess
+    step: Step
     slots: tuple[str, ...]
 
 
 class ThisMachine:
-    """This machine: one step per GPU, or without a GPU as many steps at once as there are workers."""
+    """This machine: one step per GPU, or a training and a few others; without a GPU as many steps as there are workers."""
 
-    def __init__(self, gpus: tuple[str, ...], workers: int, environment: Mapping[str, str]) -> None:
-        self.gpus, self.environment = gpus, dict(environment)
-        self.slots = len(gpus) or workers
-        self._free = list(gpus or map(str, range(workers)))
+    def __init__(self, gpus: tuple[str, ...], workers: int, environment: Mapping[str, str], beside: int = 0) -> None:
+        self.gpus, self.environment, self.beside = gpus, dict(environment), beside if gpus else 0
+        self._slots = gpus or tuple(map(str, range(workers)))
+        self.slots = len(self._slots)
         self._running: dict[str, _Running] = {}
         os.environ.update(environment)  # the fork server imports JAX, which reads some of it then
 
     def has_room_for(self, step: Step) -> bool:
-        return self._count_slots(step) <= len(self._free)
+        return len(self._open_slots(step)) >= self._count_slots(step)
 
     def _count_slots(self, step: Step) -> int:
         """Number of slots that a step takes; without GPUs every step takes one."""
         return max(1, step.gpus) if self.gpus else 1
 
+    def _open_slots(self, step: Step) -> list[str]:
+        """Slots that may take a step, the least busy first."""
+        steps = {slot: [running.step for running in self._running.values() if slot in running.slots] for slot in self._slots}
+        if not self.beside:
+            return [slot for slot, here in steps.items() if not here]
+        room = 1 if step.kind in TRAININGS else self.beside
+        same = {slot: sum((other.kind in TRAININGS) == (step.kind in TRAININGS) for other in steps[slot]) for slot in steps}
+        return sorted((slot for slot in steps if same[slot] < room), key=lambda slot: len(steps[slot]))
+
     def start(self, step: Step, command: tuple[str, ...], log: Path) -> None:
-        slots = tuple(self._free.pop(0) for _ in range(self._count_slots(step)))
+        slots = tuple(self._open_slots(step)[: self._count_slots(step)])
         own = {"CUDA_VISIBLE_DEVICES": ",".join(slots)} if self.gpus else {}
         process = start_step(command, log, {**self.environment, **step.environment, **own}, launcher=step.launcher)
-        self._running[step.name] = _Running(process, slots)
+        self._running[step.name] = _Running(process, step, slots)
 
     def wait(self) -> list[tuple[str, int]]:
         multiprocessing.connection.wait([running.process.sentinel for running in self._running.values()])
@@ -114,7 +128,6 @@ class ThisMachine:
     def _settle(self, name: str) -> int:
         running = self._running.pop(name)
         running.process.join()
-        self._free = sorted([*self._free, *running.slots])
         return running.process.exitcode or 0
 
     def stop(self) -> None:

@@ -171,7 +171,7 @@ def _plan_evaluate(study: Study, variant: Variant, baselines: bool) -> Step:
         "evaluate",
         variant.name,
         ("xew.metrics.evaluate", str(_rollouts_path(study, variant.name)), *given, *asked),
-        needs=("generate", f"rollout/{variant.name}"),
+        needs=("generate", _training_name(variant), f"rollout/{variant.name}"),
         inputs=[asked[:1], study.evaluate, source_digest("metrics", "statistics")],
         product=out,
     )

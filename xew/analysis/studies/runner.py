@@ -7,10 +7,10 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 from xew.analysis.studies.config import Study
-from xew.analysis.studies.cost import format_duration
+from xew.analysis.studies.cost import correct_by_ledger, critical_paths, estimate, format_duration
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import Machines
-from xew.analysis.studies.plan import Step
+from xew.analysis.studies.plan import Step, sort_steps
 from xew.dataset import find_accepted
 from xew.protocol import seed_split
 
@@ -26,6 +26,8 @@ class StudyRunner:
     machines: Machines
     critical_paths: Mapping[str, float]
     """Seconds from the start of each step to the end of the study."""
+    budget: "Budget | None" = None
+    """Time after which nothing may run, if there is such a time."""
     started: dict[str, float] = field(default_factory=dict)
     """Start times of the steps that run [s]."""
     settled: int = 0
@@ -34,14 +36,17 @@ class StudyRunner:
     """Steps that failed, and steps that could not be made because of them, with the reason."""
 
     def run(self) -> dict[str, str]:
-        """Run every step that can be run; returns those that failed, with the reason."""
+        """Run every step that can be run and for which there is time; returns those that failed, with the reason."""
         order = TopologicalSorter({name: step.needs for name, step in self.steps.items()})
         order.prepare()
+        self.ledger.find_all_done(self.steps)
         waiting: set[str] = set()
         try:
             while order.is_active():
                 waiting |= set(order.get_ready())
                 ended = self._settle_or_start(waiting)
+                if not ended and not self.started:
+                    break  # there is no time for any of those that are left
                 if not ended:
                     ended = [self._finish(name, code) for name, code in self.machines.wait()]
                 order.done(*ended)
@@ -54,13 +59,13 @@ class StudyRunner:
     def _settle_or_start(self, waiting: set[str]) -> list[str]:
         """Start what there is room for; returns steps that need no work or cannot be made."""
         ended = []
-        for name in sorted(waiting, key=lambda name: -self.critical_paths[name]):
+        for name in sorted(waiting, key=self.budget.rank if self.budget else lambda name: -self.critical_paths[name]):
             step = self.steps[name]
             reason = self._find_blocker(step)
             if reason:
                 self.failed[name] = reason
             elif not self.ledger.find_done(step):
-                if self.machines.has_room_for(step):
+                if self.machines.has_room_for(step) and (self.budget is None or self.budget.fits(name)):
                     waiting.discard(name)
                     self._start(step)
                 continue
@@ -85,6 +90,8 @@ class StudyRunner:
         """Note how a step ended; returns its name."""
         step, seconds = self.steps[name], time.monotonic() - self.started.pop(name)
         error = self.ledger.finish(step, code, seconds)
+        if self.budget is not None and not error:
+            self.budget.learn(self.ledger)
         if not error and step.kind == "generate":
             error = self._check_data()
         if error:
@@ -106,6 +113,40 @@ class StudyRunner:
 
     def _print_progress(self, text: str) -> None:
         print(f"{time.strftime('%H:%M:%S')} [{self.settled}/{len(self.steps)}] {text}", flush=True)
+
+
+class Budget:
+    """Time that a study may take now: whole cells first, and nothing is trained that would not be graded in time.
+
+    Args:
+        study, steps: what is run.
+        ledger: of the study.
+        seconds: time from now.
+    """
+
+    def __init__(self, study: Study, steps: Mapping[str, Step], ledger: Ledger, seconds: float) -> None:
+        self._steps, self._costs = steps, estimate(study, steps)
+        self._end = time.monotonic() + seconds
+        self._order = {step.name: place for place, step in enumerate(sort_steps(steps))}
+        self.learn(ledger)
+
+    def learn(self, ledger: Ledger) -> None:
+        """Estimate again, by how long steps of each kind have taken."""
+        seconds = correct_by_ledger(self._costs, self._steps, ledger)
+        paths = critical_paths({name: step for name, step in self._steps.items() if step.kind != "analyse"}, seconds, own=True)
+        self._seconds = seconds | paths
+
+    def rank(self, name: str) -> tuple[float, int]:
+        """Sort key: what is soonest graded comes first."""
+        return self._seconds[name], self._order[name]
+
+    def fits(self, name: str) -> bool:
+        """Whether a step and what follows it up to the grades of the same variant would end in time.
+
+        What is trained is rolled out and graded while there is any time: otherwise the training was for nothing.
+        """
+        spent = name.partition("/")[0] in ("rollout", "evaluate")
+        return time.monotonic() + (0.0 if spent else self._seconds[name]) <= self._end
 
 
 def complete_command(step: Step, goes_on: bool, failed: Mapping[str, str]) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from typing import NoReturn
 from xew.analysis.studies.config import Study
 from xew.analysis.studies.cost import correct_by_ledger, estimate, format_costs, format_duration
 from xew.analysis.studies.ledger import Ledger
-from xew.analysis.studies.plan import Step, sort_steps
+from xew.analysis.studies.plan import Step
 from xew.analysis.studies.processes import last_lines
 
 COLUMNS = ("latents", "train", "rollout", "evaluate")
@@ -16,7 +16,7 @@ COLUMNS = ("latents", "train", "rollout", "evaluate")
 
 def format_status(study: Study, steps: Mapping[str, Step], ledger: Ledger, failed: Mapping[str, str] | None = None) -> str:
     """A row per variant and a column per kind of step: the time of what is done, FAILED, blocked, begun, or '-'."""
-    find_done_steps(steps, ledger)
+    ledger.find_all_done(steps)
     width = max(len(variant.name) for variant in study.planned_runs) + 2
     lines = [f"{'variant':<{width}}" + "".join(f"{kind:>12}" for kind in COLUMNS)]
     for variant in study.planned_runs:
@@ -26,13 +26,6 @@ def format_status(study: Study, steps: Mapping[str, Step], ledger: Ledger, faile
         lines.append(f"{variant.name:<{width}}" + "".join(f"{state:>12}" for state in states))
     lines += [f"{name:<{width}}{_format_state(steps[name], ledger, failed or {}):>12}" for name in steps if "/" not in name]
     return "\n".join(lines)
-
-
-def find_done_steps(steps: Mapping[str, Step], ledger: Ledger) -> None:
-    """Have the ledger look at every step, each after those that it needs."""
-    for step in sort_steps(steps):
-        if all(ledger.outcome(name) for name in step.needs):
-            ledger.find_done(step)
 
 
 def _format_state(step: Step, ledger: Ledger, failed: Mapping[str, str]) -> str:

@@ -35,8 +35,6 @@ class Job:
     episode: Path
     frame_rate: float
     """The episode's."""
-    codec: ModelCodec | None = None
-    """Codec that the truth goes through, of the baseline CODEC_TRUTH alone."""
 
     @property
     def place(self) -> Path:
@@ -113,7 +111,7 @@ def _jobs(rollout: Rollout, data: Path, settings: str, baselines: Collection[str
             yield Job(replace(cell, model=name, condition="", prediction=source), None, episode, record.frame_rate)
     if codec is not None:
         through = replace(cell, model=CODEC_TRUTH, condition=codec.key, prediction=codec.digest)
-        yield Job(through, None, episode, record.frame_rate, codec)
+        yield Job(through, None, episode, record.frame_rate)
 
 
 def _check_horizons(jobs: Iterable[Job]) -> None:
@@ -166,20 +164,23 @@ def _raise_or_note(problems: list[str] | None, message: str) -> None:
     problems.append(message)
 
 
-def read_prediction(job: Job, truth: Truth, allow: Collection[str] = (), frame_zero: str = "given") -> np.ndarray:
+def read_prediction(
+    job: Job, truth: Truth, codecs: Mapping[str, ModelCodec], allow: Collection[str] = (), frame_zero: str = "given"
+) -> np.ndarray:
     """The video to grade [t h w 3] uint8, of the truth's shape.
 
     Args:
         job: of a rollout or a baseline.
         truth: of its episode.
+        codecs: by the conditions of the baseline CODEC_TRUTH that name them.
         allow: what else is an error: "resize", "trim", "rate".
         frame_zero: "absent" where the rollout begins with frame 1.
 
     Raises:
         RolloutError: the video cannot be read, or is not of the truth's shape, and that is not allowed.
     """
-    if job.codec is not None:
-        return job.codec.reconstruct(truth.rgb)
+    if job.rollout is None and job.cell.model == CODEC_TRUTH:
+        return codecs[job.cell.condition].reconstruct(truth.rgb)
     if job.rollout is None:
         return BASELINES[job.cell.model].make(job.episode, truth)
     video = read_rollout_video(job.rollout, None if "rate" in allow else job.frame_rate)

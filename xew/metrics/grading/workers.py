@@ -1,6 +1,7 @@
 """Many videos at once: worker threads, what each has for itself, and how far they run ahead.
 
-Threads and not processes: decoding, OpenCV and XLA let go of Python's lock, and compiled programs are shared.
+Threads share compiled programs, and decoding, OpenCV and XLA let go of Python's lock; for many cores there are processes
+(`evaluate --processes`).
 """
 
 import os
