@@ -120,6 +120,9 @@ def test_a_damaged_codec_is_told(tmp_path: Path) -> None:
             np.savez(tmp_path / "codec.npz", **(arrays | {name: other}))
             with pytest.raises(ConfigError):
                 load_kept_codec(PatchCodec, tmp_path, "copy it again")
+    (tmp_path / "codec.npz").unlink()
+    with pytest.raises(ConfigError, match=r"lacks its codec \(.*codec.npz\); copy it again"):
+        load_kept_codec(PatchCodec, tmp_path, "copy it again")
 
 
 def test_a_damaged_log_of_numbers_is_gone_on_from(tmp_path: Path) -> None:
