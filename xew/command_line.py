@@ -11,7 +11,7 @@ from typing import Annotated, Any, Generic, NamedTuple, TypeVar
 
 import tyro
 
-from xew.config import ConfigError
+from xew.config import ConfigError, check_finite
 
 F = TypeVar("F")
 C = TypeVar("C")
@@ -24,7 +24,7 @@ class Command(NamedTuple, Generic[F, C]):
     """The config, or what else the command works on."""
     flags: F
     config: C
-    """The content of the config with the overrides in it; only types have been checked."""
+    """The content of the config with the overrides in it; only types have been checked, and that numbers are finite."""
 
 
 def parse_command(
@@ -50,7 +50,7 @@ def parse_command(
         metavar: name of the first argument, for messages.
 
     Raises:
-        ConfigError: the config is not named, or cannot be read.
+        ConfigError: the config is not named, or cannot be read, or a number is not finite.
         SystemExit: an option is unknown or malformed (tyro has told so; code 2), or asks for --help (code 0).
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -76,6 +76,7 @@ def parse_command(
     found = tyro.cli(whole, args=words, default=default, prog=prog, description=description, config=style)
     assert config is not None  # without a path --help was asked for, which has ended the program
     changed: Any = dataclasses.replace(config, **{name: getattr(found, name) for name in others})  # type: ignore[type-var]
+    check_finite(changed, str(path))
     return Command(found.path, flags(**{name: getattr(found, name) for name in own}), changed)
 
 

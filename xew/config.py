@@ -63,13 +63,14 @@ def load(cls: type[T], path: Path | str, overrides: Sequence[str] = ()) -> T:
     """Read a YAML file into the frozen dataclass `cls`, then apply overrides such as `--train.steps 100`.
 
     Raises:
-        ConfigError: no such file, not YAML, unknown key, missing key or wrong type.
+        ConfigError: no such file, not YAML, unknown key, missing key, wrong type or a number that is not finite.
         SystemExit: an override is unknown or malformed (tyro has told so; code 2), or asks for --help (code 0).
     """
     loaded = parse(cls, read_yaml(path), str(path))
-    if not overrides:
-        return loaded
-    return tyro.cli(cls, args=list(overrides), default=loaded, prog=f"… {path}")
+    if overrides:
+        loaded = tyro.cli(cls, args=list(overrides), default=loaded, prog=f"… {path}")
+    check_finite(loaded, str(path))
+    return loaded
 
 
 def find_config(path: Path | str) -> Path:
@@ -297,7 +298,7 @@ def _flush(stream: TextIO | None) -> None:
 
 
 def _silence_closed_pipes() -> bool:
-    """Send what is still held back for a pipe without a reader to nowhere. Was there such a pipe?"""
+    """Discard what is still to be written to a pipe without a reader, and return whether there was such a pipe."""
     closed = [stream for stream in (sys.stdout, sys.stderr) if stream is not None and _has_no_reader(stream)]
     for stream in closed:
         nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -45,7 +45,7 @@ RUN_FILES = (
 
 
 def demand_regular(path: Path) -> Path:
-    """The path itself, where it is that of a regular file. Others may block for ever or never end.
+    """The path itself, where it is that of a regular file. Reading another kind may block forever or never end.
 
     Raises:
         OSError: it is a FIFO, a socket, a device or a folder; or there is nothing (FileNotFoundError).

@@ -19,13 +19,14 @@ from xew.episode import Record, read_record
 from xew.metrics.grading.bundle import differences, read_bundle, write_bundle
 from xew.metrics.grading.scores import Cell, CellStore
 from xew.model.cache.scales import read_scales
-from xew.model.codecs.codec import CodecSettings
+from xew.model.codecs.autoencoders import ConvAutoencoderCodec, WanVaeCodec
+from xew.model.codecs.codec import load_kept_codec
 from xew.model.codecs.conv_autoencoder import AUTOENCODERS
 from xew.model.codecs.vae import VAES
 from xew.model.conditions import ACTIONS, list_conditions
 from xew.model.rollout import is_done
-from xew.model.runs.folder import START, load_kept_codec, trace_start
-from xew.model.runs.sums import find_damage
+from xew.model.runs.checkpoint import find_damage
+from xew.model.runs.lineage import START, trace_start
 from xew.rollout import read_rollout, read_rollout_video
 from xew.sim_warp.manifest import read_manifest
 
@@ -126,15 +127,13 @@ def cell(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
 
 
 def vae(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
-    settings = CodecSettings(name="wan_vae", vae="tiny")
-    content = {"size": asdict(VAES[settings.vae]), "dtype": "float32", "chunk": 8, "hash": "h"}
-    return folder / "vae.json", content, lambda: load_kept_codec(settings, folder, "copy it again")
+    content = {"size": asdict(VAES["tiny"]), "dtype": "float32", "chunk": 8, "hash": "h"}
+    return folder / "vae.json", content, lambda: load_kept_codec(WanVaeCodec, folder, "copy it again")
 
 
 def autoencoder(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
     content = {"size": asdict(next(iter(AUTOENCODERS.values()))), "dtype": "float32", "hash": "h"}
-    settings = CodecSettings(name="conv_autoencoder")
-    return folder / "autoencoder.json", content, lambda: load_kept_codec(settings, folder, "copy it again")
+    return folder / "autoencoder.json", content, lambda: load_kept_codec(ConvAutoencoderCodec, folder, "copy it again")
 
 
 def sums(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:

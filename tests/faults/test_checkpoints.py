@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from xew.config import ConfigError
-from xew.model.codecs.codec import CodecSettings, PatchCodec
-from xew.model.runs.checkpoint import TrainState, open_checkpoints, restore_state, save_state
-from xew.model.runs.folder import load_kept_codec
+from xew.model.codecs.codec import load_kept_codec
+from xew.model.codecs.patches import PatchCodec
+from xew.model.runs.checkpoint import TrainState, note_sums, open_checkpoints, restore_state, save_state
 from xew.model.runs.log import RunLog
-from xew.model.runs.sums import note_sums
 
 
 def state(step: int, value: float = 1.0, width: int = 64) -> TrainState:
@@ -109,19 +108,21 @@ def test_a_damaged_codec_is_told(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     codec = PatchCodec.fit([rng.integers(0, 256, (5, 16, 16, 3), np.uint8)], 8, 4)
     codec.save(tmp_path)
-    settings = CodecSettings(name="patch_pca", spatial_factor=8, channels=4)
-    assert load_kept_codec(settings, tmp_path, "copy it again").hash == codec.hash
+    assert load_kept_codec(PatchCodec, tmp_path, "copy it again").hash == codec.hash
     content = (tmp_path / "codec.npz").read_bytes()
     arrays = dict(np.load(tmp_path / "codec.npz"))
     for damaged in (b"", content[:100], content[:-30], b"PK\x03\x04" + content[4:200], b"text"):
         (tmp_path / "codec.npz").write_bytes(damaged)
         with pytest.raises(ConfigError, match="copy it again"):
-            load_kept_codec(settings, tmp_path, "copy it again")
+            load_kept_codec(PatchCodec, tmp_path, "copy it again")
     for name in arrays:
         for other in (arrays[name] * np.nan if arrays[name].dtype.kind == "f" else np.int64(0), arrays[name][..., None]):
             np.savez(tmp_path / "codec.npz", **(arrays | {name: other}))
             with pytest.raises(ConfigError):
-                load_kept_codec(settings, tmp_path, "copy it again")
+                load_kept_codec(PatchCodec, tmp_path, "copy it again")
+    (tmp_path / "codec.npz").unlink()
+    with pytest.raises(ConfigError, match=r"lacks its codec \(.*codec.npz\); copy it again"):
+        load_kept_codec(PatchCodec, tmp_path, "copy it again")
 
 
 def test_a_damaged_log_of_numbers_is_gone_on_from(tmp_path: Path) -> None:

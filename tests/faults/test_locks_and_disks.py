@@ -19,7 +19,7 @@ from xew.episode import EpisodeError, read_record, read_states, write_episode
 from xew.files import hold_lock, write_text
 from xew.model import outside
 from xew.model.experiment import load_experiment
-from xew.model.runs.folder import claim_run
+from xew.model.runs.begin import claim_run
 from xew.sim_warp import generate, yields
 
 REPOSITORY = Path(__file__).parents[2]

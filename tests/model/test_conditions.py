@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from tests import synthetic
 from xew.config import ConfigError
 from xew.episode import read_record, read_states, read_video, write_episode
-from xew.model.cache.scales import apply_scales, fit_scales, read_scales, save_scales
+from xew.model.cache.scales import apply_scales, dump_scales, fit_scales, read_scales
 from xew.model.conditions import (
     ACTIONS,
     CONDITIONS,
@@ -225,7 +225,7 @@ def test_scales_of_training_numbers_come_back_from_disk(tmp_path: Path) -> None:
     for number in np.flatnonzero(high - low > 2e-3):
         np.testing.assert_allclose(scales["tool_poses"](np.stack([low, high]))[:, number], [-1, 1], atol=1e-3)
     assert np.abs(scaled[:, high - low == 0]).max(initial=0) < 1e-2
-    save_scales(tmp_path / "scales.json", scales)
+    (tmp_path / "scales.json").write_text(dump_scales(scales))
     again = read_scales(tmp_path / "scales.json", tuple(conditions.values()), "do that")
     grouped = clip_numbers(conditions["pooled_context"], told[:9], 0, 5)[None]
     arrays = {"pooled_context": grouped, "ray_channels": np.ones((1, 2, 16), np.float32)}

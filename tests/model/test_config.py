@@ -185,7 +185,7 @@ def test_bodies_to_adapt_to_are_named_one_by_one_and_not_replayed(tmp_path: Path
     config.save(load_experiment(MODEL_CONFIGS[0], ["--split", "scaling_bodies_4"]), tmp_path / "config.yaml")
     adaptation = ["--adapt.start_from", str(tmp_path), "--adapt.robots", "body:1-2", "--adapt.replay", "0.5"]
     choice = load_experiment(MODEL_CONFIGS[0], adaptation).choice
-    assert choice.adapt.robots == ("body_1", "body_2") and choice.replay == ("body_0", "body_3")
+    assert choice.robots == ("body_1", "body_2") and choice.replay == ("body_0", "body_3")
 
 
 def test_what_lies_beside_the_data_does_so_wherever_one_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

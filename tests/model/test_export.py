@@ -14,9 +14,9 @@ from xew.config import ConfigError
 from xew.model import export
 from xew.model.devices.sharding import make_mesh
 from xew.model.experiment import create_model, load_experiment
-from xew.model.network.dit_layouts import check_dit, load_dit
+from xew.model.network.dit_layouts import check_dit, load_dit, load_dit_params
 from xew.model.runs.checkpoint import TrainState, open_checkpoints, save_state
-from xew.model.training.start import check_network, start_params
+from xew.model.settings.network import check_network
 from xew.model.training.step import make_learner
 from xew.model.weights.reading import read_tensors
 
@@ -66,9 +66,9 @@ def test_constants_of_a_checkpoint_are_those_of_the_model(run: Path, tmp_path: P
         ("_rope_base", 3.0, "_rope_base = 3.0"),
     ):
         config.write_text(json.dumps(written | {key: other}))
-        for check in (load_dit, check_dit):
+        for check, of in ((load_dit, tmp_path / "out"), (check_dit, read_tensors(tmp_path / "out"))):
             with pytest.raises(ConfigError, match=said):
-                check(model, tmp_path / "out")
+                check(model, of)
     config.write_text("[")
     with pytest.raises(ConfigError, match=r"config\.json cannot be read"):
         load_dit(model, tmp_path / "out")
@@ -109,7 +109,8 @@ def test_training_starts_from_published_weights(run: Path, tmp_path: Path) -> No
     save_file(only_wan, tmp_path / "wan.safetensors")
     experiment = load_experiment(run / "config.yaml", ["--model.weights", str(tmp_path / "wan.safetensors")])
     check_network(experiment.network)
-    params = start_params(make_learner(experiment.learning, make_mesh(experiment.mesh)), None, run)
+    learner = make_learner(experiment.learning, make_mesh(experiment.mesh))
+    params = load_dit_params(*learner.random_network(), tmp_path / "wan.safetensors")
     expected = nnx.state(create_model(experiment), nnx.Param)
     np.testing.assert_array_equal(
         params["blocks"]["ffn"]["first"]["kernel"][...], expected["blocks"]["ffn"]["first"]["kernel"][...] + 2

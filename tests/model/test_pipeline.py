@@ -23,7 +23,8 @@ from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.log import RunLog
 from xew.model.runs.roundtrip import open_roundtrip
-from xew.model.training.data import ClipSource, fake_batch, make_dataset
+from xew.model.training.data import ClipSource, fake_batch
+from xew.model.training.order import make_dataset
 from xew.protocol import SEEN_ROBOTS
 from xew.rollout import find_rollouts, read_rollout_video
 

@@ -11,9 +11,8 @@ from tests import synthetic
 from xew.episode import EpisodeError
 from xew.model import latents, release, train
 from xew.model.rollout import load_predictor
-from xew.model.runs.checkpoint import load_params
+from xew.model.runs.checkpoint import find_damage, load_params
 from xew.model.runs.folder import load_run_config
-from xew.model.runs.sums import find_damage
 
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}

@@ -173,14 +173,13 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
     return Scores(rows, curves, metrics, rows.attrs)
 
 
-def merge_scores(tables: Sequence[tuple[str, Path]], own_robots: Sequence[str] = (), trainings: Sequence[int] = ()) -> Scores:
+def merge_scores(tables: Sequence[tuple[str, Path]], trainings: Sequence[int] = ()) -> Scores:
     """The score tables of a study's variants as one, with the column `variant` in front.
 
     Baselines that several tables hold are kept once; they have no variant.
 
     Args:
         tables: variant and path of its score table; a variant may have several.
-        own_robots: as in `read_scores`.
         trainings: seed of the training that each table is of, for the column `training`; without them there is none.
 
     Raises:
@@ -194,7 +193,7 @@ def merge_scores(tables: Sequence[tuple[str, Path]], own_robots: Sequence[str] =
     graded: set[tuple[object, ...]] = set()
     seeds: Sequence[int | None] = trainings or [None] * len(tables)
     for (variant, path), seed in zip(tables, seeds, strict=True):
-        scores = read_scores(path, own_robots)
+        scores = read_scores(path)
         if not variant or scores.of_study:
             found = f"is a merged table of {scores.rows[VARIANT].nunique()} variants" if variant else "has no variant's name"
             raise ConfigError(f"{path} {found}; expected the score table of one variant, and its name.")

@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from xew.command_line import parse_command
 from xew.config import admit, demand_admitted, load, pick
+from xew.model.codecs.codec import codec_class
 from xew.model.codecs.contract import CodecSettings, latent_frames
 from xew.model.codecs.vae import VAES
 from xew.model.conditions import Condition
@@ -25,7 +26,7 @@ from xew.model.network.mechanisms import MECHANISMS
 from xew.model.settings.checks import check_experiment
 from xew.model.settings.network import Network
 from xew.model.settings.optimizer import make_optimizer
-from xew.model.settings.parts import ClipInputs, Encoding, EpisodeChoice, Instructions, Learning, pick_conditions
+from xew.model.settings.parts import ClipInputs, Encoding, EpisodeChoice, Instructions, Learning, pick_conditions, sample_roles
 from xew.model.settings.settings import AdaptSettings, Clip, ModelSettings, RolloutSettings, TrainSettings
 from xew.model.text.instructions import TEXT_ENCODERS, VOCABULARY, TextEncoder, TextSource
 from xew.protocol import ACTION_DIM, SPLITS, Split, expand_robots
@@ -102,16 +103,20 @@ class Experiment:
     @property
     def encoding(self) -> Encoding:
         autoencoder = pick(VAES, self.codec.vae, "autoencoder") if self.codec.name == "wan_vae" else None
-        return Encoding(self.inputs, self.codec, self.cache_folder, self.data, self.adapt.start_from, autoencoder)
+        start_from, kind = self.adapt.start_from, codec_class(self.codec)
+        return Encoding(self.inputs, self.codec, kind, self.cache_folder, self.data, start_from, autoencoder)
 
     @property
     def choice(self) -> EpisodeChoice:
         """Which episodes are read. Raises ConfigError if the run that is replayed has gone."""
-        adapt, replay = replace(self.adapt, robots=expand_robots(self.adapt.robots)), tuple[str, ...]()
-        if adapt.start_from is not None and adapt.replay:
+        adapt, targets, replay = self.adapt, expand_robots(self.adapt.robots), tuple[str, ...]()
+        samples = sample_roles(self.robots, targets) if self.train.sample_every else {}
+        if adapt.start_from is None:
+            return EpisodeChoice(self.robots.train_robots, samples=samples)
+        if adapt.replay:
             source = load_recorded(adapt.start_from / "config.yaml").robots.train_robots
-            replay = tuple(robot for robot in source if robot not in adapt.robots)
-        return EpisodeChoice(self.robots, adapt, replay, samples=self.train.sample_every > 0)
+            replay = tuple(robot for robot in source if robot not in targets)
+        return EpisodeChoice(targets, adapt.episodes, replay, samples)
 
     @property
     def learning(self) -> Learning:

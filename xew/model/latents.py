@@ -59,13 +59,13 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
         source: where the episodes' pixels come from.
         batch: clips that the codec encodes at once.
     """
-    encoding, dataset = experiment.encoding, read_dataset(experiment.data)
-    episodes = training_episodes(dataset, experiment.choice)
+    encoding, choice, dataset = experiment.encoding, experiment.choice, read_dataset(experiment.data)
+    episodes = training_episodes(dataset, choice)
     codec = prepare_codec(encoding, episodes, source)
     keep_scales(encoding, episodes)
     experiment.instructions.encode(record.instruction for _, record in dataset.accepted)
     cache = LatentCache(encoding, codec)
-    written = encode_episodes(cache, [*episodes, *replay_episodes(dataset, experiment.choice)], source, batch)
+    written = encode_episodes(cache, [*episodes, *replay_episodes(dataset, choice)], source, batch)
     header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip), "streams": list(cache.streams)}
     header |= {"episodes": len(episodes), "ceiling": report_ceiling(experiment, cache, dataset, episodes, source)}
     write_text(encoding.folder / "header.json", json.dumps(header, indent=1) + "\n")

@@ -21,12 +21,12 @@ from xew.config import ConfigError, admit, user_errors
 from xew.dataset import read_dataset
 from xew.episode import Record
 from xew.files import read_text, write_text
-from xew.model.cache.scales import load_run_scales, share_scales
+from xew.model.cache.scales import load_run_scales
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment
-from xew.model.runs.checkpoint import load_params, open_checkpoints, save_params
-from xew.model.runs.folder import load_run, prepare_run
-from xew.model.runs.sums import note_sums
+from xew.model.runs.begin import prepare_run
+from xew.model.runs.checkpoint import load_params, save_params, write_checkpoints
+from xew.model.runs.folder import load_run
 from xew.model.settings.settings import AdaptSettings
 
 CARD = "README.md"
@@ -56,11 +56,9 @@ def release(run: Path, out: Path, data: Path | None = None, scores: Path | None 
     summary = read_text(scores) if scores else ""
     params, step = load_params(run, experiment.network, step)
     released = replace(experiment, out=out, data=Path("data"), cache=None, adapt=AdaptSettings())
-    prepare_run(released, codec, resume=False, overwrite=False)
-    share_scales(out, experiment.conditions, load_run_scales(experiment.conditions, run))
-    with open_checkpoints(out) as checkpoints:
+    prepare_run(released, codec, load_run_scales(experiment.conditions, run), resume=False, overwrite=False)
+    with write_checkpoints(out) as checkpoints:
         save_params(checkpoints, step, jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), params))
-    note_sums(out)
     size = sum(leaf.size for leaf in jax.tree.leaves(params))
     write_text(out / CARD, write_card(experiment, step, size, seen, summary))
     return step

@@ -19,7 +19,6 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
-from flax import nnx
 from jax.sharding import Mesh
 from tqdm import tqdm
 
@@ -31,14 +30,13 @@ from xew.episode import Record, episode_folder, remove_left_overs
 from xew.files import checkpoint_time, hold_lock, read_json
 from xew.model.cache.codecs import load_codec
 from xew.model.cache.scales import Scale, load_run_scales
-from xew.model.codecs.codec import codec_class
 from xew.model.codecs.contract import Codec
 from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
 from xew.model.episodes.choice import select_episodes, training_episodes
 from xew.model.experiment import Experiment, parse_experiment
 from xew.model.network.dit import cast_params
 from xew.model.network.dit_layouts import load_dit_params
-from xew.model.runs.checkpoint import restore_params
+from xew.model.runs.checkpoint import load_params
 from xew.model.runs.folder import load_run_codec, load_run_config
 from xew.model.sampling.predict import Prediction, Predictor
 from xew.model.settings.checks import check_experiment
@@ -69,9 +67,7 @@ def load_predictor(run: Path, experiment: Experiment, step: int | None = None) -
     if is_config(run):
         return load_published(experiment, run), None
     mesh, codec = make_mesh(MeshSettings()), load_run_codec(run, experiment.codec)
-    shapes = nnx.state(nnx.eval_shape(experiment.network.create), nnx.Param)
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=replicated_sharding(mesh)), shapes)
-    params, step = restore_params(run, like, step)
+    params, step = load_params(run, experiment.network, step, replicated_sharding(mesh))
     scales = load_run_scales(experiment.conditions, run)
     return _make_predictor(experiment, codec, params, mesh, scales), step
 
@@ -108,9 +104,7 @@ def load_published(experiment: Experiment, source: Path) -> Predictor:
     mesh = make_mesh(MeshSettings())
     graph, params = make_learner(experiment.learning, mesh).random_network()
     params = load_dit_params(graph, params, experiment.model.weights)
-    episodes = (
-        training_episodes(read_dataset(experiment.data), experiment.choice) if codec_class(experiment.codec).fitted else ()
-    )
+    episodes = training_episodes(read_dataset(experiment.data), experiment.choice) if experiment.encoding.kind.fitted else ()
     return _make_predictor(experiment, load_codec(experiment.encoding, episodes), params, mesh, {})
 
 

@@ -20,7 +20,7 @@ from xew.compilation import keep_compiled_programs
 from xew.config import ConfigError, user_errors
 from xew.dataset import read_dataset
 from xew.files import hold_lock
-from xew.model.cache.scales import share_scales
+from xew.model.cache.scales import load_run_scales
 from xew.model.devices.sharding import (
     AXES,
     check_batch,
@@ -33,17 +33,19 @@ from xew.model.devices.sharding import (
 )
 from xew.model.episodes.choice import choose_episodes
 from xew.model.experiment import Experiment, parse_experiment
+from xew.model.runs.begin import begin_run, check_one_of, check_start
 from xew.model.runs.checkpoint import TrainState
-from xew.model.runs.folder import begin_run, check_one_of, check_start
 from xew.model.runs.session import open_session
 from xew.model.sampling.predict import Predictor
+from xew.model.settings.network import check_network
 from xew.model.settings.optimizer import learning_rate, make_optimizer, set_steps
-from xew.model.training.data import ClipSource, make_dataset
+from xew.model.training.data import ClipSource
 from xew.model.training.flops import flops_of_step
 from xew.model.training.loop import STOPPED, Meter, Timetable, run_steps
 from xew.model.training.memory import check_memory, estimate_memory
+from xew.model.training.order import make_dataset
 from xew.model.training.samples import log_samples
-from xew.model.training.start import begin_state, check_network
+from xew.model.training.start import begin_state
 from xew.model.training.step import StepResult, abstract_state, make_learner
 
 NOISE_LEVEL_EDGES = (0.0, 0.5, 0.8, 0.95, 1.0)
@@ -124,8 +126,8 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     flops = flops_of_step(learning, encoding.inputs)
     check_memory(estimate_memory(learning, learner.shapes, encoding, mesh), ignore=ignore_memory)
 
-    begin_run(experiment, source.cache.codec, resume=resume, overwrite=overwrite)
-    source.scales = share_scales(out, encoding.inputs.conditions, source.scales)
+    begin_run(experiment, source.cache.codec, source.scales, resume=resume, overwrite=overwrite)
+    source.scales = load_run_scales(encoding.inputs.conditions, out)
     graph, codec = experiment.sampling_network.structure, source.cache.codec
     predictor = Predictor(encoding.inputs, experiment.instructions, experiment.sampling, codec, graph, None, source.scales)
     timetable = Timetable(settings.steps, settings.log_every, settings.save_every, settings.sample_every, rates)

@@ -18,10 +18,11 @@ from xew.model.codecs.conv_autoencoder import (
     AUTOENCODERS,
     AutoencoderSize,
     ConvAutoencoder,
-    count_parameters,
+    abstract_autoencoder,
     load_autoencoder,
     save_autoencoder,
 )
+from xew.model.network.dit import parameter_count
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def settings(weights: Path | None, channels: int = 48) -> CodecSettings:
 
 def test_the_shipped_size_fits_into_20_megabytes() -> None:
     """Two bytes a number, and a little for names and norms."""
-    assert 9.0e6 < count_parameters(AUTOENCODERS["base"]) <= 9.7e6
+    assert 9.0e6 < parameter_count(abstract_autoencoder(AUTOENCODERS["base"])) <= 9.7e6
     assert (AUTOENCODERS["base"].spatial_factor, AUTOENCODERS["base"].channels) == autoencoders.PACKAGED_SHAPE
 
 
@@ -96,7 +97,8 @@ def test_a_batch_is_its_clips_and_weights_are_no_constants(codec: ConvAutoencode
     videos = np.stack([smooth_clip(8), smooth_clip(9)])
     expected = np.stack([codec.encode(video) for video in videos])
     np.testing.assert_allclose(encode_pictures(codec, videos), expected, atol=1e-4)
-    assert sum(np.size(leaf) for leaf in jax.tree.leaves(codec)) == count_parameters(AUTOENCODERS["tiny"]) + 2 * 48
+    learned = parameter_count(abstract_autoencoder(AUTOENCODERS["tiny"]))
+    assert sum(np.size(leaf) for leaf in jax.tree.leaves(codec)) == learned + 2 * 48
 
 
 def test_saved_codec_is_the_same(codec: ConvAutoencoderCodec, weights: Path, tmp_path: Path) -> None:

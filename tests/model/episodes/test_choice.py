@@ -11,7 +11,7 @@ from xew.episode import Record
 from xew.model import latents
 from xew.model.codecs.ceiling import Ceiling
 from xew.model.episodes.choice import sample_episodes, training_episodes
-from xew.model.settings.parts import EpisodeChoice
+from xew.model.settings.parts import EpisodeChoice, sample_roles
 from xew.model.settings.settings import Clip
 from xew.protocol import FIXED, HELD_OUT_ROBOTS, ROBOT_NAMES, SEEN_ROBOTS, TEST_SEED_START, VALIDATION_SEED_START, seed_split
 
@@ -27,21 +27,21 @@ def dataset(*families: str, robots: tuple[str, ...] = (*ROBOT_NAMES, BODY, UNSEE
 
 
 def test_samples_are_of_validation_seeds_of_training_robots_and_of_a_body() -> None:
-    found = sample_episodes(dataset("train", "validation", "test"), EpisodeChoice(FIXED))
+    found = sample_episodes(dataset("train", "validation", "test"), sample_roles(FIXED))
     assert set(found) == {*(f"seen/{robot}" for robot in SEEN_ROBOTS), f"unseen/{BODY}"}
     assert {record.seed for _, record in found.values()} == {VALIDATION_SEED_START}
 
 
 def test_without_validation_seeds_samples_are_of_training_seeds_and_never_of_test_seeds() -> None:
     for families in (("train", "test"), ("train",)):
-        found = sample_episodes(dataset(*families, robots=ROBOT_NAMES), EpisodeChoice(FIXED))
+        found = sample_episodes(dataset(*families, robots=ROBOT_NAMES), sample_roles(FIXED))
         assert set(found) == {f"seen/{robot}" for robot in SEEN_ROBOTS}
         assert {record.seed for _, record in found.values()} == {0}
-    assert sample_episodes(dataset("test"), EpisodeChoice(FIXED)) == {}
+    assert sample_episodes(dataset("test"), sample_roles(FIXED)) == {}
 
 
 def test_nothing_is_trained_on_validation_or_test_seeds() -> None:
-    episodes = training_episodes(dataset("train", "validation", "test"), EpisodeChoice(FIXED))
+    episodes = training_episodes(dataset("train", "validation", "test"), EpisodeChoice(FIXED.train_robots))
     assert {seed_split(record.seed) for _, record in episodes} == {"train"}
 
 
@@ -60,7 +60,7 @@ def test_the_ceiling_in_the_log_is_of_no_test_seed_and_of_no_held_out_robot(
 
     monkeypatch.setattr(latents, "measure_ceiling", measure)
     experiment, cache = SimpleNamespace(robots=FIXED, clip=Clip(5, 48, 64)), SimpleNamespace(codec=None)
-    training = training_episodes(data, EpisodeChoice(FIXED))
+    training = training_episodes(data, EpisodeChoice(FIXED.train_robots))
     said = latents.report_ceiling(experiment, cache, data, training, source)
     expected = "validation" if "validation" in families else "train"
     assert {seed_split(record.seed) for record in read} == {expected} and said["of"].startswith(expected)

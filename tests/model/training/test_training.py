@@ -24,13 +24,14 @@ from xew.model.episodes.choice import first_of_each, replay_episodes, sample_epi
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs import checkpoint
-from xew.model.runs.checkpoint import TrainState
+from xew.model.runs.checkpoint import TrainState, restore_sum
+from xew.model.runs.lineage import trace_start
 from xew.model.settings.optimizer import learning_rate, set_steps
 from xew.model.training import data, memory
-from xew.model.training.data import Batch, ClipSource, fake_batch, make_dataset
+from xew.model.training.data import Batch, ClipSource, fake_batch
 from xew.model.training.flops import flops_of_step
 from xew.model.training.memory import estimate_memory
-from xew.model.training.start import start_params
+from xew.model.training.order import make_dataset
 from xew.model.training.step import (
     abstract_state,
     cut_samples,
@@ -472,7 +473,10 @@ def test_adapted_run_starts_from_the_trained_weights(world: Path, tmp_path: Path
     train.main([*arguments, "--train.steps", "1", "--resume"])  # of nothing: it begins, and notes where
     adapted = load_experiment(tmp_path / "run" / "config.yaml")
     learner = make_learner(adapted.learning, make_mesh(adapted.mesh))
-    start, base = start_params(learner, adapted.adapt.start_from, tmp_path / "run"), network(world / "run")[0]
+    start, base = (
+        restore_sum(trace_start(tmp_path / "run", world / "run"), learner.network_shapes)[0],
+        network(world / "run")[0],
+    )
     jax.tree.map(np.testing.assert_array_equal, start, base)
     after = network(tmp_path / "run")[0]
     moved = [float(np.abs(np.asarray(a - b)).max()) for a, b in zip(*map(jax.tree.leaves, (after, start)), strict=True)]
@@ -480,8 +484,9 @@ def test_adapted_run_starts_from_the_trained_weights(world: Path, tmp_path: Path
 
 
 def test_samples_of_an_adapted_run_are_named_by_role(experiment: Experiment) -> None:
-    adapted = replace(experiment, adapt=replace(experiment.adapt, start_from=Path("runs/x"), robots=("piper",)))
-    names = sample_episodes(read_dataset(adapted.data), adapted.choice)
+    adapt = replace(experiment.adapt, start_from=Path("runs/x"), robots=("piper",))
+    adapted = replace(experiment, adapt=adapt, train=replace(experiment.train, sample_every=1))
+    names = sample_episodes(read_dataset(adapted.data), adapted.choice.samples)
     seen = {"seen/aloha_agilex", "seen/arx_x5", "seen/ur5_wsg"}
     assert set(names) == seen | {"target/piper"}
     assert {seed_split(record.seed) for _, record in names.values()} == {"train"}, "no test seed is looked at"

@@ -27,8 +27,9 @@ from xew.model.network.dit_layouts import (
 )
 from xew.model.network.mechanisms import MECHANISMS
 from xew.model.weights import reading, writing
+from xew.model.weights.filling import fill
 from xew.model.weights.layout import Source, checkpoint_shapes
-from xew.model.weights.reading import fill, read_tensors
+from xew.model.weights.reading import read_tensors
 from xew.model.weights.writing import save_weights
 
 REFERENCE = Path(__file__).parents[1] / "reference"
@@ -409,11 +410,11 @@ def test_flowwam_checkpoint(lacks: tuple[str, ...], tmp_path: Path) -> None:
 def test_another_size_is_told(tmp_path: Path) -> None:
     arrays = wan_arrays()
     save_file(arrays, tmp_path / "in.safetensors")
-    check_dit(nnx.eval_shape(lambda: wan(*STREAMS)), tmp_path / "in.safetensors")
+    check_dit(nnx.eval_shape(lambda: wan(*STREAMS)), read_tensors(tmp_path / "in.safetensors"))
     larger = nnx.eval_shape(lambda: WorldModel(MODELS["debug"], CHANNELS, rngs=nnx.Rngs(0)))
-    for refuses in (check_dit, load_dit):
+    for refuses, given in ((check_dit, read_tensors(tmp_path / "in.safetensors")), (load_dit, tmp_path / "in.safetensors")):
         with pytest.raises(ConfigError, match=r"blocks\.2\.self_attn\.q\.weight \(for blocks.*and 48 more.*another shape"):
-            refuses(larger, tmp_path / "in.safetensors")
+            refuses(larger, given)
     arrays["blocks.1.ffn.2.weight"] = arrays["blocks.1.ffn.2.weight"][:, :-1].copy()
     save_file(arrays, tmp_path / "in.safetensors")
     expected = r"1 of another shape: blocks\.1\.ffn\.2\.weight is \[32, 63\], the model's blocks\.ffn\.second\.kernel"

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from xew.config import ConfigError
 from xew.sim_warp.kinematics import finger_positions, forward_kinematics, joint_positions, link_matrices, link_poses, tool_pose
 from xew.sim_warp.kinematics.batched import BatchedKinematics
-from xew.sim_warp.kinematics.inverse import ArmSolver, inverse_kinematics
+from xew.sim_warp.kinematics.inverse import ArmSolver, arm_solver
 from xew.sim_warp.plan import tool
 from xew.sim_warp.robots import ROBOTS, RobotSpec, load_urdf
 from xew.sim_warp.robots.reach import main as reach
@@ -189,9 +189,10 @@ def test_inverse_undoes_forward(robot: RobotSpec) -> None:
     arm = np.arange(16) % 2
     wanted = np.stack([tool_pose(robot, side, row[None])[0] for side, row in zip(arm, joint_pos, strict=True)])
     seed = np.clip(joint_pos + rng.normal(0, 0.05, joint_pos.shape), lower, upper)
-    found, position_error, rotation_error = inverse_kinematics(robot, arm, wanted, seed)
+    solution = arm_solver(robot).solve(arm, wanted, seed)
+    found, position_error = solution.joint_pos, solution.position_error
     assert position_error.max() < 2e-4
-    assert rotation_error.max() < 1e-3
+    assert solution.rotation_error.max() < 1e-3
     assert (found >= lower).all() and (found <= upper).all()
     again = np.stack([tool_pose(robot, side, row[None])[0] for side, row in zip(arm, found, strict=True)])
     assert np.linalg.norm(again[:, :3] - wanted[:, :3], axis=-1) == pytest.approx(position_error, abs=1e-9)
@@ -207,8 +208,8 @@ def test_arms_that_differ_are_refused() -> None:
 def test_out_of_reach_is_reported() -> None:
     robot = ROBOTS["piper"]
     far = np.array([[5.0, 5.0, 5.0, 0, 0, 0, 1]])
-    _, position_error, _ = inverse_kinematics(robot, 0, far, np.array([robot.arms[0].home]))
-    assert position_error[0] > 1
+    solution = arm_solver(robot).solve(0, far, np.array([robot.arms[0].home]))
+    assert solution.position_error[0] > 1
 
 
 @robots

@@ -84,11 +84,11 @@ def measure(
     )
 
 
-def chamfer_floor(robots: Mapping[str, RobotSpec | Urdf], seeds: Sequence[int] = (0,), frame: Frame = "root") -> np.ndarray:
+def chamfer_floor(robots: Mapping[str, RobotSpec | Urdf], seeds: Sequence[int] = (0,)) -> np.ndarray:
     """Distance of each robot from itself in another draw [s n] float64 [m], so what sampling makes of no distance. Ours."""
 
     def measure_to_itself(robot: RobotSpec | Urdf, seed: int) -> float:
-        return chamfer(workspace_cloud(robot, seed, frame), workspace_cloud(robot, seed + ANOTHER_DRAW, frame))
+        return chamfer(workspace_cloud(robot, seed), workspace_cloud(robot, seed + ANOTHER_DRAW))
 
     return np.array([[measure_to_itself(robot, seed) for robot in robots.values()] for seed in seeds])
 

@@ -1,4 +1,4 @@
-"""The tables of one run: its scores as means, intervals and verdicts, robot by robot."""
+"""The tables in the report on one run: its scores as means, intervals and verdicts, robot by robot."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

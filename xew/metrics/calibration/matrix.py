@@ -5,7 +5,7 @@ Writes rows (task seed robot case metric value), and Markdown tables of them
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,6 @@ def grade_predictors(
     masker: Masker,
     tracker: Tracker,
     metrics: Sequence[str] = tuple(METRICS),
-    objects: Callable[[Path], tuple[np.ndarray, np.ndarray]] | None = render_objects,
 ) -> list[Row]:
     """Rows of one episode: the value of each metric for each predictor, NaN where it has none.
 
@@ -51,10 +50,9 @@ def grade_predictors(
         other: the folder of the same seed with another robot, if there is one.
         masker, tracker: estimators.
         metrics: names of METRICS.
-        objects: function of the folder to the videos with objects at rest and erased, None to leave them out.
     """
     truth = read_truth(folder, record.frame_count, {input_kind(name) for name in metrics})
-    still, erased = (None, None) if objects is None else objects(folder)
+    still, erased = render_objects(folder)
     material = Material(truth.rgb, None if other is None else _cut(read_video(other / "rgb.mkv"), truth), still, erased)
     key = {"task": record.task, "seed": record.seed, "robot": record.robot}
     return [key | row for row in grade_material(material, truth, masker, tracker, metrics)]

@@ -1,7 +1,8 @@
-"""Whether what a tracker found is the thing itself: the truth knows which pixels round a point are its body's.
+"""Presence: whether the body of a tracked point is there at all, by those pixels round the point that are the body's own.
 
-A tracker compares all that is round a point. Of an object that a hand holds most of that is the hand, so that a video in
-which the object is gone looks much like the true one there. Here only the body's own pixels are compared.
+A tracker compares everything round a point. Round a point on an object that a hand holds, most pixels show the hand, so a
+video in which the object is gone looks much like the true one there. Here only pixels of the body are compared, which the
+ground truth tells.
 """
 
 import cv2

@@ -1,4 +1,4 @@
-"""Scores on disk: a tidy table that says itself what its metrics mean, and the per-frame curves beside it.
+"""Scores on disk: a tidy table with a description of its metrics in it, and the per-frame curves beside it.
 
 scores.parquet         model condition task seed robot metric value | frames exact_frames content
 scores.curves.parquet  model condition task seed robot metric frame value

@@ -1,4 +1,4 @@
-"""What a score table says, robot by robot: means with intervals, and differences between models with a verdict.
+"""The summary that `evaluate` writes beside scores: means with intervals by robot, and differences of models with a verdict.
 
 Draws, intervals, noise floors and verdicts are those of `xew.statistics`, as in the report. The ground truth that the floor
 is of is graded softened, as any prediction is (`jobs.SOFTNESS`).

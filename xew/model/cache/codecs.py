@@ -11,37 +11,35 @@ from xew.dataset import Episode
 from xew.episode import complete_folder
 from xew.model.cache.clips import clip_starts, take_frames
 from xew.model.cache.keys import codec_path
-from xew.model.codecs.codec import codec_class
+from xew.model.codecs.codec import RUN_REMEDY, load_kept_codec
 from xew.model.codecs.contract import Codec
-from xew.model.runs.folder import load_kept_codec, load_run_codec
 from xew.model.settings.parts import Encoding
 from xew.model.video.frames import to_model_size
 from xew.model.video.pixels import PixelSource, stored_pixels
 
 
 def load_codec(encoding: Encoding, episodes: Sequence[Episode]) -> Codec:
-    """The codec of these episodes: fitted on them, or read from the weights that the config names.
+    """The codec of these episodes: fitted on them, read from the weights that the config names, or that of the run to adapt.
 
     Raises:
-        ConfigError: `latents` has not been run for them, or the weights are missing or do not fit.
+        ConfigError: `latents` has not been run for them, the weights are missing or do not fit, or the codec is damaged.
     """
-    if encoding.start_from is not None:
-        return load_run_codec(encoding.start_from, encoding.codec)
-    kind = codec_class(encoding.codec)
-    if not kind.fitted:
-        return kind.prepare(encoding.codec, list)
-    path = codec_path(encoding, episodes)
-    if not path.exists():
-        raise ConfigError(f"no codec fitted on {encoding.data} as it is now under {path.parent}; {encoding.remedy}.")
-    return load_kept_codec(encoding.codec, path, f"delete it and {encoding.remedy}")
+    if encoding.start_from is None and not encoding.kind.fitted:
+        return encoding.kind.prepare(encoding.codec, list)
+    path, remedy = codec_path(encoding, episodes), RUN_REMEDY
+    if encoding.start_from is None:
+        if not path.exists():
+            raise ConfigError(f"no codec fitted on {encoding.data} as it is now under {path.parent}; {encoding.remedy}.")
+        remedy = f"delete it and {encoding.remedy}"
+    return load_kept_codec(encoding.kind, path, remedy)
 
 
 def prepare_codec(encoding: Encoding, episodes: Sequence[Episode], source: PixelSource = stored_pixels) -> Codec:
     """The codec of these episodes, which is fitted on them and kept where that has not been done."""
-    fits = encoding.start_from is None and codec_class(encoding.codec).fitted
+    fits = encoding.start_from is None and encoding.kind.fitted
     if not fits or codec_path(encoding, episodes).exists():
         return load_codec(encoding, episodes)
-    codec = codec_class(encoding.codec).prepare(encoding.codec, lambda: _clips_to_fit(encoding, episodes, source))
+    codec = encoding.kind.prepare(encoding.codec, lambda: _clips_to_fit(encoding, episodes, source))
     with complete_folder(codec_path(encoding, episodes)) as unfinished:
         codec.save(unfinished)
     return codec

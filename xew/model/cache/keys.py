@@ -12,9 +12,12 @@ from typing import Any
 from xew.config import digest
 from xew.dataset import Episode
 from xew.episode import Record, episode_folder
+from xew.model.codecs.codec import RUN_CODEC
 from xew.model.settings.parts import Encoding
 
 CACHE_VERSION = 2
+RUN_SCALES = "scales.json"
+"""Name of the file in a run that holds the scales of its numbers."""
 
 
 def stream_path(encoding: Encoding, codec_hash: str, record: Record, stream: str) -> Path:
@@ -32,13 +35,17 @@ def stream_path(encoding: Encoding, codec_hash: str, record: Record, stream: str
 
 
 def codec_path(encoding: Encoding, episodes: Sequence[Episode]) -> Path:
-    """The folder where the codec fitted on these episodes is kept."""
+    """The folder where the codec of these episodes is kept: in the cache if it is fitted on them, or in the run to adapt."""
+    if encoding.start_from is not None:
+        return encoding.start_from / RUN_CODEC
     hashes = [(record.hashes["rgb"], record.hashes["robot"]) for _, record in episodes]
     return encoding.folder / f"codec-{_hash((CACHE_VERSION, digest(encoding.codec), digest(encoding.inputs.clip), hashes))}"
 
 
 def scales_path(encoding: Encoding, episodes: Sequence[Episode]) -> Path:
-    """The file where the scales of these episodes' numbers are kept."""
+    """The file where the scales of these episodes' numbers are kept: in the cache, or in the run to adapt."""
+    if encoding.start_from is not None:
+        return encoding.start_from / RUN_SCALES
     names = sorted({condition.name for condition in encoding.inputs.conditions.values() if condition.scale != "none"})
     hashes = sorted(record.hashes["states"] for _, record in episodes)
     return encoding.folder / f"scales-{_hash((CACHE_VERSION, hashes, names))}.json"

@@ -9,22 +9,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax
 import numpy as np
-from jax.experimental import multihost_utils
 
 from xew.config import ConfigError, parse
 from xew.dataset import Episode
-from xew.files import read_json, replacing
-from xew.model.cache.keys import scales_path
+from xew.files import read_json, write_text
+from xew.model.cache.keys import RUN_SCALES, scales_path
 from xew.model.conditions import Command, Condition
 from xew.model.episodes.commands import episode_command
 from xew.model.settings.parts import Encoding
 
 PERCENTILES = (1, 99)
 """Percentiles that become -1 and 1, with clipping beyond, as in Ctrl-World and Boundless-World-Model."""
-SCALES = "scales.json"
-"""Name of the file in a run."""
+RUN_REMEDY = "train it again with --overwrite"
+"""Sentence on what to do where a run's scales are damaged or lost."""
 STILL = 1e-3
 """Least width [m, rad or 1]: a number that hardly moves over all training episodes is divided by this, so that its noise is
 not blown up."""
@@ -76,14 +74,13 @@ def apply_scales(
     return {stream: scales[names[stream]](array) if stream in names else array for stream, array in arrays.items()}
 
 
-def save_scales(path: Path, scales: Mapping[str, Scale]) -> None:
-    """Write scales as JSON, all or nothing."""
+def dump_scales(scales: Mapping[str, Scale]) -> str:
+    """The JSON of scales, as `read_scales` reads it."""
     content = {
         name: {"middle": scale.middle.tolist(), "width": scale.width.tolist(), "limit": scale.limit}
         for name, scale in scales.items()
     }
-    with replacing(path) as unfinished:
-        unfinished.write_text(json.dumps(content, indent=1) + "\n")
+    return json.dumps(content, indent=1) + "\n"
 
 
 @dataclass(frozen=True)
@@ -121,33 +118,23 @@ def read_scales(path: Path, conditions: Sequence[Condition], remedy: str) -> dic
 
 def load_run_scales(conditions: Mapping[str, Condition], run: Path) -> dict[str, Scale]:
     """The scales that a run was trained with. Raises ConfigError if it needs some and has none."""
-    return read_scales(run / SCALES, tuple(conditions.values()), "train it again with --overwrite")
+    return read_scales(run / RUN_SCALES, tuple(conditions.values()), RUN_REMEDY)
 
 
 def load_scales(encoding: Encoding, episodes: Sequence[Episode]) -> dict[str, Scale]:
     """The scales of these episodes' numbers, or in an adaptation those of the run that it starts from.
 
     Raises:
-        ConfigError: `latents` has not been run for them.
+        ConfigError: `latents` has not been run for them, or the run has lost them.
     """
-    conditions = encoding.inputs.conditions
-    if encoding.start_from is not None:
-        return load_run_scales(conditions, encoding.start_from)
-    return read_scales(scales_path(encoding, episodes), tuple(conditions.values()), encoding.remedy)
+    conditions = tuple(encoding.inputs.conditions.values())
+    remedy = encoding.remedy if encoding.start_from is None else RUN_REMEDY
+    return read_scales(scales_path(encoding, episodes), conditions, remedy)
 
 
 def keep_scales(encoding: Encoding, episodes: Sequence[Episode]) -> None:
     """Fit and keep the scales of numbers of these episodes, where any is needed and they are not there yet."""
     path, conditions = scales_path(encoding, episodes), encoding.inputs.conditions.values()
     if any(condition.scale != "none" for condition in conditions) and encoding.start_from is None and not path.exists():
-        save_scales(path, fit_scales(conditions, (episode_command(folder, record) for folder, record in episodes)))
-
-
-def share_scales(out: Path, conditions: Mapping[str, Condition], found: Mapping[str, Scale]) -> dict[str, Scale]:
-    """The scales that a run was begun with; those found in the data, which all processes wait for, if it is new."""
-    path = out / SCALES
-    if found and not path.exists() and jax.process_index() == 0:
-        save_scales(path, found)
-    if jax.process_count() > 1:
-        multihost_utils.sync_global_devices("scales")
-    return load_run_scales(conditions, out)
+        scales = fit_scales(conditions, (episode_command(folder, record) for folder, record in episodes))
+        write_text(path, dump_scales(scales))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from xew.config import ConfigError, check_finite, load, pick
+from xew.config import ConfigError, load, pick
 from xew.dataset import Dataset, Episode
 from xew.model.codec_training.kinds import KINDS, Kind
 from xew.model.codec_training.pictures import ALIGNED, UNALIGNED, Cut
@@ -173,7 +173,6 @@ def load_codec_experiment(path: Path | str, overrides: Sequence[str] = ()) -> Co
 
 def check_codec_experiment(experiment: CodecExperiment, path: Path | str) -> CodecExperiment:
     """The experiment itself. Raises ConfigError, naming its path, if one of its choices does not exist or does not fit."""
-    check_finite(experiment, str(path))
     check_least(LEAST, experiment, str(path))
     check_streams(experiment.streams)
     _ = experiment.train_robots

@@ -1,8 +1,12 @@
-"""The registry of codecs; what each promises is said in contract.py. To add one: a class there, and one line in CODECS."""
+"""The registry of codecs, and codecs that are kept in a folder. What each promises is said in contract.py.
 
+To add one: a class with the methods of `Codec`, and one line in CODECS.
+"""
+
+from pathlib import Path
 from typing import Any
 
-from xew.config import pick
+from xew.config import ConfigError, pick
 from xew.model.codecs.autoencoders import ConvAutoencoderCodec, WanVaeCodec
 from xew.model.codecs.contract import Codec, CodecSettings
 from xew.model.codecs.patches import PatchCodec
@@ -13,7 +17,29 @@ CODECS: dict[str, type[Codec]] = {
     "wan_vae": WanVaeCodec,
 }
 
+RUN_CODEC = "codec"
+"""Name of the folder in a run that holds its codec."""
+RUN_REMEDY = "copy the whole run again, or train again"
+"""Sentence on what to do where a run's codec is damaged or lost."""
+
 
 def codec_class(settings: CodecSettings) -> type[Any]:
     """The class of codec that a config names, with what `Codec` asks. Raises ConfigError if there is none of that name."""
     return pick(CODECS, settings.name, "codec")
+
+
+def load_kept_codec(kind: type[Any], folder: Path, remedy: str) -> Codec:
+    """The codec of this class that is kept in a folder.
+
+    Raises:
+        ConfigError: the folder lacks a file or is damaged; `remedy` says what to do.
+    """
+    try:
+        return kind.load(folder)
+    except ConfigError:
+        raise
+    except FileNotFoundError as error:
+        raise ConfigError(f"{folder.parent} lacks its codec ({error.filename}); {remedy}.") from error
+    except Exception as error:  # zipfile, zlib, NumPy and safetensors each have their own
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ConfigError(f"{folder} is damaged ({reason}); {remedy}.") from error

@@ -33,8 +33,9 @@ from xew.files import replacing
 from xew.model.codecs.vae import LatentStatistic
 from xew.model.codecs.vae_layers import Conv, Layers, RmsNorm, as_row, patchify, unpatchify
 from xew.model.video.frames import TEMPORAL_FACTOR
+from xew.model.weights.filling import fill
 from xew.model.weights.layout import Source
-from xew.model.weights.reading import fill, read_tensors
+from xew.model.weights.reading import read_tensors
 
 Groups = Float[Array, "n 4 h w 3"]
 Features = Float[Array, "n y x c"]
@@ -217,12 +218,6 @@ def convolve(conv: Conv, x: Inputs) -> Float[Array, "n y x o"]:
 def abstract_autoencoder(size: AutoencoderSize, dtype: DTypeLike = jnp.float32) -> ConvAutoencoder:
     """An autoencoder whose leaves have no values yet; weights are loaded into it."""
     return nnx.eval_shape(lambda: ConvAutoencoder(size, dtype=dtype, rngs=nnx.Rngs(0)))
-
-
-def count_parameters(size: AutoencoderSize) -> int:
-    """Number of parameters of an autoencoder of this size."""
-    params = nnx.state(abstract_autoencoder(size), nnx.Param)
-    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(params))
 
 
 class NamedLeaf(NamedTuple):

@@ -14,8 +14,9 @@ from flax import nnx
 
 from xew.config import ConfigError
 from xew.model.codecs.vae import VideoVae
+from xew.model.weights.filling import fill
 from xew.model.weights.layout import Layout, Source
-from xew.model.weights.reading import Tensors, fill, read_config, read_tensors
+from xew.model.weights.reading import Tensors, read_tensors
 from xew.model.weights.writing import save_weights
 
 STATISTICS = ("latents_mean", "latents_std")
@@ -90,7 +91,7 @@ def load_vae(vae: VideoVae, path: Path) -> None:
     """
     tensors = read_tensors(path)
     fill(vae, tensors, _layout_of(vae, tensors), optional=STATISTICS)
-    config = read_config(path)
+    config = tensors.config
     for name in STATISTICS:
         if name in config and name not in tensors:
             getattr(vae, name).set_value(jnp.asarray(_read_statistic(path, name, config[name], vae.size.channels)))

@@ -1,6 +1,6 @@
 """Choosing the episodes of a data set that a training, its samples or a rollout read."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from xew.config import ConfigError, suggestion
 from xew.dataset import Dataset, Episode, read_dataset
 from xew.episode import EpisodeError
 from xew.model.settings.parts import EpisodeChoice
-from xew.protocol import expand_robots, validation_split
+from xew.protocol import expand_robots
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ def choose_episodes(dataset: Dataset, choice: EpisodeChoice) -> TrainingEpisodes
     Raises:
         ConfigError, EpisodeError: there are none to learn from, too few to adapt to, or no videos to draw samples of.
     """
-    samples = sample_episodes(dataset, choice) if choice.samples else {}
+    samples = sample_episodes(dataset, choice.samples)
     bare = [folder for folder, record in samples.values() if not record.videos]
     if bare:
         raise ConfigError(
@@ -40,15 +40,13 @@ def choose_episodes(dataset: Dataset, choice: EpisodeChoice) -> TrainingEpisodes
 
 
 def training_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
-    """Episodes to learn from, of training seeds: all of the split's training robots, or a few of the robots to adapt to.
+    """Episodes to learn from, of training seeds: all of the training robots, or a few of the robots to adapt to.
 
     Raises:
         ConfigError, EpisodeError: there are none, or too few to adapt to.
     """
-    adapt = choice.adapt
-    if adapt.start_from is None:
-        return _select_training(dataset, choice.split.train_robots, need_all=False)
-    return first_of_each(_select_training(dataset, adapt.robots, need_all=True), adapt.episodes)
+    found = _select_training(dataset, choice.robots, need_all=choice.shots > 0)
+    return first_of_each(found, choice.shots) if choice.shots else found
 
 
 def replay_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
@@ -81,15 +79,14 @@ def first_of_each(episodes: Sequence[Episode], count: int) -> list[Episode]:
     return [episode for _, group in sorted(groups.items()) for episode in group[:count]]
 
 
-def sample_episodes(dataset: Dataset, choice: EpisodeChoice) -> dict[str, Episode]:
-    """An episode of each robot by which choices are made (`validation_split`), by role and robot, never of a test seed.
+def sample_episodes(dataset: Dataset, roles: Mapping[str, str]) -> dict[str, Episode]:
+    """An episode of each of these robots that the data has, by role and robot, never of a test seed.
 
     It is of a validation seed where there is one of that robot, else of a training seed, which a model of the robot has seen.
-    In an adapted run the robots adapted to are the target, and seen are those of the run that it started from.
+
+    Args:
+        roles: of the robots that samples are drawn of, by robot.
     """
-    split, targets = validation_split(choice.split), choice.adapt.robots
-    roles = dict.fromkeys(split.train_robots, "seen") | dict.fromkeys(split.held_out_robots, "unseen")
-    roles |= dict.fromkeys(targets, "target")
     found = [e for family in ("validation", "train") for e in dataset.select(robots=tuple(roles), split=family)]
     first = {record.robot: (folder, record) for folder, record in reversed(found)}
     return {f"{roles[robot]}/{robot}": first[robot] for robot in roles if robot in first}

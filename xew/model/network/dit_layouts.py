@@ -18,8 +18,9 @@ from xew.config import ConfigError
 from xew.files import write_text
 from xew.model.network.dit import STREAMS, WorldModel
 from xew.model.network.tokens import PATCH, TIME_FREQUENCIES
+from xew.model.weights.filling import check_fit, fill
 from xew.model.weights.layout import Layout, Source
-from xew.model.weights.reading import Tensors, check_fit, fill, read_config, read_tensors
+from xew.model.weights.reading import Tensors, read_tensors
 from xew.model.weights.writing import save_weights
 
 Naming = Literal["official", "diffusers"]
@@ -128,9 +129,9 @@ def load_dit(model: WorldModel, path: Path) -> None:
             positions than the model's.
     """
     tensors = read_tensors(path)
-    _check_constants(model, path)
-    layout = dit_layout(model, find_naming(tensors))
-    fill(model, tensors, layout, optional=_optional_names(model, tensors))
+    _check_constants(model, tensors)
+    layout, optional = _find_layout(model, tensors)
+    fill(model, tensors, layout, optional=optional)
     for name in model.condition_streams:
         if STREAMS[name].source == "latents" and layout[f"stream_inputs.{name}.kernel"].keys[0] not in tensors:
             model.stream_inputs[name] = jax.tree.map(jnp.copy, model.patch_embedding)
@@ -139,29 +140,30 @@ def load_dit(model: WorldModel, path: Path) -> None:
             embedding.set_value(jnp.zeros_like(embedding.get_value()))
 
 
-def check_dit(model: WorldModel, path: Path) -> None:
-    """Raise what `load_dit` would, without reading a tensor; `model` may be of `nnx.eval_shape`."""
-    tensors = read_tensors(path)
-    _check_constants(model, path)
-    check_fit(model, tensors, dit_layout(model, find_naming(tensors)), optional=_optional_names(model, tensors))
+def check_dit(model: WorldModel, tensors: Tensors) -> None:
+    """Raise what `load_dit` would of these tensors, without reading one; `model` may be of `nnx.eval_shape`."""
+    _check_constants(model, tensors)
+    layout, optional = _find_layout(model, tensors)
+    check_fit(model, tensors, layout, optional=optional)
 
 
-def _check_constants(model: WorldModel, path: Path) -> None:
+def _check_constants(model: WorldModel, tensors: Tensors) -> None:
     """Raise ConfigError if config.json beside the weights says another eps or base of positions than the model's."""
-    config, size = read_config(path), model.size
+    config, size = tensors.config, model.size
     for key, field in (("eps", "epsilon"), (ROPE_BASE, "rotary_base")):
         theirs, ours = config.get(key, getattr(size, field)), getattr(size, field)
         if not isinstance(theirs, int | float) or not math.isclose(theirs, ours, rel_tol=1e-6):
             raise ConfigError(
-                f"the weights {path} were made with {key} = {theirs!r} (config.json), the model's size has {field} = {ours:g}; "
-                f"choose a size with that {field} (MODELS in xew/model/network/dit.py)."
+                f"the weights {tensors.source} were made with {key} = {theirs!r} (config.json), the model's size has {field} = "
+                f"{ours:g}; choose a size with that {field} (MODELS in xew/model/network/dit.py)."
             )
 
 
-def _optional_names(model: WorldModel, tensors: Tensors) -> tuple[str, ...]:
-    """Leaves that a checkpoint may lack (all that Wan does not have) and keys that it may have beside."""
+def _find_layout(model: WorldModel, tensors: Tensors) -> tuple[Layout, tuple[str, ...]]:
+    """The layout of a checkpoint; and leaves that it may lack (all that Wan does not have) and keys that it may have beside."""
     naming = find_naming(tensors)
-    return (*(dit_layout(model, naming).keys() - wan_layout(model, naming).keys()), *NOT_OURS)
+    layout = dit_layout(model, naming)
+    return layout, (*(layout.keys() - wan_layout(model, naming).keys()), *NOT_OURS)
 
 
 def load_dit_params(graph: nnx.GraphDef, params: Any, path: Path) -> Any:

@@ -1,7 +1,15 @@
-"""Checkpoints of a run (Orbax): written in the background, read on whatever devices there are."""
+"""Checkpoints of a run (Orbax): written in the background, read on whatever devices there are, as they were written.
 
+Reads, writes <out>/checkpoints/STEP, and <out>/sums/STEP.json: SHA-256 of each of its files, once it is complete
+
+A checkpoint whose sums were not written yet, because the run was killed just then, or which an earlier version made, is read
+without them.
+"""
+
+import contextlib
 import functools
-from collections.abc import Sequence
+import json
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +22,10 @@ import orbax.checkpoint as ocp
 from flax import nnx
 
 from xew.config import ConfigError
+from xew.files import file_digest, read_json, write_text
 from xew.model.devices.sharding import place_like
 from xew.model.network.lora import apply_lora, init_lora
-from xew.model.runs.folder import KeptStep, trace_run
-from xew.model.runs.sums import damaged, find_damage, note_sums
+from xew.model.runs.lineage import KeptStep, trace_run
 from xew.model.settings.network import Network
 
 SUMMING = ThreadPoolExecutor(1, "sums")
@@ -43,6 +51,17 @@ def open_checkpoints(out: Path, keep: int = 1) -> ocp.CheckpointManager:
     """The checkpoints of a run, written in the background."""
     options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=True)
     return ocp.CheckpointManager((out / "checkpoints").absolute(), options=options)
+
+
+@contextlib.contextmanager
+def write_checkpoints(out: Path, keep: int = 1) -> Iterator[ocp.CheckpointManager]:
+    """Open the checkpoints of a run that writes them; at the end of the block all are complete and have their sums."""
+    try:
+        with open_checkpoints(out, keep) as checkpoints:
+            yield checkpoints
+    finally:
+        if jax.process_index() == 0:
+            note_sums(out)
 
 
 def save_state(checkpoints: ocp.CheckpointManager, state: TrainState, data_position: dict[str, Any]) -> None:
@@ -100,17 +119,20 @@ def restore_params(out: Path, like: Any, step: int | None = None) -> tuple[Any, 
     return restore_sum(trace_run(out, step), like)
 
 
-def load_params(run: Path, network: Network, step: int | None = None) -> tuple[Any, int]:
-    """The parameters of a run's network on the first device, as `restore_params`, in the types of training; and their step.
+def load_params(
+    run: Path, network: Network, step: int | None = None, sharding: jax.sharding.Sharding | None = None
+) -> tuple[Any, int]:
+    """The parameters of a run's network, as `restore_params`, in the types of training; and their step.
 
     Args:
         run: folder of the run.
         network: that of its config.
         step: of the checkpoint; the latest where left out.
+        sharding: where they are to lie; on the first device where left out.
     """
-    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    place = sharding or jax.sharding.SingleDeviceSharding(jax.devices()[0])
     shapes = nnx.state(nnx.eval_shape(network.create), nnx.Param)
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), shapes)
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), shapes)
     return restore_params(run, like, step)
 
 
@@ -180,3 +202,68 @@ def _is_finite(leaf: Any) -> bool:
 def _abstract(tree: Any) -> Any:
     """Keep only shapes, types and this machine's placement: Orbax would otherwise look for the devices that saved."""
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding), tree)
+
+
+def note_sums(out: Path) -> None:
+    """Write the sums of all complete checkpoints of a run that have none yet, and remove those of checkpoints that are gone."""
+    steps = {folder.name: folder for folder in (out / "checkpoints").glob("*") if folder.name.isdecimal()}
+    for name, folder in steps.items():
+        path = _sums(out, int(name))
+        if path.exists():
+            continue
+        try:
+            sums = {file.relative_to(folder).as_posix(): file_digest(file) for file in _files(folder)}
+            write_text(path, json.dumps(sums, indent=1, sort_keys=True) + "\n")
+        except OSError:  # it is being replaced by a later one, or the disk is full: then it is read without sums
+            continue
+    for path in (out / "sums").glob("*.json"):
+        if path.stem not in steps:
+            path.unlink(missing_ok=True)
+
+
+def find_damage(out: Path, step: int, items: Collection[str]) -> str:
+    """What is wrong with the files of a checkpoint by its sums; '' where nothing is, or where there are no sums.
+
+    Args:
+        out: folder of the run.
+        step: of the checkpoint.
+        items: those of its parts that are read; other files directly in its folder count too.
+    """
+    folder, path = out / "checkpoints" / str(step), _sums(out, step)
+    if not path.exists():
+        return ""
+    try:
+        sums = read_json(path)
+        if not isinstance(sums, dict) or not all(isinstance(digest, str) for digest in sums.values()):
+            raise ValueError("expected digests by the names of files")
+    except (OSError, ValueError) as error:
+        return f"its sums {path} cannot be read: {error}"
+    for name, digest in sums.items():
+        if "/" in name and name.partition("/")[0] not in items:
+            continue
+        try:
+            found = file_digest(folder / name)
+        except OSError:
+            return f"{name} is missing"
+        if found != digest:
+            return f"{name} has other bytes than were written"
+    return ""
+
+
+def damaged(out: Path, step: int, items: Collection[str], what: object) -> ConfigError:
+    """The error for a damaged checkpoint, in one line: what is wrong with which, and the last one that is whole."""
+    steps = sorted((int(path.name) for path in (out / "checkpoints").glob("*") if path.name.isdecimal()), reverse=True)
+    whole = [other for other in steps if other != step and _sums(out, other).exists() and not find_damage(out, other, items)]
+    offer = "no other is known to be whole: copy the run again, or train it anew with --overwrite"
+    if whole:
+        offer = f"step {whole[0]} is whole: move that folder away to go on from it, or read it by --checkpoint {whole[0]}"
+    reason = " ".join(str(what).split())[:200] or type(what).__name__
+    return ConfigError(f"{out / 'checkpoints' / str(step)}: the checkpoint of step {step} is damaged ({reason}); {offer}.")
+
+
+def _sums(out: Path, step: int) -> Path:
+    return out / "sums" / f"{step}.json"
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.rglob("*") if file.is_file())

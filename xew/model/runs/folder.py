@@ -1,4 +1,4 @@
-"""Run folders: what they hold, who may write them, and the config and codec that they were made with.
+"""Run folders: what they hold, and the config and codec that they were made with.
 
 <out>/config.yaml       the resolved config, itself a valid input
 <out>/codec/            the codec that the latents were made with
@@ -10,220 +10,12 @@
 <out>/metrics.jsonl     and TensorBoard's event files
 """
 
-import dataclasses
-import json
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
 
-import jax
-from jax.experimental import multihost_utils
-
-from xew import config
 from xew.config import ConfigError
-from xew.files import RUN_FILES, RUN_MARK, checkpoint_time, is_run, read_json, remove_written, write_text
-from xew.model.codecs.codec import codec_class
+from xew.model.codecs.codec import RUN_CODEC, RUN_REMEDY, codec_class, load_kept_codec
 from xew.model.codecs.contract import Codec, CodecSettings
 from xew.model.experiment import Experiment, load_recorded
-from xew.model.settings.settings import AdaptSettings
-
-T = TypeVar("T")
-
-START = "start.json"
-"""Name of the file that says, in an adapted run, which checkpoint of which run it started from."""
-
-
-FREE_TO_CHANGE = (
-    "data",
-    "cache",
-    "out",
-    "codec.chunk",
-    "codec.weights",
-    "mesh.",
-    "model.attention",
-    "model.remat",
-    "model.unroll",
-    "train.accumulate",
-    "train.epochs",
-    "train.seconds",
-    "train.steps",
-    "train.log_every",
-    "train.save_every",
-    "train.sample_every",
-    "train.keep_checkpoints",
-    "pictures.device_share",
-    "pictures.host_gb",
-    "report.",
-    "rollout.",
-)
-"""Settings that a resumed run may change; any other would make it another experiment."""
-
-
-def begin_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite: bool) -> None:
-    """Make the run folder ready, by the first process; the others wait for it."""
-    out, start = experiment.out, experiment.adapt.start_from
-    if jax.process_index() == 0:
-        prepare_run(experiment, codec, resume=resume, overwrite=overwrite)
-        if start is not None and not (resume and (out / START).exists()):
-            note_start(out, start)
-    if jax.process_count() > 1:
-        multihost_utils.sync_global_devices("run folder")
-
-
-def note_start(out: Path, run: Path) -> None:
-    """Write into a new run which checkpoint of another run it starts from."""
-    step = max((int(path.name) for path in (run / "checkpoints").glob("*") if path.name.isdecimal()), default=None)
-    if step is None:
-        raise ConfigError(f"{run} has no checkpoint to start from; train it: python -m xew.model.train CONFIG --out {run}")
-    note = {"run": str(run), "step": step, "saved": checkpoint_time(run, step)}
-    write_text(out / START, json.dumps(note, indent=1) + "\n")
-
-
-def prepare_run(experiment: Experiment, codec: Codec, *, resume: bool, overwrite: bool) -> None:
-    """Make a run folder ready, new, continued or replaced, and keep config and codec in it.
-
-    Raises:
-        ConfigError: it holds a run and neither was asked, or it would be continued with another config or codec.
-    """
-    out = experiment.out
-    claim_run(out, experiment, load_recorded, resume=resume, overwrite=overwrite)
-    _check_same_codec(experiment.codec, codec, out)
-    try:
-        (out / "codec").mkdir(exist_ok=True)
-        codec.save(out / "codec")
-    except OSError as error:
-        raise ConfigError(f"cannot write the run {out}: {error}; choose another --out.") from error
-
-
-def check_one_of(resume: bool, overwrite: bool) -> None:
-    """Raise ConfigError where a run would be both continued and replaced."""
-    if resume and overwrite:
-        raise ConfigError("--resume continues the run in --out, --overwrite replaces it; give one of them.")
-
-
-def claim_run(out: Path, settings: T, read: Callable[[Path], T], *, resume: bool, overwrite: bool) -> None:
-    """Make a folder ready for a run with these settings, new, continued or replaced, and write them there as config.yaml.
-
-    Args:
-        read: reads settings of this kind.
-
-    Raises:
-        ConfigError: it holds a run and neither was asked, or it would be continued with another config.
-    """
-    saved = out / "config.yaml"
-    if out.exists() and not out.is_dir():
-        raise ConfigError(f"{out} is a file; choose another --out.")
-    if saved.exists() and overwrite:
-        _remove_run(out)
-    elif saved.exists() and resume:
-        _check_same(read(saved), settings, out)
-    elif saved.exists():
-        raise ConfigError(
-            f"{out} holds a run already; continue it with --resume, replace it with --overwrite, or choose --out."
-        )
-    elif out.exists() and any(out.iterdir()):
-        raise ConfigError(f"{out} is not empty and holds no run; choose another --out.")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / RUN_MARK).touch()
-        config.save(settings, saved)
-    except OSError as error:
-        raise ConfigError(f"cannot write the run {out}: {error}; choose another --out.") from error
-
-
-def _remove_run(out: Path) -> None:
-    """Remove what trainings have written into the folder of a run. Raises ConfigError if it is none, or holds anything else."""
-    if not is_run(out):
-        raise ConfigError(f"{out} has a config.yaml but holds no run, so it is not replaced; choose another --out.")
-    try:
-        left = remove_written(out, RUN_FILES)
-    except OSError as error:
-        raise ConfigError(f"cannot replace the run {out}: {error}; choose another --out.") from error
-    if left:
-        shown = ", ".join(str(path.relative_to(out)) for path in left[:3])
-        print(f"{out}: the run is replaced; what is not its own stays there ({shown})")
-
-
-def _check_same_codec(settings: CodecSettings, codec: Codec, out: Path) -> None:
-    """Raise ConfigError where the codec is another. A file of weights may have moved, but must hold the same."""
-    if (out / "codec").exists() and load_run_codec(out, settings).hash != codec.hash:
-        raise ConfigError(f"{out} was begun with another codec than the config's now; set it back, or choose --out.")
-
-
-def check_start(experiment: Experiment) -> None:
-    """Raise ConfigError unless the run to adapt, if any, is another one, of the same network on the same clips and codec."""
-    run = experiment.adapt.start_from
-    if run is None:
-        return
-    if run.resolve() == experiment.out.resolve():
-        raise ConfigError(f"out is {experiment.out}, the run that adapt.start_from names; choose another --out.")
-    _check_same_network(load_run_config(run), experiment, run)
-
-
-@dataclass(frozen=True)
-class KeptStep:
-    """A checkpoint of a run."""
-
-    run: Path
-    step: int | None
-    """Step; the latest where None."""
-    adapt: AdaptSettings
-    """Adaptation of that run; with LoRA the checkpoint holds corrections, else the whole network."""
-
-
-def trace_run(out: Path, step: int | None = None) -> list[KeptStep]:
-    """The checkpoints that a run's network is the sum of: one of a whole network, then corrections, its own last.
-
-    Raises:
-        ConfigError: what the run was adapted from has gone or was trained anew since, or the note of it is lost.
-    """
-    own = KeptStep(out, step, load_run_config(out).adapt)
-    return [*trace_start(out, own.adapt.start_from), own] if own.adapt.lora_rank else [own]
-
-
-def trace_start(out: Path, run: Path | None) -> list[KeptStep]:
-    """The checkpoints that make the network which an adapted run started from, as noted when it began.
-
-    Args:
-        out: the adapted run.
-        run: the run that it started from.
-
-    Raises:
-        ConfigError: they have gone or were trained anew since, or a note is lost.
-    """
-    kept: list[KeptStep] = []
-    while run is not None:
-        kept.insert(0, _read_start(out, run))
-        out, adapt = run, kept[0].adapt
-        run = adapt.start_from if adapt.lora_rank else None
-    return kept
-
-
-@dataclass(frozen=True)
-class _StartNote:
-    """What start.json says."""
-
-    run: str
-    step: int
-    saved: int | None
-
-
-def _read_start(out: Path, run: Path) -> KeptStep:
-    """Read which checkpoint of a run another was adapted from. Raises ConfigError if it has gone, or the note is lost."""
-    try:
-        note = config.parse(_StartNote, read_json(out / START), str(out / START))
-    except (OSError, ValueError, ConfigError) as error:
-        raise ConfigError(
-            f"{out} does not tell from which checkpoint of {run} it was adapted ({error}); copy the whole run, or "
-            "adapt again with --overwrite."
-        ) from error
-    if not (run / "config.yaml").exists() or checkpoint_time(run, note.step) != note.saved:
-        raise ConfigError(
-            f"{out} was adapted from step {note.step} of {run}, which is not there any more or was trained anew; "
-            "put that run back (a longer train.keep_checkpoints keeps it), or adapt again with --overwrite."
-        )
-    return KeptStep(run, note.step, load_run_config(run).adapt)
 
 
 def load_run(out: Path) -> tuple[Experiment, Codec]:
@@ -234,63 +26,11 @@ def load_run(out: Path) -> tuple[Experiment, Codec]:
 
 def load_run_config(out: Path) -> Experiment:
     """The config that a run was trained with. Raises ConfigError if the folder holds none."""
-    _demand_run(out)
-    return load_recorded(out / "config.yaml")
-
-
-def _demand_run(out: Path) -> None:
     if not (out / "config.yaml").exists():
         raise ConfigError(f"{out} holds no run; train one: python -m xew.model.train CONFIG --out {out}")
+    return load_recorded(out / "config.yaml")
 
 
 def load_run_codec(out: Path, settings: CodecSettings) -> Codec:
     """The codec, of these settings, that a run was trained with. Raises ConfigError if the folder lacks it."""
-    try:
-        return load_kept_codec(settings, out / "codec", "copy the whole run again, or train again")
-    except FileNotFoundError as error:
-        raise ConfigError(f"{out} lacks its codec ({error.filename}); copy the whole run, or train again.") from error
-
-
-def load_kept_codec(settings: CodecSettings, folder: Path, remedy: str) -> Codec:
-    """The codec, of these settings, that is kept in a folder.
-
-    Raises:
-        FileNotFoundError: it lacks a file.
-        ConfigError: it is damaged; `remedy` says what to do.
-    """
-    try:
-        return codec_class(settings).load(folder)
-    except (FileNotFoundError, ConfigError):
-        raise
-    except Exception as error:  # zipfile, zlib, NumPy and safetensors each have their own
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ConfigError(f"{folder} is damaged ({reason}); {remedy}.") from error
-
-
-def _check_same(saved: Any, asked: Any, out: Path) -> None:
-    """Raise ConfigError where settings that may not change differ."""
-    before, after = dict(_flatten(saved)), dict(_flatten(asked))
-    changed = [key for key in after if before[key] != after[key] and not key.startswith(FREE_TO_CHANGE)]
-    if changed:
-        found = "; ".join(f"{key} was {before[key]!r}, is {after[key]!r}" for key in changed)
-        raise ConfigError(f"{out} was begun with another config ({found}); set it back, use --overwrite, or choose --out.")
-
-
-def _check_same_network(source: Any, asked: Any, run: Path) -> None:
-    """Raise ConfigError unless the network of a run can be adapted as the one asked for: on the same clips and codec."""
-    before, after = dict(_flatten(source)), dict(_flatten(asked))
-    compared = [key for key in after if key.startswith(("clip.", "codec.", "model.")) and not key.startswith(FREE_TO_CHANGE)]
-    changed = [key for key in compared if before[key] != after[key] and key not in ("model.dtype", "model.weights")]
-    if changed:
-        found = "; ".join(f"{key} is {before[key]!r} there, {after[key]!r} here" for key in changed)
-        raise ConfigError(f"the network of {run} cannot be adapted as another one ({found}); make them agree.")
-
-
-def _flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Name every field of nested settings, as ('train.steps', value)."""
-    for field in dataclasses.fields(settings):
-        value = getattr(settings, field.name)
-        if dataclasses.is_dataclass(value):
-            yield from _flatten(value, f"{prefix}{field.name}.")
-        else:
-            yield prefix + field.name, value
+    return load_kept_codec(codec_class(settings), out / RUN_CODEC, RUN_REMEDY)

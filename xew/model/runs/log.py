@@ -22,7 +22,7 @@ from tensorboard.plugins.hparams.summary_v2 import hparams_pb
 from tensorboard.plugins.text.summary_v2 import text_pb
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
-from xew.files import demand_regular, replacing
+from xew.files import demand_regular, write_text
 
 FRAME_MILLISECONDS = 120
 
@@ -36,15 +36,17 @@ class RunLog:
     """
 
     def __init__(self, folder: Path, step: int) -> None:
+        path, config = folder / "metrics.jsonl", folder / "config.yaml"
+        before = demand_regular(path).read_text(errors="replace") if path.exists() else None
+        settings = demand_regular(config).read_text() if config.exists() else None
         self.events = EventFileWriter(str(folder))
-        path = folder / "metrics.jsonl"
-        if path.exists():
-            _keep_until(path, step)
+        if before is not None:
             self.events.add_event(Event(wall_time=time.time(), step=step + 1, session_log=SessionLog(status=SessionLog.START)))
+        if settings is not None:
+            self._settings(step, settings)
+        if before is not None and (kept := _keep_until(before, step)) != before:
+            write_text(path, kept)
         self.lines = path.open("a")
-        config = folder / "config.yaml"
-        if config.exists():
-            self._settings(step, demand_regular(config).read_text())
 
     def _settings(self, step: int, text: str) -> None:
         """Log a config, given as YAML, as text and as HParams."""
@@ -87,13 +89,9 @@ def flatten_settings(content: Any, path: str = "") -> dict[str, bool | float | s
     return {path: float(content) if isinstance(content, int | float) else str(content)}
 
 
-def _keep_until(path: Path, step: int) -> None:
-    """Leave out of metrics.jsonl the lines of later steps, and those that were cut off or damaged."""
-    lines = demand_regular(path).read_text(errors="replace").splitlines(keepends=True)
-    kept = [line for line in lines if line.endswith("\n") and _step_of(line) <= step]
-    if kept != lines:
-        with replacing(path) as temporary:
-            temporary.write_text("".join(kept))
+def _keep_until(text: str, step: int) -> str:
+    """Leave out of the text of metrics.jsonl the lines of later steps, and those that were cut off or damaged."""
+    return "".join(line for line in text.splitlines(keepends=True) if line.endswith("\n") and _step_of(line) <= step)
 
 
 def _step_of(line: str) -> float:

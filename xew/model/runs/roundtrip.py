@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from xew.config import ConfigError
 from xew.model.codecs.contract import Codec
 from xew.model.experiment import Experiment
 from xew.model.runs.folder import load_run
@@ -40,11 +39,6 @@ def open_roundtrip(run: Path) -> RunRoundtrip:
     """The codec of a run as a function of video to video.
 
     Raises:
-        ConfigError: there is no such run.
+        ConfigError: there is no such run, or it has lost its codec.
     """
-    try:
-        return RunRoundtrip(*load_run(run))
-    except FileNotFoundError as error:
-        raise ConfigError(
-            f"{run} is no run with a codec ({error.filename}); name a folder that xew.model.train wrote."
-        ) from error
+    return RunRoundtrip(*load_run(run))

@@ -8,9 +8,8 @@ from typing import Any
 
 import jax
 
-from xew.model.runs.checkpoint import open_checkpoints
+from xew.model.runs.checkpoint import write_checkpoints
 from xew.model.runs.log import RunLog
-from xew.model.runs.sums import note_sums
 
 
 @dataclass(frozen=True)
@@ -37,14 +36,10 @@ def open_session(out: Path, keep: int) -> Iterator[Session]:
         out: folder of the run.
         keep: number of checkpoints to keep.
     """
-    try:
-        with open_checkpoints(out, keep) as checkpoints:
-            log = RunLog(out, checkpoints.latest_step() or 0) if jax.process_index() == 0 else None
-            try:
-                yield Session(out, checkpoints, log)
-            finally:
-                if log is not None:
-                    log.close()
-    finally:
-        if jax.process_index() == 0:
-            note_sums(out)
+    with write_checkpoints(out, keep) as checkpoints:
+        log = RunLog(out, checkpoints.latest_step() or 0) if jax.process_index() == 0 else None
+        try:
+            yield Session(out, checkpoints, log)
+        finally:
+            if log is not None:
+                log.close()

@@ -3,8 +3,9 @@
 Reads  episodes (first frame, instruction, commands)
 Writes uint8 video at the model's size
 
-Long episodes are predicted in chunks; the last predicted frame of one is the reference of the next. A batch of episodes is cut
-over the devices of the mesh that the parameters lie on, and every chunk runs on them from frames to frames.
+Long episodes are predicted in chunks; the last predicted frame of one is the reference of the next, and the noise of each
+depends on the seed, the episode and the chunk. A batch of episodes is cut over the devices of the mesh that the parameters
+lie on, and every chunk runs on them from frames to frames.
 """
 
 import functools

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from typing import Any, Protocol
 
-from xew.config import ConfigError, check_finite, pick
+from xew.config import ConfigError, pick
 from xew.model.codecs.codec import codec_class
 from xew.model.codecs.contract import CodecSettings
 from xew.model.conditions import Condition
@@ -90,7 +90,6 @@ def check_experiment(experiment: Settings, source: str) -> None:
 
 
 def _check_choices(experiment: Settings, source: str) -> None:
-    check_finite(experiment, source)
     check_least(LEAST, experiment, source)
     codec_class(experiment.codec).check(experiment.codec)
     pick(SAMPLERS, experiment.rollout.sampler, "sampler")

@@ -1,16 +1,16 @@
-"""The network of an experiment: everything that making it needs."""
+"""The network of an experiment: everything that making it needs, and whether it can be made."""
 
 from dataclasses import dataclass
 
 import jax.numpy as jnp
 from flax import nnx
 
-from xew.model.network.dit import (
-    ModelSize,
-    WorldModel,
-)
+from xew.model.network.blocks import choose_attention
+from xew.model.network.dit import ModelSize, WorldModel
+from xew.model.network.dit_layouts import check_dit
 from xew.model.settings.settings import ModelSettings
 from xew.model.video.frames import TEMPORAL_FACTOR
+from xew.model.weights.reading import read_tensors
 
 
 @dataclass(frozen=True)
@@ -51,3 +51,11 @@ class Network:
             prediction=settings.prediction,
             rngs=nnx.Rngs(self.seed),
         )
+
+
+def check_network(network: Network) -> None:
+    """Raise ConfigError if the network cannot be computed here as asked, or its published weights do not fit."""
+    settings = network.settings
+    if settings.weights is not None:
+        check_dit(nnx.eval_shape(network.create), read_tensors(settings.weights))
+    choose_attention(settings.attention, network.size.head_dim, jnp.dtype(settings.dtype))

@@ -1,8 +1,9 @@
 """The parts that an experiment is resolved into, each for one place that takes it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import optax
@@ -13,9 +14,9 @@ from xew.model.codecs.vae import VaeSize
 from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition, list_conditions
 from xew.model.network.dit import STREAMS, token_grid
 from xew.model.settings.network import Network
-from xew.model.settings.settings import AdaptSettings, Clip, ModelSettings, TrainSettings
+from xew.model.settings.settings import Clip, ModelSettings, TrainSettings
 from xew.model.text.instructions import TextEncoder, TextSource, encode_instructions
-from xew.protocol import Split
+from xew.protocol import Split, validation_split
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,8 @@ class Encoding:
 
     inputs: ClipInputs
     codec: CodecSettings
+    kind: type[Any]
+    """Class of codec that the settings name, with what `Codec` asks."""
     folder: Path
     data: Path
     start_from: Path | None
@@ -79,15 +82,16 @@ class Encoding:
 
 @dataclass(frozen=True)
 class EpisodeChoice:
-    """Which episodes of a data set a training reads."""
+    """Which episodes of a data set a training reads; every robot by its own key."""
 
-    split: Split
-    adapt: AdaptSettings = field(default_factory=AdaptSettings)
-    """Adaptation, with every robot by its own key."""
+    robots: tuple[str, ...]
+    """Robots whose training episodes are learned from."""
+    shots: int = 0
+    """Number of episodes of each task and robot in an adaptation, which needs them of all robots; 0 takes all there are."""
     replay: tuple[str, ...] = ()
     """Robots whose training episodes are replayed, in an adaptation with replay."""
-    samples: bool = False
-    """Whether sample videos are drawn."""
+    samples: Mapping[str, str] = field(default_factory=dict)
+    """Roles of the robots that sample videos are drawn of: seen, unseen or target."""
 
 
 @dataclass(frozen=True)
@@ -105,3 +109,15 @@ def pick_conditions(settings: ModelSettings) -> list[Condition]:
     """Look up the conditions of action, embodiment and history. Raises ConfigError for a name that does not exist."""
     action, embodiment = pick(ACTIONS, settings.action, "action", (tuple,)), pick(CONDITIONS, settings.embodiment, "embodiment")
     return [*list_conditions(action), *list_conditions(embodiment), *([HISTORY] if settings.history else [])]
+
+
+def sample_roles(split: Split, targets: Iterable[str] = ()) -> dict[str, str]:
+    """Roles of the robots that samples are drawn of: those by which choices are made (`validation_split`), and their targets.
+
+    Args:
+        split: of the training; of an adapted run's, that of the run that it started from.
+        targets: robots that are adapted to.
+    """
+    chosen = validation_split(split)
+    roles = dict.fromkeys(chosen.train_robots, "seen") | dict.fromkeys(chosen.held_out_robots, "unseen")
+    return roles | dict.fromkeys(targets, "target")

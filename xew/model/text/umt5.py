@@ -20,8 +20,9 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Bool, Float, Int
 
+from xew.model.weights.filling import fill
 from xew.model.weights.layout import Layout, Source
-from xew.model.weights.reading import fill, read_tensors
+from xew.model.weights.reading import read_tensors
 
 EPSILON = 1e-6
 

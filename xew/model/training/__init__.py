@@ -3,4 +3,4 @@
 The same numbers on one device and on many, interrupted or not.
 """
 
-__all__ = ["data", "flops", "loop", "memory", "samples", "start", "step"]
+__all__ = ["data", "flops", "loop", "memory", "order", "samples", "start", "step"]

@@ -1,4 +1,4 @@
-"""Batches for training: clips of the latent cache in an order that a resumed run continues.
+"""Samples for training: clips of the latent cache with what goes with them; order.py makes batches of them.
 
 Reads  the latent cache
 Writes `Batch`
@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import grain
 import jax
 import numpy as np
 
@@ -19,13 +18,8 @@ from xew.model.cache.scales import Scale, apply_scales, load_scales
 from xew.model.cache.store import LatentCache, open_cache
 from xew.model.codecs.contract import latent_frames
 from xew.model.settings.parts import ClipInputs, Encoding, Instructions
-from xew.model.settings.settings import count_replayed
 from xew.model.text.instructions import VOCABULARY
 from xew.model.video.frames import TEMPORAL_FACTOR
-
-PASSES = 2**40
-"""Passes over the samples. Training ends before, and Grain, which rounds the length of an endless data set up to one more
-than Python can index, can count them."""
 
 
 @jax.tree_util.register_dataclass
@@ -114,38 +108,6 @@ def valid_frames(left: int, frames: int) -> np.ndarray:
     """Valid mask [t] float32 of a clip's latent frames that show any of the `left` frames of its episode from there on."""
     firsts = np.maximum(np.arange(latent_frames(frames)) * TEMPORAL_FACTOR - (TEMPORAL_FACTOR - 1), 0)
     return (firsts < left).astype(np.float32)
-
-
-def make_dataset(
-    source: ClipSource, batch: int, seed: int, replay: float = 0.0, own: np.ndarray | None = None
-) -> grain.IterDataset:
-    """Make endless shuffled batches; the iterator's get_state and set_state carry its position.
-
-    The order is that of whole batches, of which each process loads its own samples, so that neither the numbers nor the
-    position depend on how many processes there are.
-
-    Args:
-        batch: samples over all processes.
-        replay: part of each batch that comes from the source's replayed episodes.
-        own: [b] numbers of the samples of each batch that this process loads; all where left out.
-    """
-    old = count_replayed(batch, replay)
-    fresh = _shuffle(range(source.fresh), seed, batch - old)
-    again = _shuffle(range(source.fresh, len(source)), seed + 1, old) if old else None
-    own = np.arange(batch) if own is None else own
-
-    def load(number: int, indices: np.ndarray) -> Batch:
-        if again is not None:
-            indices = np.concatenate([indices, again[number]])
-        return stack([source[int(index)] for index in indices[own]])
-
-    dataset = fresh.map_with_index(load)
-    return dataset.to_iter_dataset(grain.ReadOptions(num_threads=2, prefetch_buffer_size=4))
-
-
-def _shuffle(samples: range, seed: int, count: int) -> grain.MapDataset:
-    """Make batches [count] of sample numbers without end; each pass over the samples has its own order."""
-    return grain.MapDataset.source(samples).seed(seed).shuffle().repeat(PASSES).batch(count)
 
 
 def stack(examples: Sequence[Batch]) -> Batch:

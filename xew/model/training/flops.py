@@ -1,4 +1,4 @@
-"""How much arithmetic a training step does, counted on the model."""
+"""How much arithmetic a training step does, counted on the model, and how much devices can do at most."""
 
 from xew.model.network.dit import flops
 from xew.model.settings.parts import ClipInputs, Learning

@@ -3,4 +3,4 @@
 A module's `Layout` says for each of its leaves which tensors it comes from and how their axes are ordered.
 """
 
-__all__ = ["layout", "reading", "writing"]
+__all__ = ["filling", "layout", "reading", "writing"]

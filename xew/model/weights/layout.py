@@ -3,7 +3,7 @@
 Reads  a module and a `Layout`
 Writes its leaves by path, and the keys and shapes of the tensors that they come from
 
-reading.py and writing.py go in either direction with it.
+filling.py and writing.py go in either direction with it.
 """
 
 from collections.abc import Callable, Iterable, Mapping

@@ -1,29 +1,27 @@
-"""Checkpoints of other projects into our modules.
+"""Checkpoints of other projects: their files, opened as `Tensors` by key.
 
-Reads  .safetensors, *.safetensors.index.json, a folder of either, .pth and .pt (PyTorch state dicts, `weights_only`)
-Writes the leaves of a module, by its `Layout`
+Reads  .safetensors, *.safetensors.index.json, a folder of either, .pth and .pt (PyTorch state dicts, `weights_only`), and
+       config.json beside them
+Writes `Tensors`, each of which is read when it is asked for
 
-Tensors are read one at a time, so that a checkpoint of 20 GB is never held twice, and nothing is ever unpickled freely.
+Nothing is ever unpickled freely.
 """
 
 import pickle
 import zipfile
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-import jax
 import ml_dtypes
 import numpy as np
-from flax import nnx
 from jaxtyping import Shaped
 from safetensors import SafetensorError, safe_open
 
 from xew.config import ConfigError
 from xew.files import read_json
-from xew.model.weights.layout import AXES, Layout, Source, list_some, module_leaves, tensor_shape
+from xew.model.weights.layout import list_some
 
 PREFIXES = ("pipe.dit.", "pipe.", "model.diffusion_model.", "model.", "module.")
 """Names of wrappers in front of keys, taken off (the longest that fits)."""
@@ -68,6 +66,23 @@ class Tensors(Mapping):
         """Shape of a tensor, without reading it."""
         return self.entries[key].shape
 
+    @property
+    def config(self) -> dict[str, Any]:
+        """What config.json beside the checkpoint says, as diffusers writes one; nothing where there is none.
+
+        Raises ConfigError if it is broken.
+        """
+        config = (self.source if self.source.is_dir() else self.source.parent) / "config.json"
+        if not config.exists():
+            return {}
+        try:
+            content = read_json(config)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{config} cannot be read: {error}; get it again, or take it away.") from error
+        if not isinstance(content, dict):
+            raise ConfigError(f"{config} holds a {type(content).__name__}, expected keys and values; get it again.")
+        return content
+
 
 def read_tensors(path: Path) -> Tensors:
     """Open a checkpoint: numpy arrays by key (bfloat16 as of ml_dtypes), read lazily; wrappers' prefixes are taken off.
@@ -86,108 +101,6 @@ def read_tensors(path: Path) -> Tensors:
         raise ConfigError(f"{path} is no whole safetensors file ({error}); download it again.") from error
     except OSError as error:
         raise ConfigError(f"cannot read the weights {path}: {error.strerror or error}.") from error
-
-
-def read_config(path: Path) -> dict[str, Any]:
-    """What config.json beside a checkpoint says, as diffusers writes one; nothing where there is none.
-
-    Args:
-        path: as for `read_tensors`.
-
-    Raises:
-        ConfigError: it is broken.
-    """
-    config = (path if path.is_dir() else path.parent) / "config.json"
-    if not config.exists():
-        return {}
-    try:
-        content = read_json(config)
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{config} cannot be read: {error}; get it again, or take it away.") from error
-    if not isinstance(content, dict):
-        raise ConfigError(f"{config} holds a {type(content).__name__}, expected keys and values; get it again.")
-    return content
-
-
-def fill(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Collection[str] = ()) -> None:
-    """Fill the leaves of a module in place from a checkpoint, in each leaf's own type and on its own devices.
-
-    Leaves that the layout does not name keep their values. An abstract module (of `nnx.eval_shape`) becomes a real one
-    but for such leaves.
-
-    Args:
-        module: whose leaves are filled.
-        tensors: of the checkpoint, from `read_tensors`.
-        layout: where each leaf comes from.
-        optional: patterns (as "flow_stream.*") of leaves that the checkpoint may lack, and of its keys that may be left.
-
-    Raises:
-        ConfigError: tensors are missing, left over or misshapen; the first few are named. Nothing has been filled then.
-    """
-    wanted = check_fit(module, tensors, layout, optional=optional)
-    leaves = module_leaves(module, layout)
-    for path, source in wanted.items():
-        variable = leaves[path]
-        value = _leaf_value(tensors, source, variable.shape, np.dtype(variable.dtype))
-        if jax.numpy.issubdtype(value.dtype, jax.numpy.inexact) and not np.isfinite(value).all():
-            raise ConfigError(f"{tensors.source}: {source.keys[0]} holds NaN or infinite numbers; get the file again.")
-        variable.set_value(_place(value, variable.get_value()))
-
-
-def check_fit(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Collection[str] = ()) -> Layout:
-    """The leaves that `fill` would fill; raises its errors without reading a tensor."""
-    wanted = {path: source for path, source in layout.items() if not _keeps_its_value(path, source, tensors, optional)}
-    _check(module_leaves(module, layout), tensors, wanted, _foreign_keys(tensors, layout, optional))
-    return wanted
-
-
-def _keeps_its_value(path: str, source: Source, tensors: Tensors, optional: Collection[str]) -> bool:
-    """Whether a leaf is to keep its value: optional, and the checkpoint has none of its tensors."""
-    return _matches(path, optional) and not any(key in tensors for key in source.keys)
-
-
-def _foreign_keys(tensors: Tensors, layout: Layout, optional: Collection[str]) -> list[str]:
-    taken = {key for source in layout.values() for key in source.keys}
-    return [key for key in tensors if key not in taken and not _matches(key, optional)]
-
-
-def _matches(name: str, patterns: Collection[str]) -> bool:
-    return any(fnmatchcase(name, pattern) for pattern in patterns)
-
-
-def _check(leaves: Mapping[str, nnx.Variable], tensors: Tensors, layout: Layout, foreign: list[str]) -> None:
-    """Raises ConfigError with all that does not fit, the first few of each kind by name."""
-    missing = [f"{key} (for {path})" for path, source in layout.items() for key in source.keys if key not in tensors]
-    misshapen = [
-        f"{key} is {list(tensors.shape(key))}, the model's {path} needs {list(shape)}"
-        for path, source in layout.items()
-        for shape in (tensor_shape(leaves[path].shape, source),)
-        for key in source.keys
-        if key in tensors and tensors.shape(key) != shape
-    ]
-    faults = {"missing": missing, "of another shape": misshapen, "not of this model": foreign}
-    found = [f"{len(names)} {kind}: {list_some(names)}" for kind, names in faults.items() if names]
-    if found:
-        raise ConfigError(
-            f"{tensors.source} does not fit the model: " + "; ".join(found) + ". Choose the model size that it was trained"
-            " with, or another file."
-        )
-
-
-def _leaf_value(tensors: Tensors, source: Source, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """A leaf of `shape` from its tensors: each is read, converted into its place, and let go."""
-    value = np.empty(shape, dtype)
-    for place, key in zip(value if source.is_stacked else (value,), source.keys, strict=True):
-        np.copyto(place, AXES[source.layout].to_leaf(tensors[key], source.kernel), casting="unsafe")
-    return value
-
-
-def _place(value: np.ndarray, like: Any) -> jax.Array:
-    """Put a value where the leaf lay before; each process gives its own devices their shards."""
-    sharding = getattr(like, "sharding", None)
-    if sharding is None:
-        return jax.device_put(value)
-    return jax.make_array_from_callback(value.shape, sharding, lambda index: value[index])
 
 
 @dataclass(frozen=True)

@@ -145,24 +145,6 @@ def _pose_errors(reached: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, n
     return position, rotation
 
 
-def inverse_kinematics(
-    robot: RobotSpec, arm: int | np.ndarray, tool_pose: np.ndarray, seed: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Joint positions for tool poses: `ArmSolver.solve` with a solver that is kept.
-
-    Args:
-        robot: whose arms.
-        arm: 0 (left) or 1 (right), one for all or [n].
-        tool_pose: [n 7], world.
-        seed: [n d], rad.
-
-    Returns:
-        joint_pos [n d] rad, position_error [n] m, rotation_error [n] rad.
-    """
-    solution = arm_solver(robot).solve(arm, tool_pose, seed)
-    return solution.joint_pos, solution.position_error, solution.rotation_error
-
-
 @lru_cache(maxsize=128)
 def arm_solver(robot: RobotSpec) -> ArmSolver:
     """The process's solver of a robot, made at first use."""

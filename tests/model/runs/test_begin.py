@@ -1,0 +1,49 @@
+"""Beginning a run: what cannot go on is told before anything of it is written."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from xew.config import ConfigError
+from xew.files import is_run
+from xew.model.codecs.patches import PatchCodec
+from xew.model.experiment import Experiment, load_experiment
+from xew.model.runs.begin import prepare_run
+from xew.model.settings.settings import AdaptSettings
+
+
+@pytest.fixture(scope="module")
+def experiment() -> Experiment:
+    return load_experiment("xew:debug", ["--codec.name", "patch_pca", "--codec.spatial-factor", "8", "--codec.channels", "4"])
+
+
+def fit_codec(experiment: Experiment, seed: int) -> PatchCodec:
+    """A codec of the experiment, whose hash depends on the seed."""
+    factor = experiment.codec.spatial_factor
+    pictures = np.random.default_rng(seed).integers(0, 256, (5, 2 * factor, 2 * factor, 3), np.uint8)
+    return PatchCodec.fit([pictures], factor, experiment.codec.channels)
+
+
+def test_a_run_is_continued_with_its_own_codec_only(experiment: Experiment, tmp_path: Path) -> None:
+    begun = replace(experiment, out=tmp_path / "run")
+    prepare_run(begun, fit_codec(experiment, 0), {}, resume=False, overwrite=False)
+    config = (tmp_path / "run/config.yaml").read_bytes()
+    longer = replace(begun, train=replace(begun.train, steps=begun.train.steps + 7))
+    with pytest.raises(ConfigError, match="was begun with another codec"):
+        prepare_run(longer, fit_codec(experiment, 1), {}, resume=True, overwrite=False)
+    assert (tmp_path / "run/config.yaml").read_bytes() == config
+    prepare_run(longer, fit_codec(experiment, 0), {}, resume=True, overwrite=False)
+    assert load_experiment(tmp_path / "run/config.yaml") == longer
+
+
+def test_a_run_without_a_checkpoint_is_not_adapted(experiment: Experiment, tmp_path: Path) -> None:
+    source = replace(experiment, out=tmp_path / "source")
+    prepare_run(source, fit_codec(experiment, 0), {}, resume=False, overwrite=False)
+    adapt = AdaptSettings(start_from=source.out, robots=("piper",))
+    with pytest.raises(ConfigError, match="source has no checkpoint to start from"):
+        prepare_run(
+            replace(experiment, out=tmp_path / "run", adapt=adapt), fit_codec(experiment, 0), {}, resume=False, overwrite=False
+        )
+    assert is_run(source.out) and not (tmp_path / "run").exists()
