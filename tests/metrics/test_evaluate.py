@@ -108,7 +108,7 @@ def test_points_on_surfaces_are_kept_beside_the_data(rollouts: Path, data: Path,
         folders.append(keep)
         return read_truth(folder, frames, compared)
 
-    monkeypatch.setattr("xew.metrics.evaluate.read_truth", read)
+    monkeypatch.setattr("xew.metrics.grading.grader.read_truth", read)
     grade(rollouts, data, metrics=("psnr",))
     assert folders == [data.with_name(f"{data.name}-surfaces")] * len(ROBOTS)
 

@@ -54,7 +54,7 @@ from xew.names import csv_text
 from xew.protocol import HELD_OUT_ROBOTS
 from xew.rollout import find_rollouts
 
-PROTOCOL = 4
+PROTOCOL = 5
 """Version of the grading: it goes up when any score would change, and scores of another version are graded anew."""
 DIMENSIONS = tuple(dict.fromkeys(metric.dimension for metric in METRICS.values()))
 

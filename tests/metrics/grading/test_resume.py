@@ -87,8 +87,8 @@ def dying(function: Callable, at: int) -> Callable:
 
 
 PLACES = [
-    (evaluate, "grade", 1),
-    (evaluate, "grade", 8),
+    (grader, "grade", 1),
+    (grader, "grade", 8),
     (files.os, "replace", 1),  # a cell that is written but does not have its name yet
     (files.os, "replace", 11),
     (files.os, "replace", CELLS + 1),  # the curves
@@ -194,13 +194,13 @@ def test_a_second_run_grades_nothing_anew_and_metrics_come_beside_those_that_are
     world: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     asked: list[tuple[str, ...]] = []
-    real = evaluate.grade
+    real = grader.grade
 
     def notes(comparison: object, metrics: tuple[str, ...]) -> object:
         asked.append(tuple(metrics))
         return real(comparison, metrics)
 
-    monkeypatch.setattr(evaluate, "grade", notes)
+    monkeypatch.setattr(grader, "grade", notes)
     out = tmp_path / "scores.parquet"
     for metrics in (("psnr",), METRICS, METRICS):
         main(Args((world / "rollouts",), world / "data", out, metrics, masks=QUICK, workers=1))
@@ -215,8 +215,8 @@ def test_baselines_are_graded_once_a_data_set(
 ) -> None:
     main(arguments(world, tmp_path / "first.parquet"))
     asked: list[object] = []
-    real = evaluate.grade
-    monkeypatch.setattr(evaluate, "grade", lambda comparison, metrics: asked.append(metrics) or real(comparison, metrics))
+    real = grader.grade
+    monkeypatch.setattr(grader, "grade", lambda comparison, metrics: asked.append(metrics) or real(comparison, metrics))
     main(arguments(world, tmp_path / "scores.parquet"))
     assert len(asked) == EPISODES
     assert read_all(tmp_path / "scores.parquet") == whole
@@ -226,7 +226,7 @@ def test_other_settings_are_graded_anew(world: Path, tmp_path: Path, monkeypatch
     out = tmp_path / "scores.parquet"
     main(Args((world / "rollouts",), world / "data", out, ("psnr",), baselines=False))
     before = out.read_bytes()
-    monkeypatch.setattr(evaluate, "grade", lambda *_: pytest.fail("graded anew"))
+    monkeypatch.setattr(grader, "grade", lambda *_: pytest.fail("graded anew"))
     main(Args((world / "rollouts",), world / "data", out, ("psnr",), baselines=False))
     assert out.read_bytes() == before
     monkeypatch.setattr(evaluate, "PROTOCOL", evaluate.PROTOCOL + 1)

@@ -187,8 +187,16 @@ def _soften(image: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _flow(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """[h w 2] pixels from each pixel of one gray image to its place in the other (DIS)."""
-    return cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(start, end, None)
+    """[h w 2] pixels from each pixel of one gray image to its place in the other (DIS).
+
+    The medium preset with a wider stride, fewer iterations and no variational refinement takes half of its time a mask, and
+    masks of a model's, a pasted and another robot's video have the same IoU within .003 (docs/calibration.md).
+    """
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow.setPatchStride(4)
+    flow.setGradientDescentIterations(16)
+    flow.setVariationalRefinementIterations(0)
+    return flow.calc(start, end, None)
 
 
 def _grid(shape: tuple[int, ...]) -> np.ndarray:

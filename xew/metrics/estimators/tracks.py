@@ -23,6 +23,9 @@ PATCH = 12
 """Half the side of the patch round a point [pixels]."""
 PATCH_STEP = 2
 """Step [pixels] between the pixels of a patch that are compared."""
+REACHES = np.arange(-PATCH, PATCH + 1, PATCH_STEP, dtype=np.float32)
+OFFSETS = np.stack(np.meshgrid(REACHES, REACHES), axis=-1).reshape(1, -1, 2)
+"""Places of these pixels from the point: [r] along one axis, and [1 r*r 2], x and y."""
 SOFTNESS = 1.5
 """Standard deviation [pixels] of the blur of what is compared, so that sharpness and grain do not count as motion."""
 FLATNESS = 10.0
@@ -207,8 +210,10 @@ def _is_in_true_frame(
     frame: np.ndarray, places: np.ndarray, true_frame: np.ndarray, points: np.ndarray, like: np.ndarray
 ) -> np.ndarray:
     """[n] is what a frame shows far from the true point there in the true frame too? Then it is no point that came there."""
-    far = np.linalg.norm(places - points, axis=-1) > PATCH
-    return far & (likeness(frame, places, true_frame, places) > like - STANDING)
+    found = np.linalg.norm(places - points, axis=-1) > PATCH
+    if found.any():
+        found[found] = likeness(frame, places[found], true_frame, places[found]) > like[found] - STANDING
+    return found
 
 
 def likeness(image: np.ndarray, places: np.ndarray, true_image: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -218,26 +223,29 @@ def likeness(image: np.ndarray, places: np.ndarray, true_image: np.ndarray, poin
     Only what lies inside both images is compared; of a place or point far outside the answer says nothing.
     """
     patch, true_patch = _patches(image, places), _patches(true_image, points)
-    shared = _inside(_around(places), image) & _inside(_around(points), true_image)
-    weight = (shared / np.maximum(shared.sum(axis=1, keepdims=True), 1))[..., None]
+    shared = _patch_inside(places, image) & _patch_inside(points, true_image)
+    weight = shared / np.maximum(shared.sum(axis=1, keepdims=True), 1).astype(np.float32)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return np.sum(weight * values, axis=1)
+        """[n 3] of values [n p 3], of what is compared."""
+        return np.einsum("np,npc->nc", weight, values)
 
-    variance = sum(np.mean(mean(np.square(values - mean(values)[:, None])), axis=-1) for values in (patch, true_patch))
-    return 1 - np.mean(mean(np.square(patch - true_patch)), axis=-1) / (variance + FLATNESS)
+    variance = sum(np.mean(mean(np.square(values)) - np.square(mean(values)), axis=-1) for values in (patch, true_patch))
+    return 1 - np.mean(mean(np.square(patch - true_patch)), axis=-1) / (np.maximum(variance, 0) + FLATNESS)
 
 
 def _patches(image: np.ndarray, points: np.ndarray) -> np.ndarray:
     """[n p 3] float32 colors round points [n 2], read between the pixels."""
-    return _sample(image, _around(points)).astype(np.float32)
+    return _sample(image, points[:, None] + OFFSETS).astype(np.float32)
 
 
-def _around(points: np.ndarray) -> np.ndarray:
-    """[n p 2] float32, where the patches round points [n 2] are read."""
-    reach = np.arange(-PATCH, PATCH + 1, PATCH_STEP, dtype=np.float32)
-    offsets = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(1, -1, 2)
-    return (points[:, None] + offsets).astype(np.float32)
+def _patch_inside(points: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """[n p] is each place of the patches round points [n 2] in a pixel of the image?"""
+    inside = [
+        (points[:, axis, None] + REACHES > -0.5) & (points[:, axis, None] + REACHES < size - 0.5)
+        for axis, size in enumerate((image.shape[1], image.shape[0]))
+    ]
+    return (inside[1][:, :, None] & inside[0][:, None, :]).reshape(len(points), -1)
 
 
 def _inside(points: np.ndarray, image: np.ndarray) -> np.ndarray:

@@ -183,6 +183,11 @@ def _restore(checkpoints: ocp.CheckpointManager, out: Path, step: int, restores:
     try:
         restored = checkpoints.restore(step, args=ocp.args.Composite(**restores))
     except Exception as error:  # Orbax has many, one for each way of being damaged
+        if "RESOURCE_EXHAUSTED" in str(error):
+            raise ConfigError(
+                f"{out}: the checkpoint of step {step} does not fit into the memory that is free on {jax.devices()[0]}; it is "
+                "whole. Stop what else runs there, or wait for it."
+            ) from error
         raise damaged(out, step, restores, error) from error
     for name in restores.keys() - {"data"}:
         for path, leaf in jax.tree_util.tree_leaves_with_path(restored[name]):
