@@ -19,7 +19,6 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
-from flax import nnx
 from jax.sharding import Mesh
 from tqdm import tqdm
 
@@ -69,8 +68,8 @@ def load_predictor(run: Path, experiment: Experiment, step: int | None = None) -
     if is_config(run):
         return load_published(experiment, run), None
     mesh, codec = make_mesh(MeshSettings()), load_run_codec(run, experiment.codec)
-    shapes = nnx.state(nnx.eval_shape(experiment.network.create), nnx.Param)
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=replicated_sharding(mesh)), shapes)
+    place = replicated_sharding(mesh)
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), experiment.network.shapes)
     params, step = restore_params(run, like, step)
     scales = load_run_scales(experiment.conditions, run)
     return _make_predictor(experiment, codec, params, mesh, scales), step

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
-from flax import nnx
 
 from xew.config import ConfigError
 from xew.model.devices.sharding import place_like
@@ -109,8 +108,7 @@ def load_params(run: Path, network: Network, step: int | None = None) -> tuple[A
         step: of the checkpoint; the latest where left out.
     """
     here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    shapes = nnx.state(nnx.eval_shape(network.create), nnx.Param)
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), shapes)
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), network.shapes)
     return restore_params(run, like, step)
 
 
