@@ -6,6 +6,7 @@ Reached from outside the registries, as a user's own would be: QUICK and QUICK_T
 import numpy as np
 
 from xew.metrics.backends import Backend
+from xew.metrics.perceptual import SharedFeatures
 
 QUICK = "tests.metrics.quick:MASKER"
 QUICK_TRACKS = "tests.metrics.quick:TRACKER"
@@ -32,3 +33,13 @@ def points_moved_by_change(prediction: np.ndarray, target: np.ndarray, points: n
 
 
 TRACKER = Backend(lambda: points_moved_by_change, None, "the true points, moved where the pixels changed")
+
+
+def mean_change(
+    shared: SharedFeatures, prediction: np.ndarray, target: np.ndarray, robot: np.ndarray | None = None, box: object = None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """For `SharedFeatures.distances`: mean change of a frame's levels, and of the robot's, both [t] float32 in [0, 1]."""
+    change = np.abs(prediction.astype(np.float32) - target).mean(axis=-1) / 255
+    if robot is None:
+        return change.mean(axis=(1, 2)), None
+    return change.mean(axis=(1, 2)), np.ma.mean(np.ma.array(change, mask=~robot), axis=(1, 2)).filled(np.nan)
