@@ -132,6 +132,17 @@ def strict_arrays() -> None:
     jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def no_origins_of_tracers() -> Iterator[None]:
+    """Flax asks every tracer for an attribute that tracers lack, and JAX's error, which nobody sees, says at length where the
+    tracer comes from: a tenth of the time of tracing a network."""
+    from jax._src.interpreters.partial_eval import DynamicJaxprTracer
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(DynamicJaxprTracer, "_origin_msg", lambda tracer: "")
+        yield
+
+
 @pytest.fixture(autouse=True)
 def named_exceptions(request: pytest.FixtureRequest) -> Iterator[None]:
     """Tests marked loose_types or loose_ranks run as JAX does by default; the mark gives the reason."""

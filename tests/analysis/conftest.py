@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.metrics.quick import QUICK
+from tests.metrics.quick import QUICK, mean_change
 from tests.synthetic import write_synthetic_data
-from xew.analysis.reports import charts
+from xew.analysis.reports import charts, pictures
 from xew.dataset import find_accepted
 from xew.episode import read_video
 from xew.metrics.evaluate import Args, main
+from xew.metrics.perceptual import SharedFeatures
 from xew.protocol import seed_split
 from xew.rollout import write_rollout
 
@@ -28,10 +29,12 @@ class Study:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def outlines_in_place_of_fonts() -> Iterator[None]:
-    """Cutting fonts down to the glyphs used is a third of a report's time; outlines of glyphs look the same in a PDF."""
+def quick_files() -> Iterator[None]:
+    """Cutting fonts down to the glyphs used is a third of a report's time, and outlines of glyphs look the same in a PDF;
+    compressing pictures as far as can be is a tenth."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(charts.STYLE, "pdf.fonttype", 3)
+        patch.setattr(pictures, "PNG_COMPRESSION", 1)
         yield
 
 
@@ -45,5 +48,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
             late = read_video(folder / "rgb.mkv")[np.maximum(np.arange(FRAMES) - 1, 0)]
             header = {"model": "late", "condition": "by one <frame>"}
             write_rollout(made.rollouts, record.task, record.seed, record.robot, late, header)
-    main(Args((made.rollouts,), made.data, made.scores, ("psnr", "lpips", "mask_iou"), masks=QUICK))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SharedFeatures, "distances", mean_change)  # LPIPS takes half a minute; what it finds, nothing here asks
+        main(Args((made.rollouts,), made.data, made.scores, ("psnr", "lpips", "mask_iou"), masks=QUICK))
     return made

@@ -15,7 +15,7 @@ import pytest
 from tests.synthetic import write_synthetic_data
 from xew.analysis import study as runner
 from xew.analysis.studies import ledger as study_ledger
-from xew.analysis.studies import merge
+from xew.analysis.studies import merge, processes
 from xew.analysis.studies.config import Study, load_study
 from xew.analysis.studies.cost import critical_paths
 from xew.analysis.studies.ledger import Ledger
@@ -42,6 +42,12 @@ def outcomes_of_files(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps here make one file each, whatever stage they claim to be."""
     for module in (study_ledger, merge):
         monkeypatch.setattr(module, "digest_product", lambda kind, product: study_ledger._digest_file(product))
+
+
+@pytest.fixture(autouse=True)
+def steps_import_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps here need no model; what real ones find imported is at work in studies/test_study_debug.py."""
+    monkeypatch.setattr(processes, "PRELOADED", ())
 
 
 @pytest.fixture
@@ -273,9 +279,10 @@ def alive(name: Path) -> bool:
 SCRIPT = """
 import sys
 from pathlib import Path
-from tests.analysis.test_study import ROOT, chain, load_study, run, runner
+from tests.analysis.test_study import ROOT, chain, load_study, processes, run, runner
 
 if __name__ == "__main__":
+    processes.PRELOADED = ()
     study = load_study(ROOT / "configs" / "study_debug.yaml", ["--out", sys.argv[1]])
     with runner.lock_study(study.out), runner.stop_on_sigterm():
         run(study, chain(study.out, data=("--wait", "300")))

@@ -14,16 +14,14 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 import tyro
 
+from tests.sim_warp.reader import Reading, read_on
 from tests.sim_warp.small import SLOW, TASK, work_inline
-from xew.dataset import find_accepted
-from xew.episode import EpisodeError, Record, read_states, read_video, verify_episode
 from xew.sim_warp.generate import Args as GenerateArgs
 from xew.sim_warp.generate import generate
 
@@ -72,41 +70,6 @@ def contents(out: Path) -> dict[str, str]:
     return {str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-@dataclass
-class Reading:
-    """What a reader saw."""
-
-    wrong: list[str] = field(default_factory=list)
-    """Whatever was not whole."""
-    rounds: int = 0
-    episodes: int = 0
-
-
-def read_on(out: Path, stop: Any, result: Any) -> None:
-    """Read all that is there, again and again, as an evaluation beside a running `generate` would; a process of its own."""
-    seen = Reading()
-    while not stop.is_set():
-        seen.rounds += 1
-        try:
-            for folder, record in _accepted(out)[-4:]:
-                if verify_episode(folder) != record or len(read_video(folder / "rgb.mkv")) != read_states(folder).frame_count:
-                    seen.wrong.append(f"{folder} is not what its header says")
-                seen.episodes += 1
-        except Exception as error:  # whatever comes of something that is not whole
-            seen.wrong.append(f"{type(error).__name__}: {error}")
-        stop.wait(0.05)
-    result.put(seen)
-
-
-def _accepted(out: Path) -> list[tuple[Path, Record]]:
-    try:
-        return find_accepted(out)
-    except EpisodeError as error:
-        if str(error).startswith("no accepted episode"):
-            return []
-        raise
-
-
 @contextmanager
 def read_beside(out: Path) -> Iterator[Reading]:
     """A reader at work in another process; what it saw is filled in at the end."""
@@ -127,16 +90,17 @@ def count(out: Path) -> int:
     return sum(len(names) for _, _, names in os.walk(out))
 
 
-def kill_at_random(out: Path, files: int, rng: random.Random) -> str | None:
+def kill_at_random(out: Path, files: int, rng: random.Random, workers: int = 2) -> str | None:
     """Start, and kill at a random moment of what is left to do; a line about it, or None if the run ended before.
 
     Args:
         files: how many there are in the end. The run is killed at most 0.05 s after a random one of those that are missing.
+        workers: how many processes work for the command.
     """
     if count(out) >= files:
         return None
     target = rng.randint(count(out), files - 1)
-    run = start(out)
+    run = start(out, workers)
     while count(out) < target and run.poll() is None:
         time.sleep(0.002)
     try:

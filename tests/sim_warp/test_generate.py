@@ -1,6 +1,7 @@
 """The command that makes data: counts, resumes, and tells what is wrong; runs in worker processes as a user's would."""
 
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.sim_warp.halves import half
 from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, work_inline
 from xew.config import ConfigError
 from xew.dataset import find_accepted, find_records
@@ -160,14 +162,21 @@ def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, *fla
     return capsys.readouterr().err.strip().splitlines()[-1]
 
 
-def test_a_full_disk_in_a_worker_is_one_line(tmp_path: Path) -> None:
-    """A limit on the size of files stands for the disk; the video of twelve frames is larger."""
-    limited = f"ulimit -f 20; exec {sys.executable} -m xew.sim_warp.generate " + " ".join(
-        [*FLAGS, "--workers", "1", "--out", str(tmp_path)]
-    )
-    run = subprocess.run(["bash", "-c", f"trap '' XFSZ; {limited}"], cwd=ROOT, capture_output=True, text=True)
-    assert run.returncode == 2 and "Traceback" not in run.stderr, run.stderr
-    assert "cannot write the episode" in run.stderr and "Free some space or choose another --out" in run.stderr
+def test_a_full_disk_in_a_worker_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+) -> None:
+    """A limit on the size of files, which workers inherit, stands for the disk; the video of twelve frames is larger."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    monkeypatch.setattr(sys, "argv", ["generate", *FLAGS, "--workers", "1", "--out", str(tmp_path)])
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20 * 1024, before[1]))
+    try:
+        with pytest.raises(SystemExit) as left:
+            main()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    said = capfd.readouterr().err
+    assert left.value.code == 2 and "Traceback" not in said, said
+    assert "cannot write the episode" in said and "Free some space or choose another --out" in said
     assert not [record for _, record in find_records(tmp_path) if record.hashes]
 
 
@@ -307,14 +316,6 @@ def test_a_hopeless_task_gives_up_and_says_so() -> None:
 
 
 # --- Worker processes.
-
-
-def half(number: int) -> int:
-    if number == 13:
-        raise ConfigError("thirteen")
-    if number == 17:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number // 2
 
 
 def test_workers_hand_over_results_and_errors() -> None:

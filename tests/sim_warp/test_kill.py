@@ -15,7 +15,7 @@ from xew.episode import Record, complete_folder, episode_folder, write_episode
 def test_kills_change_no_byte(tmp_path: Path) -> None:
     expected, out, rng = make_undisturbed(tmp_path / "undisturbed"), tmp_path / "killed", random.Random(0)
     with read_beside(out) as reader:
-        told = [kill_at_random(out, len(expected), rng) for _ in range(2)]
+        told = [kill_at_random(out, len(expected), rng, workers) for workers in (2, 1)]
         complete(out)
     assert any(told), "both runs ended before they were killed"
     assert not reader.wrong and reader.episodes, reader.wrong

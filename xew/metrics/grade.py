@@ -27,8 +27,11 @@ from xew.metrics.perceptual import (
 )
 from xew.metrics.truth import Points, Surfaces, Truth, is_inside
 
-FRAME_BLOCK = 16
-"""Number of frames graded at once on a CPU; on a GPU it is `ACCELERATOR_CHUNK`."""
+FRAME_BLOCK = 4
+"""Number of frames graded at once on a CPU; on a GPU it is `ACCELERATOR_CHUNK`. A video's last block is filled up: a short one
+costs little."""
+TRACK_BLOCK = 16
+"""Number of frames that tracks are filled up to a multiple of, so that videos of many lengths share a program."""
 POINT_BLOCK = 8
 OF_WHOLE_FRAMES = {"region_lpips": "lpips"}
 """Metrics of the robot's box by name, each with the metric that it equals where the box is the whole frame, as it often is."""
@@ -265,7 +268,7 @@ def _touches_all_borders(mask: np.ndarray) -> bool:
 def _grade_tracks(name: str, arrays: Arrays, side: float) -> tuple[float, np.ndarray | None]:
     """A score and its curve. What is filled up is not valid, which no metric of tracks looks at."""
     metric = METRICS[name]
-    padded = [_fill(_fill(array, 0, FRAME_BLOCK, 0), 1, POINT_BLOCK, 0) for array in arrays]
+    padded = [_fill(_fill(array, 0, TRACK_BLOCK, 0), 1, POINT_BLOCK, 0) for array in arrays]
     options = {"side": np.float32(side)} if metric.by_image else {}
     value = float(metric.function(*padded, **options))
     return value, None if metric.whole else np.asarray(_frame_by_frame(metric)(padded, options))[: len(arrays[0])]

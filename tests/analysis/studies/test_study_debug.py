@@ -1,12 +1,16 @@
 """The debug study from nothing to a report by its real commands, then a part of it from its data, killed again and again.
 
-The task is the tests' own of twelve simulated frames, and of the 18 models five are made, something of every part.
+The whole study runs in this process, what is redone and what is killed in processes of their own. The task is the tests' own of
+twelve simulated frames, and of the 18 models four are made, something of every part; models that are given joints in place of
+videos are trained and rolled out in tests/model/test_pipeline.py, other systems in test_systems.py beside it.
 """
 
+import contextlib
 import filecmp
 import json
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -15,53 +19,65 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import jax
 import pandas as pd
 import pytest
 import yaml
 
-from tests.metrics.quick import QUICK
-from tests.sim_warp.small import TASK
+from tests.analysis.inline import InlineMachines
+from tests.metrics.quick import QUICK, QUICK_TRACKS
+from tests.sim_warp.small import TASK, work_inline
+from xew.analysis import study
 from xew.protocol import BASELINES, PAPER_PARTS, PARTS, VARIANTS
 
 ROOT = Path(__file__).parents[3]
 CONFIG = ROOT / "configs" / "study_debug.yaml"
 MADE = (
     "fixed-optical_flow-none",
-    "fixed-joints-none",
     "fixed-optical_flow-nine_views",
     "loeo_franka_panda-*",
     "few_shot-piper-1",
 )
-"""Something of each table."""
+"""Something of each part of the paper."""
 ADAPTED = "few_shot-piper-1"
 """An adaptation from one of the others."""
 PART = (ADAPTED, "--parts", "few_shot", "forgetting")
 """What is killed: a training, an adaptation from it, and all that they need and lead to."""
-KILLS = 3
+KILLS = 2
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a study of this file lies, and what it shares with others."""
+    """Where a study of this file lies, and the config that it shares with others."""
 
     root: Path
     config: Path
-    environment: dict[str, str]
 
     @property
     def study(self) -> Path:
         return self.root / "study"
 
-    def command(self, *variants: str) -> list[str]:
+    def arguments(self, *variants: str) -> list[str]:
         """Of a study of these variants (and of more choices after them)."""
         files = [str(self.config), "--experiment", str(ROOT / "configs" / "debug.yaml")]
-        return [sys.executable, "-m", "xew.analysis.study", *files, "--out", "study", "--tasks", TASK, "--variants", *variants]
+        return [*files, "--out", "study", "--tasks", TASK, "--variants", *variants]
 
-    def run(self, *variants: str) -> str:
-        """What the study's command prints; it must end well."""
-        done = subprocess.run(self.command(*variants), cwd=self.root, env=self.environment, capture_output=True, text=True)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
+    def start(self, *variants: str) -> subprocess.Popen[str]:
+        """The study's command, whose steps are processes of their own."""
+        command = [sys.executable, "-m", "xew.analysis.study", *self.arguments(*variants)]
+        own = {"PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": "", "PYTHONUNBUFFERED": "1"}
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        return subprocess.Popen(command, cwd=self.root, env=os.environ | own, text=True, **pipes)
+
+    def run(self, *variants: str) -> None:
+        """The same study in this process, where its steps share programs, weights and imports; it must end well."""
+        self.root.mkdir(exist_ok=True)
+        # Optax raises floats to the power of its int32 count of steps.
+        with pytest.MonkeyPatch.context() as patch, jax.numpy_dtype_promotion("standard"):
+            patch.chdir(self.root)
+            patch.setattr(study, "open_machines", lambda _: InlineMachines())
+            work_inline(patch)
+            study.main(self.arguments(*variants))
 
 
 @pytest.fixture(scope="module")
@@ -69,27 +85,27 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     """A folder without data or weights; compiled programs are those of the session, which compiles many of them too."""
     root = tmp_path_factory.mktemp("debug")
     settings = yaml.safe_load(CONFIG.read_text())
-    # XLA's options are those of the session, but not for grading, which computes for longer than it compiles.
-    settings["step_environment"] = {"evaluate": {"XLA_FLAGS": ""}}
-    settings["evaluate"] = ["--masks", QUICK]  # the masker that finds masks is at work in tests/metrics/test_evaluate.py
+    del settings["step_environment"]  # XLA's options are those of the session
+    # The estimators that find masks and points are at work in tests/metrics/test_evaluate.py.
+    settings["evaluate"] = ["--masks", QUICK, "--tracks", QUICK_TRACKS]
     (root / "config.yaml").write_text(yaml.safe_dump(settings))
-    own = {"PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
-    yield Place(root, root / "config.yaml", os.environ | own)
+    yield Place(root, root / "config.yaml")
     shutil.rmtree(root)
 
 
 @pytest.fixture(scope="module")
-def printed(place: Place) -> str:
+def made(place: Place) -> Place:
     """The whole study, from nothing."""
-    return place.run(*MADE)
+    place.run(*MADE)
+    return place
 
 
 def rows_of(study: Path) -> pd.DataFrame:
     return pd.read_parquet(study / "scores.parquet")
 
 
-def test_from_nothing_to_a_report(place: Place, printed: str) -> None:
-    table = rows_of(place.study)
+def test_from_nothing_to_a_report(made: Place) -> None:
+    table = rows_of(made.study)
     planned = table.attrs["study"]
     assert set(table["variant"]) == {"", *planned["variants"]}
     assert len(planned["variants"]) == len(MADE) and planned["incomplete"] == [] and not planned["of_paper"]
@@ -99,46 +115,51 @@ def test_from_nothing_to_a_report(place: Place, printed: str) -> None:
         assert counts["found"] == dict.fromkeys(VARIANTS[name].graded_robots, 1)
     assert set(table.loc[table["variant"] == "", "model"]) == set(BASELINES)
     assert table["value"].notna().all()
-    assert (place.study / "report" / "index.html").stat().st_size > 10_000
-    assert f"report: {Path('study', 'report', 'index.html')}" in printed
+    assert (made.study / "report" / "index.html").stat().st_size > 10_000
 
 
-def test_done_is_done(place: Place, printed: str) -> None:
-    before = {path: path.stat().st_mtime_ns for path in place.study.rglob("*") if path.is_file() and "state" not in path.parts}
-    again = place.run(*MADE)
-    after = {path: path.stat().st_mtime_ns for path in before}
-    changed = {path.name for path in before if before[path] != after[path]}
-    assert changed <= {"study.yaml", "status.txt", ".lock"}
-    assert "[0/" not in again.partition("about")[2], again
+def test_done_is_done_and_redone_is_the_same(made: Place) -> None:
+    """By the real command, whose step is a process of its own."""
+    before = {path: path.stat().st_mtime_ns for path in made.study.rglob("*") if path.is_file() and "state" not in path.parts}
+    rows = rows_of(made.study)
+    process = made.start(*MADE, "--redo", f"evaluate/{ADAPTED}")
+    said, _ = process.communicate()
+    assert process.returncode == 0, said
+    assert f"report: {Path('study', 'report', 'index.html')}" in said
+    assert re.findall(r"\] (\S+) done after", said) == [f"evaluate/{ADAPTED}"]
+    pd.testing.assert_frame_equal(rows_of(made.study), rows)
+    changed = {path.relative_to(made.study) for path in before if before[path] != path.stat().st_mtime_ns}
+    assert {path.parts[0] for path in changed} <= {"study.yaml", "status.txt", ".lock", "logs", "scores"}, changed
+    assert {path.parts[1].split(".")[0] for path in changed if path.parts[0] == "scores"} == {ADAPTED}, changed
 
 
-def test_an_adaptation_started_from_its_variant(place: Place, printed: str) -> None:
-    start = json.loads((place.study / "runs" / ADAPTED / "start.json").read_text())
+def test_an_adaptation_started_from_its_variant(made: Place) -> None:
+    start = json.loads((made.study / "runs" / ADAPTED / "start.json").read_text())
     assert Path(start["run"]).name == VARIANTS[ADAPTED].start.name  # type: ignore[union-attr]
 
 
-def test_killed_anywhere_it_ends_in_the_same_videos_and_scores(place: Place, printed: str) -> None:
+def test_killed_anywhere_it_ends_in_the_same_videos_and_scores(made: Place) -> None:
     """A part of the study again from nothing but data and compiled programs, killed as it goes: the same bytes at the end."""
-    killed = Place(place.root / "killed", place.config, place.environment)
-    shutil.copytree(place.study / "data", killed.study / "data")
+    killed = Place(made.root / "killed", made.config)
+    shutil.copytree(made.study / "data", killed.study / "data")
     moments = random.Random(int(time.time()))
     for number in range(KILLS):
-        seconds = moments.uniform(3, 10)
-        print(f"kill {number} after {seconds:.2f} s")
-        process = subprocess.Popen(killed.command(*PART), cwd=killed.root, env=killed.environment, stdout=subprocess.PIPE)
-        try:
+        seconds = moments.uniform(0, 8)
+        print(f"kill {number} after {seconds:.2f} s of its first step")
+        process = killed.start(*PART)
+        assert process.stdout is not None
+        assert any("] latents" in line or "] train" in line or "] rollout" in line for line in process.stdout), "no step began"
+        with contextlib.suppress(subprocess.TimeoutExpired):
             process.communicate(timeout=seconds)
-            break
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.communicate()
+        process.kill()
+        process.communicate()
     killed.run(*PART)
-    found, expected = rows_of(killed.study), rows_of(place.study)
-    made = [folder.name for folder in (killed.study / "rollouts").iterdir()]
-    assert ADAPTED in made and len(made) > 1
-    for variant in made:
-        folders = (study / "rollouts" / variant for study in (place.study, killed.study))
-        assert different_videos(*folders) == []
+    found, expected = rows_of(killed.study), rows_of(made.study)
+    folders = [folder.name for folder in (killed.study / "rollouts").iterdir()]
+    assert ADAPTED in folders and len(folders) > 1
+    for variant in folders:
+        both = (study / "rollouts" / variant for study in (made.study, killed.study))
+        assert different_videos(*both) == []
         rows = (table[table["variant"] == variant].reset_index(drop=True) for table in (expected, found))
         pd.testing.assert_frame_equal(*rows, check_categorical=False)
 

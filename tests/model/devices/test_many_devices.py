@@ -33,6 +33,8 @@ model: {size: tiny, action: joints, embodiment: robot_render}
 train: {steps: 4, batch: 4, learning_rate: 1e-3, log_every: 1, save_every: 2, sample_every: 0, ema_decay: 0.5}
 rollout: {steps: 1, batch: 4}
 """
+TWO, FOUR = ("--mesh.fsdp", "2"), ("--mesh.data", "2", "--mesh.fsdp", "2")
+"""Overrides for so many devices."""
 FLOAT_NOISE = 1e-5
 """How far losses of about 2 may differ where sums are taken in another order."""
 
@@ -72,53 +74,53 @@ def losses(world: Path, out: str) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def straight(world: Path) -> Path:
-    """Four straight steps on 1, 2 and 4 devices: runs one, two, four; in two parts and with two chunks: parts."""
-    two, four = ("--mesh.fsdp", "2"), ("--mesh.data", "2", "--mesh.fsdp", "2")
-    jobs = [job(world, "one", 1), job(world, "two", 2, *two), job(world, "four", 4, *four)]
-    end(begin([*jobs, job(world, "parts", 2, *two, "--train.accumulate", "2")]))
-    return world
-
-
-@pytest.fixture(scope="module")
 def killed(world: Path) -> Path:
     """Runs that were killed after the checkpoint of step 2, on 1 and on 2 devices."""
-    jobs = (job(world, "killed_one", 1, kill=True), job(world, "killed_two", 2, "--mesh.fsdp", "2", kill=True))
+    jobs = (job(world, "killed_one", 1, kill=True), job(world, "killed_two", 2, *TWO, kill=True))
     for process in [begin([killed]) for killed in jobs]:
         end(process, -signal.SIGKILL)
     return world
 
 
-def test_the_same_config_gives_the_same_numbers(straight: Path) -> None:
-    one = losses(straight, "one")
-    assert len(one) == 4
-    for other in ("two", "four", "parts"):
-        np.testing.assert_allclose(losses(straight, other), one, atol=FLOAT_NOISE)
-
-
-def test_killed_runs_repeat_the_straight_ones_on_any_devices(straight: Path, killed: Path) -> None:
-    """2 steps, kill, 2 steps are 4 straight steps: to the bit on as many devices, to float noise on others."""
+@pytest.fixture(scope="module")
+def done(killed: Path) -> Path:
+    """Four straight steps on 1, 2 and 4 devices: runs one, two, four; in two parts: parts. What was killed has
+    gone on: killed_one and killed_two on as many devices as before, two_on_one and two_on_four on others. All by one process.
+    """
     for name in ("two_on_one", "two_on_four"):
         shutil.copytree(killed / "killed_two", killed / name)
-    two, four = ("--mesh.fsdp", "2"), ("--mesh.data", "2", "--mesh.fsdp", "2")
-    jobs = [job(killed, "killed_one", 1, "--resume"), job(killed, "killed_two", 2, *two, "--resume")]
-    jobs += [job(killed, "two_on_one", 1, "--resume"), job(killed, "two_on_four", 4, *four, "--resume")]
+    jobs = [job(killed, "one", 1), job(killed, "two", 2, *TWO), job(killed, "four", 4, *FOUR)]
+    jobs += [job(killed, "parts", 2, *TWO, "--train.accumulate", "2")]
+    jobs += [job(killed, "killed_one", 1, "--resume"), job(killed, "killed_two", 2, *TWO, "--resume")]
+    jobs += [job(killed, "two_on_one", 1, "--resume"), job(killed, "two_on_four", 4, *FOUR, "--resume")]
     end(begin(jobs))
-    np.testing.assert_array_equal(losses(killed, "killed_one"), losses(straight, "one"))
-    np.testing.assert_array_equal(losses(killed, "killed_two"), losses(straight, "two"))
+    return killed
+
+
+def test_the_same_config_gives_the_same_numbers(done: Path) -> None:
+    one = losses(done, "one")
+    assert len(one) == 4
+    for other in ("two", "four", "parts"):
+        np.testing.assert_allclose(losses(done, other), one, atol=FLOAT_NOISE)
+
+
+def test_killed_runs_repeat_the_straight_ones_on_any_devices(done: Path) -> None:
+    """2 steps, kill, 2 steps are 4 straight steps: to the bit on as many devices, to float noise on others."""
+    np.testing.assert_array_equal(losses(done, "killed_one"), losses(done, "one"))
+    np.testing.assert_array_equal(losses(done, "killed_two"), losses(done, "two"))
     for name in ("two_on_one", "two_on_four"):
-        np.testing.assert_allclose(losses(killed, name), losses(straight, "one"), atol=FLOAT_NOISE)
+        np.testing.assert_allclose(losses(done, name), losses(done, "one"), atol=FLOAT_NOISE)
 
 
-def test_two_processes_are_as_one(straight: Path) -> None:
+def test_two_processes_are_as_one(done: Path) -> None:
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
-    asked = job(straight, "processes", 2, "--mesh.fsdp", "2")
+    asked = job(done, "processes", 2, *TWO)
     variables = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2"}
     for process in [begin([asked], 1, JAX_PROCESS_ID=str(number), **variables) for number in range(2)]:
         end(process)
-    np.testing.assert_allclose(losses(straight, "processes"), losses(straight, "one"), atol=FLOAT_NOISE)
+    np.testing.assert_allclose(losses(done, "processes"), losses(done, "one"), atol=FLOAT_NOISE)
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,7 @@ def test_a_stapler_without_its_spring_falls_shut() -> None:
     assert scene_hash(slack) != scene_hash(whole)
 
 
-def test_the_spring_acts_alike_in_mujoco_warp_and_only_in_its_own_world() -> None:
+def test_the_spring_acts_alike_in_mujoco_warp_and_only_in_its_own_world(quick_kernels: None) -> None:
     robot, laptop = ROBOTS["piper"], TASKS["open_laptop"].sample(scene_rng("open_laptop", 1), 1)
     worlds = [World(robot, laptop, at_home(robot, 8)), World(robot, pressed(0.9), at_home(robot, 8))]
     expected, found = simulate(worlds, "cpu"), physics_gpu.simulate_batch(worlds, "cpu")

@@ -172,7 +172,7 @@ def mixed() -> list[World]:
 
 
 @pytest.fixture(scope="module")
-def batch(mixed: list[World]) -> list[Motion]:
+def batch(mixed: list[World], quick_kernels: None) -> list[Motion]:
     return physics_gpu.simulate_batch(mixed, "cpu")
 
 

@@ -15,6 +15,8 @@ DIFFERENCE_FULL = 96
 """Difference, in levels of 255, from which on the difference picture is darkest."""
 FRAME = (208, 215, 222)
 """Color of the edge of a difference picture, RGB."""
+PNG_COMPRESSION = 9
+"""Effort of compressing pictures, 0 to 9: a page holds hundreds of them."""
 
 
 def difference_picture(predicted: np.ndarray, observed: np.ndarray) -> np.ndarray:
@@ -77,7 +79,7 @@ def sheet(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
 
 def encode_png(image: np.ndarray) -> bytes:
     """The PNG file of an RGB image [h w 3] uint8."""
-    done, encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    done, encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
     if not done:
         raise OSError("OpenCV cannot encode a PNG")
     return encoded.tobytes()

@@ -381,11 +381,15 @@ def attend_in_pairs(
     if queries % 2 == 0 and keys % 2 == 0:
         return jax.nn.dot_product_attention(q, k, v, implementation=implementation)
     q, k, v = (jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, 0), (0, 0))) for x in (q, k, v))
-    lengths = {
-        "query_seq_lengths": jnp.full(len(q), queries, jnp.int32),
-        "key_value_seq_lengths": jnp.full(len(k), keys, jnp.int32),
-    }
-    return jax.nn.dot_product_attention(q, k, v, implementation=implementation, **lengths)[:, :queries]
+    attended = jax.nn.dot_product_attention(
+        q,
+        k,
+        v,
+        query_seq_lengths=jnp.full(len(q), queries, jnp.int32),
+        key_value_seq_lengths=jnp.full(len(k), keys, jnp.int32),
+        implementation=implementation,
+    )
+    return attended[:, :queries]
 
 
 def _reason_against_cudnn(head_dim: int, dtype: np.dtype) -> str:

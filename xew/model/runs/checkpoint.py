@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
-from flax import nnx
 
 from xew.config import ConfigError
 from xew.files import file_digest, read_json, write_text
@@ -131,8 +130,7 @@ def load_params(
         sharding: where they are to lie; on the first device where left out.
     """
     place = sharding or jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    shapes = nnx.state(nnx.eval_shape(network.create), nnx.Param)
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), shapes)
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), network.shapes)
     return restore_params(run, like, step)
 
 

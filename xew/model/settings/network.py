@@ -1,7 +1,10 @@
 """The network of an experiment: everything that making it needs, and whether it can be made."""
 
+import functools
 from dataclasses import dataclass
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 from flax import nnx
 
@@ -30,7 +33,12 @@ class Network:
     @property
     def structure(self) -> nnx.GraphDef:
         """The network without its parameters, made without computing anything."""
-        return nnx.split(nnx.eval_shape(self.create), nnx.Param)[0]
+        return _split_shapes(self)[0]
+
+    @property
+    def shapes(self) -> Any:
+        """Shapes and types of the parameters, in their tree, without computing anything."""
+        return jax.tree.map(lambda leaf: leaf, _split_shapes(self)[1])  # a tree of one's own: it can be changed
 
     def create(self) -> WorldModel:
         """Make the network at its random start; wrap in `nnx.eval_shape` for shapes only."""
@@ -59,3 +67,9 @@ def check_network(network: Network) -> None:
     if settings.weights is not None:
         check_dit(nnx.eval_shape(network.create), read_tensors(settings.weights))
     choose_attention(settings.attention, network.size.head_dim, jnp.dtype(settings.dtype))
+
+
+@functools.lru_cache(maxsize=16)
+def _split_shapes(network: Network) -> tuple[nnx.GraphDef, Any]:
+    """Structure and shapes of a network. To trace its making takes a second, and a command asks several times."""
+    return nnx.split(nnx.eval_shape(network.create), nnx.Param)

@@ -128,8 +128,8 @@ def make_learner(learning: Learning, mesh: Mesh) -> Learner:
 
 def abstract_state(learning: Learning) -> tuple[nnx.GraphDef, TrainState]:
     """The network's structure, and the shapes and types of the state of step 0, without computing anything."""
-    graph = nnx.split(nnx.eval_shape(learning.network.create), nnx.Param)[0]
-    return graph, jax.eval_shape(lambda: _init(learning, None))
+    network = learning.network
+    return network.structure, jax.eval_shape(lambda params: _init(learning, params), network.shapes)
 
 
 def _init(learning: Learning, start: Any) -> TrainState:
