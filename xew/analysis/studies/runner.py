@@ -116,7 +116,7 @@ class StudyRunner:
 
 
 class Budget:
-    """Time that a study may take now: whole cells first, and nothing is trained that would not be graded in time.
+    """Time that a study may take now: what is soonest graded first, and nothing is trained that would not be graded in time.
 
     Args:
         study, steps: what is run.

@@ -373,9 +373,9 @@ def attend_in_pairs(
     v: Float[Array, "b s heads k"],
     implementation: Literal["xla", "cudnn"],
 ) -> Float[Array, "b q heads k"]:
-    """Attention of any numbers of queries and keys by one that takes even numbers alone, as cuDNN's gradients do.
+    """Attention [b q heads k] of any numbers of queries [b q heads k] and keys and values [b s heads k], in even numbers.
 
-    An odd number gets one more, which is masked and cut off again.
+    cuDNN's gradients take even numbers alone. An odd number gets one more, which is masked and cut off again.
     """
     queries, keys = q.shape[1], k.shape[1]
     if queries % 2 == 0 and keys % 2 == 0:
