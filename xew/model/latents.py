@@ -15,7 +15,7 @@ from typing import Any
 
 from xew.config import ConfigError, user_errors
 from xew.dataset import Dataset, Episode, read_dataset
-from xew.files import write_text
+from xew.files import read_json, write_text
 from xew.model.cache.codecs import prepare_codec
 from xew.model.cache.encode import encode_episodes
 from xew.model.cache.keys import CACHE_VERSION
@@ -24,6 +24,7 @@ from xew.model.cache.store import LatentCache
 from xew.model.codecs.ceiling import choose_evenly, measure_ceiling
 from xew.model.episodes.choice import replay_episodes, training_episodes
 from xew.model.experiment import Experiment, parse_experiment
+from xew.model.settings.settings import Clip
 from xew.model.video.pixels import PixelSource, rendered_pixels, stored_pixels
 from xew.protocol import validation_split
 
@@ -77,15 +78,32 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
 def report_ceiling(
     experiment: Experiment, cache: LatentCache, dataset: Dataset, episodes: Sequence[Episode], source: PixelSource
 ) -> dict[str, Any]:
-    """Measure the codec's reconstruction on validation seeds, or on training data where there are none; never on test seeds."""
+    """The codec's reconstruction on validation seeds, or on training data where there are none; never on test seeds.
+
+    It is measured once for a cache, however many experiments are encoded into it: the header says of which videos it is.
+    """
     robots = validation_split(experiment.robots)
     validation = dataset.select(robots=(*robots.train_robots, *robots.held_out_robots), split="validation")
     chosen = choose_evenly(validation or episodes, CEILING_CLIPS)
+    on = "validation seeds" if validation else "training episodes, for there are no validation seeds"
+    hashes = [record.hashes["rgb"] for _, record in chosen]
+    kept = _read_ceiling(cache, experiment.clip, hashes)
+    if kept is not None:
+        return kept
     videos = (source(folder, record, ("rgb",))["rgb"] for folder, record in chosen)
     measured = measure_ceiling(cache.codec, videos, **asdict(experiment.clip))
-    on = "validation seeds" if validation else "training episodes, for there are no validation seeds"
     print(f"codec ceiling: {measured}, of {on}")
-    return {**asdict(measured), "of": on, "robots": sorted({record.robot for _, record in chosen})}
+    return {**asdict(measured), "of": on, "robots": sorted({record.robot for _, record in chosen}), "videos": hashes}
+
+
+def _read_ceiling(cache: LatentCache, clip: Clip, videos: Sequence[str]) -> dict[str, Any] | None:
+    """The ceiling that a cache's header has of the same codec, clips and videos (their hashes); None where it has none."""
+    try:
+        header = read_json(cache.encoding.folder / "header.json")
+        same = (header["codec"], header["clip"]) == (cache.codec.hash, asdict(clip))
+        return header["ceiling"] if same and header["ceiling"]["videos"] == list(videos) else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """Which episodes a training looks at: nothing that is tuned reads test seeds."""
 
+import json
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -47,7 +49,7 @@ def test_nothing_is_trained_on_validation_or_test_seeds() -> None:
 
 @pytest.mark.parametrize("families", [("train", "validation", "test"), ("train", "test")])
 def test_the_ceiling_in_the_log_is_of_no_test_seed_and_of_no_held_out_robot(
-    families: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+    families: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     data, read = dataset(*families), []
 
@@ -59,9 +61,18 @@ def test_the_ceiling_in_the_log_is_of_no_test_seed_and_of_no_held_out_robot(
         return {"rgb": np.zeros((1, 2, 2, 3), np.uint8)}
 
     monkeypatch.setattr(latents, "measure_ceiling", measure)
-    experiment, cache = SimpleNamespace(robots=FIXED, clip=Clip(5, 48, 64)), SimpleNamespace(codec=None)
+    experiment, cache = SimpleNamespace(robots=FIXED, clip=Clip(5, 48, 64)), SimpleNamespace()
+    cache.codec, cache.encoding = SimpleNamespace(hash="its weights"), SimpleNamespace(folder=tmp_path)
     training = training_episodes(data, EpisodeChoice(FIXED.train_robots))
     said = latents.report_ceiling(experiment, cache, data, training, source)
     expected = "validation" if "validation" in families else "train"
     assert {seed_split(record.seed) for record in read} == {expected} and said["of"].startswith(expected)
     assert not {record.robot for record in read} & {*HELD_OUT_ROBOTS, UNSEEN}
+    # Of the same videos it is not measured again, and of another codec it is.
+    count = len(read)
+    (tmp_path / "header.json").write_text(
+        json.dumps({"codec": "its weights", "clip": asdict(Clip(5, 48, 64)), "ceiling": said})
+    )
+    assert latents.report_ceiling(experiment, cache, data, training, source) == said and len(read) == count
+    cache.codec.hash = "others"
+    assert latents.report_ceiling(experiment, cache, data, training, source) == said and len(read) == 2 * count
