@@ -12,6 +12,7 @@ import math
 import os
 from collections import defaultdict
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated
 
@@ -26,7 +27,7 @@ from xew.dataset import explain_missing, read_dataset
 from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, encode_png, read_record, read_states, read_video, verify_episode
 from xew.files import hold_lock, replacing, write_bytes
 from xew.names import path_below
-from xew.sim_warp.devices.workers import Workers, quiet_warp
+from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.generate import yield_table
 from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
 from xew.sim_warp.production.surfaces import visibility_table
@@ -34,7 +35,7 @@ from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS
 
 EPISODES_PER_WORKER = 32
-"""Number of episodes that are verified in the time in which a process starts."""
+"""Number of episodes that are verified, or fewer rendered, in the time in which a process starts."""
 STRIP_FRAMES = 8
 SHEET_TIMES = (0.0, 0.5, 1.0)
 """Instants that a contact sheet shows, as shares of the episode."""
@@ -140,10 +141,24 @@ def rerender(folders: list[Path], count: int) -> None:
 
 def render_videos(folders: list[Path]) -> None:
     """Make and store the videos of episodes that have none."""
-    renderer = Renderer()
-    for folder in tqdm(folders, desc="rendering", unit="episode"):
-        add_videos(folder, renderer)
+    device = find_device(None)
+    with Workers(worker_count(device), first_alone=not has_kernels(device)) as workers:
+        several = len(folders) >= 2 * EPISODES_PER_WORKER
+        made = workers.run(_render_video, folders) if several else map(_render_video, folders)
+        for _ in tqdm(made, desc="rendering", unit="episode", total=len(folders)):
+            pass
     print(f"videos of {len(folders)} episodes made from their states")
+
+
+@cache
+def _renderer() -> Renderer:
+    """The renderer of this process, made once."""
+    return Renderer()
+
+
+def _render_video(folder: Path) -> None:
+    """Make and store the videos of one episode, in a worker process or here."""
+    add_videos(folder, _renderer())
 
 
 def draw_pictures(cells: list[tuple[Path, Record]], out: Path, seeds: int) -> None:
