@@ -190,7 +190,7 @@ def _flow(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """[h w 2] pixels from each pixel of one gray image to its place in the other (DIS).
 
     The medium preset with a wider stride, fewer iterations and no variational refinement takes half of its time a mask, and
-    masks of a model's, a pasted and another robot's video have the same IoU within .003 (docs/calibration.md).
+    masks of a model's, a pasted and another robot's video have the same IoU within .003 (docs/performance.md).
     """
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setPatchStride(4)
