@@ -153,7 +153,7 @@ def grade_tables(args: Args) -> None:
     jobs = find_jobs(args, tuple(BASELINES) if args.baselines else (), errors if args.keep_going else None, codecs)
     total = len(jobs) + len(errors)
     diagnostics = tuple(DIAGNOSTICS) if args.diagnostics else ()
-    errors += grade_all(jobs, (*metrics, *diagnostics), args, store)
+    errors += grade_all(jobs, (*metrics, *diagnostics), args, store, codecs)
     cells = [job.cell for job in jobs]
     write_tables(args.out, attributes, cells, store)
     if diagnostics:
@@ -248,7 +248,9 @@ def find_jobs(
     return list_jobs(args.rollouts, args.data, str(settings(args)), baselines, workers, problems, codecs)
 
 
-def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: CellStore) -> list[str]:
+def grade_all(
+    jobs: list[Job], metrics: tuple[str, ...], args: Args, store: CellStore, codecs: Mapping[str, ModelCodec]
+) -> list[str]:
     """Grade what is not in the store yet, and return what went wrong.
 
     Episodes are read and graded by threads or processes, a few ahead of each other, so that memory does not grow with their
@@ -265,7 +267,7 @@ def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: Cell
     errors: list[str] = []
     without_shapes: list[Path] = []
     with tqdm(total=len(jobs), initial=len(jobs) - len(todo), desc="evaluate", unit="video", disable=None) as bar:
-        for group, graded in zip(groups, _grade_groups(groups, metrics, args, store), strict=True):
+        for group, graded in zip(groups, _grade_groups(groups, metrics, args, store, codecs), strict=True):
             errors += graded.errors
             without_shapes += [] if graded.has_shapes else [group[0][0].episode]
             bar.update(len(group))
@@ -277,14 +279,19 @@ def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: Cell
     return errors
 
 
-def _grade_groups(groups: Sequence[Group], metrics: tuple[str, ...], args: Args, store: CellStore) -> Iterator[Graded]:
-    """What came out of each group, in their order, from threads of this process or from processes of their own."""
+def _grade_groups(
+    groups: Sequence[Group], metrics: tuple[str, ...], args: Args, store: CellStore, codecs: Mapping[str, ModelCodec]
+) -> Iterator[Graded]:
+    """What came out of each group, in their order, from threads of this process or from processes of their own.
+
+    Processes open the codecs for themselves.
+    """
     opener = make_grader_opener(args, metrics, store)
     if args.processes > 1 and len(groups) > 1:
         yield from map_in_processes(opener.open_in_process, groups, args.processes)
         return
     stop = threading.Event()
-    yield from map_in_order(opener.open(stop), groups, worker_count(args.workers), stop)
+    yield from map_in_order(opener.open(stop, codecs), groups, worker_count(args.workers), stop)
 
 
 def make_grader_opener(args: Args, metrics: Sequence[str], store: CellStore) -> GraderOpener:
@@ -325,13 +332,14 @@ def check(args: Args, path: Path) -> None:
         return
     held = {sample["model"] for sample in bundle["samples"]}  # a bundle of an earlier version has fewer baselines
     _demand_codecs(path, bundle, args)
-    jobs = find_jobs(args, [name for name in BASELINES if name in held], codecs=find_codecs(args))
+    codecs = find_codecs(args)
+    jobs = find_jobs(args, [name for name in BASELINES if name in held], codecs=codecs)
     raise_if_any(path, differences(bundle, settings(args), [job.cell for job in jobs]))
     print("made from these rollouts and this data, by their digests")
     picked = [jobs[i] for i in np.unique(np.linspace(0, len(jobs) - 1, args.regrade).astype(int))]
     metrics = tuple(name for name in bundle["metrics"] if name in METRICS)
     store = CellStore(path_beside(args.out, "cells"), baselines_folder(args.data, args.out))
-    grader, found = make_grader_opener(args, metrics, store).open(threading.Event()), list[str]()
+    grader, found = make_grader_opener(args, metrics, store).open(threading.Event(), codecs), list[str]()
     for job in tqdm(picked, desc="grade anew", unit="video", disable=None):
         verify_episode(job.episode)
         truth = read_truth(job.episode, job.cell.frames, {input_kind(name) for name in metrics})

@@ -252,7 +252,7 @@ def test_processes_write_the_same_bytes_and_tell_mistakes(world: Path, whole: di
     gone = [(replace(job, episode=tmp_path / "gone"), ("psnr",)) for job in jobs[:2]]
     store = evaluate.CellStore(tmp_path / "cells", tmp_path / "baselines")
     with pytest.raises(EpisodeError, match="gone"):
-        list(evaluate._grade_groups([[job] for job in gone], ("psnr",), several, store))
+        list(evaluate._grade_groups([[job] for job in gone], ("psnr",), several, store, {}))
 
 
 def test_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -65,9 +65,13 @@ class GraderOpener:
     trust: tuple[str, ...] = ()
     """Options of `xew.metrics.evaluate`."""
 
-    def open(self, stop: threading.Event) -> "Grader":
-        """Open estimators and codecs. Raises ConfigError if weights are missing or a codec cannot be opened."""
-        codecs = open_codecs(self.codecs, self.codec_opener, self.models) if self.codecs else {}
+    def open(self, stop: threading.Event, codecs: Mapping[str, ModelCodec] | None = None) -> "Grader":
+        """Open estimators, and codecs where they are not given, by model.
+
+        Raises ConfigError if weights are missing or a codec cannot be opened.
+        """
+        if codecs is None:
+            codecs = open_codecs(self.codecs, self.codec_opener, self.models) if self.codecs else {}
         return Grader(self, self._open_bench(), {codec.key: codec for codec in codecs.values()}, stop)
 
     def open_in_process(self) -> "Grader":
