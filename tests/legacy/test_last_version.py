@@ -16,7 +16,7 @@ import pytest
 from tests.commands import run_command
 from xew.dataset import find_accepted
 from xew.episode import read_states, read_video, verify_episode
-from xew.metrics.evaluate import PROTOCOL
+from xew.protocol import GRADING_PROTOCOL
 
 ARCHIVE = Path(__file__).with_name("version_0_1_0.tar.xz")
 EPISODE = Path("place_empty_cup/1000000/piper")
@@ -78,7 +78,7 @@ def test_rollouts_that_are_done_are_not_made_again(old: Path) -> None:
 
 def test_the_bundle_is_whole_and_says_that_the_protocol_was_another(old: Path) -> None:
     run_command("xew.metrics.evaluate", "--check", "scores.bundle.json")
-    with pytest.raises(AssertionError, match=f"protocol is 3, here {PROTOCOL}"):
+    with pytest.raises(AssertionError, match=f"protocol is 3, here {GRADING_PROTOCOL}"):
         run_command("xew.metrics.evaluate", "rollouts", "--data", "data", "--check", "scores.bundle.json")
 
 

@@ -149,6 +149,22 @@ def test_the_floor_of_a_model_is_the_truth_through_its_codec(
     assert "of 'early', of which no rollout is graded; graded are late" in capsys.readouterr().err
 
 
+def test_baselines_are_graded_before_there_is_a_model(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    codec = {"codec_opener": f"{__name__}:Halved", "metrics": ("psnr",), "workers": 2}
+    alone = tmp_path / "baselines.parquet"
+    main(Args((), data, alone, baselines_of="test", codec=(Path("configs/any"),), max_frames=ASKED, **codec))
+    scores = pd.read_parquet(alone)
+    assert set(scores["model"]) == {*BASELINES, CODEC_TRUTH} and set(scores["frames"]) == {ASKED}
+    assert "codecs" not in scores.attrs, "no model is there whose floor it would be"
+    root = tmp_path / "rollouts"
+    write_rollout(root, TASK, SEED, ROBOTS[0], late(truth(data, ROBOTS[0]))[:ASKED], {"model": "late", "condition": "none"})
+    capsys.readouterr()
+    beside = grade(root, data, codec=(Path("runs/late"),), baselines=True, **codec)
+    assert f"{len(BASELINES) + 1} of {len(BASELINES) + 2} are graded already" in capsys.readouterr().out
+    own = scores[scores["robot"] == ROBOTS[0]].set_index(["model", "condition"])["value"]
+    assert own.sort_index().equals(beside[beside["model"] != "late"].set_index(["model", "condition"])["value"].sort_index())
+
+
 def test_all_four_dimensions_with_baselines_by_default(rollouts: Path, data: Path) -> None:
     """A model that is a frame late lies between the frozen first frame and the truth, by every metric that says how far."""
     main(Args((rollouts,), data, rollouts.parent / "scores.parquet", workers=2))
@@ -504,6 +520,7 @@ def test_missing_episodes_trees_and_metrics_are_named(
         ({"masks": "sam2"}, "--masks-checkpoint"),
         ({"tracks_checkpoint": tmp_path / "none.pth"}, "does not exist"),
         ({"frame_zero": "predicted", "baselines": True}, "--no-baselines"),
+        ({"baselines_of": "test", "baselines": True}, "leave out the rollouts"),
         ({"workers": -1}, "--workers"),
         ({"out": tmp_path / "scores.csv"}, ".parquet"),
     ):

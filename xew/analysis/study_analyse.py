@@ -49,11 +49,13 @@ def main(args: Args) -> None:
     study = load_study(path)
     study = replace(study, out=args.study)
     planned = {run.name: run for run in study.planned_runs}
-    graded = args.variants or tuple(name for name in planned if (args.study / "scores" / f"{name}.parquet").exists())
+    graded = args.variants or tuple(name for name in planned if study.scores_path(name).exists())
     if not graded:
         raise ConfigError(f"{args.study} has no graded variant yet; run python -m xew.analysis.study {args.study}/study.yaml")
-    tables = [(planned[name].of if name in planned else name, args.study / "scores" / f"{name}.parquet") for name in graded]
+    tables = [(planned[name].of if name in planned else name, study.scores_path(name)) for name in graded]
     seeds = [(planned[name].seed or 0) if name in planned else 0 for name in graded]
+    if study.baselines_path.exists():
+        tables, seeds = [("baselines", study.baselines_path), *tables], [0, *seeds]
     merged = merge_scores(tables, trainings=seeds if study.training_seeds else ())
     scores = replace(merged, attributes={**merged.attributes, "study": describe(study, merged)})
     write_scores(scores, args.study / "scores.parquet")

@@ -9,6 +9,7 @@ Writes scores.parquet, one row per model, condition, task, seed, robot and metri
 
     python -m xew.metrics.evaluate demo/rollouts --data demo/data --out demo/scores.parquet
     python -m xew.metrics.evaluate demo/rollouts --data demo/data --check demo/scores.bundle.json --regrade 5
+    python -m xew.metrics.evaluate --data demo/data --baselines-of test --out demo/baselines.parquet
 """
 
 import itertools
@@ -25,6 +26,7 @@ from tqdm import tqdm
 
 from xew.concurrency import map_in_order, map_in_processes
 from xew.config import ConfigError, pick, suggestion, user_errors
+from xew.dataset import find_accepted
 from xew.episode import EpisodeError, verify_episode
 from xew.files import hold_lock
 from xew.metrics import METRICS
@@ -34,7 +36,7 @@ from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.bundle import Bundle, differences, disagreements, raise_if_any, read_bundle, write_bundle
 from xew.metrics.grading.codecs import OPENER, ModelCodec, open_codecs
 from xew.metrics.grading.grader import Graded, GraderOpener, Group, prepare_process
-from xew.metrics.grading.jobs import Job, list_jobs
+from xew.metrics.grading.jobs import Job, list_baseline_jobs, list_jobs
 from xew.metrics.grading.scores import (
     CellStore,
     baselines_folder,
@@ -51,11 +53,9 @@ from xew.metrics.grading.workers import worker_count
 from xew.metrics.metric import SUITES
 from xew.metrics.truth import read_truth
 from xew.names import csv_text
-from xew.protocol import HELD_OUT_ROBOTS
+from xew.protocol import GRADING_PROTOCOL, HELD_OUT_ROBOTS, seed_split
 from xew.rollout import find_rollouts
 
-PROTOCOL = 5
-"""Version of the grading: it goes up when any score would change, and scores of another version are graded anew."""
 DIMENSIONS = tuple(dict.fromkeys(metric.dimension for metric in METRICS.values()))
 
 
@@ -92,9 +92,14 @@ class Args:
     baselines: bool = True
     """Also grade, as models of their own, the frozen first frame, the robot's render pasted into it, another robot's episode,
     and the true video itself: the noise floor of the scores."""
+    baselines_of: Literal["train", "validation", "test"] | None = None
+    """In place of rollouts: grade the baselines on all episodes of these seeds, before there is a model."""
+    max_frames: int = 0
+    """With --baselines-of: number of frames that are graded, for rollouts that are cut to it; 0 for whole episodes."""
     codec: tuple[Path, ...] = ()
     """Runs of `xew.model.train` that made some of the rollouts: the truth is graded through the codec of each, and is the noise
-    floor of its model's scores. Other models have the floor of the true video."""
+    floor of its model's scores. Other models have the floor of the true video. With --baselines-of a config of
+    `xew.model.train` may be named in place of a run."""
     codec_opener: str = OPENER
     """Function that opens these runs, as module:NAME (`xew.metrics.grading.codecs.open_codec`)."""
     diagnostics: bool = False
@@ -149,7 +154,8 @@ def grade_tables(args: Args) -> None:
     store = CellStore(path_beside(args.out, "cells"), baselines_folder(args.data, args.out))
     errors: list[str] = []
     codecs = find_codecs(args)
-    attributes |= {"codecs": {model: [codec.key] for model, codec in sorted(codecs.items())}} if codecs else {}
+    if args.rollouts and codecs:
+        attributes |= {"codecs": {model: [codec.key] for model, codec in sorted(codecs.items())}}
     jobs = find_jobs(args, tuple(BASELINES) if args.baselines else (), errors if args.keep_going else None, codecs)
     total = len(jobs) + len(errors)
     diagnostics = tuple(DIAGNOSTICS) if args.diagnostics else ()
@@ -207,7 +213,7 @@ def settings(args: Args) -> dict[str, Any]:
     pick(MASKERS, args.masks, "masker")
     pick(TRACKERS, args.tracks, "tracker")
     return {
-        "protocol": PROTOCOL,
+        "protocol": GRADING_PROTOCOL,
         "estimators": {
             "masks": _identity(args.masks, args.masks_checkpoint, "--masks-checkpoint"),
             "tracks": _identity(args.tracks, args.tracks_checkpoint, "--tracks-checkpoint"),
@@ -228,8 +234,10 @@ def find_codecs(args: Args) -> dict[str, ModelCodec]:
     return open_codecs(args.codec, args.codec_opener, find_models(args)) if args.codec else {}
 
 
-def find_models(args: Args) -> frozenset[str]:
-    """Names of the models whose rollouts are graded."""
+def find_models(args: Args) -> frozenset[str] | None:
+    """Names of the models whose rollouts are graded; None where baselines are graded before there is a model."""
+    if args.baselines_of is not None:
+        return None
     return frozenset(rollout.model for root in args.rollouts for rollout in find_rollouts(root, []))
 
 
@@ -244,8 +252,13 @@ def find_jobs(
         raise ConfigError(
             "frame 0 of the frozen first frame is the truth: with --frame-zero predicted say --no-baselines, and no --codec."
         )
-    workers = worker_count(args.workers)
-    return list_jobs(args.rollouts, args.data, str(settings(args)), baselines, workers, problems, codecs)
+    if args.baselines_of is None:
+        workers = worker_count(args.workers)
+        return list_jobs(args.rollouts, args.data, str(settings(args)), baselines, workers, problems, codecs)
+    if args.rollouts or not baselines:
+        raise ConfigError("--baselines-of grades baselines alone: leave out the rollouts, and --no-baselines.")
+    episodes = [episode for episode in find_accepted(args.data) if seed_split(episode[1].seed) == args.baselines_of]
+    return list_baseline_jobs(episodes, str(settings(args)), baselines, codecs or {}, args.max_frames)
 
 
 def grade_all(
@@ -302,7 +315,7 @@ def make_grader_opener(args: Args, metrics: Sequence[str], store: CellStore) -> 
         tracks=(args.tracks, args.tracks_checkpoint),
         codecs=tuple(args.codec),
         codec_opener=args.codec_opener,
-        models=find_models(args) if args.codec else frozenset(),
+        models=find_models(args) if args.codec else None,
         surfaces=surfaces_folder(args.data, args.out),
         store=store,
         allow=args.allow,

@@ -48,7 +48,7 @@ def test_the_configs_plan_every_variant_of_their_parts(name: str) -> None:
     }
     assert wanted <= {variant.name for variant in study.planned_variants}
     steps = plan(study)
-    assert len(steps) == 3 + 4 * len(study.planned_variants)
+    assert len(steps) == 4 + 4 * len(study.planned_variants)
     assert set(study.parts) >= set(PAPER_PARTS)
 
 
@@ -77,15 +77,20 @@ def test_an_adaptation_waits_for_what_it_starts_from(study: Study) -> None:
     assert order[0] == "generate" and order[-1] == "analyse"
 
 
-def test_baselines_are_graded_once_and_over_all_robots(study: Study) -> None:
-    graded = [step for step in plan(study).values() if "--baselines" in step.command]
-    assert [step.name for step in graded] == ["evaluate/fixed-optical_flow-none"]
+def test_baselines_are_graded_once_and_before_there_is_a_model(study: Study) -> None:
+    steps = plan(study)
+    command = steps["baselines"].command
+    assert command[command.index("--baselines-of") + 1] == "test" and command[command.index("--max-frames") + 1] == "5"
+    assert command[command.index("--codec") + 1] == "studies/debug/configs/fixed-optical_flow-none.yaml"
+    assert steps["baselines"].needs == ("generate", "latents/fixed-optical_flow-none")
+    assert "baselines" in steps["analyse"].needs
+    assert all("--no-baselines" in step.command for step in steps.values() if step.kind == "evaluate")
 
 
 def test_every_training_seed_is_a_training_of_every_variant(study: Study) -> None:
     study = load_study(DEBUG, ["--training-seeds", "3", "7"])
     steps, once = plan(study), plan(load_study(DEBUG))
-    assert len(steps) == 3 + 4 * 2 * len(study.planned_variants) and set(once) < set(steps)
+    assert len(steps) == 4 + 4 * 2 * len(study.planned_variants) and set(once) < set(steps)
     again = steps["adapt/few_shot-piper-1-seed_7"]
     assert "train/fixed-optical_flow-nine_views-seed_7" in again.needs and "latents/few_shot-piper-1-seed_7" in again.needs
     runs = {run.name: run for run in study.planned_runs}
@@ -93,7 +98,7 @@ def test_every_training_seed_is_a_training_of_every_variant(study: Study) -> Non
     assert [settings[name]["train"]["seed"] for name in settings] == [3, 7]
     assert settings["-seed_7"]["adapt"]["start_from"] == "studies/debug/runs/fixed-optical_flow-nine_views-seed_7"
     assert (runs["fixed-irasim-seed_7"].of, runs["fixed-irasim"].of) == ("fixed-irasim", "fixed-irasim")
-    assert [step.name for step in steps.values() if "--baselines" in step.command] == ["evaluate/fixed-optical_flow-none"]
+    assert [step.name for step in steps.values() if step.kind == "baselines"] == ["baselines"]
     for name, run in runs.items():
         command = steps[f"evaluate/{name}"].command
         assert command[command.index("--codec") + 1] == str(run_folder(study, run)), "the floor is of its own codec"
@@ -201,31 +206,40 @@ def test_keys_depend_on_inputs_and_on_what_came_before() -> None:
     assert step_key(replace(step, command=("other",), product=Path("b")), ["x"]) in keys
 
 
-@pytest.mark.parametrize("path", ["metrics/grading/scores.py", "metrics/networks/added.json", "metrics/metric.py"])
-def test_grades_are_stale_when_a_file_changes_at_any_depth(
+@pytest.mark.parametrize("path", ["analysis/tables/claims.py", "analysis/tables/added.json", "analysis/report.py"])
+def test_the_report_is_stale_when_a_file_changes_at_any_depth(
     study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str
 ) -> None:
     """A step that is done needs work again when the code in a sub-folder of its room changes."""
     root = tmp_path / "xew"
     ignored = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(CONFIGS.parent / "xew" / "metrics", root / "metrics", ignore=ignored)
+    shutil.copytree(CONFIGS.parent / "xew" / "analysis", root / "analysis", ignore=ignored)
     monkeypatch.setattr(xew, "__path__", [str(root)])
 
-    def plan_grading() -> Step:
+    def plan_report() -> Step:
         source_digest.cache_clear()
-        return replace(plan(study)["evaluate/fixed-joints-none"], needs=(), product=tmp_path / "scores.parquet")
+        return replace(plan(study)["analyse"], needs=(), product=tmp_path / "index.html")
 
-    step, ledger = plan_grading(), Ledger(tmp_path / "study")
-    step.product.write_text("scores")
+    step, ledger = plan_report(), Ledger(tmp_path / "study")
+    step.product.write_text("report")
     ledger.begin(step)
     assert ledger.finish(step, 0, 1.0) == ""
-    (root / "metrics" / "grading" / "__pycache__").mkdir()
-    (root / "metrics" / "grading" / "__pycache__" / "scores.pyc").write_bytes(b"compiled")
-    assert ledger.find_done(plan_grading())
+    (root / "analysis" / "tables" / "__pycache__").mkdir()
+    (root / "analysis" / "tables" / "__pycache__" / "claims.pyc").write_bytes(b"compiled")
+    assert ledger.find_done(plan_report())
     with (root / path).open("a") as file:
         file.write("# edited")
-    assert not ledger.find_done(plan_grading())
+    assert not ledger.find_done(plan_report())
     source_digest.cache_clear()
+
+
+def test_grades_are_stale_when_the_protocol_of_grading_is_another(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A study's grades outlast edits of the code that change no score; the protocol's version tells when they do."""
+    before = plan(study)
+    monkeypatch.setattr("xew.analysis.studies.plan.GRADING_PROTOCOL", 999)
+    after = plan(study)
+    changed = {name for name, step in before.items() if step_key(step, ()) != step_key(after[name], ())}
+    assert changed == {"baselines", *(name for name in before if name.startswith("evaluate/"))}
 
 
 def test_epochs_are_counted_in_steps() -> None:

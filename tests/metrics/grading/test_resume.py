@@ -229,7 +229,7 @@ def test_other_settings_are_graded_anew(world: Path, tmp_path: Path, monkeypatch
     monkeypatch.setattr(grader, "grade", lambda *_: pytest.fail("graded anew"))
     main(Args((world / "rollouts",), world / "data", out, ("psnr",), baselines=False))
     assert out.read_bytes() == before
-    monkeypatch.setattr(evaluate, "PROTOCOL", evaluate.PROTOCOL + 1)
+    monkeypatch.setattr(evaluate, "GRADING_PROTOCOL", evaluate.GRADING_PROTOCOL + 1)
     with pytest.raises(pytest.fail.Exception, match="graded anew"):
         main(Args((world / "rollouts",), world / "data", out, ("psnr",), baselines=False))
 

@@ -28,7 +28,7 @@ from xew.protocol import (
 )
 from xew.sim_warp.tasks import get_task
 
-KINDS = ("generate", "latents", "train", "adapt", "rollout", "evaluate", "distances", "analyse")
+KINDS = ("generate", "latents", "baselines", "train", "adapt", "rollout", "evaluate", "distances", "analyse")
 """Kinds of steps, in the order of the work."""
 
 Settings = dict[str, Any]
@@ -162,6 +162,15 @@ class Study:
     def data_folder(self) -> Path:
         """Folder of the episodes."""
         return self.data or self.out / "data"
+
+    @property
+    def baselines_path(self) -> Path:
+        """Score table of the baselines, which no variant has a name like."""
+        return self.scores_path("baselines")
+
+    def scores_path(self, variant: str) -> Path:
+        """Score table of a variant's training."""
+        return self.out / "scores" / f"{variant}.parquet"
 
     @property
     def task_count(self) -> int:

@@ -34,10 +34,9 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     episodes = study.task_count * (study.train_seeds + study.test_seeds) * len(study.robots)
     costs["generate"] = Cost(episodes, "episodes", rates.start_s + episodes * rates.episode_s, episodes * rates.episode_mb)
     encoded: set[tuple[str, ...]] = set()
-    for number, variant in enumerate(study.planned_runs):
+    for variant in study.planned_runs:
         experiment = build_experiment(study, variant)
         streams = _count_new_streams(variant, experiment, encoded) * study.training_count(variant)
-        videos = sum(study.graded_counts(variant).values()) * (1 if number else 1 + len(BASELINES))
         updates, graded = count_optimizer_steps(study, variant, experiment), sum(study.graded_counts(variant).values())
         costs |= {
             f"latents/{variant.name}": Cost(
@@ -49,8 +48,10 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
             f"rollout/{variant.name}": Cost(
                 graded, "episodes", rates.start_s + graded * rates.rollout_s, graded * rates.rollout_mb
             ),
-            f"evaluate/{variant.name}": Cost(videos, "videos", rates.start_s + videos * rates.grade_s),
+            f"evaluate/{variant.name}": Cost(graded, "videos", rates.start_s + graded * rates.grade_s),
         }
+    videos = study.task_count * study.test_seeds * len(study.robots) * len(BASELINES)
+    costs["baselines"] = Cost(videos, "videos", rates.start_s + videos * rates.grade_s)
     costs |= {"distances": Cost(1, "table", 2 * rates.start_s), "analyse": Cost(1, "report", 2 * rates.start_s)}
     return {name: costs[name] for name in steps}
 

@@ -144,7 +144,7 @@ class Ledger:
     def forget(self, step: Step) -> None:
         """Have a step made anew; of grades, also remove what a command would go on from (`scores/<variant>.*`)."""
         self._path(step).unlink(missing_ok=True)
-        if step.kind == "evaluate":
+        if step.kind in ("baselines", "evaluate"):
             remove_written(step.product.parent, [f"{step.product.stem}.{ending}" for ending in GRADES])
 
     def _path(self, step: Step) -> Path:
@@ -228,6 +228,7 @@ def _digest(content: Any) -> str:
 _DIGESTS: dict[str, Callable[[Path], str | None]] = {
     "generate": _digest_episodes,
     "latents": _digest_folder,
+    "baselines": _digest_file,
     "train": _digest_run,
     "adapt": _digest_run,
     "rollout": _digest_rollouts,

@@ -24,6 +24,9 @@ from xew.config import TRUST, ConfigError
 
 TRAININGS = ("train", "adapt")
 """Kinds of steps that keep a GPU busy all the time."""
+GRADINGS = ("baselines", "evaluate")
+"""Kinds of steps that keep processors busy, and let those go first that feed a GPU."""
+GRADING_NICENESS = 10
 PATIENCE_S = 120.0
 """Time that steps have to end after they were asked to [s]; training saves in that time."""
 
@@ -117,7 +120,9 @@ class ThisMachine:
     def start(self, step: Step, command: tuple[str, ...], log: Path) -> None:
         slots = tuple(self._open_slots(step)[: self._count_slots(step)])
         own = {"CUDA_VISIBLE_DEVICES": ",".join(slots)} if self.gpus else {}
-        process = start_step(command, log, {**self.environment, **step.environment, **own}, launcher=step.launcher)
+        environment = {**self.environment, **step.environment, **own}
+        niceness = GRADING_NICENESS if self.beside and step.kind in GRADINGS else 0
+        process = start_step(command, log, environment, launcher=step.launcher, niceness=niceness)
         self._running[step.name] = _Running(process, step, slots)
 
     def wait(self) -> list[tuple[str, int]]:

@@ -1,7 +1,8 @@
 """The graph of a study: every step that it takes, what each needs first, and what each depends on.
 
 generate -> latents -> train -> rollout -> evaluate -> analyse
-                         |__ latents -> adapt -> rollout -> evaluate __|
+               |         |__ latents -> adapt -> rollout -> evaluate __|
+               |__ baselines _____________________________________ |
 distances _____________________________________________________________|
 """
 
@@ -21,7 +22,7 @@ import xew
 from xew.analysis.studies.config import Settings, Study, build_experiment, run_folder
 from xew.episode import SCHEMA_VERSION
 from xew.files import write_text
-from xew.protocol import Variant
+from xew.protocol import GRADING_PROTOCOL, Variant
 
 
 @dataclass(frozen=True)
@@ -57,18 +58,21 @@ def plan(study: Study) -> dict[str, Step]:
     experiments = {run.name: build_experiment(study, run) for run in study.planned_runs}
     steps = [_plan_generate(study)]
     firsts: dict[str, str] = {}
-    for number, variant in enumerate(study.planned_runs):
+    for variant in study.planned_runs:
         experiment = experiments[variant.name]
         first = firsts.setdefault(variant.split, f"latents/{variant.name}")
         steps += [
             _plan_latents(study, variant, experiment, first),
             _plan_train(study, variant, experiment),
             _plan_rollout(study, variant, experiment),
-            _plan_evaluate(study, variant, baselines=number == 0),
+            _plan_evaluate(study, variant),
         ]
+    steps.insert(2, _plan_baselines(study, study.planned_runs[0], experiments[study.planned_runs[0].name]))
     if "loeo" in study.parts:
         steps.append(_plan_distances(study))
-    steps.append(_plan_analyse(study, tuple(step.name for step in steps if step.kind in ("evaluate", "distances"))))
+    steps.append(
+        _plan_analyse(study, tuple(step.name for step in steps if step.kind in ("baselines", "evaluate", "distances")))
+    )
     return {step.name: replace(step, environment=study.step_environment.get(step.kind, {})) for step in steps}
 
 
@@ -94,10 +98,6 @@ def _config_path(study: Study, variant: Variant) -> Path:
 
 def _rollouts_path(study: Study, variant: str) -> Path:
     return study.out / "rollouts" / variant
-
-
-def _scores_path(study: Study, variant: str) -> Path:
-    return study.out / "scores" / f"{variant}.parquet"
 
 
 def _plan_generate(study: Study) -> Step:
@@ -160,19 +160,34 @@ def _plan_rollout(study: Study, variant: Variant, experiment: Settings) -> Step:
     )
 
 
-def _plan_evaluate(study: Study, variant: Variant, baselines: bool) -> Step:
-    """Grading of a variant. The first one covers all robots, so the baselines are graded with it and with no other."""
-    out = _scores_path(study, variant.name)
+def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Step:
+    """Grading of the baselines, and of the truth through the codec that most variants share, on all test episodes.
+
+    It keeps processors busy while the first models train; later gradings find what it has graded, and nothing waits for it.
+    """
+    out, frames = study.baselines_path, experiment.get("rollout", {}).get("max_frames", 0)
+    asked = ("--baselines-of", "test", "--codec", str(_config_path(study, variant)), "--max-frames", str(frames))
+    return Step(
+        "baselines",
+        "",
+        ("xew.metrics.evaluate", "--data", str(study.data_folder), "--out", str(out), *asked, *study.evaluate),
+        needs=("generate", f"latents/{variant.name}"),
+        inputs=[frames, study.evaluate, GRADING_PROTOCOL],
+        product=out,
+    )
+
+
+def _plan_evaluate(study: Study, variant: Variant) -> Step:
+    """Grading of a variant. The truth through a codec is graded once for all variants that share it."""
+    out = study.scores_path(variant.name)
     given = ("--data", str(study.data_folder), "--out", str(out))
-    # The truth through a codec is graded once for all variants that share it.
-    codec = ("--codec", str(run_folder(study, variant)))
-    asked = ("--baselines" if baselines else "--no-baselines", *codec, *study.evaluate)
+    asked = ("--no-baselines", "--codec", str(run_folder(study, variant)), *study.evaluate)
     return Step(
         "evaluate",
         variant.name,
         ("xew.metrics.evaluate", str(_rollouts_path(study, variant.name)), *given, *asked),
         needs=("generate", _training_name(variant), f"rollout/{variant.name}"),
-        inputs=[asked[:1], study.evaluate, source_digest("metrics", "statistics")],
+        inputs=[study.evaluate, GRADING_PROTOCOL],
         product=out,
     )
 
@@ -218,7 +233,7 @@ def _training_inputs(experiment: Settings) -> Settings:
 def source_digest(*rooms: str) -> str:
     """Digest of all files of some rooms, at any depth.
 
-    Steps that are quickly made again, such as grading and the report, depend on the code; the others do not.
+    Steps that are quickly made again, such as the report, depend on the code. Grading depends on the version of its protocol.
     """
     content = hashlib.sha256()
     for root in map(Path, xew.__path__):

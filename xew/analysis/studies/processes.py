@@ -40,6 +40,7 @@ def start_step(
     environment: Mapping[str, str],
     method: Literal["forkserver", "spawn"] = "forkserver",
     launcher: Sequence[str] = (),
+    niceness: int = 0,
 ) -> BaseProcess:
     """Start `python -m command...` as a process of its own; `.exitcode` is the command's.
 
@@ -49,12 +50,14 @@ def start_step(
         environment: variables set for it beside the study's own.
         method: forkserver is quick; spawn starts from a fresh interpreter.
         launcher: a program and its arguments that start the command instead, such as srun.
+        niceness: amount by which others go before it where processors are short.
     """
     if method == "forkserver":
         multiprocessing.set_forkserver_preload(list(PRELOADED))
     context = CONTEXTS[method]
     log.parent.mkdir(parents=True, exist_ok=True)
-    process = context.Process(target=_run, args=(tuple(command), log, dict(environment), tuple(launcher)), name=log.stem)
+    given = (tuple(command), log, dict(environment), tuple(launcher), niceness)
+    process = context.Process(target=_run, args=given, name=log.stem)
     process.start()
     return process
 
@@ -74,9 +77,10 @@ def last_lines(log: Path, count: int = 3) -> str:
     return "\n".join([line for line in lines if line and not line.startswith(ENDED)][-count:])
 
 
-def _run(command: tuple[str, ...], log: Path, environment: dict[str, str], launcher: tuple[str, ...]) -> None:
+def _run(command: tuple[str, ...], log: Path, environment: dict[str, str], launcher: tuple[str, ...], niceness: int) -> None:
     """Run a module as `python -m` would, or the launcher's process; called in the new process."""
     os.environ.update(environment)
+    os.nice(niceness)
     os.setpgrp()  # Ctrl-C reaches the study only, which asks its steps to stop
     leave_with_parent(lambda: os.kill(os.getpid(), signal.SIGTERM))
     with log.open("a", buffering=1) as file, hold_lock(log.with_suffix(".lock")):

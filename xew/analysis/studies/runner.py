@@ -137,8 +137,8 @@ class Budget:
         self._seconds = seconds | paths
 
     def rank(self, name: str) -> tuple[float, int]:
-        """Sort key: what is soonest graded comes first."""
-        return self._seconds[name], self._order[name]
+        """Sort key: what every table has comes first, then what is soonest graded."""
+        return 0.0 if name == "baselines" else self._seconds[name], self._order[name]
 
     def fits(self, name: str) -> bool:
         """Whether a step and what follows it up to the grades of the same variant would end in time.

@@ -73,13 +73,13 @@ def open_codec(run: Path, opener: str = OPENER) -> Roundtrip:
     return roundtrip
 
 
-def open_codecs(runs: Sequence[Path], opener: str, models: Collection[str]) -> dict[str, ModelCodec]:
+def open_codecs(runs: Sequence[Path], opener: str, models: Collection[str] | None) -> dict[str, ModelCodec]:
     """The codecs of runs by the names of the models that they are of.
 
     Args:
         runs: folders of the runs.
         opener: as of `open_codec`.
-        models: names of all models that are graded.
+        models: names of all models that are graded; None where codecs may be of others, too.
 
     Raises:
         ConfigError: a run cannot be opened, is of a model that is not graded, or two are of one model.
@@ -87,7 +87,7 @@ def open_codecs(runs: Sequence[Path], opener: str, models: Collection[str]) -> d
     codecs: dict[str, ModelCodec] = {}
     for run in runs:
         roundtrip = open_codec(run, opener)
-        if roundtrip.model not in models:
+        if models is not None and roundtrip.model not in models:
             raise ConfigError(
                 f"--codec {run} is the run of {roundtrip.model!r}, of which no rollout is graded; graded are "
                 f"{', '.join(sorted(models))}. Name the runs that these rollouts were made by."

@@ -54,8 +54,8 @@ class GraderOpener:
     """Runs whose codecs the truth goes through."""
     codec_opener: str
     """Function that opens them, as module:NAME."""
-    models: frozenset[str]
-    """Names of all models that are graded, where codecs are named."""
+    models: frozenset[str] | None
+    """Names of all models that are graded; None where codecs may be of others, too."""
     surfaces: Path
     """Folder that points on surfaces are kept in."""
     store: CellStore

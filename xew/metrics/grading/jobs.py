@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from xew.concurrency import map_in_order
 from xew.config import ConfigError
+from xew.dataset import Episode
 from xew.episode import EpisodeError, Record, episode_folder, read_record
 from xew.files import digest_files
 from xew.metrics.grading.baselines import BASELINES
@@ -65,7 +66,10 @@ def list_jobs(
         EpisodeError: a rollout cannot be graded. ConfigError: none is named.
     """
     if not rollouts:
-        raise ConfigError("no rollouts named; give their folder: python -m xew.metrics.evaluate ROLLOUTS --data DATA")
+        raise ConfigError(
+            "no rollouts named; give their folder: python -m xew.metrics.evaluate ROLLOUTS --data DATA, or grade the baselines "
+            "alone: --baselines-of test"
+        )
 
     def try_jobs(rollout: Rollout) -> list[Job] | EpisodeError:
         try:
@@ -105,13 +109,50 @@ def _jobs(rollout: Rollout, data: Path, settings: str, baselines: Collection[str
     key = (rollout.model, rollout.condition, rollout.task, rollout.seed, rollout.robot)
     cell = Cell(*key, frames, digest, rgb, states, settings)
     yield Job(cell, rollout, episode, record.frame_rate)
+    yield from _baseline_jobs(cell, (episode, record), baselines, () if codec is None else (codec,))
+
+
+def _baseline_jobs(cell: Cell, episode: Episode, baselines: Collection[str], codecs: Iterable[ModelCodec]) -> Iterator[Job]:
+    """Jobs of baselines, and of the truth through codecs, on the episode and frames of a cell."""
+    folder, record = episode
     for name in baselines:
-        source = BASELINES[name].source(episode, record)
+        source = BASELINES[name].source(folder, record)
         if source is not None:
-            yield Job(replace(cell, model=name, condition="", prediction=source), None, episode, record.frame_rate)
-    if codec is not None:
+            yield Job(replace(cell, model=name, condition="", prediction=source), None, folder, record.frame_rate)
+    for codec in codecs:
         through = replace(cell, model=CODEC_TRUTH, condition=codec.key, prediction=codec.digest)
-        yield Job(through, None, episode, record.frame_rate)
+        yield Job(through, None, folder, record.frame_rate)
+
+
+def list_baseline_jobs(
+    episodes: Sequence[Episode],
+    settings: str,
+    baselines: Collection[str],
+    codecs: Mapping[str, ModelCodec],
+    max_frames: int = 0,
+) -> list[Job]:
+    """The baselines on episodes that no model has predicted yet, jobs of one episode together.
+
+    Args:
+        episodes: folders and headers.
+        settings: what else the scores depend on, as text.
+        baselines: keys of BASELINES.
+        codecs: what the truth goes through.
+        max_frames: number of frames that are graded; 0 for whole episodes.
+
+    Raises ConfigError where there is no episode or the number of frames is one that cannot be graded.
+    """
+    if not episodes:
+        raise ConfigError("the data set holds no episode of these seeds; generate some, or name others: --baselines-of.")
+    if max_frames < 0 or max_frames == 1:
+        raise ConfigError(f"--max-frames is {max_frames}; expected at least 2 frames, or 0 for whole episodes.")
+    jobs: list[Job] = []
+    for folder, record in episodes:
+        rgb, states = (record.hashes.get(name, "") for name in ("rgb", "states"))
+        frames = min(record.frame_count, max_frames or record.frame_count)
+        cell = Cell("", "", record.task, record.seed, record.robot, frames, "", rgb, states, settings)
+        jobs += _baseline_jobs(cell, (folder, record), baselines, codecs.values())
+    return sorted(jobs, key=lambda job: (job.episode, job.cell.key))
 
 
 def _check_horizons(jobs: Iterable[Job]) -> None:

@@ -5,8 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from xew.dataset import read_dataset
+from xew.model.cache.codecs import load_codec
 from xew.model.codecs.contract import Codec
-from xew.model.experiment import Experiment
+from xew.model.episodes.choice import training_episodes
+from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.folder import load_run
 from xew.model.video.frames import to_camera_size, to_model_size
 
@@ -38,7 +41,15 @@ class RunRoundtrip:
 def open_roundtrip(run: Path) -> RunRoundtrip:
     """The codec of a run as a function of video to video.
 
+    Args:
+        run: folder of the run; or the config of one that has not been trained, whose latents have been made.
+
     Raises:
-        ConfigError: there is no such run, or it has lost its codec.
+        ConfigError: there is no such run, or it has lost its codec; of a config, see `load_codec`.
     """
-    return RunRoundtrip(*load_run(run))
+    if run.suffix != ".yaml":
+        return RunRoundtrip(*load_run(run))
+    experiment = load_experiment(run)
+    encoding, choice = experiment.encoding, experiment.choice
+    episodes = training_episodes(read_dataset(experiment.data), choice) if encoding.kind.fitted else []
+    return RunRoundtrip(experiment, load_codec(encoding, episodes))
