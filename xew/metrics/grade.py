@@ -16,7 +16,7 @@ from xew.metrics import METRICS, contact_f1
 from xew.metrics.backends import Masker, Tracker
 from xew.metrics.estimators.contact import predicted_contact
 from xew.metrics.estimators.presence import confirm_tracks
-from xew.metrics.metric import ACCELERATOR_CHUNK, Metric
+from xew.metrics.metric import ACCELERATOR_CHUNK
 from xew.metrics.perceptual import (
     SMALLEST_SIDE,
     SharedFeatures,
@@ -30,9 +30,9 @@ from xew.metrics.truth import Points, Surfaces, Truth, is_inside
 FRAME_BLOCK = 4
 """Number of frames graded at once on a CPU; on a GPU it is `ACCELERATOR_CHUNK`. A video's last block is filled up: a short one
 costs little."""
-TRACK_BLOCK = 16
-"""Number of frames that tracks are filled up to a multiple of, so that videos of many lengths share a program."""
-POINT_BLOCK = 8
+TRACK_BLOCK, POINT_BLOCK = 64, 32
+"""Numbers of frames and points that tracks are filled up to multiples of, so that videos of all lengths and robots share a few
+programs: compiling one takes seconds, running it milliseconds."""
 OF_WHOLE_FRAMES = {"region_lpips": "lpips"}
 """Metrics of the robot's box by name, each with the metric that it equals where the box is the whole frame, as it often is."""
 DIAGNOSTICS = {"contact_f1": contact_f1}
@@ -120,14 +120,15 @@ def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
     values: dict[str, float] = {}
     curves: dict[str, np.ndarray] = {}
     shared = _curves_by_shared_features(comparison, metrics, inputs)
+    of_tracks = _grade_tracks(comparison, metrics, inputs)
     for name in metrics:
         arrays = inputs[input_kind(name)]
         if arrays is None:
             values[name] = float("nan")
         elif name in DIAGNOSTICS:
             values[name] = float(DIAGNOSTICS[name](*arrays))
-        elif METRICS[name].inputs == "track":
-            values[name], curve = _grade_tracks(name, arrays, comparison.side)
+        elif name in of_tracks:
+            values[name], curve = of_tracks[name]
             curves |= {} if curve is None else {name: curve}
         else:
             whole = OF_WHOLE_FRAMES.get(name)
@@ -265,23 +266,36 @@ def _touches_all_borders(mask: np.ndarray) -> bool:
     return bool(mask[[0, -1]].any(axis=1).all() and mask[:, [0, -1]].any(axis=0).all())
 
 
-def _grade_tracks(name: str, arrays: Arrays, side: float) -> tuple[float, np.ndarray | None]:
-    """A score and its curve. What is filled up is not valid, which no metric of tracks looks at."""
-    metric = METRICS[name]
-    padded = [_fill(_fill(array, 0, TRACK_BLOCK, 0), 1, POINT_BLOCK, 0) for array in arrays]
-    options = {"side": np.float32(side)} if metric.by_image else {}
-    value = float(metric.function(*padded, **options))
-    return value, None if metric.whole else np.asarray(_frame_by_frame(metric)(padded, options))[: len(arrays[0])]
+def _grade_tracks(
+    comparison: Comparison, metrics: Collection[str], inputs: dict[str, Arrays | None]
+) -> dict[str, tuple[float, np.ndarray | None]]:
+    """Scores and curves [t], if any, of all metrics of tracks. What is filled up is not valid, which none of them looks at.
+
+    Tracks are small, so that a GPU has nothing to gain: they are compared where they are.
+    """
+    found: dict[str, tuple[float, np.ndarray | None]] = {}
+    kinds = {name: input_kind(name) for name in metrics if name in METRICS and METRICS[name].inputs == "track"}
+    for kind in dict.fromkeys(kinds.values()):
+        names, arrays = tuple(name for name in kinds if kinds[name] == kind), inputs[kind]
+        if arrays is not None:
+            padded = [_fill(_fill(array, 0, TRACK_BLOCK, 0), 1, POINT_BLOCK, 0) for array in arrays]
+            with jax.default_device(jax.local_devices(backend="cpu")[0]):
+                values, curves = jax.device_get(_compare_tracks(names, padded, np.float32(comparison.side)))
+            count = len(arrays[0])
+            found |= {name: (float(values[name]), curves[name][:count] if name in curves else None) for name in names}
+    return found
 
 
-@functools.cache
-def _frame_by_frame(metric: Metric) -> Callable[..., jax.Array]:
-    """A metric of tracks of each frame alone, [t], NaN where it has nothing to compare; of arrays and of its options."""
-
-    def of_frames(arrays: list[jax.Array], options: dict[str, jax.Array]) -> jax.Array:
-        return jax.vmap(lambda *frame: metric.function(*(array[None] for array in frame), **options))(*arrays)
-
-    return jax.jit(of_frames)
+@functools.partial(jax.jit, static_argnums=0)
+def _compare_tracks(
+    names: tuple[str, ...], arrays: list[jax.Array], side: jax.Array
+) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
+    """Metrics of tracks by name, as one program: scalars, and [t] of each frame alone, NaN where it has nothing to compare."""
+    chosen = {name: METRICS[name] for name in names}
+    functions = {name: functools.partial(m.function, side=side) if m.by_image else m.function for name, m in chosen.items()}
+    values = {name: function(*arrays) for name, function in functions.items()}
+    frames = [array[:, None] for array in arrays]
+    return values, {name: jax.vmap(functions[name])(*frames) for name, m in chosen.items() if not m.whole}
 
 
 def _curve(name: str, arrays: Arrays) -> np.ndarray:
@@ -289,7 +303,8 @@ def _curve(name: str, arrays: Arrays) -> np.ndarray:
     curve = METRICS[name].curve
     assert curve is not None, "metrics of frames have one"
     count = len(arrays[0])
-    block = FRAME_BLOCK if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK
+    few = jax.default_backend() == "cpu" and not METRICS[name].whole
+    block = FRAME_BLOCK if few else ACCELERATOR_CHUNK
     padded = [_fill(array, 0, block, "last") for array in arrays]
     size = len(padded[0]) if METRICS[name].whole else block
     blocks = [curve(*(array[i : i + size] for array in padded)) for i in range(0, len(padded[0]), size)]
