@@ -213,6 +213,7 @@ def test_rollouts_cover_the_test_episodes(run: Path, world: Path) -> None:
         assert made.header["source_hash"] == tested[key].hashes["rgb"]
         assert made.condition == "joints+robot_render"
     codec = open_roundtrip(run)  # whose truth is the floor of these rollouts' scores
+    assert open_roundtrip(run / "config.yaml").digest == codec.digest, "the codec in the cache, before there is a run"
     assert {made.model for made in found.values()} == {codec.model}
     true = read_video(world / "data" / "/".join(next(iter(found.values())).folder.parts[-3:]) / "rgb.mkv")
     left = codec(true)
