@@ -5,9 +5,11 @@ Strictness is the default. What needs an exception asks for it by name and with 
 """
 
 import os
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from jaxtyping import install_import_hook
@@ -56,7 +58,7 @@ SLOW = (
     "tests/model/training/test_training.py",
     "tests/sim_warp/assets/",
     "tests/sim_warp/production/test_produce.py",
-    "tests/sim_warp/robots/test_bodies.py::test_two_processes_write_the_same_bytes_for_64_bodies",
+    "tests/sim_warp/robots/test_bodies.py::test_two_processes_write_the_same_bytes",
     "tests/sim_warp/robots/test_own_robots.py::test_data_keep_their_robot",
     "tests/sim_warp/tasks/",
     "tests/sim_warp/test_benchmarks.py",
@@ -79,6 +81,8 @@ XLA_FLAGS = (
 """Options of XLA under test, for subprocesses too. Programs of tests run for milliseconds, and most of the time is compiling,
 which these make ten times faster (the gradient of the tiny network: 1.5 s instead of 14 s). AVX has no fused multiply-add:
 without XLA's fusion emitters, equal numbers would otherwise be computed in two ways, and their difference would not be zero."""
+PROGRAMS = Path(__file__).parents[1] / ".pytest_cache" / "jax"
+"""Folder of compiled programs that workers, subprocesses and sessions share."""
 CACHE_DAYS = 14
 """Number of days for which a compiled program that no session has written again is kept."""
 
@@ -93,18 +97,18 @@ def annotated_modules() -> list[str]:
 for pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(pool, "1")  # before NumPy loads: two workers with a pool of threads each only wait for one another
 os.environ.setdefault("XLA_FLAGS", " ".join(XLA_FLAGS))  # before JAX compiles anything
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(PROGRAMS))  # before JAX is imported, which reads it once
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # so is this: hundreds of small programs count, too
 if CHECK_SHAPES:
     install_import_hook(annotated_modules(), f"{tests.checking.__name__}.check_annotations")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Name the marks, and share one folder of compiled programs between workers, subprocesses and sessions."""
+    """Name the marks, and clear old programs away."""
     config.addinivalue_line("markers", "loose_types(reason): arrays of different types may meet; says whose code needs that")
     config.addinivalue_line("markers", "loose_ranks(reason): arrays of different rank may meet; says whose code needs that")
-    folder = Path(os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(config.rootpath / ".pytest_cache" / "jax")))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # hundreds of small programs a test are much, too
     if not hasattr(config, "workerinput"):
-        remove_old_files(folder)
+        remove_old_files(Path(os.environ["JAX_COMPILATION_CACHE_DIR"]))
 
 
 def remove_old_files(folder: Path) -> None:
@@ -140,6 +144,24 @@ def no_origins_of_tracers() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(DynamicJaxprTracer, "_origin_msg", lambda tracer: "")
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_context_a_thread() -> Iterator[None]:
+    """JAX lowers each program in an MLIR context of its own, which it fills with all dialects first: a tenth of the time of
+    tests that run networks operation by operation."""
+    from jax._src.interpreters import mlir
+
+    make_context, of_thread = mlir.make_ir_context, threading.local()
+
+    def get_context() -> Any:
+        if not hasattr(of_thread, "context"):
+            of_thread.context = make_context()
+        return of_thread.context
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mlir, "make_ir_context", get_context)
         yield
 
 

@@ -5,12 +5,12 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 
 import pytest
 
-from xew.concurrency import leave_with_parent, map_in_order
+from xew.concurrency import leave_with_parent, map_in_order, map_in_processes
 
 
 def test_results_come_in_order_and_not_too_far_ahead() -> None:
@@ -115,3 +115,17 @@ def test_the_first_process_has_no_parent_to_leave_with() -> None:
     before, left = threading.enumerate(), []
     leave_with_parent(lambda: left.append(True))
     assert threading.enumerate() == before and not left, "nothing watches for a parent that there is not"
+
+
+def open_reader() -> Callable[[str], tuple[str | None, int]]:
+    return lambda name: (os.environ.get(name), os.getpid())
+
+
+def test_processes_have_the_environment_of_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though they are forked from a process that was started with an earlier one."""
+    found = []
+    for text in ("first", "second"):
+        monkeypatch.setenv("XEW_TEST", text)
+        found += map_in_processes(open_reader, ["XEW_TEST"], 1)
+    assert [text for text, _ in found] == ["first", "second"]
+    assert len({process for _, process in found} | {os.getpid()}) == 3

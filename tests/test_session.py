@@ -64,3 +64,8 @@ def test_shapes_are_not_checked_where_that_is_turned_off() -> None:
         environment = os.environ | {"XEW_CHECK_SHAPES": value, "PYTHONPATH": str(ROOT)}
         done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
         assert done.stdout.strip() == checked, done.stderr
+
+
+def test_compiled_programs_are_kept_for_other_workers() -> None:
+    assert jax.config.jax_compilation_cache_dir == os.environ["JAX_COMPILATION_CACHE_DIR"]
+    assert jax.config.jax_persistent_cache_min_compile_time_secs == 0

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests import synthetic
+from tests.sim_warp.small import TASK, work_inline
 from xew.episode import EpisodeError, read_record, write_video
 from xew.model import latents
 from xew.model.cache.clips import needed_pixels
@@ -19,7 +20,7 @@ from xew.model.experiment import load_experiment
 from xew.model.video.pixels import stored_pixels
 
 CONFIG = """
-clip: {frames: 17, height: 64, width: 80}
+clip: {frames: 9, height: 64, width: 80}
 codec: {spatial_factor: 8, channels: 4}
 model: {size: tiny, action: optical_flow, embodiment: robot_render}
 train: {steps: 1, batch: 1}
@@ -38,8 +39,9 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from xew.sim_warp import generate
 
     root = tmp_path_factory.mktemp("latents")
-    chosen = ["--tasks", "place_empty_cup", "--robots", "aloha_agilex", "--train-seeds", "1", "--test-seeds", "0"]
+    chosen = ["--tasks", TASK, "--robots", "aloha_agilex", "--train-seeds", "1", "--test-seeds", "0"]
     with pytest.MonkeyPatch.context() as patch:
+        work_inline(patch)
         patch.setattr(sys, "argv", ["generate", *chosen, "--out", str(root / "data")])
         generate.main()
     shutil.copytree(root / "data", root / "bare")

@@ -3,6 +3,7 @@
 Both are reached from outside the registries, as a user's own would be: TASK and SLOW name them.
 """
 
+import resource
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -71,6 +72,11 @@ def work_inline(patch: "pytest.MonkeyPatch") -> None:
     """Let commands that are called in this process start no workers."""
     for module in WITH_WORKERS:
         patch.setattr(f"xew.sim_warp.{module}.Workers", InlineWorkers)
+
+
+def fill_disk() -> None:
+    """Let this process write no file as large as the video of twelve frames."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20 * 1024, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
 
 
 def at_home(robot: RobotSpec, frames: int) -> np.ndarray:

@@ -1,7 +1,6 @@
 """The command that makes data: counts, resumes, and tells what is wrong; runs in worker processes as a user's would."""
 
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -13,12 +12,13 @@ from pathlib import Path
 import pytest
 
 from tests.sim_warp.halves import half
-from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, work_inline
+from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, fill_disk, work_inline
 from xew.config import ConfigError
 from xew.dataset import find_accepted, find_records
 from xew.episode import EpisodeError, Record, episode_folder, verify_episode, write_episode
 from xew.protocol import TEST_SEED_START, VALIDATION_SEED_START, seed_split
 from xew.sim_warp import generate as command
+from xew.sim_warp.devices import workers
 from xew.sim_warp.devices.workers import Workers
 from xew.sim_warp.generate import (
     MOST_UNPAIRED,
@@ -165,15 +165,11 @@ def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, *fla
 def test_a_full_disk_in_a_worker_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
 ) -> None:
-    """A limit on the size of files, which workers inherit, stands for the disk; the video of twelve frames is larger."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    """A limit on the size of files, which the worker sets as it begins, stands for the disk."""
     monkeypatch.setattr(sys, "argv", ["generate", *FLAGS, "--workers", "1", "--out", str(tmp_path)])
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20 * 1024, before[1]))
-    try:
-        with pytest.raises(SystemExit) as left:
-            main()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    monkeypatch.setattr(workers, "quiet_warp", fill_disk)
+    with pytest.raises(SystemExit) as left:
+        main()
     said = capfd.readouterr().err
     assert left.value.code == 2 and "Traceback" not in said, said
     assert "cannot write the episode" in said and "Free some space or choose another --out" in said

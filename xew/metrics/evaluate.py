@@ -301,7 +301,7 @@ def _grade_groups(
     """
     opener = make_grader_opener(args, metrics, store)
     if args.processes > 1 and len(groups) > 1:
-        yield from map_in_processes(opener.open_in_process, groups, args.processes)
+        yield from map_in_processes(opener.open_in_process, groups, args.processes, imported=("xew.metrics.grading.grader",))
         return
     stop = threading.Event()
     yield from map_in_order(opener.open(stop, codecs), groups, worker_count(args.workers), stop)

@@ -139,9 +139,11 @@ def test_an_adaptation_started_from_its_variant(made: Place) -> None:
 
 
 def test_killed_anywhere_it_ends_in_the_same_videos_and_scores(made: Place) -> None:
-    """A part of the study again from nothing but data and compiled programs, killed as it goes: the same bytes at the end."""
+    """A part of the study again from nothing but data, the baselines' scores and compiled programs, killed as it goes: the same
+    bytes at the end."""
     killed = Place(made.root / "killed", made.config)
-    shutil.copytree(made.study / "data", killed.study / "data")
+    for name in ("data", "data-baselines"):
+        shutil.copytree(made.study / name, killed.study / name)
     moments = random.Random(int(time.time()))
     for number in range(KILLS):
         seconds = moments.uniform(0, 8)

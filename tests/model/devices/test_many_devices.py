@@ -55,7 +55,7 @@ def job(world: Path, out: str, devices: int, *overrides: str, kill: bool = False
 
 def begin(jobs: Sequence[dict[str, Any]], devices: int = 4, **environment: str) -> subprocess.Popen:
     """A process with so many CPU devices that does these jobs."""
-    paths = {"PYTHONPATH": str(HERE.parents[2]), "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir)}
+    paths = {"PYTHONPATH": str(HERE.parents[2])}
     command = [sys.executable, str(HERE / "device_runs.py"), json.dumps(list(jobs))]
     return subprocess.Popen(
         command, env=os.environ | on_devices(devices) | paths | environment, stderr=subprocess.PIPE, text=True

@@ -4,28 +4,28 @@ Reads  jobs and a function of a job; both travel to the workers by pickle
 Writes results, as they come
 
 On a GPU, too: what Python does there for a batch takes longer than the device, and several batches in flight keep it busy.
-A worker ignores Ctrl-C (its parent decides) and leaves when its parent is killed, so that nobody writes on unwatched.
+A worker ignores Ctrl-C (its parent decides) and leaves when its parent is killed, so that nobody writes on unwatched
+(`xew.concurrency.open_processes`).
 """
 
-import multiprocessing
 import os
-import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import TypeVar
 
 import warp
 
-from xew.concurrency import leave_with_parent
+from xew.concurrency import open_processes
 from xew.config import ConfigError
 from xew.episode import EpisodeError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-
+IMPORTED = ("xew.sim_warp.production.produce",)
+"""Modules that workers are forked with: physics and the renderer."""
 MEMORY_PER_WORKER = 9e9
 """Memory of a GPU that a worker takes [bytes]: a batch of 256 worlds, 512 frames in flight and what CUDA itself takes."""
 
@@ -61,8 +61,7 @@ class Workers:
 
     def __init__(self, count: int, first_alone: bool = True) -> None:
         os.environ.setdefault("OMP_NUM_THREADS", "1")  # a worker is a core; more threads would wait for one another
-        context = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(max(1, count), context, initializer=_become_worker)
+        self._pool = open_processes(count, IMPORTED, quiet_warp)
         self._has_compiled = not first_alone
 
     def __enter__(self) -> "Workers":
@@ -94,9 +93,3 @@ class Workers:
 def quiet_warp() -> None:
     """For commands and their workers: no banner and no line per kernel module among the progress bars."""
     warp.config.log_level = warp.LOG_ERROR
-
-
-def _become_worker() -> None:
-    quiet_warp()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    leave_with_parent(lambda: os._exit(1))

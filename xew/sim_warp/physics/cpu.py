@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 
+from xew.sim_warp.devices.newton import compile_conversion_quickly
 from xew.sim_warp.physics.worlds import (
     FIRST_OBJECT,
     LEFT_ARM_LINKS,
@@ -27,6 +28,7 @@ _ARMS = ((LEFT_FINGERS, LEFT_ARM_LINKS), (RIGHT_FINGERS, RIGHT_ARM_LINKS))
 
 def simulate_one(world: World) -> Motion:
     """Step one world through its commands."""
+    compile_conversion_quickly()
     solver = build_solver([world], "cpu", use_mujoco_cpu=True)
     model, data = solver.mj_model, solver.mj_data
     labels = solver.model.shape_label

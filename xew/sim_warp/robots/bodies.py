@@ -11,7 +11,7 @@ on from there unless it is told to begin anew.
 With --digest it prints SHA-256 digests of the URDF and meshes of each body of the catalog, and of all: two machines that print
 the same make the same bodies.
 
-Command: python -m xew.sim_warp.robots.bodies [--count 104 --anew --workers 2 --out FILE | --digest]
+Command: python -m xew.sim_warp.robots.bodies [--count 104 --anew --workers 2 --out FILE | --count 104 --digest]
 """
 
 import hashlib
@@ -130,7 +130,7 @@ class Args:
     """Find procedural bodies that work."""
 
     count: int = BODY_COUNT
-    """Number of bodies in the catalog."""
+    """Number of bodies in the catalog, or of those whose digests are printed."""
     anew: bool = False
     """Forget the bodies that the file knows."""
     workers: int = os.cpu_count() or 1
@@ -145,7 +145,7 @@ def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
     if args.digest:
-        for line in digest_lines(read_catalog(args.out)):
+        for line in digest_lines(read_catalog(args.out)[: args.count]):
             print(line)
         return
     entries = list(read_catalog(args.out)) if args.out.is_file() and not args.anew else []
