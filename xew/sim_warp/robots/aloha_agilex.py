@@ -12,6 +12,7 @@ LEFT = Arm(
     root_pose=(0, -0.62, 0, 0, 0, 0.7071067812, 0.7071067812),
     joints=("fl_joint1", "fl_joint2", "fl_joint3", "fl_joint4", "fl_joint5", "fl_joint6"),
     home=(-1.1287, 0.9535, 0.7022, -1.0705, -0.463, -1.0553),
+    rest=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     tool_link="fl_link6",
     tool_pose=(0.1406, 0, 0, 0, 0, 0, 1),
     fingers=("fl_joint7", "fl_joint8"),
@@ -35,4 +36,5 @@ SPEC = RobotSpec(
     joint_lower=(-3.14, -0.05, -0.1, -1.6, -1.57, -2.0),
     joint_upper=(2.618, 3.5, 3.2, 1.55, 1.57, 2.0),
     joint_velocity=(5.0, 5.0, 5.5, 5.5, 5.0, 5.0),
+    joint_acceleration=(3.0, 3.0, 3.0, 3.0, 3.0, 3.0),
 )

@@ -12,6 +12,7 @@ LEFT = Arm(
     root_pose=(-0.22, -0.38, 0.84, 0, 0, 0.7071067812, 0.7071067812),
     joints=("joint1", "joint2", "joint3", "joint4", "joint5", "joint6"),
     home=(-0.7354, 0.559, 0.3734, -0.9806, -0.3421, -0.6646),
+    rest=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     tool_link="link6",
     tool_pose=(0.142, 0, 0, 0, 0, 0, 1),
     fingers=("joint7", "joint8"),
