@@ -133,8 +133,8 @@ def demand_motion(data: Path, records: Iterable[Record], motion: str) -> None:
     found = count_motions(records)
     if motion != MIXED_MOTION and set(found) - {motion}:
         raise EpisodeError(
-            f"{data} has {_list_motions(found)} to be read, and the split is of {motion} motion; choose a split of the other kind"
-            " (--split fixed, fixed_own), or one that ends in _mixed to mix them on purpose."
+            f"{data} has {_list_motions(found)} to be read, and the split is of {motion} motion; choose a split of the other"
+            " kind (--split fixed, fixed_own), or one that ends in _mixed to mix them on purpose."
         )
 
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from xew.sim_warp.embodiment.spec import RobotSpec
@@ -48,23 +49,40 @@ def own_commands(robot: RobotSpec, timelines: Sequence[Timeline]) -> list[tuple[
 
     They are the same bits whatever is solved beside them.
     """
-    steps = [timeline.steps for timeline in timelines]
-    longest = max(len(moves) for moves in steps) * SAMPLES + 1
-    targets = np.stack([_lines(moves, longest) for moves in steps], 1).reshape(longest, -1, 7)
+    longest = max(len(timeline.steps) for timeline in timelines) * SAMPLES + 1
+    targets = np.stack([_lines(timeline.steps, longest) for timeline in timelines], 1).reshape(longest, -1, 7)
     arms = np.tile([LEFT, RIGHT], len(timelines))
     solution = arm_solver(robot).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
     found = []
     for index, timeline in enumerate(timelines):
         columns = slice(2 * index, 2 * index + 2)
-        asked = _asked_rows(steps[index], longest)
-        problem = find_unreached(
-            np.where(asked, solution.position_error[:, columns], 0.0),
-            np.where(asked, solution.rotation_error[:, columns], 0.0),
-        )
-        path, action = _follow(robot, timeline, steps[index], solution.joint_pos[:, columns])
-        commands = Commands(action.astype(np.float32), problem or find_too_fast(robot, action))
-        found.append((replace(path, pose=tool_poses(robot, action)), commands))
+        asked = _asked_rows(timeline.steps, longest)
+        path, action = _follow(robot, timeline, solution.joint_pos[:, columns])
+        far = (np.where(asked, error[:, columns], 0.0) for error in (solution.position_error, solution.rotation_error))
+        problem = find_unreached(*far) or find_too_fast(robot, action)
+        found.append((path, Commands(action.astype(np.float32), problem)))
     return found
+
+
+def _follow(robot: RobotSpec, timeline: Timeline, joint_pos: np.ndarray) -> tuple[ToolPath, np.ndarray]:
+    """The path and the commands [t 16] of one plan; `joint_pos` [rows 2 d] rad solves `_lines`."""
+    begin = [_begin(robot, arm, timeline.steps, joint_pos) for arm in (LEFT, RIGHT)]
+    moves, clock = _plan_moves(robot, timeline, begin, joint_pos)
+    planned, own = np.array(clock).T
+
+    def in_own_time(instants: ArrayLike) -> np.ndarray:
+        """Instants of the robot's own time at which those of the plan come [s]."""
+        return np.interp(np.asarray(instants, float), planned, own)
+
+    times = frame_times(clock[-1][1])
+    joints = np.stack([_sample(begin[arm], arm, moves, times) for arm in (LEFT, RIGHT)], 1)
+    knots = [np.array(grips).T for grips in timeline.grips]
+    gripper = np.stack([np.interp(times, in_own_time(at), value) for at, value in knots], 1)
+    action = canonical_commands(np.clip(joints, robot.joint_lower, robot.joint_upper), gripper)
+    holds = tuple(
+        replace(hold, start=float(in_own_time(hold.start)), end=float(in_own_time(hold.end))) for hold in timeline.holds
+    )
+    return ToolPath(tool_poses(robot, action), gripper, holds, clock=tuple(clock)), action
 
 
 def _lines(steps: Sequence[Step], rows: int) -> np.ndarray:
@@ -84,9 +102,9 @@ def _asked_rows(steps: Sequence[Step], rows: int) -> np.ndarray:
     """[rows 2] bool, whether a tool must be at its row of `_lines`: all along a line, else at the end of each move."""
     asked = np.zeros((rows, 2), bool)
     for number, step in enumerate(steps):
-        for arm, segment in step.items():
-            first = number * SAMPLES
-            asked[first if _keeps_line(steps, number, arm) else first + SAMPLES : first + SAMPLES + 1, arm] = True
+        first, last = number * SAMPLES, (number + 1) * SAMPLES
+        for arm in step:
+            asked[first if _keeps_line(steps, number, arm) else last : last + 1, arm] = True
     return asked
 
 
@@ -97,30 +115,29 @@ def _keeps_line(steps: Sequence[Step], number: int, arm: int) -> bool:
     return segment.is_curve or (segment.is_straight and not comes_from_rest)
 
 
-def _follow(robot: RobotSpec, timeline: Timeline, steps: Sequence[Step], joint_pos: np.ndarray) -> tuple[ToolPath, np.ndarray]:
-    """The path, without its poses, and the commands [t 16] of one plan; `joint_pos` [rows 2 d] solves `_lines`."""
-    begin = [_begin(robot, arm, steps, joint_pos) for arm in (LEFT, RIGHT)]
-    at = list(begin)
-    moves: list[_Move] = []
-    clock = [(0.0, 0.0)]
+def _plan_moves(
+    robot: RobotSpec, timeline: Timeline, begin: Sequence[np.ndarray], joint_pos: np.ndarray
+) -> tuple[list[_Move], list[tuple[float, float]]]:
+    """The moves of one plan from joints `begin` on, and the pairs of its clock and the robot's own.
+
+    `joint_pos` [rows 2 d] rad solves `_lines`.
+    """
+    steps, at, moves, clock = timeline.steps, list(begin), list[_Move](), [(0.0, 0.0)]
     for number, step in enumerate(steps):
         rows = joint_pos[number * SAMPLES : (number + 1) * SAMPLES + 1]
-        first = next(iter(step.values()))
+        on_line = [arm for arm in step if _keeps_line(steps, number, arm)]
         courses = {}
         for arm in step:
-            way = rows[:, arm] if _keeps_line(steps, number, arm) else np.linspace(at[arm], rows[-1, arm], SAMPLES + 1)
+            way = rows[:, arm] if arm in on_line else np.linspace(at[arm], rows[-1, arm], SAMPLES + 1)
             courses[arm], at[arm] = CubicSpline(np.linspace(0, 1, SAMPLES + 1), way), way[-1]
-        on_line = any(_keeps_line(steps, number, arm) for arm in step)
-        least = first.end_time - first.start_time if on_line else SHORTEST_MOVE
-        start = clock[-1][1] + first.start_time - clock[-1][0]
-        moves.append(_Move(start, max(least, *(_shortest_time(robot, course) for course in courses.values())), courses))
-        clock += [(first.start_time, start), (first.end_time, start + moves[-1].seconds)]
+        planned = next(iter(step.values()))
+        least = planned.end_time - planned.start_time if on_line else SHORTEST_MOVE
+        seconds = max(least, *(_shortest_time(robot, course) for course in courses.values()))
+        start = clock[-1][1] + planned.start_time - clock[-1][0]
+        moves.append(_Move(start, seconds, courses))
+        clock += [(planned.start_time, start), (planned.end_time, start + seconds)]
     clock.append((timeline.time, clock[-1][1] + timeline.time - clock[-1][0]))
-    times = frame_times(clock[-1][1])
-    joints = np.stack([_sample(begin[arm], arm, moves, times) for arm in (LEFT, RIGHT)], 1)
-    return _own_path(timeline, clock, times), canonical_commands(
-        np.clip(joints, robot.joint_lower, robot.joint_upper), _grippers(timeline, clock, times)
-    )
+    return moves, list(dict.fromkeys(clock))
 
 
 def _begin(robot: RobotSpec, arm: int, steps: Sequence[Step], joint_pos: np.ndarray) -> np.ndarray:
@@ -149,22 +166,3 @@ def _sample(begin: np.ndarray, arm: int, moves: Sequence[_Move], times: np.ndarr
             now = times >= move.start
             joints[now] = move.courses[arm](minimum_jerk((times[now] - move.start) / move.seconds))
     return joints
-
-
-def _grippers(timeline: Timeline, clock: list[tuple[float, float]], times: np.ndarray) -> np.ndarray:
-    """[t 2] grippers at instants [t] s of the robot's own time."""
-    values = []
-    for knots in timeline.grips:
-        at, value = np.array(knots).T
-        values.append(np.interp(times, np.interp(at, *np.array(clock).T), value))
-    return np.stack(values, 1)
-
-
-def _own_path(timeline: Timeline, clock: list[tuple[float, float]], times: np.ndarray) -> ToolPath:
-    """The path in the robot's own time, with its poses still to be filled in."""
-    planned, own = np.array(clock).T
-    holds = tuple(
-        replace(hold, start=float(np.interp(hold.start, planned, own)), end=float(np.interp(hold.end, planned, own)))
-        for hold in timeline.holds
-    )
-    return ToolPath(np.empty((len(times), 2, 7)), _grippers(timeline, clock, times), holds, clock=tuple(clock))
