@@ -157,7 +157,7 @@ def count_motions(records: Iterable[Record]) -> dict[str, int]:
 
 
 def _list_motions(counts: dict[str, int]) -> str:
-    return " and ".join(f"{count} episodes of {motion} motion" for motion, count in counts.items())
+    return "episodes " + " and ".join(f"of {motion} motion ({count})" for motion, count in counts.items())
 
 
 def explain_missing(data: Path, what: str = "episode") -> EpisodeError:

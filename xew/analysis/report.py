@@ -38,7 +38,7 @@ from xew.analysis.statistics.summary import RobotTable, Row, finding, flat_summa
 from xew.analysis.tables import formats
 from xew.analysis.tables.table import Table, TableCell, TableRow, TableSection, format_interval, format_number, metric_columns
 from xew.config import ConfigError, user_errors
-from xew.dataset import demand_one_motion, find_records
+from xew.dataset import count_motions, demand_one_motion, find_records
 from xew.episode import Record, episode_folder, read_video
 from xew.files import hold_lock, write_bytes, write_text
 from xew.names import csv_text, path_below, plain_markdown
@@ -293,7 +293,9 @@ def _data_section(sheets: Sequence[Picture], records: Sequence[Record]) -> Marku
     if not sheets:
         return None
     accepted = sum(record.success for record in records)
-    text = f"{len(records)} cells were tried, {accepted} succeeded. A seed counts when every robot has mastered it."
+    motions = " and of ".join(count_motions(records))
+    tried = f"{len(records)} cells of {motions} motion were tried, {accepted} succeeded."
+    text = f"{tried} A seed counts when every robot has mastered it."
     return page.section("The paired data", page.paragraph(text), *(sheet.html for sheet in sheets))
 
 

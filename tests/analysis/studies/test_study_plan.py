@@ -77,6 +77,14 @@ def test_an_adaptation_waits_for_what_it_starts_from(study: Study) -> None:
     assert order[0] == "generate" and order[-1] == "analyse"
 
 
+def test_a_study_of_own_motion_makes_and_names_it(study: Study) -> None:
+    own = replace(study, motion="own")
+    assert plan(own)["generate"].command[-2:] == ("--motion", "own") and "--motion" not in plan(study)["generate"].command
+    variants = (VARIANTS["fixed-irasim"], VARIANTS["loeo_piper-optical_flow-nine_views"])
+    assert [build_experiment(own, variant)["split"] for variant in variants] == ["fixed_own", "loeo_piper_own"]
+    assert build_experiment(study, variants[0])["split"] == "fixed"
+
+
 def test_baselines_are_graded_once_and_over_all_robots(study: Study) -> None:
     graded = [step for step in plan(study).values() if "--baselines" in step.command]
     assert [step.name for step in graded] == ["evaluate/fixed-optical_flow-none"]

@@ -69,9 +69,9 @@ def test_motion_is_mixed_on_purpose_only() -> None:
 
     assert read(shared, "fixed") == read(Dataset(shared.root, own * 2), "fixed_own") == read(mixed, "fixed_mixed") == 6
     for split in ("fixed", "fixed_own"):
-        with pytest.raises(EpisodeError, match=r"3 episodes of shared motion and 3 episodes of own motion.*ends in _mixed"):
+        with pytest.raises(EpisodeError, match=r"episodes of shared motion \(3\) and of own motion \(3\) .*ends in _mixed"):
             read(mixed, split)
-    with pytest.raises(EpisodeError, match="6 episodes of shared motion to be read, and the split is of own motion"):
+    with pytest.raises(EpisodeError, match=r"episodes of shared motion \(6\) to be read, and the split is of own motion"):
         read(shared, "fixed_own")
     replayed = EpisodeChoice((HELD_OUT_ROBOTS[0],), 1, robots)
     with pytest.raises(EpisodeError, match="own motion"):

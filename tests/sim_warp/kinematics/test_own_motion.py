@@ -145,7 +145,7 @@ def test_the_tables_tell_distances_at_equal_phase(planned: dict[str, Planned]) -
     plan = timeline()
     shared = plan.path()
     tools = tools_at_phase(plan, shared, shared.pose[..., :3])
-    np.testing.assert_allclose(tools, shared.pose[..., :3], atol=1e-12)
+    np.testing.assert_allclose(tools[:-1], shared.pose[:-1, :, :3], atol=1e-12)  # the last frame is after the end of the plan
     moved = {"arx_x5": tools, "piper": tools + [0.003, 0.004, 0.0]}
     scenes = [
         Compared("lift_pot", motion, tools_by_robot, seconds)
