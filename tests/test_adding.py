@@ -1,4 +1,7 @@
-"""A metric, a robot, a condition and a task from a module outside go through every command, to a report that shows them."""
+"""A metric, a robot, a condition and a task from a module outside go through every command, to a report that shows them.
+
+A procedural body goes with them, and both robots move each in its own way: that spares a second run of all commands.
+"""
 
 import importlib
 import sys
@@ -10,6 +13,7 @@ import pytest
 
 from tests.commands import run_command
 from tests.sim_warp.small import work_inline
+from xew.dataset import find_records
 from xew.metrics import METRICS
 
 pytestmark = [
@@ -52,8 +56,9 @@ METRIC = Metric(brightness_error, brightness_error, "visual", "levels", (0, 255)
 ROBOT = replace(ROBOTS["piper"], title="An added robot")
 CONDITION = Condition("half_way", "joints", half_way)
 TASK = Task("added", "close both hands", sample, small.plan, small.success)
-SPLIT = Split(("additions:ROBOT",), ())
+SPLIT = Split(("additions:ROBOT", "body_64"), (), motion="own")
 '''
+ROBOTS = ("additions:ROBOT", "body_64")
 CONFIG = """
 data: data
 out: runs/added
@@ -81,8 +86,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def test_what_is_added_goes_the_whole_way(folder: Path) -> None:
-    made = ("--tasks", "additions:TASK", "--robots", "additions:ROBOT", "--train-seeds", "1", "--test-seeds", "1")
+    made = ("--tasks", "additions:TASK", "--robots", *ROBOTS, "--motion", "own", "--train-seeds", "1", "--test-seeds", "1")
     run_command("xew.sim_warp.generate", *made, "--device", "cpu", "--workers", "1", "--out", "data")
+    assert {record.motion for _, record in find_records(Path("data"))} == {"own"}
     run_command("xew.model.latents", "config.yaml")
     run_command("xew.model.train", "config.yaml")
     run_command("xew.model.rollout", "runs/added", "--data", "data", "--split", "test", "--out", "rollouts")
@@ -90,11 +96,16 @@ def test_what_is_added_goes_the_whole_way(folder: Path) -> None:
     run_command("xew.metrics.evaluate", "rollouts", "--data", "data", *graded)
     scores = pd.read_parquet(folder / "scores.parquet")
     assert set(scores["metric"]) == {"psnr", "brightness_error"}
-    assert set(scores["task"]) == {"additions:TASK"} and set(scores["robot"]) == {"additions:ROBOT"}
+    assert set(scores["task"]) == {"additions:TASK"} and set(scores["robot"]) == set(ROBOTS)
+    assert scores.attrs["motion"] == "own"
     assert "additions:CONDITION" in set(scores["condition"])
     values = scores[scores["metric"] == "brightness_error"].set_index("model")["value"]
-    assert values["ground_truth"] == 0 < values.drop("ground_truth").max()
+    assert (values["ground_truth"] == 0).all() and values.drop("ground_truth").max() > 0
     run_command("xew.analysis.report", "scores.parquet", "--data", "data", "--rollouts", "rollouts", "--out", "report")
     page = (folder / "report" / "index.html").read_text()
-    for shown in ("brightness_error", "additions:ROBOT", "additions:CONDITION"):
+    for shown in ("brightness_error", *ROBOTS, "additions:CONDITION"):
         assert shown in page or shown.replace("_", " ") in page.lower(), f"the report does not show {shown}"
+    run_command("xew.analysis.distance", "--robot", "body_64", "--seeds", "1", "--no-looks", "--out", "distances")
+    pairs = pd.read_csv("distances/distances.csv")
+    of_body = pairs[(pairs["axis"] == "kinematic") & (pairs[["robot", "other"]] == "body_64").any(axis=1)]
+    assert len(of_body) == 5 and (of_body["value"] > 0).all()

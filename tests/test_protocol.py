@@ -1,6 +1,7 @@
 """The protocol as data: counts of the paper's tables, roles, names, and that the model knows every word of it."""
 
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -11,6 +12,8 @@ from xew.protocol import (
     FORGETTING_ROBOT,
     HELD_OUT_ROBOTS,
     LOEO,
+    MIXED_MOTION,
+    MOTIONS,
     PAPER_PARTS,
     PARTS,
     ROBOT_NAMES,
@@ -32,6 +35,7 @@ from xew.protocol import (
     reference,
     seed_split,
     split_counts,
+    split_key,
     training_counts,
     validation_split,
 )
@@ -97,7 +101,16 @@ def test_the_model_knows_every_action_conditioning_and_split() -> None:
         assert variant.action in ACTIONS and variant.embodiment in CONDITIONS and variant.split in SPLITS
         assert variant.start is None or variant.start in VARIANTS.values()
     loeo = {f"loeo_{robot}" for robot in LOEO}
-    assert set(SPLITS) == {"fixed", "distance", "validation", *loeo, *SCALING}
+    shared = {"fixed", "distance", "validation", *loeo, *SCALING}
+    assert set(SPLITS) == {key + ending for key in shared for ending in ("", "_own", "_mixed")}
+
+
+def test_the_key_of_a_split_says_the_motion_of_its_episodes() -> None:
+    assert [SPLITS[key].motion for key in ("fixed", "loeo_piper_own", "distance_mixed")] == ["shared", "own", "mixed"]
+    for motion in (*MOTIONS, MIXED_MOTION):
+        split = SPLITS[split_key("fixed", motion)]
+        assert replace(split, motion="shared") == FIXED
+        assert validation_split(split).motion == motion
 
 
 def test_splits_with_bodies_count_what_they_should() -> None:

@@ -6,13 +6,14 @@ new or whose file has changed since this process read them last.
 
 import os
 import time
-from collections.abc import Collection, Iterator
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from xew.episode import TEMPORARY, EpisodeError, Record, read_record
-from xew.protocol import seed_split
+from xew.protocol import MIXED_MOTION, MOTIONS, seed_split
 
 Episode = tuple[Path, Record]
 """Folder and header of one cell."""
@@ -125,6 +126,38 @@ def find_accepted(data: Path) -> list[Episode]:
     Raises EpisodeError if there is none, and says what to do.
     """
     return list(read_dataset(data).accepted)
+
+
+def demand_motion(data: Path, records: Iterable[Record], motion: str) -> None:
+    """Raise EpisodeError where episodes of a data set are not of the kind of motion that a split names (`Split.motion`)."""
+    found = count_motions(records)
+    if motion != MIXED_MOTION and set(found) - {motion}:
+        raise EpisodeError(
+            f"{data} has {_list_motions(found)} to be read, and the split is of {motion} motion; choose a split of the other"
+            " kind (--split fixed, fixed_own), or one that ends in _mixed to mix them on purpose."
+        )
+
+
+def demand_one_motion(data: Path, records: Iterable[Record], mixed: bool) -> str:
+    """The kind of motion of a data set's episodes, one of `MOTIONS`; MIXED_MOTION if they have both and may.
+
+    Raises:
+        EpisodeError: they have both, and `mixed` does not allow it.
+    """
+    found = count_motions(records)
+    if len(found) > 1 and not mixed:
+        raise EpisodeError(f"{data} has {_list_motions(found)}, which do not compare; mix them on purpose by --mixed-motion.")
+    return MIXED_MOTION if len(found) > 1 else next(iter(found), MOTIONS[0])
+
+
+def count_motions(records: Iterable[Record]) -> dict[str, int]:
+    """Numbers of episodes by kind of motion, in the order of `MOTIONS`; kinds of which there are none are left out."""
+    counts = Counter(record.motion for record in records)
+    return {motion: counts[motion] for motion in MOTIONS if counts[motion]}
+
+
+def _list_motions(counts: dict[str, int]) -> str:
+    return "episodes " + " and ".join(f"of {motion} motion ({count})" for motion, count in counts.items())
 
 
 def explain_missing(data: Path, what: str = "episode") -> EpisodeError:

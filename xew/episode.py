@@ -33,6 +33,7 @@ from xew.config import ConfigError, parse
 from xew.files import demand_regular, read_json
 from xew.names import EpisodeError as EpisodeError
 from xew.names import check_label, check_name, path_below
+from xew.protocol import MOTIONS, SHARED_MOTION
 
 SCHEMA_VERSION = 2
 WIDTH, HEIGHT = 320, 240
@@ -116,6 +117,8 @@ class Record:
     schema_version: int = SCHEMA_VERSION
     videos: bool = True
     """Are rgb and robot stored? Where not, `python -m xew.sim_warp.inspect --render` makes them from the states."""
+    motion: str = SHARED_MOTION
+    """Kind of motion, one of `xew.protocol.MOTIONS`; headers that were written before there were two are of the first."""
 
 
 def episode_folder(data: Path, task: str, seed: int, robot: str) -> Path:
@@ -261,6 +264,8 @@ def _check_record(record: Record) -> Record:
             check_label(name, "name of an object or keypoint")
     except EpisodeError as error:
         raise ValueError(str(error).rstrip(".")) from error
+    if record.motion not in MOTIONS:
+        raise ValueError(f"its motion is {record.motion!r}, expected {' or '.join(MOTIONS)}")
     if not (math.isfinite(record.frame_rate) and record.frame_rate > 0 and record.frame_count >= 0):
         raise ValueError(f"it has {record.frame_count} frames at {record.frame_rate} a second")
     return record

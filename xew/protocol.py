@@ -5,7 +5,7 @@ It follows the paper's section 3 and its appendix. Every room may read this file
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 ROBOT_NAMES = ("aloha_agilex", "arx_x5", "ur5_wsg", "franka_panda", "piper")
 """Keys of the five robots of the paper, in its order."""
@@ -31,6 +31,13 @@ DIMENSION_TITLES = {
     "objects": "Object dynamics",
 }
 """Titles of the dimensions, the groups of metrics; they are reported side by side, never as one number."""
+
+SHARED_MOTION, OWN_MOTION = "shared", "own"
+MOTIONS = (SHARED_MOTION, OWN_MOTION)
+"""Kinds of motion that episodes may have: all robots of a scene follow one tool path on one clock, so that the body alone
+differs; or each goes between the task's waypoints by a path, in a time and from a rest posture of its own."""
+MIXED_MOTION = "mixed"
+"""Both kinds of motion, where a split, a table or a report has them on purpose."""
 
 FRAME_RATE = 1000 / 60
 """Number of stored frames per second [Hz]: one every 15 physics steps of 4 ms."""
@@ -75,6 +82,8 @@ class Split:
 
     train_robots: tuple[str, ...]
     held_out_robots: tuple[str, ...]
+    motion: str = SHARED_MOTION
+    """Kind of motion of its episodes: one of MOTIONS, or MIXED_MOTION."""
 
 
 FIXED = Split(SEEN_ROBOTS, HELD_OUT_ROBOTS)
@@ -105,16 +114,26 @@ VALIDATION = Split(SEEN_ROBOTS, VALIDATION_BODIES)
 
 def validation_split(split: Split) -> Split:
     """Robots by which choices about models of a split are made: its training robots, and bodies as those never seen."""
-    return Split(split.train_robots, VALIDATION_BODIES)
+    return replace(split, held_out_robots=VALIDATION_BODIES)
 
 
-SPLITS = (
+def split_key(split: str, motion: str) -> str:
+    """The key of a split in a kind of motion: fixed, fixed_own, fixed_mixed."""
+    return split if motion == SHARED_MOTION else f"{split}_{motion}"
+
+
+_SHARED_SPLITS = (
     {"fixed": FIXED}
     | {f"loeo_{robot}": split for robot, split in LOEO.items()}
     | SCALING
     | {"distance": DISTANCE, "validation": VALIDATION}
 )
-"""All splits by key."""
+SPLITS = {
+    split_key(key, motion): replace(split, motion=motion)
+    for motion in (*MOTIONS, MIXED_MOTION)
+    for key, split in _SHARED_SPLITS.items()
+}
+"""All splits by key. A plain key is of shared motion, `_own` behind it of own motion, and `_mixed` of both on purpose."""
 
 SHOTS = (1, 2, 3)
 """Numbers of training episodes of each task that a model is adapted with (M); they are of the first accepted seeds."""

@@ -178,6 +178,24 @@ def edit(study: Study, out: Path, change: object) -> Path:
     return out / "scores.parquet"
 
 
+def test_kinds_of_motion_are_reported_together_on_purpose_only(
+    study: Study, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    for motion, data, word in (
+        ("mixed", None, "has scores of shared and of own motion, which do not compare"),
+        ("own", study.data, "has episodes of shared motion"),
+    ):
+        path = edit(study, tmp_path, lambda rows: rows)
+        rows = pd.read_parquet(path)
+        rows.attrs["motion"] = motion
+        rows.to_parquet(path, index=False)
+        with pytest.raises(SystemExit):
+            main(Args(path, data, out=tmp_path / "report"))
+        assert word in capsys.readouterr().err and not (tmp_path / "report").exists()
+        assert read_scores(path).measured_by["motion"] == motion
+    assert read_scores(study.scores).motion == "shared"
+
+
 def test_an_incomplete_table_says_so(study: Study, tmp_path: Path) -> None:
     piper = lambda rows: rows[~((rows["robot"] == "piper") & (rows["seed"] == 1_000_001))]  # noqa: E731
     main(Args(edit(study, tmp_path, piper), study.data, (study.rollouts,), tmp_path / "report"))

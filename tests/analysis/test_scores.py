@@ -209,7 +209,13 @@ def test_missing_cells_of_a_study_are_by_variant(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("protocol", 3), ("estimators", {"masks": "sam2"}), ("frame_zero", "absent"), ("metrics", {"lpips": METRICS["lpips"]})],
+    [
+        ("protocol", 3),
+        ("estimators", {"masks": "sam2"}),
+        ("frame_zero", "absent"),
+        ("motion", "own"),
+        ("metrics", {"lpips": METRICS["lpips"]}),
+    ],
 )
 def test_tables_that_do_not_compare_are_not_merged(key: str, value: object, tmp_path: Path) -> None:
     rows = graded()

@@ -533,6 +533,22 @@ def test_missing_episodes_trees_and_metrics_are_named(
     assert "xew.model.rollout" in capsys.readouterr().err
 
 
+def test_kinds_of_motion_are_graded_together_on_purpose_only(
+    rollouts: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    mixed = tmp_path / "mixed"
+    shutil.copytree(data, mixed)
+    header = episode_folder(mixed, TASK, SEED, "piper") / "episode.json"
+    header.write_text(json.dumps(json.loads(header.read_text()) | {"motion": "own"}))
+    with pytest.raises(SystemExit):
+        grade(rollouts, mixed, metrics=("psnr",))
+    message = capsys.readouterr().err
+    assert "episodes of shared motion (1) and of own motion (1)" in message and "--mixed-motion" in message
+    scores = grade(rollouts, mixed, metrics=("psnr",), mixed_motion=True)
+    assert scores.attrs["motion"] == "mixed"
+    assert grade(rollouts, data, metrics=("psnr",)).attrs["motion"] == "shared"
+
+
 def test_models_over_different_horizons_do_not_share_a_table(
     rollouts: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

@@ -1,5 +1,6 @@
 """The command that makes data: counts, resumes, and tells what is wrong; runs in worker processes as a user's would."""
 
+import json
 import os
 import shutil
 import signal
@@ -15,7 +16,7 @@ from tests.sim_warp.halves import half
 from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, fill_disk, work_inline
 from xew.config import ConfigError
 from xew.dataset import find_accepted, find_records
-from xew.episode import EpisodeError, Record, episode_folder, verify_episode, write_episode
+from xew.episode import EpisodeError, Record, episode_folder, read_record, verify_episode, write_episode
 from xew.protocol import TEST_SEED_START, VALIDATION_SEED_START, seed_split
 from xew.sim_warp import generate as command
 from xew.sim_warp.devices import workers
@@ -30,6 +31,7 @@ from xew.sim_warp.generate import (
     plan_families,
     yield_table,
 )
+from xew.sim_warp.inspect import find_problem
 from xew.sim_warp.manifest import Manifest
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import produce
@@ -70,6 +72,30 @@ def test_seeds_are_tried_until_enough_are_accepted(undisturbed: Path) -> None:
     assert len(records) == len(ROBOTS) * 6
     for folder, record in find_accepted(undisturbed):
         assert verify_episode(folder) == record and set(record.hashes) == {"states", "rgb", "robot"}
+
+
+def test_motion_of_its_own_is_on_record_and_mixed_on_purpose_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    work_inline(monkeypatch)
+    out = tmp_path / "own"
+    asked = Args((TASK,), ("franka_panda",), None, 1, 0, out=out, device="cpu", motion="own", states_only=True)
+    generate(asked)
+    ((folder, record),) = find_records(out)
+    assert record.motion == "own" and find_problem(folder) == "", "its holds are known again in its own time"
+    with pytest.raises(
+        EpisodeError, match="holds episodes of own motion, and shared motion is asked for; choose another --out"
+    ):
+        generate(replace(asked, motion="shared"))
+    generate(replace(asked, robots=("franka_panda", "piper"), motion="shared", mixed_motion=True))
+    records = [record for _, record in find_records(out)]
+    assert {record.robot: record.motion for record in records} == {"franka_panda": "own", "piper": "shared"}
+    assert yield_table(records).splitlines()[-1] == "motion: shared 1, own 1"
+    header = folder / "episode.json"
+    fields = json.loads(header.read_text())
+    header.write_text(json.dumps({name: value for name, value in fields.items() if name != "motion"}))
+    assert read_record(folder).motion == "shared", "headers of earlier versions do not say it"
+    header.write_text(json.dumps(fields | {"motion": "fast"}))
+    with pytest.raises(EpisodeError, match="its motion is 'fast', expected shared or own"):
+        read_record(folder)
 
 
 def test_what_was_rejected_is_on_record_with_its_reason(undisturbed: Path) -> None:

@@ -38,11 +38,11 @@ from xew.analysis.statistics.summary import RobotTable, Row, finding, flat_summa
 from xew.analysis.tables import formats
 from xew.analysis.tables.table import Table, TableCell, TableRow, TableSection, format_interval, format_number, metric_columns
 from xew.config import ConfigError, user_errors
-from xew.dataset import find_records
+from xew.dataset import count_motions, demand_one_motion, find_records
 from xew.episode import Record, episode_folder, read_video
 from xew.files import hold_lock, write_bytes, write_text
 from xew.names import csv_text, path_below, plain_markdown
-from xew.protocol import BASELINES, HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
+from xew.protocol import BASELINES, HELD_OUT_ROBOTS, MIXED_MOTION, ROBOT_NAMES, seed_split
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
 from xew.statistics import MIN_SCENES, strict_metrics
 
@@ -80,6 +80,8 @@ class Args:
     """Robots that the models have not seen; each has a table of its own, as have all robots that are not the paper's."""
     distances: Path | None = None
     """Folder that python -m xew.analysis.distance wrote, for a study; without it the paper's distances are used."""
+    mixed_motion: bool = False
+    """Report on scores of episodes of shared and of own motion together."""
     paper: bool = False
     """Instead of scores: rebuild the paper's distance table from the paper's own scores and distances."""
 
@@ -101,10 +103,26 @@ def main(args: Args) -> None:
         _report_paper(args)
     elif args.scores:
         scores = read_scores(args.scores, _own_robots(args.data))
+        _check_motion(args, scores)
         (_report_study if scores.of_study else _report_scores)(args, scores)
     else:
         raise ConfigError("no score table was named: give the one that xew.metrics.evaluate wrote, or --paper.")
     print(f"report: {args.out / 'index.html'}")
+
+
+def _check_motion(args: Args, scores: Scores) -> None:
+    """Raise ConfigError or EpisodeError where scores or data are of both kinds of motion, unless they may, or of different."""
+    if scores.motion == MIXED_MOTION and not args.mixed_motion:
+        raise ConfigError(
+            f"{args.scores} has scores of shared and of own motion, which do not compare; report on them by --mixed-motion."
+        )
+    records = [record for _, record in find_records(args.data)] if args.data else []
+    motion = demand_one_motion(args.data, records, args.mixed_motion) if args.data and records else scores.motion
+    if motion != scores.motion and not args.mixed_motion:
+        raise ConfigError(
+            f"{args.data} has episodes of {motion} motion, {args.scores} has scores of {scores.motion} motion; name the data"
+            " that was graded."
+        )
 
 
 def _own_robots(data: Path | None) -> list[str]:
@@ -275,7 +293,9 @@ def _data_section(sheets: Sequence[Picture], records: Sequence[Record]) -> Marku
     if not sheets:
         return None
     accepted = sum(record.success for record in records)
-    text = f"{len(records)} cells were tried, {accepted} succeeded. A seed counts when every robot has mastered it."
+    motions = " and of ".join(count_motions(records))
+    tried = f"{len(records)} cells of {motions} motion were tried, {accepted} succeeded."
+    text = f"{tried} A seed counts when every robot has mastered it."
     return page.section("The paired data", page.paragraph(text), *(sheet.html for sheet in sheets))
 
 

@@ -18,7 +18,7 @@ import pandas as pd
 from xew.config import IMPORT_PATH, ConfigError, parse
 from xew.files import demand_regular, replacing
 from xew.names import EpisodeError, check_label, check_name
-from xew.protocol import BASELINES, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES
+from xew.protocol import BASELINES, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES, SHARED_MOTION
 from xew.statistics import find_power
 
 VARIANT = "variant"
@@ -31,8 +31,10 @@ NAMES = [VARIANT, "model", "condition", "task", "robot", "metric"]
 COLUMNS = [*KEY, "metric", "value", "frames", "exact_frames"]
 COPY, TRUTH = COPY_FIRST_FRAME, GROUND_TRUTH
 """Baselines that others are measured by: the frozen first frame, and the true video, which is the ceiling."""
-COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero")
-"""Attributes that say how a table was graded; tables that differ in one cannot be compared."""
+COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero", "motion")
+"""Attributes that say how a table was graded, and on what motion; tables that differ in one cannot be compared."""
+EARLIER = {"motion": SHARED_MOTION}
+"""Values of attributes in tables that were written before tables carried them."""
 DEFINITION = ("dimension", "unit", "higher_is_better", "low", "high", "reference")
 """Attributes of each metric that every table has, old ones too."""
 EARLIER_TITLES = {
@@ -120,6 +122,11 @@ class Scores:
         return self.attributes.get("frame_zero", "given")
 
     @property
+    def motion(self) -> str:
+        """Kind of motion of the graded episodes (`xew.protocol.MOTIONS`), or MIXED_MOTION."""
+        return self.attributes.get("motion", EARLIER["motion"])
+
+    @property
     def codecs(self) -> dict[str, list[str]]:
         """By model (of a study by variant): conditions of the truth through its codec, of which its noise floor is."""
         return dict(self.attributes.get("codecs", {}))
@@ -129,7 +136,13 @@ class Scores:
         """How the table was graded, as names and texts."""
         estimators = {f"estimator of {name}": str(used) for name, used in self.attributes.get("estimators", {}).items()}
         allowed = ", ".join(self.attributes.get("allowed", ())) or "nothing"
-        return {"protocol": str(self.protocol), **estimators, "frame 0": self.frame_zero, "changed to fit": allowed}
+        return {
+            "protocol": str(self.protocol),
+            **estimators,
+            "frame 0": self.frame_zero,
+            "changed to fit": allowed,
+            "motion": self.motion,
+        }
 
     @property
     def of_study(self) -> bool:
@@ -315,6 +328,7 @@ class _Attributes:
     robots: tuple[str, ...] = ()
     study: dict[str, Any] = field(default_factory=dict)
     codecs: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    motion: Literal["shared", "own", "mixed"] = "shared"
 
 
 def _check_attributes(path: Path, attributes: Mapping[Hashable, Any]) -> None:
@@ -367,8 +381,9 @@ def _merge_attributes(tables: Sequence[tuple[Path, Mapping[Hashable, Any]]]) -> 
     first = tables[0][1]
     for key in COMPARABLE:
         same = _have_same_metrics if key == "metrics" else operator.eq
-        if not all(same(attributes.get(key, {}), first.get(key, {})) for _, attributes in tables):
-            found = "\n".join(f"  {path}: {attributes.get(key)}" for path, attributes in tables)
+        values = [attributes.get(key, EARLIER.get(key, {})) for _, attributes in tables]
+        if not all(same(value, values[0]) for value in values):
+            found = "\n".join(f"  {path}: {value or None}" for (path, _), value in zip(tables, values, strict=True))
             raise ConfigError(
                 f"the score tables differ in {key}, so their numbers do not compare:\n{found}\n"
                 f"Grade all by the same version and options: {EVALUATE.format(path='SCORES')} --overwrite"

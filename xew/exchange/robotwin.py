@@ -26,7 +26,7 @@ from xew.episode import EpisodeError, Record, States, episode_folder, read_recor
 from xew.exchange.hdf5 import Recorded, read_robotwin, text_beside
 from xew.files import hold_lock
 from xew.names import check_name
-from xew.protocol import ACTION_DIM, ARMS
+from xew.protocol import ACTION_DIM, ARMS, OWN_MOTION
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.geometry.camera import Camera
 from xew.sim_warp.geometry.poses import matrix_from_pose, pose_from_matrix
@@ -113,6 +113,7 @@ def import_episode(path: Path, args: Args) -> Record:
         keypoint_names=names,
         versions={"xew": xew.__version__},
         source=f"{SOURCE} ({recorded.layout})",
+        motion=OWN_MOTION,  # RoboTwin plans for each robot by itself
         unknown=UNKNOWN if recorded.tool_pose is not None else (*UNKNOWN, "tool_pose"),
     )
     return read_record(write_episode(args.out, record, states, recorded.rgb, video))

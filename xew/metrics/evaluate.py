@@ -26,8 +26,8 @@ from tqdm import tqdm
 
 from xew.concurrency import map_in_order, map_in_processes
 from xew.config import ConfigError, pick, suggestion, user_errors
-from xew.dataset import find_accepted
-from xew.episode import EpisodeError, verify_episode
+from xew.dataset import demand_one_motion, find_accepted
+from xew.episode import EpisodeError, read_record, verify_episode
 from xew.files import hold_lock
 from xew.metrics import METRICS
 from xew.metrics.backends import MASKERS, TRACKERS, identity
@@ -119,6 +119,8 @@ class Args:
     """Grade nothing: check that a bundle is consistent, and, where rollouts are named, that it was made from them."""
     regrade: int = 0
     """With --check: grade so many of its videos anew and compare."""
+    mixed_motion: bool = False
+    """Grade episodes of shared and of own motion into one table."""
     trust: tuple[str, ...] = ()
     """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
@@ -157,6 +159,8 @@ def grade_tables(args: Args) -> None:
     if args.rollouts and codecs:
         attributes |= {"codecs": {model: [codec.key] for model, codec in sorted(codecs.items())}}
     jobs = find_jobs(args, tuple(BASELINES) if args.baselines else (), errors if args.keep_going else None, codecs)
+    records = map(read_record, dict.fromkeys(job.episode for job in jobs))
+    attributes["motion"] = demand_one_motion(args.data, records, args.mixed_motion)
     total = len(jobs) + len(errors)
     diagnostics = tuple(DIAGNOSTICS) if args.diagnostics else ()
     errors += grade_all(jobs, (*metrics, *diagnostics), args, store, codecs)

@@ -112,11 +112,11 @@ class Experiment:
         adapt, targets, replay = self.adapt, expand_robots(self.adapt.robots), tuple[str, ...]()
         samples = sample_roles(self.robots, targets) if self.train.sample_every else {}
         if adapt.start_from is None:
-            return EpisodeChoice(self.robots.train_robots, samples=samples)
+            return EpisodeChoice(self.robots.train_robots, samples=samples, motion=self.robots.motion)
         if adapt.replay:
             source = load_recorded(adapt.start_from / "config.yaml").robots.train_robots
             replay = tuple(robot for robot in source if robot not in targets)
-        return EpisodeChoice(targets, adapt.episodes, replay, samples)
+        return EpisodeChoice(targets, adapt.episodes, replay, samples, self.robots.motion)
 
     @property
     def learning(self) -> Learning:

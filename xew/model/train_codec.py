@@ -86,7 +86,7 @@ def train_codec(experiment: CodecExperiment, *, resume: bool = False, overwrite:
     check_lpips()
     settings = experiment.train
     dataset = read_dataset(experiment.data)
-    episodes = training_episodes(dataset, experiment.train_robots)
+    episodes = training_episodes(dataset, experiment.train_robots, experiment.motion)
     claim_run(experiment.out, experiment, load_codec_experiment, resume=resume, overwrite=overwrite)
     pictures = load_pictures(experiment, episodes)
     batches = Batches(pictures, experiment.streams, settings)

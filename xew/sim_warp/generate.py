@@ -8,7 +8,7 @@ the manifest (manifest.py) knows to fail are left out. What is on disk is not ma
 it again, and the result is the same.
 
 Command: python -m xew.sim_warp.generate --batch 256 [--tasks … --robots … --train-seeds 50 --test-seeds 20
-    --validation-seeds 4 --out data]
+    --validation-seeds 4 --motion shared --out data]
 """
 
 import itertools
@@ -19,17 +19,24 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 import warp as wp
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.dataset import find_records
+from xew.dataset import count_motions, find_records
 from xew.episode import EpisodeError, Record, episode_folder, remove_left_overs
 from xew.files import hold_lock
-from xew.protocol import SEED_STARTS, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expand_robots, seed_split
+from xew.protocol import (
+    SEED_STARTS,
+    SHARED_MOTION,
+    TEST_SEEDS_PER_TASK,
+    TRAIN_SEEDS_PER_TASK,
+    expand_robots,
+    seed_split,
+)
 from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
@@ -73,6 +80,11 @@ class Args:
     unpaired: bool = False
     """Each robot gets seeds of its own, and no scene waits for another robot to succeed: more scenes for a codec to learn
     from, nothing to compare robots by."""
+    motion: Literal["shared", "own"] = "shared"
+    """shared: all robots follow one tool path on one clock, so that the body alone differs. own: each robot goes between the
+    task's waypoints by a path, in a time and from a rest posture of its own."""
+    mixed_motion: bool = False
+    """Let a data set have episodes of both kinds, each cell of one."""
     states_only: bool = False
     """Store no videos, only states and all hashes; `python -m xew.sim_warp.inspect DATA --render` makes them on demand."""
     manifest: Path = PACKAGED
@@ -91,6 +103,8 @@ class Family:
     robots: tuple[str, ...]
     failing: frozenset[int] = frozenset()
     """Seeds on which one of the robots is known to fail."""
+    motion: str = SHARED_MOTION
+    """Kind of motion of what is missing."""
     done: dict[int, dict[str, Record]] = field(default_factory=lambda: defaultdict(dict))
 
     def add(self, record: Record) -> None:
@@ -119,7 +133,7 @@ class Family:
             if hopeful == self.wanted:
                 break
             if missing := self._missing_robots(seed):
-                jobs.append(Job(self.task, seed, missing, rejected=not self._is_hopeful(seed)))
+                jobs.append(Job(self.task, seed, missing, not self._is_hopeful(seed), self.motion))
             hopeful += self._is_hopeful(seed)
         return jobs
 
@@ -143,7 +157,7 @@ def plan_families(args: Args, robots: Sequence[str], manifest: Manifest) -> list
         for first, wanted in asked:
             for number, team in enumerate(teams):
                 first_seed = first + number * SEEDS_OF_ROBOT
-                families.append(Family(task, first_seed, wanted, team, manifest.failing(task, team)))
+                families.append(Family(task, first_seed, wanted, team, manifest.failing(task, team), args.motion))
     return families
 
 
@@ -255,8 +269,8 @@ def _read_existing(families: list[Family], args: Args) -> None:
     """Add what is on disk to the families.
 
     Raises:
-        EpisodeError: a header is damaged or in another's place, an episode of these tasks was imported, or videos are wanted
-            that were left out.
+        EpisodeError: a header is damaged or in another's place, an episode of these tasks was imported, videos are wanted
+            that were left out, or episodes are of the other kind of motion.
     """
     out = args.out
     for folder, record in find_records(out):
@@ -264,6 +278,11 @@ def _read_existing(families: list[Family], args: Args) -> None:
             raise EpisodeError(
                 f"{out} was made with --states-only; go on so, make its videos by `python -m xew.sim_warp.inspect {out} "
                 "--render`, or choose another --out."
+            )
+        if record.motion != args.motion and not args.mixed_motion:
+            raise EpisodeError(
+                f"{out} holds episodes of {record.motion} motion, and {args.motion} motion is asked for; choose another --out,"
+                " or mix them on purpose by --mixed-motion."
             )
         for family in families:
             if args.unpaired and record.robot not in family.robots:
@@ -288,7 +307,7 @@ def _print_speed(frames: Counter[str], spent: dict[str, float]) -> None:
 
 
 def yield_table(records: Sequence[Record]) -> str:
-    """A line per task and robot: cells tried, succeeded, why not, and frames; then a line per task of accepted seeds."""
+    """A line per task and robot: cells tried, succeeded, why not, and frames; a line per task of accepted seeds; the motion."""
     cells: dict[tuple[str, str], list[Record]] = defaultdict(list)
     seeds: dict[str, dict[int, bool]] = defaultdict(dict)
     for record in records:
@@ -305,6 +324,7 @@ def yield_table(records: Sequence[Record]) -> str:
         lines.append(f"{task:<{wide}} {robot:<{room}} {len(tried):>6}{share:>11}{frames:>8}  {listed}")
     for task, accepted in sorted(seeds.items()):
         lines.append(f"{task:<{wide}} all robots together: {sum(accepted.values())} of {len(accepted)} seeds accepted")
+    lines.append("motion: " + ", ".join(f"{motion} {count}" for motion, count in count_motions(records).items()))
     return "\n".join(lines)
 
 

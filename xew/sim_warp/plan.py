@@ -67,6 +67,8 @@ HOME = (tool((-0.17, -0.24, 0.88), tilt=np.radians(30)), tool((0.17, -0.24, 0.88
 """Poses of both tools when an episode begins: every robot's home posture puts them there, in the head camera's view."""
 ASIDE = (tool((-0.28, -0.24, 0.93), tilt=np.radians(30)), tool((0.28, -0.24, 0.93), tilt=np.radians(30)))
 """Poses where a tool waits while the other arm works alone: wide hands would meet over the middle of the table."""
+TURNED = 1e-6
+"""Angle from which a tool counts as turned [rad]."""
 ASIDE_TIME = 0.96
 """Time for the way from home to aside [s]: in less the PiPER's wrist would turn faster than it may."""
 
@@ -83,12 +85,29 @@ class Hold:
 
 
 @dataclass(frozen=True)
-class _Segment:
+class Segment:
     """One arm along waypoints, evenly spaced in progress."""
 
     start_time: float
+    """Begin [s]."""
     end_time: float
     waypoints: tuple[Tool, ...]
+    is_curve: bool = False
+    """Must the tool stay on the line through the waypoints, whoever moves it?"""
+
+    @property
+    def is_straight(self) -> bool:
+        """Does the task need the tool on this line: a curve, or a move without a turn, as approaches and lifts are?"""
+        turn = (self.waypoints[0].rotation.inv() * self.waypoints[-1].rotation).magnitude()
+        return self.is_curve or bool(turn < TURNED)
+
+    def sample(self, progress: np.ndarray) -> np.ndarray:
+        """[t 7] poses of the tool at progress [t] from 0 to 1: x y z [m] and quaternion x y z w, world."""
+        knots = np.linspace(0, 1, len(self.waypoints))
+        positions = np.stack([waypoint.position for waypoint in self.waypoints])
+        position = np.stack([np.interp(progress, knots, positions[:, axis]) for axis in range(3)], -1)
+        turns = Slerp(knots, Rotation.concatenate([waypoint.rotation for waypoint in self.waypoints]))
+        return np.concatenate([position, turns(progress).as_quat()], -1)
 
 
 @dataclass(frozen=True)
@@ -102,6 +121,8 @@ class ToolPath:
     holds: tuple[Hold, ...]
     frame_rate: float = FRAME_RATE
     """Stored frames a second [Hz]."""
+    clock: tuple[tuple[float, float], ...] = ()
+    """Pairs of an instant of the plan and the same instant of this path [s], ascending."""
 
     @property
     def frame_count(self) -> int:
@@ -117,7 +138,7 @@ class Timeline:
     """Time now [s]."""
     at: list[Tool] = field(default_factory=lambda: list(HOME))
     """Pose of each tool now."""
-    segments: tuple[list[_Segment], list[_Segment]] = field(default_factory=lambda: ([], []))
+    segments: tuple[list[Segment], list[Segment]] = field(default_factory=lambda: ([], []))
     grips: tuple[list[tuple[float, float]], list[tuple[float, float]]] = field(
         default_factory=lambda: ([(0.0, 1.0)], [(0.0, 1.0)])
     )
@@ -128,13 +149,13 @@ class Timeline:
         """Move one or both tools straight, starting and arriving together after `at_least` so many seconds."""
         end = self.time + max(at_least, *(_duration(self.at[arm], goal) for arm, goal in goals.items()))
         for arm, goal in goals.items():
-            self.segments[arm].append(_Segment(self.time, end, (self.at[arm], goal)))
+            self.segments[arm].append(Segment(self.time, end, (self.at[arm], goal)))
             self.at[arm] = goal
         self.time = end
 
     def follow(self, arm: int, goals: list[Tool], seconds: float) -> None:
         """Move one tool through waypoints without stopping: a curve, such as the arc of a lid's edge."""
-        self.segments[arm].append(_Segment(self.time, self.time + seconds, (self.at[arm], *goals)))
+        self.segments[arm].append(Segment(self.time, self.time + seconds, (self.at[arm], *goals), is_curve=True))
         self.at[arm] = goals[-1]
         self.time += seconds
 
@@ -155,10 +176,26 @@ class Timeline:
 
     def path(self) -> ToolPath:
         """Both tools at each stored frame, 60 ms apart, from time 0 until the last move has ended."""
-        times = np.arange(int(np.ceil(self.time * FRAME_RATE)) + 1) / FRAME_RATE
+        times = frame_times(self.time)
         poses = [_sample(HOME[arm], self.segments[arm], times) for arm in (LEFT, RIGHT)]
         grippers = [np.interp(times, *np.array(self.grips[arm]).T) for arm in (LEFT, RIGHT)]
-        return ToolPath(np.stack(poses, 1), np.stack(grippers, 1), tuple(self.holds))
+        return ToolPath(
+            np.stack(poses, 1), np.stack(grippers, 1), tuple(self.holds), clock=((0.0, 0.0), (self.time, self.time))
+        )
+
+    @property
+    def steps(self) -> list[dict[int, Segment]]:
+        """The moves in order, each as the segments of the arms that have a part in it, which begin and end together."""
+        by_start: dict[float, dict[int, Segment]] = {}
+        for arm in (LEFT, RIGHT):
+            for segment in self.segments[arm]:
+                by_start.setdefault(segment.start_time, {})[arm] = segment
+        return [by_start[start] for start in sorted(by_start)]
+
+
+def frame_times(seconds: float) -> np.ndarray:
+    """[t] instants of the stored frames of a path of this length [s]."""
+    return np.arange(int(np.ceil(seconds * FRAME_RATE)) + 1) / FRAME_RATE
 
 
 def _duration(start: Tool, end: Tool) -> float:
@@ -174,20 +211,11 @@ def minimum_jerk(share: np.ndarray) -> np.ndarray:
     return np.clip(share**3 * (10 - 15 * share + 6 * share**2), 0, 1)
 
 
-def _sample(home: Tool, segments: list[_Segment], times: np.ndarray) -> np.ndarray:
+def _sample(home: Tool, segments: list[Segment], times: np.ndarray) -> np.ndarray:
     """[t 7] pose of one tool; it stands still between segments."""
     pose = np.tile(np.concatenate([home.position, home.rotation.as_quat()]), (len(times), 1))
     for segment in segments:
         now = times >= segment.start_time
         progress = minimum_jerk((times[now] - segment.start_time) / (segment.end_time - segment.start_time))
-        pose[now] = _interpolate_waypoints(segment.waypoints, progress)
+        pose[now] = segment.sample(progress)
     return pose
-
-
-def _interpolate_waypoints(waypoints: tuple[Tool, ...], progress: np.ndarray) -> np.ndarray:
-    """[t 7] poses at progress [t] from 0 to 1 through waypoints that are evenly spaced in it."""
-    knots = np.linspace(0, 1, len(waypoints))
-    positions = np.stack([waypoint.position for waypoint in waypoints])
-    position = np.stack([np.interp(progress, knots, positions[:, axis]) for axis in range(3)], -1)
-    turns = Slerp(knots, Rotation.concatenate([waypoint.rotation for waypoint in waypoints]))
-    return np.concatenate([position, turns(progress).as_quat()], -1)

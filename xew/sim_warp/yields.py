@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 import warp as wp
@@ -25,7 +25,7 @@ from tqdm import tqdm
 from xew.config import user_errors
 from xew.episode import EpisodeError, Record
 from xew.files import write_text
-from xew.protocol import expand_robots
+from xew.protocol import SHARED_MOTION, expand_robots
 from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
 from xew.sim_warp.production.episodes import header
@@ -50,6 +50,8 @@ class Args:
     seeds: int = 20
     """Number of seeds of each task, all of which count."""
     first_seed: int = 0
+    motion: Literal["shared", "own"] = "shared"
+    """shared: one tool path for all robots. own: each robot's own path, time and rest posture."""
     batch: int = 256
     """Number of worlds that a GPU steps together."""
     workers: int | None = None
@@ -70,7 +72,9 @@ def attempt_seeds(args: Args) -> Iterator[list[Record]]:
     tasks, robots = dict.fromkeys(args.tasks), {name: get_robot(name) for name in expand_robots(args.robots)}
     for name in tasks:
         get_task(name)
-    jobs = [Job(task, args.first_seed + index, tuple(robots)) for task in tasks for index in range(args.seeds)]
+    jobs = [
+        Job(task, args.first_seed + index, tuple(robots), motion=args.motion) for task in tasks for index in range(args.seeds)
+    ]
     if args.workers is not None and args.workers < 1:
         raise EpisodeError(f"--workers is {args.workers}; expected at least 1, or none for as many as there are cores.")
     if not jobs or not robots or args.first_seed < 0:
@@ -159,6 +163,7 @@ def page(records: Sequence[Record], args: Args) -> str:
     tasks = "\n\n".join(task_section(get_task(name)) for name in sorted(args.tasks))
     seeds = f"{args.seeds} seeds from {args.first_seed}"
     first = f" --first-seed {args.first_seed}" if args.first_seed else ""
+    first += f" --motion {args.motion}" if args.motion != SHARED_MOTION else ""
     device = next(record.device for record in records)
     return f"""# The tasks
 

@@ -87,6 +87,14 @@ def test_baselines_are_graded_once_and_before_there_is_a_model(study: Study) -> 
     assert all("--no-baselines" in step.command for step in steps.values() if step.kind == "evaluate")
 
 
+def test_a_study_of_own_motion_makes_and_names_it(study: Study) -> None:
+    own = replace(study, motion="own")
+    assert plan(own)["generate"].command[-2:] == ("--motion", "own") and "--motion" not in plan(study)["generate"].command
+    variants = (VARIANTS["fixed-irasim"], VARIANTS["loeo_piper-optical_flow-nine_views"])
+    assert [build_experiment(own, variant)["split"] for variant in variants] == ["fixed_own", "loeo_piper_own"]
+    assert build_experiment(study, variants[0])["split"] == "fixed"
+
+
 def test_every_training_seed_is_a_training_of_every_variant(study: Study) -> None:
     study = load_study(DEBUG, ["--training-seeds", "3", "7"])
     steps, once = plan(study), plan(load_study(DEBUG))

@@ -64,6 +64,10 @@ def test_another_robot_is_the_next_by_name_in_the_same_scene(data: Path, tmp_pat
     for robot, other in zip(ROBOTS, (*ROBOTS[1:], ROBOTS[0]), strict=True):
         video = other_robot(episode(data, robot), truth(data, robot))
         np.testing.assert_array_equal(video, read_video(episode(data, other) / "rgb.mkv"))
+    longer = replace(truth(data, "piper"), rgb=np.repeat(truth(data, "piper").rgb, 2, 0))
+    video = other_robot(episode(data, "piper"), longer)
+    assert video.shape == longer.rgb.shape, "in own motion robots take their own time; the quicker stands still at its end"
+    assert (video[len(video) // 2 :] == video[len(video) // 2 - 1]).all()
     copy = tmp_path / "data"
     shutil.copytree(data, copy)
     folder = episode(copy, "arx_x5")

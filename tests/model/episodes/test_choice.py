@@ -1,21 +1,31 @@
 """Which episodes a training looks at: nothing that is tuned reads test seeds."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from xew.dataset import Dataset
-from xew.episode import Record
+from xew.dataset import Dataset, demand_one_motion
+from xew.episode import EpisodeError, Record
 from xew.model import latents
 from xew.model.codecs.ceiling import Ceiling
-from xew.model.episodes.choice import sample_episodes, training_episodes
+from xew.model.episodes.choice import choose_episodes, sample_episodes, training_episodes
 from xew.model.settings.parts import EpisodeChoice, sample_roles
 from xew.model.settings.settings import Clip
-from xew.protocol import FIXED, HELD_OUT_ROBOTS, ROBOT_NAMES, SEEN_ROBOTS, TEST_SEED_START, VALIDATION_SEED_START, seed_split
+from xew.protocol import (
+    FIXED,
+    HELD_OUT_ROBOTS,
+    ROBOT_NAMES,
+    SEEN_ROBOTS,
+    SPLITS,
+    TEST_SEED_START,
+    VALIDATION_SEED_START,
+    seed_split,
+)
 
 BODY, UNSEEN = "body_96", "body_64"
 FAMILIES = {"train": 0, "validation": VALIDATION_SEED_START, "test": TEST_SEED_START}
@@ -45,6 +55,31 @@ def test_without_validation_seeds_samples_are_of_training_seeds_and_never_of_tes
 def test_nothing_is_trained_on_validation_or_test_seeds() -> None:
     episodes = training_episodes(dataset("train", "validation", "test"), EpisodeChoice(FIXED.train_robots))
     assert {seed_split(record.seed) for _, record in episodes} == {"train"}
+
+
+def test_motion_is_mixed_on_purpose_only() -> None:
+    """The split names the kind of motion; a data set of both is read by a split that ends in _mixed."""
+    shared = dataset("train")
+    own = tuple((folder, replace(record, motion="own")) for folder, record in shared.cells if record.seed == 1)
+    mixed = Dataset(shared.root, tuple(cell for cell in shared.cells if cell[1].seed == 0) + own)
+    robots = SPLITS["fixed"].train_robots
+
+    def read(data: Dataset, split: str, **settings: Any) -> int:
+        return len(training_episodes(data, EpisodeChoice(robots, motion=SPLITS[split].motion, **settings)))
+
+    assert read(shared, "fixed") == read(Dataset(shared.root, own * 2), "fixed_own") == read(mixed, "fixed_mixed") == 6
+    for split in ("fixed", "fixed_own"):
+        with pytest.raises(EpisodeError, match=r"episodes of shared motion \(3\) and of own motion \(3\) .*ends in _mixed"):
+            read(mixed, split)
+    with pytest.raises(EpisodeError, match=r"episodes of shared motion \(6\) to be read, and the split is of own motion"):
+        read(shared, "fixed_own")
+    replayed = EpisodeChoice((HELD_OUT_ROBOTS[0],), 1, robots)
+    with pytest.raises(EpisodeError, match="own motion"):
+        choose_episodes(mixed, replayed)
+    records = [record for _, record in mixed.cells]
+    assert demand_one_motion(mixed.root, records, mixed=True) == "mixed"
+    with pytest.raises(EpisodeError, match="do not compare; mix them on purpose by --mixed-motion"):
+        demand_one_motion(mixed.root, records, mixed=False)
 
 
 @pytest.mark.parametrize("families", [("train", "validation", "test"), ("train", "test")])

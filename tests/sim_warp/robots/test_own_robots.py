@@ -26,7 +26,7 @@ from xew.sim_warp.production.rerender import render_again
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import RobotSpec, adopt_robots, get_robot, load_robot, load_urdf
 from xew.sim_warp.robots.user import own
-from xew.sim_warp.robots.user.own import FOLDERS
+from xew.sim_warp.robots.user.own import FOLDERS, keep_robot
 
 PLACED: dict[str, Any] = {"root_pose": [0, -0.37, 0.75, 0, 0, 0.5**0.5, 0.5**0.5]}
 
@@ -124,11 +124,16 @@ def test_a_place_is_searched_for_once(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_a_robot_yaml_decides_what_it_names(tmp_path: Path) -> None:
-    arms = [PLACED | {"finger_open": [0.03, 0.03]}, {}]
-    robot = load_robot(write_yaml(tmp_path / "some arm", title="Some arm", arms=arms, distance=0.5, joint_velocity=[1.0] * 6))
+    arms = [PLACED | {"finger_open": [0.03, 0.03], "rest": [0.1] * 6}, {}]
+    limits = {"joint_velocity": [1.0] * 6, "joint_acceleration": [2.0] * 6}
+    robot = load_robot(write_yaml(tmp_path / "some arm", title="Some arm", arms=arms, distance=0.5, **limits))
     assert (robot.key, robot.title) == ("some_arm", "Some arm")
     assert [arm.root_pose[0] for arm in robot.arms] == [-0.25, 0.25]
     assert robot.arms[1].finger_open == (0.03, 0.03) and robot.joint_velocity == (1.0,) * 6
+    kept = keep_robot(robot, tmp_path / "data")
+    for found in (robot, kept):
+        assert [arm.rest for arm in found.arms] == [(0.1,) * 6, ()], "a rest is of one arm; the other begins at home"
+        assert found.joint_acceleration == (2.0,) * 6
 
 
 def test_a_name_of_the_project_s_robots_is_set_apart(tmp_path: Path) -> None:
@@ -326,6 +331,8 @@ def test_a_bad_embodiment_ends_in_one_line(
         ({"arms": [PLACED | {"home": [0.0] * 5}, {}]}, "a home has 5 joints, the arm 6"),
         ({"arms": [PLACED, PLACED | {"joints": ["arm1", "arm2"]}]}, "the arms have 6 and 2 joints; expected equal arms"),
         ({"arms": [PLACED, {}], "joint_upper": [1.0]}, "need 6 numbers each"),
+        ({"arms": [PLACED, {}], "joint_acceleration": [1.0] * 5}, "expected 6 numbers above 0"),
+        ({"arms": [PLACED | {"rest": [9.0] * 6}, {}]}, "the left arm's rest is [9.0, 9.0, 9.0"),
         ({"urdf": 3}, "urdf: expected str, found int 3"),
     ],
 )

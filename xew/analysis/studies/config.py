@@ -14,9 +14,11 @@ from typing import Any
 
 from xew.config import ConfigError, check_finite, load, read_yaml, suggestion
 from xew.protocol import (
+    MOTIONS,
     PAPER_PARTS,
     PARTS,
     ROBOT_NAMES,
+    SHARED_MOTION,
     SHOTS,
     SPLITS,
     TASK_COUNT,
@@ -24,6 +26,7 @@ from xew.protocol import (
     TRAIN_SEEDS_PER_TASK,
     Variant,
     expected_counts,
+    split_key,
     training_counts,
 )
 from xew.sim_warp.tasks import get_task
@@ -143,6 +146,8 @@ class Study:
     """Settings laid over it for adaptations with replay or LoRA."""
     systems: dict[str, Settings] = field(default_factory=dict)
     """Settings laid over it for another project's system."""
+    motion: str = SHARED_MOTION
+    """Kind of motion of all episodes, one of protocol.MOTIONS."""
     generate: tuple[str, ...] = ()
     """Further arguments of `xew.sim_warp.generate`."""
     evaluate: tuple[str, ...] = ()
@@ -261,6 +266,7 @@ def _check_names(study: Study, path: Path) -> None:
         ("part", study.parts, tuple(PARTS)),
         ("robot", study.robots, ROBOT_NAMES),
         ("number of shots", shots, known_shots),
+        ("kind of motion", (study.motion,), MOTIONS),
         ("task", study.tasks, study.tasks),  # known: checked above, and may be outside tasks
         ("training seed", tuple(map(str, study.training_seeds)), tuple(map(str, study.training_seeds))),
         ("kind of step in step_environment", tuple(study.step_environment), KINDS),
@@ -295,7 +301,7 @@ def build_experiment(study: Study, variant: Variant) -> Settings:
         "data": str(study.data_folder),
         "out": str(run_folder(study, variant)),
         "cache": str(study.out / "latents"),
-        "split": variant.split,
+        "split": split_key(variant.split, study.motion),
         "model": {"action": variant.action, "embodiment": variant.embodiment},
     }
     return merge_settings(settings, given)

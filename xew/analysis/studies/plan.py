@@ -22,7 +22,7 @@ import xew
 from xew.analysis.studies.config import Settings, Study, build_experiment, run_folder
 from xew.episode import SCHEMA_VERSION
 from xew.files import write_text
-from xew.protocol import GRADING_PROTOCOL, Variant
+from xew.protocol import GRADING_PROTOCOL, SHARED_MOTION, Variant
 
 
 @dataclass(frozen=True)
@@ -103,12 +103,14 @@ def _rollouts_path(study: Study, variant: str) -> Path:
 def _plan_generate(study: Study) -> Step:
     tasks = ("--tasks", *study.tasks) if study.tasks else ()
     seeds = ("--train-seeds", str(study.train_seeds), "--test-seeds", str(study.test_seeds))
+    motion = () if study.motion == SHARED_MOTION else ("--motion", study.motion)
+    asked = (*tasks, "--robots", *study.robots, *seeds, *motion, *study.generate)
     return Step(
         "generate",
         "",
-        ("xew.sim_warp.generate", "--out", str(study.data_folder), *tasks, "--robots", *study.robots, *seeds, *study.generate),
+        ("xew.sim_warp.generate", "--out", str(study.data_folder), *asked),
         needs=(),
-        inputs=[SCHEMA_VERSION, study.tasks, study.robots, study.train_seeds, study.test_seeds],
+        inputs=[SCHEMA_VERSION, study.tasks, study.robots, study.train_seeds, study.test_seeds, *motion],
         product=study.data_folder,
     )
 

@@ -58,21 +58,25 @@ def pasted_render(folder: Path, truth: Truth) -> np.ndarray:
 
 
 def other_robot(folder: Path, truth: Truth) -> np.ndarray:
-    """The true episode of the next robot by name in the same scene: uint8 [t h w 3]."""
+    """The true episode of the next robot by name in the same scene: uint8 [t h w 3]; a shorter one stands still at its end."""
     other = find_other_robot(folder)
     assert other is not None, "BASELINES asks before"
-    return read_video(other / "rgb.mkv")[: len(truth.rgb)]
+    video = read_video(other / "rgb.mkv")
+    return video[np.minimum(np.arange(len(truth.rgb)), len(video) - 1)]
 
 
 def find_other_robot(folder: Path) -> Path | None:
-    """The folder of the next robot by name, in a circle, whose episode of the same scene has its video and is no shorter."""
+    """The folder of the next robot by name, in a circle, whose episode of the same scene has its video.
+
+    In shared motion it is as long; in own motion each robot takes its own time.
+    """
     record = read_record(folder)
     names = sorted(path.name for path in folder.parent.iterdir() if (path / "episode.json").exists())
     place = names.index(folder.name)
     for name in names[place + 1 :] + names[:place]:
         other = folder.parent / name
         found = read_record(other)
-        if found.success and found.videos and found.frame_count >= record.frame_count and found.scene_hash == record.scene_hash:
+        if found.success and found.videos and found.scene_hash == record.scene_hash:
             return other
     return None
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from xew.config import ConfigError, load, pick
-from xew.dataset import Dataset, Episode
+from xew.dataset import Dataset, Episode, demand_motion
 from xew.model.codec_training.kinds import KINDS, Kind
 from xew.model.codec_training.pictures import ALIGNED, UNALIGNED, Cut
 from xew.model.settings.checks import LEAST_OF_STEPS, check_least, check_steps
@@ -116,7 +116,8 @@ class CodecExperiment:
     robots: tuple[str, ...] = ()
     """Robots that are learned from, by name (`body:0-63` names 64 procedural bodies); those of `split` where left out."""
     split: str = "fixed"
-    """Split, one of protocol.SPLITS, whose training robots are learned from where no robots are named."""
+    """Split, one of protocol.SPLITS, whose training robots are learned from where no robots are named; it names the kind of
+    motion, too."""
     streams: dict[str, float] = field(default_factory=lambda: {"rgb": 4.0, "robot_render": 2.0, "optical_flow": 1.0})
     """Share of the samples that each stream of pictures has, by name: the scene, and conditions that are pictures."""
     dtype: Literal["float32", "bfloat16"] = "float32"
@@ -133,6 +134,11 @@ class CodecExperiment:
     def train_robots(self) -> tuple[str, ...]:
         """Keys of the robots that are learned from."""
         return expand_robots(self.robots) or pick(SPLITS, self.split, "split").train_robots
+
+    @property
+    def motion(self) -> str:
+        """Kind of motion of the episodes that are learned from, or MIXED_MOTION, as the split names it."""
+        return pick(SPLITS, self.split, "split").motion
 
     @property
     def cut(self) -> Cut:
@@ -213,8 +219,13 @@ def select_episodes(dataset: Dataset, robots: Collection[str], seeds: Seeds) -> 
     ]
 
 
-def training_episodes(dataset: Dataset, robots: Sequence[str]) -> list[Episode]:
-    """Episodes of training seeds of some robots. Raises ConfigError if there is none at all."""
+def training_episodes(dataset: Dataset, robots: Sequence[str], motion: str) -> list[Episode]:
+    """Episodes of training seeds of some robots.
+
+    Raises:
+        ConfigError: there is none at all.
+        EpisodeError: some are of another kind of motion.
+    """
     episodes = select_episodes(dataset, robots, "train")
     if not episodes:
         raise ConfigError(
@@ -222,4 +233,5 @@ def training_episodes(dataset: Dataset, robots: Sequence[str]) -> list[Episode]:
             f"{' …' if len(robots) > 6 else ''}; it has {', '.join(sorted({r.robot for _, r in dataset.cells})) or 'nothing'}."
             f" Make some: python -m xew.sim_warp.generate --robots {' '.join(robots[:6])} --out {dataset.root}"
         )
+    demand_motion(dataset.root, (record for _, record in episodes), motion)
     return episodes

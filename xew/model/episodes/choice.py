@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from xew.config import ConfigError, suggestion
-from xew.dataset import Dataset, Episode, read_dataset
+from xew.dataset import Dataset, Episode, demand_motion, read_dataset
 from xew.episode import EpisodeError
 from xew.model.settings.parts import EpisodeChoice
 from xew.protocol import expand_robots
@@ -36,7 +36,9 @@ def choose_episodes(dataset: Dataset, choice: EpisodeChoice) -> TrainingEpisodes
             f"{bare[0]} was made with --states-only and has no video to begin a sample with; draw none with "
             f"--train.sample-every 0, or make videos: python -m xew.sim_warp.inspect {dataset.root} --render"
         )
-    return TrainingEpisodes(training_episodes(dataset, choice), replay_episodes(dataset, choice), samples)
+    fresh, replay = training_episodes(dataset, choice), replay_episodes(dataset, choice)
+    demand_motion(dataset.root, (record for _, record in samples.values()), choice.motion)
+    return TrainingEpisodes(fresh, replay, samples)
 
 
 def training_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
@@ -45,23 +47,29 @@ def training_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
     Raises:
         ConfigError, EpisodeError: there are none, or too few to adapt to.
     """
-    found = _select_training(dataset, choice.robots, need_all=choice.shots > 0)
+    found = _select_training(dataset, choice.robots, choice.motion, need_all=choice.shots > 0)
     return first_of_each(found, choice.shots) if choice.shots else found
 
 
 def replay_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
     """In an adaptation with replay, what the run that it starts from was trained on; else none."""
-    return _select_training(dataset, choice.replay, need_all=True) if choice.replay else []
+    return _select_training(dataset, choice.replay, choice.motion, need_all=True) if choice.replay else []
 
 
-def _select_training(dataset: Dataset, robots: Sequence[str], *, need_all: bool) -> list[Episode]:
-    """Episodes of training seeds of some robots. Raises ConfigError if a robot has none (one of all, unless all are needed)."""
+def _select_training(dataset: Dataset, robots: Sequence[str], motion: str, *, need_all: bool) -> list[Episode]:
+    """Episodes of training seeds of some robots.
+
+    Raises:
+        ConfigError: a robot has none (one of all, unless all are needed).
+        EpisodeError: some are of another kind of motion.
+    """
     chosen = dataset.select(robots=robots, split="train")
     missing = [robot for robot in robots if robot not in {record.robot for _, record in chosen}]
     if missing and (need_all or not chosen):
         meant = suggestion(missing[0], dataset.robots)
         command = f"python -m xew.sim_warp.generate --robots {' '.join(robots)} --out {dataset.root}"
         raise ConfigError(f"{dataset.root} has no training episode of {', '.join(missing)};{meant} make some: {command}")
+    demand_motion(dataset.root, (record for _, record in chosen), motion)
     return chosen
 
 

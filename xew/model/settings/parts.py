@@ -16,7 +16,7 @@ from xew.model.network.dit import STREAMS, token_grid
 from xew.model.settings.network import Network
 from xew.model.settings.settings import Clip, ModelSettings, TrainSettings
 from xew.model.text.instructions import TextEncoder, TextSource, encode_instructions
-from xew.protocol import Split, validation_split
+from xew.protocol import SHARED_MOTION, Split, validation_split
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,8 @@ class EpisodeChoice:
     """Robots whose training episodes are replayed, in an adaptation with replay."""
     samples: Mapping[str, str] = field(default_factory=dict)
     """Roles of the robots that sample videos are drawn of: seen, unseen or target."""
+    motion: str = SHARED_MOTION
+    """Kind of motion of the episodes, or MIXED_MOTION, as the split names it."""
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,9 @@ from pathlib import Path
 
 from xew.sim_warp.geometry.poses import Pose
 
+USUAL_ACCELERATION = 15.0
+"""Acceleration limit of joints of which none is known [rad/s²]: that of RoboTwin's planner for four of its five robots."""
+
 
 @dataclass(frozen=True)
 class Arm:
@@ -27,6 +30,8 @@ class Arm:
     """Finger joint positions at gripper 0 [m]."""
     finger_open: tuple[float, float]
     """Finger joint positions at gripper 1 [m]."""
+    rest: tuple[float, ...] = ()
+    """Joint positions at which motion of its own begins [rad]; `home` where left out."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +50,15 @@ class RobotSpec:
     joint_upper: tuple[float, ...]
     joint_velocity: tuple[float, ...]
     """Speed limits that experts keep [rad/s]."""
+    joint_acceleration: tuple[float, ...] = ()
+    """Acceleration limits that motion of its own keeps [rad/s²]; `USUAL_ACCELERATION` where left out."""
     label: str = ""
     """Short name in columns and legends; the title where it is left out."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "label", self.label or self.title)
+        usual = (USUAL_ACCELERATION,) * self.arm_joint_count
+        object.__setattr__(self, "joint_acceleration", self.joint_acceleration or usual)
 
     @property
     def one_urdf_holds_both_arms(self) -> bool:

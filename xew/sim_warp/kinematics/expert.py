@@ -38,9 +38,9 @@ def joint_commands(robot: RobotSpec, paths: list[ToolPath]) -> list[Commands]:
     commands = []
     for index, path in enumerate(paths):
         columns, frames = slice(2 * index, 2 * index + 2), slice(path.frame_count)
-        action = _action(solution.joint_pos[frames, columns], path.gripper)
-        problem = _find_unreached(solution.position_error[frames, columns], solution.rotation_error[frames, columns])
-        commands.append(Commands(action.astype(np.float32), problem or _find_too_fast(robot, action)))
+        action = canonical_commands(solution.joint_pos[frames, columns], path.gripper)
+        problem = find_unreached(solution.position_error[frames, columns], solution.rotation_error[frames, columns])
+        commands.append(Commands(action.astype(np.float32), problem or find_too_fast(robot, action)))
     return commands
 
 
@@ -49,7 +49,7 @@ def _extend_path(pose: np.ndarray, frames: int) -> np.ndarray:
     return np.concatenate([pose, np.repeat(pose[-1:], frames - len(pose), 0)])
 
 
-def _action(joint_pos: np.ndarray, gripper: np.ndarray) -> np.ndarray:
+def canonical_commands(joint_pos: np.ndarray, gripper: np.ndarray) -> np.ndarray:
     """[t 2 d] joints and [t 2] grippers -> [t 16] canonical."""
     action = np.zeros((len(gripper), ACTION_DIM))
     for arm, (joints, column) in enumerate(ARMS):
@@ -58,7 +58,7 @@ def _action(joint_pos: np.ndarray, gripper: np.ndarray) -> np.ndarray:
     return action
 
 
-def _find_unreached(position: np.ndarray, rotation: np.ndarray) -> str | None:
+def find_unreached(position: np.ndarray, rotation: np.ndarray) -> str | None:
     """Words for tool errors [t 2] m and rad beyond the tolerance."""
     for arm, side in enumerate(("left", "right")):
         far, turned = position[:, arm].max(), rotation[:, arm].max()
@@ -67,7 +67,7 @@ def _find_unreached(position: np.ndarray, rotation: np.ndarray) -> str | None:
     return None
 
 
-def _find_too_fast(robot: RobotSpec, action: np.ndarray) -> str | None:
+def find_too_fast(robot: RobotSpec, action: np.ndarray) -> str | None:
     """Words for commands [t 16] that turn a joint faster than its limit."""
     speed = np.abs(np.diff(action, axis=0)) * FRAME_RATE
     limit = np.array(robot.joint_velocity)

@@ -10,10 +10,12 @@ from functools import cached_property
 
 import numpy as np
 
+from xew.protocol import OWN_MOTION, SHARED_MOTION
 from xew.sim_warp.kinematics.expert import Commands, joint_commands
 from xew.sim_warp.kinematics.forward import tool_poses
+from xew.sim_warp.kinematics.own_motion import own_commands
 from xew.sim_warp.physics import Motion, World, simulate
-from xew.sim_warp.plan import ToolPath
+from xew.sim_warp.plan import Timeline, ToolPath
 from xew.sim_warp.production.outcome import find_failure
 from xew.sim_warp.rendering.observe import Recording, scene_recording
 from xew.sim_warp.robots import ROBOTS, RobotSpec
@@ -32,6 +34,8 @@ class Job:
     """Names under which episodes know them."""
     rejected: bool = False
     """Whether another robot has failed on it already; then nothing is rendered."""
+    motion: str = SHARED_MOTION
+    """Kind of motion, one of `xew.protocol.MOTIONS`."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +47,14 @@ class Cell:
     task: Task
     scene: Scene
     path: ToolPath
+    """Path of both tools: all robots' of the scene, or the robot's own."""
     robot_name: str
     robot: RobotSpec
     commands: Commands
     motion: Motion | None = None
     """Motion that physics made of the commands; None before, and where the robot cannot follow the plan."""
+    motion_kind: str = SHARED_MOTION
+    """Kind of motion that the commands are of, one of `xew.protocol.MOTIONS`."""
 
     @property
     def known_motion(self) -> Motion:
@@ -83,14 +90,23 @@ def plan_cells(jobs: Sequence[Job], robots: Mapping[str, RobotSpec] = ROBOTS) ->
     """
     tasks = [get_task(job.task) for job in jobs]
     scenes = [task.sample(scene_rng(job.task, job.seed), job.seed) for job, task in zip(jobs, tasks, strict=True)]
-    paths = [task.plan(scene).path() for task, scene in zip(tasks, scenes, strict=True)]
+    plans = [task.plan(scene) for task, scene in zip(tasks, scenes, strict=True)]
     seeds: list[list[Cell]] = [[] for _ in jobs]
-    for name in dict.fromkeys(robot for job in jobs for robot in job.robots):
-        mine = [index for index, job in enumerate(jobs) if name in job.robots]
+    for name, kind in dict.fromkeys((robot, job.motion) for job in jobs for robot in job.robots):
+        mine = [index for index, job in enumerate(jobs) if name in job.robots and job.motion == kind]
         robot = robots[name]
-        for index, commands in zip(mine, joint_commands(robot, [paths[index] for index in mine]), strict=True):
-            seeds[index].append(Cell(jobs[index].task, tasks[index], scenes[index], paths[index], name, robot, commands))
+        for index, (path, commands) in zip(mine, plan_motion(robot, [plans[index] for index in mine], kind), strict=True):
+            place = jobs[index].task, tasks[index], scenes[index]
+            seeds[index].append(Cell(*place, path, name, robot, commands, motion_kind=kind))
     return seeds
+
+
+def plan_motion(robot: RobotSpec, plans: Sequence[Timeline], kind: str) -> list[tuple[ToolPath, Commands]]:
+    """A robot's tool paths and commands for many plans, in one kind of motion (`xew.protocol.MOTIONS`)."""
+    if kind == OWN_MOTION:
+        return own_commands(robot, plans)
+    paths = [plan.path() for plan in plans]
+    return list(zip(paths, joint_commands(robot, paths), strict=True))
 
 
 def simulate_cells(seeds: list[list[Cell]], device: str | None = None, batch: int | None = None) -> list[list[Cell]]:

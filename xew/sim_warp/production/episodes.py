@@ -60,6 +60,7 @@ def header(cell: Cell, device: wp.Device) -> Record:
         scene_hash=scene_hash(cell.scene),
         versions=_versions(),
         device=device.name,
+        motion=cell.motion_kind,
     )
 
 

@@ -20,6 +20,8 @@ from xew.episode import (
     states_hash,
     write_episode,
 )
+from xew.protocol import OWN_MOTION
+from xew.sim_warp.kinematics.own_motion import own_commands
 from xew.sim_warp.physics.plausibility import find_implausible
 from xew.sim_warp.rendering.observe import observe, scene_recording
 from xew.sim_warp.rendering.render import Renderer
@@ -68,7 +70,9 @@ def demand_plausible(folder: Path) -> None:
     """Raise EpisodeError if an accepted episode's states hold what could not have happened (plausibility.py)."""
     record, states = read_record(folder), read_states(folder)
     scene = _sample_again(folder, record)
-    holds = recorded_task(record.task).plan(scene).path().holds
+    plan = recorded_task(record.task).plan(scene)
+    robot = recorded_robot(record.robot, data_folder(folder)) if record.motion == OWN_MOTION else None
+    holds = (own_commands(robot, [plan])[0][0] if robot else plan.path()).holds
     problem = find_implausible(scene, holds, states.object_pose, states.penetration, states.tool_pose, record.frame_rate)
     if problem:
         raise EpisodeError(f"{folder}: {problem}; delete it and run generate again.")

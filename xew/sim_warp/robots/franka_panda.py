@@ -12,6 +12,7 @@ LEFT = Arm(
     root_pose=(-0.28, -0.68, 0.53, 0, 0, 0.7071067812, 0.7071067812),
     joints=("panda_joint1", "panda_joint2", "panda_joint3", "panda_joint4", "panda_joint5", "panda_joint6", "panda_joint7"),
     home=(-0.0136, -0.518, -0.2595, -2.714, 0.0195, 2.7176, 0.4963),
+    rest=(-0.094, -0.491, -0.172, -2.547, -0.047, 2.231, 0.559),
     tool_link="panda_hand",
     tool_pose=(0, 0, 0.0979, 0.7071067812, 0, 0.7071067812, 0),
     fingers=("panda_finger_joint1", "panda_finger_joint2"),
@@ -22,6 +23,7 @@ RIGHT = replace(
     LEFT,
     root_pose=(0.28, -0.68, 0.53, 0, 0, 0.7071067812, 0.7071067812),
     home=(0.0135, -0.518, 0.2597, -2.7141, -0.0193, 2.7176, 1.0744),
+    rest=(0.094, -0.491, 0.172, -2.547, 0.047, 2.231, 1.012),
 )
 
 SPEC = RobotSpec(

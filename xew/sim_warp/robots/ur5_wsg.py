@@ -13,6 +13,7 @@ LEFT = Arm(
     root_pose=(-0.35, -0.65, 0.75, 0, 0, 0, 1),
     joints=("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"),
     home=(-1.7942, -1.4173, -2.3647, -0.4176, 1.6818, -0.1943),
+    rest=(-1.722, -1.454, -2.054, -1.205, 1.571, -0.152),
     tool_link="ee_link",
     tool_pose=(0.1385, 0, 0, 0, 0, 0, 1),
     fingers=("base_joint_gripper_left", "base_joint_gripper_right"),
@@ -23,6 +24,7 @@ RIGHT = replace(
     LEFT,
     root_pose=(0.35, -0.65, 0.75, 0, 0, 0, 1),
     home=(-0.7122, -1.3756, -2.3561, -0.6199, 1.1827, 0.787),
+    rest=(-0.9, -1.454, -2.054, -1.205, 1.571, 0.671),
 )
 
 SPEC = RobotSpec(

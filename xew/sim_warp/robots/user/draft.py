@@ -29,6 +29,8 @@ class ArmDraft:
     home: tuple[float, ...] | None = None
     near: tuple[float, ...] | None = None
     """Posture to search the home from, if home is left open [rad]."""
+    rest: tuple[float, ...] | None = None
+    """Posture in which motion of its own begins [rad]; open: home."""
     tool_link: str | None = None
     tool_pose: Pose | None = None
     tool_at_tips: bool = False
@@ -46,12 +48,14 @@ class RobotDraft:
     """Path of the URDF, relative to the file that says so."""
     title: str | None = None
     arms: tuple[ArmDraft, ArmDraft] = (ArmDraft(), ArmDraft())
-    """Left and right arm. What only the left says holds for the right too, but for `root_pose` and `home`."""
+    """Left and right arm. What only the left says holds for the right too, but for `root_pose`, `home` and `rest`."""
     joint_lower: tuple[float, ...] | None = None
     """Limits that experts keep [rad]; open: the URDF's."""
     joint_upper: tuple[float, ...] | None = None
     joint_velocity: tuple[float, ...] | None = None
     """Speed limits that experts keep [rad/s]; open: the URDF's."""
+    joint_acceleration: tuple[float, ...] | None = None
+    """Acceleration limits that motion of its own keeps [rad/s²]; open: 15 of each joint."""
     distance: float | None = None
     """Distance between the bases of two equal arms [m], half to either side of `root_pose`; open: the first of
     `placement.DISTANCES` at which both arms reach home."""

@@ -60,6 +60,7 @@ def complete_arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]
                 fingers=fingers,
                 finger_closed=_clip_fingers(urdf, fingers, closed),
                 finger_open=_clip_fingers(urdf, fingers, opened),
+                rest=given.rest or (),
             )
         )
         _check_arm(urdf, arms[-1], source)
@@ -67,9 +68,9 @@ def complete_arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]
 
 
 def fill_right_arm(arms: tuple[ArmDraft, ArmDraft]) -> tuple[ArmDraft, ArmDraft]:
-    """Both arms, the right one as the left where it is left open, but for its home."""
+    """Both arms, the right one as the left where it is left open, but for its home and rest."""
     left, right = arms
-    return (left, replace(left, home=None)) if right == ArmDraft() else (left, right)
+    return (left, replace(left, home=None, rest=None)) if right == ArmDraft() else (left, right)
 
 
 def _check_joints(urdf: Urdf, names: Sequence[str], source: str) -> None:
@@ -126,6 +127,19 @@ def complete_limits(
             "upper and velocities above 0."
         )
     return lower, upper, speed
+
+
+def check_own_motion(draft: RobotDraft, arms: tuple[Arm, Arm], lower: np.ndarray, upper: np.ndarray, source: str) -> None:
+    """Raise ConfigError for acceleration limits or rest postures that do not fit the arms [d] and their limits [d] rad."""
+    given = np.array(draft.joint_acceleration if draft.joint_acceleration is not None else [1.0] * len(lower))
+    if len(given) != len(lower) or not (given > 0).all():
+        raise ConfigError(f"{source}: joint_acceleration is {given.tolist()}; expected {len(lower)} numbers above 0.")
+    for side, arm in zip(("left", "right"), arms, strict=True):
+        rest = np.array(arm.rest or lower)
+        if len(rest) != len(lower) or (rest < lower).any() or (rest > upper).any():
+            raise ConfigError(
+                f"{source}: the {side} arm's rest is {list(arm.rest)}; expected {len(lower)} joints within their limits."
+            )
 
 
 def find_fingers(urdf: Urdf) -> list[tuple[str, str]]:

@@ -30,7 +30,7 @@ from xew.protocol import BODY_NAME, ROBOT_NAMES, expand_robots
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
 from xew.sim_warp.robots.user.draft import OWN, ArmDraft, RobotDraft, find_description, read_draft
-from xew.sim_warp.robots.user.infer import complete_arms, complete_limits, fill_right_arm
+from xew.sim_warp.robots.user.infer import check_own_motion, complete_arms, complete_limits, fill_right_arm
 
 FOLDERS = "XEW_ROBOTS"
 """Name of the environment variable that lists folders of robots, separated as in PATH."""
@@ -84,6 +84,7 @@ def complete_draft(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> Robo
     if counts[0] != counts[1] or counts[0] not in (6, 7):
         raise ConfigError(f"{source}: the arms have {counts[0]} and {counts[1]} joints; expected equal arms of six or seven.")
     lower, upper, speed = complete_limits(draft, urdf, arms, source)
+    check_own_motion(draft, arms, lower, upper, source)
     robot = RobotSpec(
         key=key,
         title=draft.title or urdf.name or key,
@@ -92,6 +93,7 @@ def complete_draft(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> Robo
         joint_lower=tuple(lower.tolist()),
         joint_upper=tuple(upper.tolist()),
         joint_velocity=tuple(speed.tolist()),
+        joint_acceleration=draft.joint_acceleration or (),
     )
     return _settle(draft, robot, source)
 
@@ -271,7 +273,9 @@ def _with_relative_meshes(urdf: Urdf) -> bytes:
 
 def _robot_yaml(robot: RobotSpec, urdf: str, digest: str) -> dict[str, object]:
     """A robot.yaml that leaves nothing open."""
-    limits = {name: list(getattr(robot, name)) for name in ("joint_lower", "joint_upper", "joint_velocity")}
+    limits = {
+        name: list(getattr(robot, name)) for name in ("joint_lower", "joint_upper", "joint_velocity", "joint_acceleration")
+    }
     return {"urdf": urdf, "title": robot.title, "arms": [_plain_arm(arm) for arm in robot.arms], **limits, "source": digest}
 
 
