@@ -122,7 +122,7 @@ def make_page(cells: list[tuple[Path, Record]], args: Args) -> None:
         raise EpisodeError(f"--most is {args.most}, expected at least 1 scene.")
     predictions = find_predictions(args.rollouts)
     scenes, left_out = choose_scenes(cells, args.scenes, args.most, predictions)
-    write_page(Page(args.data.absolute().name, scenes, left_out, predictions, args.flow), args.page)
+    write_page(Page(f"Episodes of {args.data.absolute().name}", scenes, left_out, predictions, args.flow), args.page)
     size = sum(file.stat().st_size for file in args.page.rglob("*") if file.is_file())
     told = f"; {left_out} left out (--scenes, --most)" if left_out else ""
     print(f"{args.page / 'index.html'}: {len(scenes)} scenes, {size / 1e6:.1f} MB{told}")

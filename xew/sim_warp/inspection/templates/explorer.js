@@ -36,7 +36,7 @@
     views = scene.robots.map((robot, column) => {
       const figure = make(at("robots"), "figure");
       make(figure, "h2", robot.title);
-      const view = { robot, column, pictures: [picture(figure, several ? "truth" : "", robot.size, "video")], psnr: chosen.psnr[column] };
+      const view = { robot, column, figure, pictures: [picture(figure, several ? "truth" : "", robot.size, "video")], psnr: chosen.psnr[column] };
       view.pictures[0].canvas.setAttribute("aria-label", `Video of ${robot.title}`);
       if (view.psnr) {
         for (const row of ["prediction", "difference"]) {
@@ -52,6 +52,7 @@
       view.spans.canvas.title = describe(robot);
       return view;
     });
+    for (const { figure, psnr } of views) if (psnr) figure.style.order = -1; // predicted robots come first
     const has = {
       mask: scene.robots.some((robot) => robot.outlines), flow: chosen.rows.includes("flow"),
       keypoints: scene.robots.some((robot) => robot.keypoints), contacts: scene.robots.some((robot) => robot.contacts),
