@@ -96,6 +96,11 @@
     one.value.textContent = frame > last ? `ended at frame ${last}` : "";
     if (one.row === "difference" || frame > last) return;
     if (layers.flow && chosen.rows.includes("flow")) {
+      if (robot.outlines) { // else its colors are lost on dark robots
+        trace(context, robot.outlines[frame]);
+        context.fillStyle = "rgb(255 255 255 / 65%)";
+        context.fill("evenodd");
+      }
       context.globalCompositeOperation = "multiply"; // what does not move is white
       tile("flow");
       context.globalCompositeOperation = "source-over";
@@ -105,12 +110,16 @@
     if (layers.contacts && robot.contacts) drawContacts(context, robot);
   }
 
-  function drawOutlines(context, outlines) {
+  function trace(context, outlines) {
     context.beginPath();
     for (const points of outlines) {
       for (let i = 0; i < points.length; i += 2) context[i ? "lineTo" : "moveTo"](points[i] + 0.5, points[i + 1] + 0.5);
       context.closePath();
     }
+  }
+
+  function drawOutlines(context, outlines) {
+    trace(context, outlines);
     context.lineWidth = 1.2;
     context.strokeStyle = "#ff7800";
     context.stroke();
