@@ -78,7 +78,7 @@ class Args:
     rollouts: tuple[Path, ...] = ()
     """Trees of predicted videos that the page shows beside the true ones; only scenes that have some are shown."""
     flow: bool = True
-    """Render optical flow for the page, about 5 s an episode on a CPU."""
+    """Render optical flow for the page, which takes some seconds an episode on a CPU."""
     trust: tuple[str, ...] = ()
     """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
