@@ -2,10 +2,11 @@
 
 Reads  <data>/<task>/<seed>/<robot>/
 Writes a table to the terminal and, where asked, pictures: a sheet a task (start, middle and end of every robot) and a strip
-       an episode (eight frames of the scene over eight of the robot alone); or a grid of all tasks and robots
+       an episode (eight frames of the scene over eight of the robot alone); a grid of all tasks and robots; or a page
+       on which the robots' videos run side by side, with overlays and predictions (`inspection/explorer.py`)
 
 Command: python -m xew.sim_warp.inspect data [--verify] [--visibility] [--rerender 5] [--render] [--pictures sheets]
-         [--grid grid.png]
+         [--grid grid.png] [--page explorer [--scenes open_laptop stack_bowls_two/0] [--rollouts rollouts/fixed]]
 """
 
 import math
@@ -29,6 +30,7 @@ from xew.files import hold_lock, replacing, write_bytes
 from xew.names import path_below
 from xew.sim_warp.devices.workers import Workers, find_device, has_kernels, quiet_warp, worker_count
 from xew.sim_warp.generate import yield_table
+from xew.sim_warp.inspection.explorer import Page, choose_scenes, find_predictions, write_page
 from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
 from xew.sim_warp.production.surfaces import visibility_table
 from xew.sim_warp.rendering.render import Renderer
@@ -67,6 +69,16 @@ class Args:
     """Number of seeds of each task that are drawn."""
     grid: Path | None = None
     """PNG file for one picture of all tasks and robots at work: the first accepted seed of each task."""
+    page: Path | None = None
+    """Folder for an offline page that plays the robots' videos side by side; open its index.html."""
+    scenes: tuple[str, ...] = ()
+    """Scenes that the page shows, each TASK or TASK/SEED; all tasks without."""
+    most: int = 6
+    """Largest number of scenes on the page: the first seed of every task, then the second."""
+    rollouts: tuple[Path, ...] = ()
+    """Trees of predicted videos that the page shows beside the true ones; only scenes that have some are shown."""
+    flow: bool = True
+    """Render optical flow for the page, which takes some seconds an episode on a CPU."""
     trust: tuple[str, ...] = ()
     """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
@@ -86,7 +98,7 @@ def main() -> None:
         damaged += verify([folder for folder, _ in pictured])
     if damaged:
         raise EpisodeError("\n".join([*damaged, f"{len(damaged)} damaged."]))
-    if not pictured and (args.visibility or args.rerender or args.render or args.pictures or args.grid):
+    if not pictured and (args.visibility or args.rerender or args.render or args.pictures or args.grid or args.page):
         raise EpisodeError(f"no seed under {args.data} is accepted, so there is nothing to render or draw.")
     if args.visibility:
         print(visibility_table([folder for folder, _ in pictured]))
@@ -99,6 +111,21 @@ def main() -> None:
         draw_pictures(pictured, args.pictures, args.seeds)
     if args.grid:
         draw_grid(pictured, args.grid)
+    if args.page:
+        make_page(pictured, args)
+
+
+def make_page(cells: list[tuple[Path, Record]], args: Args) -> None:
+    """Write the explorer's page of some scenes, and say where it is and what it leaves out."""
+    assert args.page is not None
+    if args.most < 1:
+        raise EpisodeError(f"--most is {args.most}, expected at least 1 scene.")
+    predictions = find_predictions(args.rollouts)
+    scenes, left_out = choose_scenes(cells, args.scenes, args.most, predictions)
+    write_page(Page(f"Episodes of {args.data.absolute().name}", scenes, left_out, predictions, args.flow), args.page)
+    size = sum(file.stat().st_size for file in args.page.rglob("*") if file.is_file())
+    told = f"; {left_out} left out (--scenes, --most)" if left_out else ""
+    print(f"{args.page / 'index.html'}: {len(scenes)} scenes, {size / 1e6:.1f} MB{told}")
 
 
 def read_headers(data: Path) -> tuple[list[tuple[Path, Record]], list[str]]:

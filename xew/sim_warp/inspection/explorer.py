@@ -1,0 +1,232 @@
+"""The explorer's page: chooses scenes, makes a film and a script of each, and writes the page that plays them.
+
+Writes <out>/index.html, and for every scene scenes/<number>_<task>_<seed>.js (overlays) and .mp4 (all robots' videos; one
+more for every model whose rollouts are shown). A page opens from a file; its scripts are read when their scene is chosen.
+"""
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from tqdm import tqdm
+
+import xew
+from xew.dataset import Episode
+from xew.episode import EpisodeError, States, data_folder, read_states, read_video
+from xew.files import hold_lock, read_text, write_text
+from xew.names import path_below
+from xew.rollout import Rollout, find_rollouts, read_rollout_video, resize_video
+from xew.sim_warp.inspection.films import Row, difference_video, tile_frames, tile_size, write_film
+from xew.sim_warp.inspection.overlays import frame_psnr, overlay_data
+from xew.sim_warp.rendering.streams import command_streams, flow_to_rgb
+from xew.sim_warp.robots import ROBOTS, recorded_robot
+
+__all__ = ["Page", "Predictions", "Scene", "choose_scenes", "find_predictions", "write_page"]
+
+MOST_ROBOTS = 10
+"""Number of robots of a scene that are shown; more would make a film that browsers do not play."""
+MARK = '<meta name="generator" content="xew explorer">'
+"""Line by which an explorer's page is known, so that no other page is replaced."""
+NO_FILE_NAME = re.compile(r"[^A-Za-z0-9_.-]")
+
+TEMPLATES = Environment(
+    loader=PackageLoader("xew.sim_warp.inspection"),
+    autoescape=True,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    undefined=StrictUndefined,
+)
+
+Predictions = Mapping[str, Mapping[tuple[str, int, str], Rollout]]
+"""Rollouts by model with condition, and by task, seed and robot."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The episodes of one task and seed."""
+
+    task: str
+    seed: int
+    cells: tuple[Episode, ...]
+    """Those that are shown, in the order of ROBOTS, others behind."""
+    left_out: int
+    """Number of robots that are not shown."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a page shows."""
+
+    title: str
+    scenes: Sequence[Scene]
+    left_out: int
+    """Number of scenes of the data set that it does not show."""
+    predictions: Predictions
+    flow: bool = True
+    """Is optical flow rendered from the commands?"""
+
+
+def find_predictions(roots: Iterable[Path]) -> Predictions:
+    """Rollouts of all trees. Raises EpisodeError where two of one model are of one episode, RolloutError as `find_rollouts`."""
+    found: dict[str, dict[tuple[str, int, str], Rollout]] = {}
+    for rollout in (rollout for root in roots for rollout in find_rollouts(root)):
+        of_model = found.setdefault(" · ".join(filter(None, (rollout.model, rollout.condition))), {})
+        other = of_model.setdefault((rollout.task, rollout.seed, rollout.robot), rollout)
+        if other is not rollout:
+            raise EpisodeError(
+                f"{other.folder} and {rollout.folder} are both of the model {rollout.model!r}, expected one rollout of an "
+                "episode; leave one of the trees out of --rollouts."
+            )
+    return found
+
+
+def choose_scenes(
+    cells: Iterable[Episode], wanted: Sequence[str], most: int, predictions: Predictions
+) -> tuple[list[Scene], int]:
+    """Scenes to show, and the number of those that are left out.
+
+    Args:
+        cells: episodes with videos.
+        wanted: TASK or TASK/SEED; all scenes where there is none.
+        most: number of scenes at most, the first seed of every task before the second.
+        predictions: where there are some, only scenes that one of them is of are shown.
+
+    Raises:
+        EpisodeError: a name in `wanted` is in no episode, or there is no scene to show.
+    """
+    scenes: dict[tuple[str, int], list[Episode]] = {}
+    for folder, record in cells:
+        scenes.setdefault((record.task, record.seed), []).append((folder, record))
+    known = {name for task, seed in scenes for name in (task, f"{task}/{seed}")}
+    # A seed is also found as its folder is called, 0800000.
+    names = [_plain_seed(name) for name in wanted]
+    if missing := [name for name in names if name not in known]:
+        raise EpisodeError(
+            f"no scene {', '.join(missing)} among those with videos, expected TASK or TASK/SEED, of the tasks "
+            f"{', '.join(sorted({task for task, _ in scenes}))}; correct --scenes."
+        )
+    predicted = {key[:2] for of_model in predictions.values() for key in of_model}
+    fit = [
+        (task, seed)
+        for task, seed in scenes
+        if (not names or task in names or f"{task}/{seed}" in names) and (not predictions or (task, seed) in predicted)
+    ]
+    if not fit:
+        raise EpisodeError("none of the scenes with videos has a rollout; name the data set that --rollouts are of.")
+    seeds: dict[str, list[int]] = {}
+    for task, seed in sorted(fit):
+        seeds.setdefault(task, []).append(seed)
+    in_turn = sorted(fit, key=lambda key: (seeds[key[0]].index(key[1]), key[0]))
+    chosen = sorted(in_turn[:most])
+    return [_scene(*key, scenes[key]) for key in chosen], len(scenes) - len(chosen)
+
+
+def _plain_seed(name: str) -> str:
+    task, slash, seed = name.rpartition("/")
+    return f"{task}/{int(seed)}" if slash and seed.isdecimal() else name
+
+
+def _scene(task: str, seed: int, cells: Sequence[Episode]) -> Scene:
+    order = {name: place for place, name in enumerate(ROBOTS)}
+    ordered = sorted(cells, key=lambda cell: (order.get(cell[1].robot, len(order)), cell[1].robot))
+    return Scene(task, seed, tuple(ordered[:MOST_ROBOTS]), max(0, len(ordered) - MOST_ROBOTS))
+
+
+def write_page(page: Page, out: Path) -> None:
+    """Write a page and what it plays into a folder, index.html last.
+
+    Raises:
+        EpisodeError: another page is there, or the folder cannot be written.
+    """
+    index = out / "index.html"
+    try:
+        if index.exists() and MARK not in read_text(index):
+            raise EpisodeError(f"{index} is not a page of the explorer and is kept; choose another folder with --page.")
+        with hold_lock(out):
+            bar = tqdm(page.scenes, desc="filming", unit="scene", disable=None)
+            entries = [_write_scene(number, scene, page, out) for number, scene in enumerate(bar)]
+            template = TEMPLATES.get_template("explorer.html")
+            version = f"xew {xew.__version__}"
+            write_text(index, template.render(page=page, index={"scenes": entries}, mark=MARK, version=version))
+    except (OSError, UnicodeDecodeError) as error:
+        raise EpisodeError(f"cannot write the page to {out}: {error}. Choose another folder with --page.") from error
+
+
+def _write_scene(number: int, scene: Scene, page: Page, out: Path) -> dict[str, Any]:
+    """Write the script and the films of a scene; returns its entry in the page's index."""
+    stem = f"scenes/{number:03d}_{NO_FILE_NAME.sub('-', scene.task)}_{scene.seed}"
+    truths = [read_video(folder / "rgb.mkv") for folder, _ in scene.cells]
+    states = [read_states(folder) for folder, _ in scene.cells]
+    rows: dict[str, Row] = {"video": truths}
+    if page.flow:
+        rows["flow"] = [_flow(cell, of_cell) for cell, of_cell in zip(scene.cells, states, strict=True)]
+    content = {
+        "frames": max(map(len, truths)),
+        "rate": scene.cells[0][1].frame_rate,
+        "films": _write_films(stem, scene, page.predictions, rows, out),
+        "robots": [
+            {
+                "title": ROBOTS[record.robot].title if record.robot in ROBOTS else record.robot,
+                "size": [truth.shape[2], truth.shape[1]],
+                "frames": len(truth),
+                "things": record.object_names,
+                **overlay_data(record, of_cell),
+            }
+            for (_, record), truth, of_cell in zip(scene.cells, truths, states, strict=True)
+        ],
+    }
+    text = json.dumps(content, separators=(",", ":"), allow_nan=False)
+    write_text(path_below(out, f"{stem}.js"), f"explorerScene({number}, {text});\n")
+    return {
+        "task": scene.task,
+        "seed": scene.seed,
+        "instruction": scene.cells[0][1].instruction,
+        "script": f"{stem}.js",
+        "left_out": scene.left_out,
+    }
+
+
+def _write_films(stem: str, scene: Scene, predictions: Predictions, rows: dict[str, Row], out: Path) -> list[dict[str, Any]]:
+    """Write a film of a scene for every model that predicts some of it, or one without; returns what the page needs of them."""
+    truths = [truth for truth in rows["video"] if truth is not None]
+    films = []
+    for place, (label, rollouts) in enumerate(_models(scene, predictions)):
+        predicted = [_read_prediction(rollout, truth) for rollout, truth in zip(rollouts, truths, strict=True)]
+        pairs = list(zip(predicted, truths, strict=True))
+        shown = dict(rows)
+        if label:
+            shown["prediction"] = predicted
+            shown["difference"] = [None if video is None else difference_video(video, truth) for video, truth in pairs]
+        tiles = list(shown.values())
+        name = f"{stem}_{place}.mp4"
+        write_film(path_below(out, name), tile_frames(tiles, max(map(len, truths))), scene.cells[0][1].frame_rate)
+        height, width = tile_size(tiles)
+        errors = [None if video is None else frame_psnr(video, truth) for video, truth in pairs]
+        films.append({"label": label, "file": name, "rows": list(shown), "tile": [width, height], "psnr": errors})
+    return films
+
+
+def _flow(cell: Episode, states: States) -> np.ndarray:
+    """The commanded robot's optical flow as a color wheel on white: [t h w 3] uint8."""
+    folder, record = cell
+    return flow_to_rgb(command_streams(recorded_robot(record.robot, data_folder(folder)), states.action).optical_flow)
+
+
+def _models(scene: Scene, predictions: Predictions) -> list[tuple[str, list[Rollout | None]]]:
+    """Models that predict robots of a scene, with a rollout of each robot or None; without any an empty label."""
+    found = []
+    for label, rollouts in predictions.items():
+        of_scene = [rollouts.get((scene.task, scene.seed, record.robot)) for _, record in scene.cells]
+        if any(of_scene):
+            found.append((label, of_scene))
+    return found or [("", [None] * len(scene.cells))]
+
+
+def _read_prediction(rollout: Rollout | None, truth: np.ndarray) -> np.ndarray | None:
+    """The video of a rollout at its episode's size and at most as long: [t h w 3] uint8."""
+    return None if rollout is None else resize_video(read_rollout_video(rollout), truth.shape[1:3])[: len(truth)]
