@@ -1,4 +1,4 @@
-"""What the tests of the model room share: exceptions from strict types for two libraries."""
+"""What the tests of the model room share: exceptions from strict types for two libraries, and programs of alike trainings."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -6,6 +6,11 @@ from typing import Any
 import jax
 import optax
 import pytest
+
+from xew.model import train
+from xew.model.settings.parts import Learning
+from xew.model.training import step
+from xew.model.training.step import Learner, TrainStep
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -24,6 +29,34 @@ def libraries_may_promote() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(optax, "chain", loose_chain)
         patch.setattr(jax.nn, "dot_product_attention", loosely(jax.nn.dot_product_attention))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def alike_trainings_share_programs() -> Iterator[None]:
+    """Trainings of the same settings trace and compile their step once in this process, which is most of a tiny one's time.
+
+    That a process of its own makes the same of a run, tests of many devices and of killed runs see.
+    """
+    learners: dict[Any, Learner] = {}
+    steps: dict[Any, tuple[TrainStep, Learner, Any]] = {}
+    make_new, compile_new = step.make_learner, Learner.compile_step
+
+    def make_learner(learning: Learning, mesh: Any) -> Learner:
+        key = (learning.network, learning.settings, learning.lora_rank, mesh)  # the optimizer follows from the settings
+        if key not in learners:
+            learners[key] = make_new(learning, mesh)
+        return learners[key]
+
+    def compile_step(learner: Learner, codec: Any = None) -> TrainStep:
+        key = (id(learner), None if codec is None else getattr(codec, "hash", id(codec)))
+        if key not in steps:
+            steps[key] = (compile_new(learner, codec), learner, codec)  # with both, so that no other gets their ids
+        return steps[key][0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "make_learner", make_learner)
+        patch.setattr(Learner, "compile_step", compile_step)
         yield
 
 

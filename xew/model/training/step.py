@@ -9,6 +9,8 @@ along `fsdp`, so that the traffic and the gradients have that dtype too; the num
 rounded its own.
 """
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -69,9 +71,12 @@ class Learner:
         Args:
             start: parameters to begin with, placed on the mesh; random where left out. They are given up to the state.
         """
-        init = jax.jit(lambda start: _init(self.learning, start), out_shardings=list_shardings(self.shapes), donate_argnums=0)
         with jax.set_mesh(self.mesh):
-            return init(start)
+            return self._compiled_init(start)
+
+    @functools.cached_property
+    def _compiled_init(self) -> Callable[[Any], TrainState]:
+        return jax.jit(lambda start: _init(self.learning, start), out_shardings=list_shardings(self.shapes), donate_argnums=0)
 
     def random_network(self) -> tuple[nnx.GraphDef, Any]:
         """The network's structure and its parameters at their random start, made where they lie on the mesh."""
