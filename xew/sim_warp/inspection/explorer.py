@@ -167,7 +167,8 @@ def _write_scene(number: int, scene: Scene, page: Page, out: Path) -> dict[str, 
         if len(truth) != of_cell.frame_count or not 1 <= record.frame_rate <= 1000:
             raise EpisodeError(
                 f"{folder} has {len(truth)} frames in rgb.mkv and {of_cell.frame_count} in states.npz, "
-                f"at {record.frame_rate:g} a second, expected as many in both, at 1 to 1000 a second; delete it and run generate again."
+                f"at {record.frame_rate:g} a second, expected as many in both, at 1 to 1000 a second; "
+                "delete it and run generate again."
             )
     rows: dict[str, Row] = {"video": truths}
     if page.flow:
