@@ -2,6 +2,7 @@
 
 import base64
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -9,14 +10,16 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from tests.analysis.conftest import FRAMES, Study
+from tests.analysis.conftest import FRAMES, SEEDS, TASKS, Study
 from tests.analysis.reports.browser import find_faults, needs_chromium
-from xew.analysis.report import Args, main
+from xew.analysis.report import Args, Picture, _strip_section, _write_explorer, main
 from xew.analysis.reports import pictures
 from xew.analysis.reports.study_charts import run_chart
 from xew.analysis.scores import MetricInfo, read_scores
+from xew.config import ConfigError
 from xew.episode import write_video
 from xew.metrics import evaluate
 from xew.rollout import find_rollouts, read_rollout_video
@@ -138,6 +141,22 @@ def test_markdown_and_figures_stand_beside_the_page(report: Path) -> None:
 def test_a_strip_shows_the_first_and_the_last_frame(report: Path) -> None:
     page = Page((report / "index.html").read_text())
     assert f"frame {FRAMES - 1}" in str(page.images[0]["alt"]) and "frame 0" in str(page.images[0]["alt"])
+
+
+def test_the_explorer_plays_the_scenes_of_the_strips(study: Study, report: Path, tmp_path: Path) -> None:
+    args = Args(study.scores, study.data, (study.rollouts,), tmp_path, explorer=True)
+    _write_explorer(read_scores(study.scores), args)
+    text = (tmp_path / "explorer" / "index.html").read_text()
+    assert Page(text).headings
+    shown = {"_".join(path.stem.split("_")[1:]) for path in (tmp_path / "explorer" / "scenes").glob("*.js")}
+    strips = [path.stem for path in (report / "figures").glob("late*")]
+    scenes = [f"{task}_{seed}" for task in TASKS for seed in SEEDS]
+    assert shown and shown == {scene for scene in scenes if any(f"_{scene}_" in name for name in strips)}
+    strip = Picture("a.png", b"", Markup("<p></p>"))
+    assert 'href="explorer/index.html"' in _strip_section([strip], args)
+    assert "explorer" not in _strip_section([strip], replace(args, explorer=False))
+    with pytest.raises(ConfigError, match="name them by --data and --rollouts"):
+        _write_explorer(read_scores(study.scores), replace(args, rollouts=()))
 
 
 @pytest.mark.parametrize("frame_zero", ["given", "absent"])

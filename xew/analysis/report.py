@@ -2,6 +2,7 @@
 
 Reads  scores.parquet and its curves; the data set and the rollouts for pictures
 Writes <out>/index.html (self-contained), report.md with figures/, tables/ (LaTeX, CSV) and summary.csv; of a study findings.csv
+       With --explorer also <out>/explorer, a page that plays videos
 
 A table with the column `variant` is a study's (xew.analysis.study writes it) and becomes the report of `reports/study.py`.
 
@@ -60,6 +61,8 @@ FILES = ("index.html", "report.md", "*.csv", "figures/*", "tables/*")
 """Patterns of the paths of what is written into the folder of a report."""
 NO_FILE_NAME = re.compile(r"[<>\"/\\|?*()\[\]`']+")
 """Letters of the names of models that stand in no name of a figure's file."""
+EXPLORER = "explorer/index.html"
+"""Path of the explorer's page below the report's folder."""
 SHEET_TASKS = 8
 """Largest number of tasks on the contact sheet."""
 
@@ -82,6 +85,8 @@ class Args:
     """Folder that python -m xew.analysis.distance wrote, for a study; without it the paper's distances are used."""
     mixed_motion: bool = False
     """Report on scores of episodes of shared and of own motion together."""
+    explorer: bool = False
+    """Write <out>/explorer too, a page that plays the scenes of the strips, for the report of one run."""
     paper: bool = False
     """Instead of scores: rebuild the paper's distance table from the paper's own scores and distances."""
 
@@ -132,13 +137,17 @@ def _own_robots(data: Path | None) -> list[str]:
 
 
 def _report_paper(args: Args) -> None:
-    if args.scores or args.data or args.rollouts or args.distances:
-        raise ConfigError("--paper reports on the paper's own figures; leave out scores, --data, --rollouts and --distances.")
+    if args.scores or args.data or args.rollouts or args.distances or args.explorer:
+        raise ConfigError(
+            "--paper reports on the paper's own figures; leave out scores, --data, --rollouts, --distances and --explorer."
+        )
     report = paper_report.build(read_paper(), _format_footer({}))
     _write_report(args.out, report.html, (report.markdown, report.files), report.summary)
 
 
 def _report_study(args: Args, scores: Scores) -> None:
+    if args.explorer:
+        raise ConfigError("--explorer is for one run; for a study: python -m xew.sim_warp.inspect DATA --page OUT.")
     if args.held_out != HELD_OUT_ROBOTS:
         raise ConfigError(
             f"--held-out is for one run; {args.scores} is a study's table, whose variants say whom they have seen."
@@ -164,6 +173,8 @@ def _report_scores(args: Args, scores: Scores) -> None:
     held_out, seen = _make_tables(scores, records, args.held_out)
     missing = find_missing_scores(scores.rows)
     strips = _make_strips(scores, args) if args.data and args.rollouts else []
+    if args.explorer:
+        _write_explorer(scores, args)
     curves = _curve_chart(scores, args.held_out)
     sheets = [_contact_sheet(args.data, records)] if args.data and any(record.success for record in records) else []
     sections = [
@@ -286,7 +297,8 @@ def _strip_section(strips: Sequence[Picture], args: Args) -> Markup:
         "Best, median and worst episode of each held-out robot by LPIPS. The difference is the largest of the three "
         f"channels, white for none, black for {pictures.DIFFERENCE_FULL} of 255 levels or more."
     )
-    return page.section("What it looks like", page.paragraph(text), *(strip.html for strip in strips))
+    played = [page.link("All robots' videos of these scenes side by side, as they run", EXPLORER)] if args.explorer else []
+    return page.section("What it looks like", page.paragraph(text), *played, *(strip.html for strip in strips))
 
 
 def _data_section(sheets: Sequence[Picture], records: Sequence[Record]) -> Markup | None:
@@ -311,14 +323,33 @@ def _method_section(scores: Scores, args: Args) -> Markup:
     return page.section("How it was measured", page.paragraph(notes), page.definitions(definitions), page.definitions(made))
 
 
+def _choose_episodes(scores: Scores, held_out: Sequence[str]) -> list[tuple[str, pd.Series]]:
+    """Up to three episodes of each held-out robot and model, each with what it is of them."""
+    rows = scores.rows[(scores.rows["metric"] == STRIP_METRIC) & scores.rows["robot"].isin(held_out)]
+    rows = rows[~rows["model"].isin(BASELINES)]
+    return [pair for _, group in rows.groupby(["robot", "model", "condition"]) for pair in _rank_episodes(group)]
+
+
+def _write_explorer(scores: Scores, args: Args) -> None:
+    """Write the explorer of the scenes that strips are of, without optical flow, which would have to be rendered."""
+    from xew.sim_warp.inspection.explorer import Page, choose_scenes, find_predictions, write_page
+
+    if not args.data or not args.rollouts:
+        raise ConfigError("--explorer plays videos; name them by --data and --rollouts.")
+    names = sorted({f"{row['task']}/{int(row['seed'])}" for _, row in _choose_episodes(scores, args.held_out)})
+    if names:
+        predictions = find_predictions(args.rollouts)
+        cells = [(folder, record) for folder, record in find_records(args.data) if record.hashes]
+        scenes, left_out = choose_scenes(cells, names, len(names), predictions)
+        given = scores.frame_zero != "absent"
+        write_page(Page(TITLE, scenes, left_out, predictions, flow=False, given=given), (args.out / EXPLORER).parent)
+
+
 def _make_strips(scores: Scores, args: Args) -> list[Picture]:
-    """Make up to three strips for each held-out robot and model."""
+    """Make the strips of the chosen episodes."""
     assert args.data is not None
     rollouts = {(r.model, r.condition, r.task, r.seed, r.robot): r for root in args.rollouts for r in find_rollouts(root)}
-    rows = scores.rows[(scores.rows["metric"] == STRIP_METRIC) & scores.rows["robot"].isin(args.held_out)]
-    rows = rows[~rows["model"].isin(BASELINES)]
-    chosen = [pair for _, group in rows.groupby(["robot", "model", "condition"]) for pair in _rank_episodes(group)]
-    shown = tqdm(chosen, desc="strips", unit="strip", disable=None)
+    shown = tqdm(_choose_episodes(scores, args.held_out), desc="strips", unit="strip", disable=None)
     return [_make_strip(row, word, rollouts, args.data, scores.frame_zero) for word, row in shown]
 
 

@@ -13,10 +13,10 @@ from tests.synthetic import write_synthetic_data
 from xew.episode import EpisodeError, Record, States, read_record, read_states, read_video
 from xew.rollout import write_rollout
 from xew.sim_warp.inspect import main
-from xew.sim_warp.inspection import explorer
 from xew.sim_warp.inspection.explorer import Page, choose_scenes, find_predictions, write_page
 from xew.sim_warp.inspection.films import difference_video, tile_frames, tile_size, write_film
 from xew.sim_warp.inspection.overlays import contact_spans, frame_psnr, mask_outline, overlay_data
+from xew.sim_warp.rendering import streams
 
 FRAMES = 5
 ROBOTS = ("piper", "ur5_wsg")
@@ -173,13 +173,29 @@ def test_flow_is_a_row_of_the_film(data: Path, tmp_path: Path, monkeypatch: pyte
     class Streams:
         optical_flow = flow
 
-    monkeypatch.setattr(explorer, "command_streams", lambda robot, action: asked.append(robot.key) or Streams)
+    monkeypatch.setattr(streams, "command_streams", lambda robot, action: asked.append(robot.key) or Streams)
     cells = [(path.parent, read_record(path.parent)) for path in sorted(data.rglob("episode.json"))]
     write_page(Page("t", choose_scenes(cells, (), 6, {})[0], 0, {}), tmp_path / "page")
     assert asked == ["ur5_wsg", "piper"]
     frames = read_video(next((tmp_path / "page" / "scenes").glob("*.mp4")))
     assert frames.shape == (FRAMES, 480, 640, 3)
     assert (np.abs(frames[2, 390, 150].astype(int) - [0, 255, 255]) < 30).all() and frames[2, 260, 300].min() > 240
+
+
+def test_rollouts_may_begin_with_frame_1_and_damage_is_told(data: Path, folder: Path, tmp_path: Path) -> None:
+    truth = read_video(folder / "rgb.mkv")
+    write_rollout(tmp_path / "tree", "place_empty_cup", 4, "piper", truth[1:], {"model": "m"})
+    cells = [(folder, read_record(folder))]
+    predictions = find_predictions([tmp_path / "tree"])
+    scenes, _ = choose_scenes(cells, (), 6, predictions)
+    write_page(Page("t", scenes, 0, predictions, flow=False, given=False), tmp_path / "page")
+    content = read_script(next((tmp_path / "page" / "scenes").glob("*.js")))
+    assert content["films"][0]["psnr"] == [[None] * FRAMES]
+    for change in ({"frame_rate": 1e-9}, {"frame_rate": 1e9}):
+        with pytest.raises(EpisodeError, match="expected as many in both, at 1 to 1000 a second"):
+            write_page(
+                Page("t", choose_scenes([(folder, replace(cells[0][1], **change))], (), 6, {})[0], 0, {}), tmp_path / "b"
+            )
 
 
 def test_another_page_is_kept_and_an_own_one_replaced(tmp_path: Path) -> None:

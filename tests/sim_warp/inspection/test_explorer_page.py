@@ -17,8 +17,8 @@ from tests.synthetic import write_synthetic_data
 from xew.dataset import find_records
 from xew.episode import episode_folder, read_states, read_video
 from xew.rollout import write_rollout
-from xew.sim_warp.inspection import explorer
 from xew.sim_warp.inspection.explorer import Page, choose_scenes, find_predictions, write_page
+from xew.sim_warp.rendering import streams
 
 pytestmark = [needs_chromium, pytest.mark.slow]
 
@@ -55,7 +55,7 @@ def page(data: Path) -> Path:
     predictions = find_predictions([data / "tree"])
     scenes, _ = choose_scenes([cell for cell in find_records(data) if "tree" not in cell[0].parts], (), 6, {})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(explorer, "command_streams", lambda robot, action: Streams)
+        patch.setattr(streams, "command_streams", lambda robot, action: Streams)
         write_page(Page(HOSTILE, scenes, 0, predictions), data / "page")
     return data / "page" / "index.html"
 

@@ -16,8 +16,8 @@ from xew.analysis.tables.findings import Finding
 from xew.analysis.tables.table import Table, TableRow
 
 __all__ = [
-    "Markup", "anchor", "chart", "claims", "contents", "definitions", "details", "escape", "labeled_picture", "note", "page",
-    "paragraph", "section", "table",
+    "Markup", "anchor", "chart", "claims", "contents", "definitions", "details", "escape", "labeled_picture", "link", "note",
+    "page", "paragraph", "section", "table",
 ]  # fmt: skip
 
 TEMPLATES = Environment(
@@ -56,6 +56,11 @@ def details(title: str, *parts: Markup) -> Markup:
 
 def paragraph(text: str) -> Markup:
     return _render("text.html", "paragraph", text)
+
+
+def link(text: str, target: str) -> Markup:
+    """A paragraph that leads to a file beside the page."""
+    return _render("text.html", "link", text, target)
 
 
 def note(text: str) -> Markup:

@@ -23,7 +23,6 @@ from xew.names import path_below
 from xew.rollout import Rollout, find_rollouts, read_rollout_video, resize_video
 from xew.sim_warp.inspection.films import Row, difference_video, tile_frames, tile_size, write_film
 from xew.sim_warp.inspection.overlays import frame_psnr, overlay_data
-from xew.sim_warp.rendering.streams import command_streams, flow_to_rgb
 from xew.sim_warp.robots import ROBOTS, recorded_robot
 
 __all__ = ["Page", "Predictions", "Scene", "choose_scenes", "find_predictions", "write_page"]
@@ -69,6 +68,8 @@ class Page:
     predictions: Predictions
     flow: bool = True
     """Is optical flow rendered from the commands?"""
+    given: bool = True
+    """Do rollouts hold the given frame 0? Else they begin with frame 1."""
 
 
 def find_predictions(roots: Iterable[Path]) -> Predictions:
@@ -162,13 +163,20 @@ def _write_scene(number: int, scene: Scene, page: Page, out: Path) -> dict[str, 
     stem = f"scenes/{number:03d}_{NO_FILE_NAME.sub('-', scene.task)}_{scene.seed}"
     truths = [read_video(folder / "rgb.mkv") for folder, _ in scene.cells]
     states = [read_states(folder) for folder, _ in scene.cells]
+    for (folder, record), truth, of_cell in zip(scene.cells, truths, states, strict=True):
+        if len(truth) != of_cell.frame_count or not 1 <= record.frame_rate <= 1000:
+            raise EpisodeError(
+                f"{folder} has {len(truth)} frames in rgb.mkv and {of_cell.frame_count} in states.npz, "
+                f"at {record.frame_rate:g} a second, expected as many in both, at 1 to 1000 a second; "
+                "delete it and run generate again."
+            )
     rows: dict[str, Row] = {"video": truths}
     if page.flow:
         rows["flow"] = [_flow(cell, of_cell) for cell, of_cell in zip(scene.cells, states, strict=True)]
     content = {
         "frames": max(map(len, truths)),
         "rate": scene.cells[0][1].frame_rate,
-        "films": _write_films(stem, scene, page.predictions, rows, out),
+        "films": _write_films(stem, scene, page, rows, out),
         "robots": [
             {
                 "title": ROBOTS[record.robot].title if record.robot in ROBOTS else record.robot,
@@ -191,12 +199,12 @@ def _write_scene(number: int, scene: Scene, page: Page, out: Path) -> dict[str, 
     }
 
 
-def _write_films(stem: str, scene: Scene, predictions: Predictions, rows: dict[str, Row], out: Path) -> list[dict[str, Any]]:
+def _write_films(stem: str, scene: Scene, page: Page, rows: dict[str, Row], out: Path) -> list[dict[str, Any]]:
     """Write a film of a scene for every model that predicts some of it, or one without; returns what the page needs of them."""
     truths = [truth for truth in rows["video"] if truth is not None]
     films = []
-    for place, (label, rollouts) in enumerate(_models(scene, predictions)):
-        predicted = [_read_prediction(rollout, truth) for rollout, truth in zip(rollouts, truths, strict=True)]
+    for place, (label, rollouts) in enumerate(_models(scene, page.predictions)):
+        predicted = [_read_prediction(rollout, truth, page.given) for rollout, truth in zip(rollouts, truths, strict=True)]
         pairs = list(zip(predicted, truths, strict=True))
         shown = dict(rows)
         if label:
@@ -213,6 +221,8 @@ def _write_films(stem: str, scene: Scene, predictions: Predictions, rows: dict[s
 
 def _flow(cell: Episode, states: States) -> np.ndarray:
     """The commanded robot's optical flow as a color wheel on white: [t h w 3] uint8."""
+    from xew.sim_warp.rendering.streams import command_streams, flow_to_rgb  # here, so that a page without it needs no Warp
+
     folder, record = cell
     return flow_to_rgb(command_streams(recorded_robot(record.robot, data_folder(folder)), states.action).optical_flow)
 
@@ -227,6 +237,9 @@ def _models(scene: Scene, predictions: Predictions) -> list[tuple[str, list[Roll
     return found or [("", [None] * len(scene.cells))]
 
 
-def _read_prediction(rollout: Rollout | None, truth: np.ndarray) -> np.ndarray | None:
-    """The video of a rollout at its episode's size and at most as long: [t h w 3] uint8."""
-    return None if rollout is None else resize_video(read_rollout_video(rollout), truth.shape[1:3])[: len(truth)]
+def _read_prediction(rollout: Rollout | None, truth: np.ndarray, given: bool) -> np.ndarray | None:
+    """The video of a rollout at its episode's size, from frame 0 on and at most as long: [t h w 3] uint8."""
+    if rollout is None:
+        return None
+    video = resize_video(read_rollout_video(rollout), truth.shape[1:3])
+    return (video if given else np.concatenate([truth[:1], video]))[: len(truth)]
