@@ -125,7 +125,7 @@ def make_page(cells: list[tuple[Path, Record]], args: Args) -> None:
     write_page(Page(f"Episodes of {args.data.absolute().name}", scenes, left_out, predictions, args.flow), args.page)
     size = sum(file.stat().st_size for file in args.page.rglob("*") if file.is_file())
     told = f"; {left_out} left out (--scenes, --most)" if left_out else ""
-    print(f"{args.page / 'index.html'}: {len(scenes)} scenes, {size / 1e6:.1f} MB{told}")
+    print(f"{args.page / 'index.html'}: {len(scenes)} scene{'s' * (len(scenes) != 1)}, {size / 1e6:.1f} MB{told}")
 
 
 def read_headers(data: Path) -> tuple[list[tuple[Path, Record]], list[str]]:

@@ -152,7 +152,7 @@ def test_the_command_writes_a_page(
     flags = [data, "--no-flow", "--page", tmp_path / "page", "--rollouts", tmp_path / "tree"]
     monkeypatch.setattr(sys, "argv", ["inspect", *map(str, flags)])
     main()
-    assert f"{tmp_path / 'page' / 'index.html'}: 1 scenes, 0." in capsys.readouterr().out
+    assert f"{tmp_path / 'page' / 'index.html'}: 1 scene, 0." in capsys.readouterr().out
     stem = "scenes/000_place_empty_cup_4"
     written = {path.relative_to(tmp_path / "page").as_posix() for path in (tmp_path / "page").rglob("*") if path.is_file()}
     assert written == {"index.html", f"{stem}.js", f"{stem}_0.mp4"}
