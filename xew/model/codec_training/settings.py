@@ -228,10 +228,6 @@ def training_episodes(dataset: Dataset, robots: Sequence[str], motion: str) -> l
     """
     episodes = select_episodes(dataset, robots, "train")
     if not episodes:
-        raise ConfigError(
-            f"{dataset.root} has no training episode with videos of {', '.join(robots[:6])}"
-            f"{' …' if len(robots) > 6 else ''}; it has {', '.join(sorted({r.robot for _, r in dataset.cells})) or 'nothing'}."
-            f" Make some: python -m xew.sim_warp.generate --robots {' '.join(robots[:6])} --out {dataset.root}"
-        )
+        raise dataset.explain_missing_robots(robots, "training episode with videos")
     demand_motion(dataset.root, (record for _, record in episodes), motion)
     return episodes

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from xew.config import ConfigError, suggestion
-from xew.dataset import Dataset, Episode, demand_motion, read_dataset
+from xew.config import ConfigError
+from xew.dataset import Dataset, Episode, read_dataset
 from xew.episode import EpisodeError
 from xew.model.settings.parts import EpisodeChoice
 from xew.protocol import expand_robots
@@ -29,16 +29,14 @@ def choose_episodes(dataset: Dataset, choice: EpisodeChoice) -> TrainingEpisodes
     Raises:
         ConfigError, EpisodeError: there are none to learn from, too few to adapt to, or no videos to draw samples of.
     """
-    samples = sample_episodes(dataset, choice.samples)
+    samples = sample_episodes(dataset, choice.samples, choice.motion)
     bare = [folder for folder, record in samples.values() if not record.videos]
     if bare:
         raise ConfigError(
             f"{bare[0]} was made with --states-only and has no video to begin a sample with; draw none with "
             f"--train.sample-every 0, or make videos: python -m xew.sim_warp.inspect {dataset.root} --render"
         )
-    fresh, replay = training_episodes(dataset, choice), replay_episodes(dataset, choice)
-    demand_motion(dataset.root, (record for _, record in samples.values()), choice.motion)
-    return TrainingEpisodes(fresh, replay, samples)
+    return TrainingEpisodes(training_episodes(dataset, choice), replay_episodes(dataset, choice), samples)
 
 
 def training_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
@@ -63,13 +61,10 @@ def _select_training(dataset: Dataset, robots: Sequence[str], motion: str, *, ne
         ConfigError: a robot has none (one of all, unless all are needed).
         EpisodeError: some are of another kind of motion.
     """
-    chosen = dataset.select(robots=robots, split="train")
+    chosen = dataset.select(robots=robots, split="train", motion=motion)
     missing = [robot for robot in robots if robot not in {record.robot for _, record in chosen}]
     if missing and (need_all or not chosen):
-        meant = suggestion(missing[0], dataset.robots)
-        command = f"python -m xew.sim_warp.generate --robots {' '.join(robots)} --out {dataset.root}"
-        raise ConfigError(f"{dataset.root} has no training episode of {', '.join(missing)};{meant} make some: {command}")
-    demand_motion(dataset.root, (record for _, record in chosen), motion)
+        raise dataset.explain_missing_robots(missing, "training episode")
     return chosen
 
 
@@ -87,15 +82,17 @@ def first_of_each(episodes: Sequence[Episode], count: int) -> list[Episode]:
     return [episode for _, group in sorted(groups.items()) for episode in group[:count]]
 
 
-def sample_episodes(dataset: Dataset, roles: Mapping[str, str]) -> dict[str, Episode]:
+def sample_episodes(dataset: Dataset, roles: Mapping[str, str], motion: str | None = None) -> dict[str, Episode]:
     """An episode of each of these robots that the data has, by role and robot, never of a test seed.
 
     It is of a validation seed where there is one of that robot, else of a training seed, which a model of the robot has seen.
 
     Args:
         roles: of the robots that samples are drawn of, by robot.
+        motion: kind of motion that the episodes have to be of; left open, any.
     """
-    found = [e for family in ("validation", "train") for e in dataset.select(robots=tuple(roles), split=family)]
+    robots = tuple(roles)
+    found = [e for family in ("validation", "train") for e in dataset.select(robots=robots, split=family, motion=motion)]
     first = {record.robot: (folder, record) for folder, record in reversed(found)}
     return {f"{roles[robot]}/{robot}": first[robot] for robot in roles if robot in first}
 
@@ -103,10 +100,10 @@ def sample_episodes(dataset: Dataset, roles: Mapping[str, str]) -> dict[str, Epi
 def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None) -> list[Episode]:
     """Accepted episodes of a seed family and of the given robots, or of all. Raises ConfigError if there is none."""
     dataset = read_dataset(data)
-    known, robots = dataset.robots, expand_robots(robots or ()) or None
-    for robot in robots or ():
-        if robot not in known:
-            raise ConfigError(f"unknown robot {robot!r};{suggestion(robot, known)} {data} has: {', '.join(known)}.")
+    robots = expand_robots(robots or ()) or None
+    missing = [robot for robot in robots or () if robot not in dataset.robots]
+    if missing:
+        raise dataset.explain_missing_robots(missing)
     chosen = dataset.select(robots=robots, split=split)
     if not chosen:
         asked = f"{split} episode of {', '.join(robots)}" if robots else f"{split} episode"
