@@ -38,7 +38,7 @@ from xew.model.episodes.choice import training_episodes as model_episodes
 from xew.model.experiment import load_experiment
 from xew.model.training.loop import STOPPED
 from xew.model.video.frames import to_model_size
-from xew.protocol import HELD_OUT_ROBOTS, SEEN_ROBOTS, expand_robots
+from xew.protocol import HELD_OUT_ROBOTS, SEEN_ROBOTS, SHARED_MOTION, expand_robots
 
 CONFIG = """
 clip: {frames: 5, height: 64, width: 96}
@@ -130,7 +130,7 @@ def test_what_is_written_is_a_codec(run: Path) -> None:
 
 
 def training_pictures(experiment: Any, regions: bool = False) -> Pictures:
-    episodes = training_episodes(read_dataset(experiment.data), experiment.train_robots)
+    episodes = training_episodes(read_dataset(experiment.data), experiment.train_robots, experiment.motion)
     return gather_pictures(episodes, list(experiment.streams), experiment.cut, 1.0, regions=regions)
 
 
@@ -263,11 +263,11 @@ def test_too_many_pictures_are_told_before_any_is_decoded(world: Path, monkeypat
 
 def test_only_training_robots_and_seeds_are_seen(world: Path) -> None:
     dataset = read_dataset(world / "data")
-    chosen = training_episodes(dataset, SEEN_ROBOTS)
+    chosen = training_episodes(dataset, SEEN_ROBOTS, SHARED_MOTION)
     assert {record.robot for _, record in chosen} == set(SEEN_ROBOTS)
     assert len(chosen) == 3 < len(find_accepted(world / "data"))
     with pytest.raises(ConfigError, match="has no training episode with videos of body_0, body_1; it has aloha_agilex"):
-        training_episodes(dataset, expand_robots(["body:0-1"]))
+        training_episodes(dataset, expand_robots(["body:0-1"]), SHARED_MOTION)
 
 
 # Samples.

@@ -39,7 +39,7 @@ def test_steps_learn(kind: str, perceptual: float, config: Path) -> None:
     experiment = replace(experiment, train=replace(experiment.train, permute=0.0, still=0.0, noise=0.0))
     graph, statistics, state = init_codec_state(experiment)
     step = make_codec_step(graph, statistics, experiment)
-    episodes = training_episodes(read_dataset(experiment.data), experiment.train_robots)
+    episodes = training_episodes(read_dataset(experiment.data), experiment.train_robots, experiment.motion)
     found = gather_pictures(episodes, ["rgb"], experiment.cut, 1.0, regions=True)
     batch = Batch(found.clips[:2], found.regions[:2], np.float32(3e-3))
     losses = []
