@@ -30,6 +30,8 @@ from xew.metrics.truth import Points, Surfaces, Truth, is_inside
 FRAME_BLOCK = 4
 """Number of frames graded at once on a CPU; on a GPU it is `ACCELERATOR_CHUNK`. A video's last block is filled up: a short one
 costs little."""
+WHOLE_BLOCK = 16
+"""Number of frames that a video is filled up to a multiple of on a CPU for metrics that need all of it."""
 TRACK_BLOCK, POINT_BLOCK = 64, 32
 """Numbers of frames and points that tracks are filled up to multiples of, so that videos of all lengths and robots share a few
 programs: compiling one takes seconds, running it milliseconds."""
@@ -303,8 +305,8 @@ def _curve(name: str, arrays: Arrays) -> np.ndarray:
     curve = METRICS[name].curve
     assert curve is not None, "metrics of frames have one"
     count = len(arrays[0])
-    few = jax.default_backend() == "cpu" and not METRICS[name].whole
-    block = FRAME_BLOCK if few else ACCELERATOR_CHUNK
+    few = WHOLE_BLOCK if METRICS[name].whole else FRAME_BLOCK
+    block = few if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK
     padded = [_fill(array, 0, block, "last") for array in arrays]
     size = len(padded[0]) if METRICS[name].whole else block
     blocks = [curve(*(array[i : i + size] for array in padded)) for i in range(0, len(padded[0]), size)]
