@@ -1,6 +1,7 @@
 """Predictors made on purpose: they are wrong as they say, and the strict metrics put them in the right order."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,6 +14,7 @@ from xew.metrics.backends import open_masker, open_tracker
 from xew.metrics.calibration.matrix import expected_order, grade_material, matrix, order_violations, to_markdown
 from xew.metrics.calibration.predictors import BELOW, PREDICTORS, Material, erase_objects, hold_objects, predict, soften
 from xew.metrics.truth import MOVED, Points, Surfaces, Truth
+from xew.protocol import GRADING_PROTOCOL, HELD_OUT_ROBOTS
 
 FRAMES, HEIGHT, WIDTH = 41, 96, 128
 ORDERED = ("keypoint_error_strict", "trajectory_error_strict")
@@ -20,6 +22,10 @@ CHEAP = (*ORDERED, "pck_strict", "coverage_strict", "object_coverage_strict", "p
 """Metrics that the test grades; those of masks and networks take longer."""
 ROBOT, THING = (34, 26), (15, 13)
 """Width and height [pixels] of the robot, a rectangle, and of the thing that moves, one too."""
+MEASURED = Path(__file__).with_name("predictors.parquet")
+"""Rows of `calibrate --predictors` on seed 800000 of five tasks, with both held-out robots and one with the PiPER alone.
+
+The attributes say the protocol."""
 rng = np.random.default_rng(11)
 
 
@@ -95,6 +101,30 @@ def test_every_predictor_has_every_strict_score(rows: pd.DataFrame) -> None:
 def test_strict_metrics_put_predictors_in_order(name: str, rows: pd.DataFrame) -> None:
     table = matrix(rows)
     assert order_violations(table)[name] == [], table.loc[name].to_dict()
+
+
+@pytest.fixture(scope="module")
+def measured() -> pd.DataFrame:
+    """Rows of real episodes, graded by the protocol of now: measure them again where it changes."""
+    rows = pd.read_parquet(MEASURED)
+    assert rows.attrs["protocol"] == GRADING_PROTOCOL
+    assert rows["task"].nunique() == 5 and set(rows["robot"]) == set(HELD_OUT_ROBOTS)
+    assert len(rows) == 9 * len(PREDICTORS) * len(METRICS)
+    return rows
+
+
+def test_strict_metrics_order_predictors_over_five_tasks_and_both_unseen_robots(measured: pd.DataFrame) -> None:
+    table = matrix(measured)
+    strict = [name for name in METRICS if "strict" in METRICS[name].suites]
+    assert {name: order_violations(table)[name] for name in strict} == {name: [] for name in strict}
+    assert not measured[measured["metric"].isin(strict)]["value"].isna().any()
+    page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
+    assert to_markdown(table) in page, "the page shows these rows"
+
+
+def test_erasing_what_moves_is_worse_than_leaving_it_in_every_task(measured: pd.DataFrame) -> None:
+    errors = measured[measured["metric"] == "trajectory_error_strict"].pivot_table(index="task", columns="case", values="value")
+    assert (errors["object erased"] > errors["object at rest"]).all(), errors[["object at rest", "object erased"]]
 
 
 def test_erasing_an_object_is_worse_than_leaving_it_where_it_was(rows: pd.DataFrame) -> None:
