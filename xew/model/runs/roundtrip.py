@@ -50,6 +50,11 @@ def open_roundtrip(run: Path) -> RunRoundtrip:
     if run.suffix != ".yaml":
         return RunRoundtrip(*load_run(run))
     experiment = load_experiment(run)
+    return RunRoundtrip(experiment, load_untrained_codec(experiment))
+
+
+def load_untrained_codec(experiment: Experiment) -> Codec:
+    """The codec of an experiment that has not been trained. Raises ConfigError as `load_codec`."""
     encoding, choice = experiment.encoding, experiment.choice
-    episodes = training_episodes(read_dataset(experiment.data), choice) if encoding.kind.fitted else []
-    return RunRoundtrip(experiment, load_codec(encoding, episodes))
+    episodes = training_episodes(read_dataset(experiment.data), choice) if encoding.kind.fitted else ()
+    return load_codec(encoding, episodes)
