@@ -156,9 +156,9 @@ def _format(successes: Sequence[bool]) -> str:
 def compare_distances(args: Distances) -> int:
     """Print quantiles of both distances by kind of pair, and plot them."""
     from xew.analysis.distance import appearance_matrix, measure
+    from xew.sim_warp.bodies import FIRST_FAMILY
     from xew.sim_warp.rendering.streams import nine_views
     from xew.sim_warp.robots import get_robot
-    from xew.sim_warp.robots.bodies import FIRST_FAMILY
 
     numbers = (*range(args.bodies), *range(FIRST_FAMILY, FIRST_FAMILY + args.wide))
     names = (*ROBOT_NAMES, *(body_key(number) for number in numbers))
@@ -265,7 +265,7 @@ def run_everything(args: Everything) -> int:
     this = [sys.executable, str(Path(__file__))]
     failed = 0
     for name, command in {
-        "digest": [sys.executable, "-m", "xew.sim_warp.robots.bodies", "--digest"],
+        "digest": [sys.executable, "-m", "xew.sim_warp.bodies", "--digest"],
         "loading": [*this, "loading"],
         "yields": [*this, "yields"],
         "rate": [*this, "rate"],

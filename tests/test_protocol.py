@@ -7,7 +7,6 @@ import pytest
 
 from xew.model.conditions import ACTIONS, CONDITIONS
 from xew.protocol import (
-    DISTANCE,
     DISTANCE_BODIES,
     FIXED,
     FORGETTING_ROBOT,
@@ -102,12 +101,12 @@ def test_the_model_knows_every_action_conditioning_and_split() -> None:
         assert variant.action in ACTIONS and variant.embodiment in CONDITIONS and variant.split in SPLITS
         assert variant.start is None or variant.start in VARIANTS.values()
     loeo = {f"loeo_{robot}" for robot in LOEO}
-    shared = {"fixed", "distance", "validation", *loeo, *SCALING}
+    shared = {"fixed", "validation", *loeo, *SCALING}
     assert set(SPLITS) == {key + ending for key in shared for ending in ("", "_own", "_mixed")}
 
 
 def test_the_key_of_a_split_says_the_motion_of_its_episodes() -> None:
-    assert [SPLITS[key].motion for key in ("fixed", "loeo_piper_own", "distance_mixed")] == ["shared", "own", "mixed"]
+    assert [SPLITS[key].motion for key in ("fixed", "loeo_piper_own", "scaling_seen_mixed")] == ["shared", "own", "mixed"]
     for motion in (*MOTIONS, MIXED_MOTION):
         split = SPLITS[split_key("fixed", motion)]
         assert replace(split, motion="shared") == FIXED
@@ -118,11 +117,12 @@ def test_splits_with_bodies_count_what_they_should() -> None:
     """K = 4, 16, 64 bodies, with the three robots and without; Panda, PiPER and 32 bodies to be tested on."""
     trained = {key: len(split.train_robots) for key, split in SCALING.items()}
     assert sorted(trained.values()) == [3, 4, 7, 16, 19, 64, 67]
-    for split in SCALING.values():
-        assert len(split.held_out_robots) == 34 and set(HELD_OUT_ROBOTS) < set(split.held_out_robots)
-        assert split_counts(split) == (1250 * len(split.train_robots), 34 * 500)
+    for key, split in SCALING.items():
+        tested = 34 + 64 * (key == "scaling_seen")  # with the bodies of the distance protocol
+        assert len(split.held_out_robots) == tested and set(HELD_OUT_ROBOTS) < set(split.held_out_robots)
+        assert split_counts(split) == (1250 * len(split.train_robots), tested * 500)
+    assert SCALING["scaling_seen"].held_out_robots[34:] == DISTANCE_BODIES
     assert split_counts(FIXED) == (3750, 1000)
-    assert DISTANCE.held_out_robots == DISTANCE_BODIES and split_counts(DISTANCE) == (3750, 64 * 500)
     assert split_counts(VALIDATION, tasks=2, test_seeds=1)[1] == 16
     assert split_counts(SCALING["scaling_bodies_16"], tasks=6, train_seeds=10)[0] == 960
 

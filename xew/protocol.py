@@ -103,13 +103,12 @@ BODY_SCALES = (4, 16, 64)
 """Numbers of bodies (K) that the scaling protocol trains on."""
 _TESTED = (*HELD_OUT_ROBOTS, *UNSEEN_BODIES)
 SCALING = {
-    "scaling_seen": Split(SEEN_ROBOTS, _TESTED),
+    "scaling_seen": Split(SEEN_ROBOTS, (*_TESTED, *DISTANCE_BODIES)),
     **{f"scaling_bodies_{count}": Split(TRAINING_BODIES[:count], _TESTED) for count in BODY_SCALES},
     **{f"scaling_seen_bodies_{count}": Split((*SEEN_ROBOTS, *TRAINING_BODIES[:count]), _TESTED) for count in BODY_SCALES},
 }
-"""The scaling protocol: the three robots, K bodies, or both; all are tested on Panda, PiPER and 32 unseen bodies."""
-DISTANCE = Split(SEEN_ROBOTS, DISTANCE_BODIES)
-"""The distance protocol: one model of the three robots, tested on 64 bodies of the wide family, error against distance."""
+"""The scaling protocol: the three robots, K bodies, or both; all are tested on Panda, PiPER and 32 unseen bodies. The model of
+the three robots alone is tested on 64 bodies of the wide family too, error against distance, so that it is trained once."""
 VALIDATION = Split(SEEN_ROBOTS, VALIDATION_BODIES)
 """The fixed split's training robots, with the bodies by which choices are made in place of the held-out robots."""
 
@@ -125,10 +124,7 @@ def split_key(split: str, motion: str) -> str:
 
 
 _SHARED_SPLITS = (
-    {"fixed": FIXED}
-    | {f"loeo_{robot}": split for robot, split in LOEO.items()}
-    | SCALING
-    | {"distance": DISTANCE, "validation": VALIDATION}
+    {"fixed": FIXED} | {f"loeo_{robot}": split for robot, split in LOEO.items()} | SCALING | {"validation": VALIDATION}
 )
 SPLITS = {
     split_key(key, motion): replace(split, motion=motion)
@@ -181,8 +177,13 @@ class Variant:
 
     @property
     def graded_robots(self) -> tuple[str, ...]:
-        """Robots whose test episodes it predicts: all; after an adaptation the target and FORGETTING_ROBOT."""
-        return ROBOT_NAMES if self.target is None else (FORGETTING_ROBOT, self.target)
+        """Robots whose test episodes it predicts: the five and bodies that its split trains on or holds out, but no training
+        body; after an adaptation the target and FORGETTING_ROBOT."""
+        if self.target is not None:
+            return FORGETTING_ROBOT, self.target
+        split = SPLITS[self.split]
+        of_paper = tuple(robot for robot in ROBOT_NAMES if robot in (*split.train_robots, *split.held_out_robots))
+        return (*of_paper, *(robot for robot in split.held_out_robots if robot not in ROBOT_NAMES))
 
     @property
     def seen_robots(self) -> tuple[str, ...]:
@@ -237,6 +238,9 @@ PARTS: dict[str, tuple[Variant, ...]] = {
         adaptation(target, shots, remedy) for remedy in ("replay", "lora") for target in HELD_OUT_ROBOTS for shots in SHOTS
     ),
     "more_systems": (system("bwm"),),
+    # Ours; of procedural bodies, which the paper does not have. The model is told of looks by the robot's render.
+    "scaling": tuple(reference(split, embodiment="robot_render") for split in SCALING),
+    "bodies": (reference("scaling_seen", embodiment="robot_render"),),
 }
 """Variants that each table compares, in the order of its rows. A variant may be in several parts."""
 PAPER_PARTS = ("fixed", "actions", "ladder", "loeo", "few_shot", "forgetting", "baselines")

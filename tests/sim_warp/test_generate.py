@@ -17,7 +17,7 @@ from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, fill_disk, work_inline
 from xew.config import ConfigError
 from xew.dataset import find_accepted, find_records
 from xew.episode import EpisodeError, Record, episode_folder, read_record, verify_episode, write_episode
-from xew.protocol import TEST_SEED_START, VALIDATION_SEED_START, seed_split
+from xew.protocol import SEED_STARTS, TEST_SEED_START, VALIDATION_SEED_START, seed_split
 from xew.sim_warp import generate as command
 from xew.sim_warp.devices import workers
 from xew.sim_warp.devices.workers import Workers
@@ -271,18 +271,28 @@ def test_as_many_seeds_are_tried_as_could_be_accepted() -> None:
     assert tried.accepted == 1 and tried.next_jobs() == [Job("task", 12, ("a", "b"))]
 
 
+AB = dict.fromkeys(SEED_STARTS, ("a", "b"))
+"""Two robots for all families of seeds."""
+
+
 def test_validation_seeds_are_a_family_of_their_own_that_is_made_when_asked_for() -> None:
     args = Args(tasks=("grab_roller",), robots=("a", "b"), train_seeds=2, test_seeds=1, validation_seeds=3)
-    families = plan_families(args, ("a", "b"), Manifest())
+    families = plan_families(args, AB, Manifest())
     assert [(f.first_seed, f.wanted) for f in families] == [(0, 2), (VALIDATION_SEED_START, 3), (TEST_SEED_START, 1)]
     assert {seed_split(seed) for seed in families[1].tries} == {"validation"}
-    assert len(plan_families(replace(args, validation_seeds=0), ("a", "b"), Manifest())) == 2
+    assert len(plan_families(replace(args, validation_seeds=0), AB, Manifest())) == 2
+
+
+def test_test_seeds_may_be_of_other_robots() -> None:
+    args = Args(tasks=("grab_roller",), train_seeds=2, test_seeds=1)
+    families = plan_families(args, AB | {"test": ("b", "c")}, Manifest())
+    assert [(family.first_seed, family.robots) for family in families] == [(0, ("a", "b")), (TEST_SEED_START, ("b", "c"))]
 
 
 def test_unpaired_robots_share_no_seed(tmp_path: Path) -> None:
     """Each robot's seeds are its own however many are tried, and it waits for no other."""
     args = Args(tasks=("grab_roller",), robots=("a", "b"), train_seeds=MOST_UNPAIRED, test_seeds=1, unpaired=True)
-    families = plan_families(args, ("a", "b"), Manifest())
+    families = plan_families(args, AB, Manifest())
     assert [(f.robots, f.wanted) for f in families] == [
         (("a",), MOST_UNPAIRED),
         (("b",), MOST_UNPAIRED),
@@ -292,7 +302,7 @@ def test_unpaired_robots_share_no_seed(tmp_path: Path) -> None:
     tried = [set(f.tries) for f in families]
     assert len(set.union(*tried)) == sum(map(len, tried))
     assert families[1].first_seed == SEEDS_OF_ROBOT and families[3].first_seed == TEST_SEED_START + SEEDS_OF_ROBOT
-    paired = plan_families(replace(args, unpaired=False), ("a", "b"), Manifest())
+    paired = plan_families(replace(args, unpaired=False), AB, Manifest())
     assert [(f.robots, f.first_seed) for f in paired] == [(("a", "b"), 0), (("a", "b"), TEST_SEED_START)]
 
 

@@ -83,6 +83,8 @@ class Args:
     """Robots that the models have not seen; each has a table of its own, as have all robots that are not the paper's."""
     distances: Path | None = None
     """Folder that python -m xew.analysis.distance wrote, for a study; without it the paper's distances are used."""
+    other_motion: Path | None = None
+    """Score table of the same study in the other kind of motion: action representations of both stand side by side."""
     mixed_motion: bool = False
     """Report on scores of episodes of shared and of own motion together."""
     explorer: bool = False
@@ -137,9 +139,10 @@ def _own_robots(data: Path | None) -> list[str]:
 
 
 def _report_paper(args: Args) -> None:
-    if args.scores or args.data or args.rollouts or args.distances or args.explorer:
+    if args.scores or args.data or args.rollouts or args.distances or args.explorer or args.other_motion:
         raise ConfigError(
-            "--paper reports on the paper's own figures; leave out scores, --data, --rollouts, --distances and --explorer."
+            "--paper reports on the paper's own figures; leave out scores, --data, --rollouts, --distances, --other-motion and "
+            "--explorer."
         )
     report = paper_report.build(read_paper(), _format_footer({}))
     _write_report(args.out, report.html, (report.markdown, report.files), report.summary)
@@ -154,13 +157,17 @@ def _report_study(args: Args, scores: Scores) -> None:
         )
     if args.data and not any(find_records(args.data)):
         raise ConfigError(f"{args.data} holds no episode; make some: python -m xew.sim_warp.generate --out {args.data}")
-    report = report_study.build(scores, args.data, args.rollouts, args.distances, _format_footer(scores.versions))
+    other = read_scores(args.other_motion, _own_robots(args.data)) if args.other_motion else None
+    report = report_study.build(scores, args.data, args.rollouts, args.distances, _format_footer(scores.versions), other)
     _write_report(args.out, report.html, (report.markdown, report.files), report.summary)
 
 
 def _report_scores(args: Args, scores: Scores) -> None:
-    if args.distances:
-        raise ConfigError(f"--distances is for the report of a study, and {args.scores} is the table of one run; leave it out.")
+    if args.distances or args.other_motion:
+        raise ConfigError(
+            f"--distances and --other-motion are for the report of a study, and {args.scores} is the table of one run; leave "
+            "them out."
+        )
     own = [robot for robot in dict.fromkeys(scores.rows["robot"]) if robot not in ROBOT_NAMES]
     for robot in args.held_out:
         if robot not in (*ROBOT_NAMES, *own):

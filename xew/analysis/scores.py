@@ -18,7 +18,7 @@ import pandas as pd
 from xew.config import IMPORT_PATH, ConfigError, parse
 from xew.files import demand_regular, replacing
 from xew.names import EpisodeError, check_label, check_name
-from xew.protocol import BASELINES, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES, SHARED_MOTION
+from xew.protocol import BASELINES, BODY_NAME, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES, SHARED_MOTION
 from xew.statistics import find_power
 
 VARIANT = "variant"
@@ -162,7 +162,7 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
     Args:
         path: what `xew.metrics.evaluate` or `write_scores` wrote.
         own_robots: names of robots that are not the paper's; a table may also name them itself (attribute `robots`), and
-            robots with an import path `module:NAME` need no further word.
+            procedural bodies and robots with an import path `module:NAME` need no further word.
 
     Raises:
         ConfigError: a file is missing or damaged; or cells are duplicate, not finite, of unknown robots, of other metrics
@@ -179,8 +179,10 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
     _check_attributes(path, rows.attrs)
     _check_texts(path, rows)
     metrics = _read_metric_infos(path, rows.attrs["metrics"])
-    added = {robot for robot in rows["robot"].unique() if IMPORT_PATH.fullmatch(str(robot))}
-    wrong = _find_wrong_rows(rows, metrics, {*ROBOT_NAMES, *added, *rows.attrs.get("robots", ()), *own_robots})
+    names = rows["robot"].unique()
+    added = {robot for robot in names if IMPORT_PATH.fullmatch(str(robot)) or BODY_NAME.fullmatch(str(robot))}
+    known = {*ROBOT_NAMES, *added, *rows.attrs.get("robots", ()), *own_robots}
+    wrong = _find_wrong_rows(rows, metrics, known)
     if wrong:
         raise ConfigError(f"{path} cannot be averaged over:\n{_format_wrong_rows(wrong)}\nGrade anew: {command} --overwrite")
     return Scores(rows, curves, metrics, rows.attrs)

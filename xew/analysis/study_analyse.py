@@ -65,7 +65,8 @@ def main(args: Args) -> None:
     rollouts = tuple((args.rollouts or args.study / "rollouts") / name for name in shown)
     table, data, out = args.study / "scores.parquet", args.data or study.data_folder, args.study / "report"
     remove_written(out, report.FILES)  # a larger study's figures would stay
-    report.main(report.Args(scores=table, data=data, rollouts=rollouts, distances=args.distances, out=out))
+    other = study.other_scores
+    report.main(report.Args(table, data, rollouts, out, distances=args.distances, other_motion=other))
 
 
 def describe(study: Study, scores: Scores) -> dict[str, Any]:
@@ -93,7 +94,7 @@ def describe(study: Study, scores: Scores) -> dict[str, Any]:
     return {
         "parts": list(study.parts),
         "tasks": study.task_count,
-        "robots": list(study.robots),
+        "robots": list(study.robot_keys),
         "train_seeds": study.train_seeds,
         "test_seeds": study.test_seeds,
         "shots": list(study.shots),

@@ -70,6 +70,8 @@ class Args:
     """Number of accepted test seeds, likewise; they count from where no training seed comes."""
     validation_seeds: int = 0
     """Number of accepted validation seeds, likewise: for samples while models train, for calibration and whatever is tuned."""
+    test_robots: tuple[str, ...] = ()
+    """Robots of the test seeds, where they are others than --robots, which then are those of all other seeds."""
     out: Path = Path("data")
     batch: int = 256
     """Number of worlds that a GPU steps together. A CPU steps each by itself, as many at a time as there are workers."""
@@ -147,16 +149,23 @@ class Family:
         return all(record.success for record in self.done[seed].values())
 
 
-def plan_families(args: Args, robots: Sequence[str], manifest: Manifest) -> list[Family]:
-    """The families of all tasks: one of all robots together, or one a robot, each with seeds that no other has."""
-    teams = [(robot,) for robot in robots] if args.unpaired else [tuple(robots)]
+def plan_families(args: Args, robots: Mapping[str, Sequence[str]], manifest: Manifest) -> list[Family]:
+    """The families of all tasks: one of all robots together, or one a robot, each with seeds that no other has.
+
+    Args:
+        args: what is asked for.
+        robots: keys of the robots by family of seeds, a key of SEED_STARTS.
+        manifest: seeds that are known to fail.
+    """
     families = []
     for task in dict.fromkeys(args.tasks):
         wanted_seeds = {"train": args.train_seeds, "validation": args.validation_seeds, "test": args.test_seeds}
-        asked = [(SEED_STARTS[name], count) for name, count in wanted_seeds.items() if count or name != "validation"]
-        for first, wanted in asked:
+        for name, wanted in wanted_seeds.items():
+            if name == "validation" and not wanted:
+                continue
+            teams = [(robot,) for robot in robots[name]] if args.unpaired else [tuple(robots[name])]
             for number, team in enumerate(teams):
-                first_seed = first + number * SEEDS_OF_ROBOT
+                first_seed = SEED_STARTS[name] + number * SEEDS_OF_ROBOT
                 families.append(Family(task, first_seed, wanted, team, manifest.failing(task, team), args.motion))
     return families
 
@@ -203,14 +212,16 @@ def generate(args: Args) -> list[Family]:
         args = replace(args, robots=(str(args.robot.absolute()),))
     _check(args)
     robots = _find_robots(args.robots, args.out)
+    tested = _find_robots(args.test_robots, args.out) or robots
     manifest = Manifest() if args.search else read_manifest(args.manifest)
-    families = plan_families(args, tuple(robots), manifest)
+    teams = dict.fromkeys(SEED_STARTS, tuple(robots)) | {"test": tuple(tested)}
+    families = plan_families(args, teams, manifest)
     _read_existing(families, args)
     spent: dict[str, float] = defaultdict(float)
     frames: Counter[str] = Counter()
     total = sum(family.wanted for family in families)
     bar = tqdm(total=total, initial=sum(f.accepted for f in families), desc="accepted seeds", unit="seed")
-    with bar, start_workers(args, robots) as make:
+    with bar, start_workers(args, {**robots, **tested}) as make:
         while jobs := {(family.task, job.seed): (family, job) for family in families for job in family.next_jobs()}:
             for records, seconds in make([job for _, job in jobs.values()]):
                 family, _ = jobs[records[0].task, records[0].seed]

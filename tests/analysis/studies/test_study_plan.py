@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 import xew
-from xew.analysis.studies.config import Study, build_experiment, load_study, merge_settings, run_folder
+from xew.analysis.studies.config import Study, build_experiment, check_study, load_study, merge_settings, run_folder
 from xew.analysis.studies.cost import (
     correct_by_ledger,
     count_optimizer_steps,
@@ -23,7 +23,7 @@ from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import ThisMachine
 from xew.analysis.studies.plan import Step, plan, sort_steps, source_digest, step_key
 from xew.config import ConfigError
-from xew.protocol import PAPER_PARTS, PARTS, VARIANTS
+from xew.protocol import PAPER_PARTS, PARTS, VARIANTS, expand_robots
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 DEBUG = CONFIGS / "study_debug.yaml"
@@ -93,6 +93,52 @@ def test_a_study_of_own_motion_makes_and_names_it(study: Study) -> None:
     variants = (VARIANTS["fixed-irasim"], VARIANTS["loeo_piper-optical_flow-nine_views"])
     assert [build_experiment(own, variant)["split"] for variant in variants] == ["fixed_own", "loeo_piper_own"]
     assert build_experiment(study, variants[0])["split"] == "fixed"
+
+
+BODIES = CONFIGS / "study_bodies_debug.yaml"
+
+
+def test_a_study_of_bodies_makes_what_its_variants_ask_for() -> None:
+    """Bodies that train have training episodes, bodies that are graded have test episodes, and the five robots both."""
+    study = load_study(BODIES, ["--robots", "ur5_wsg", "piper", "body:0-15", "body:64-65", "body:104-111"])
+    names = [variant.name for variant in study.planned_variants]
+    assert names == [f"scaling_seen{bodies}-optical_flow-robot_render" for bodies in ("", "_bodies_4", "_bodies_16")]
+    assert study.trained_robots == ("ur5_wsg", "piper", *expand_robots(["body:0-15"]))
+    assert study.graded_robots == ("ur5_wsg", "piper", *expand_robots(["body:64-65", "body:104-111"]))
+    steps = plan(study)
+    command = steps["generate"].command
+    trained, tested = command[command.index("--robots") + 1 :], command[command.index("--test-robots") + 1 :]
+    assert (trained[:18], tested[:12]) == (study.trained_robots, study.graded_robots)
+    first, last = study.planned_variants[0], study.planned_variants[-1]
+    assert study.graded_counts(first) == dict.fromkeys(study.graded_robots, 6)
+    assert study.graded_counts(last) == dict.fromkeys(study.graded_robots[:4], 6), "one model alone is asked for distances"
+    assert [study.training_count(variant) for variant in (first, last)] == [6, 17 * 6]
+    command = steps["distances"].command
+    assert command[command.index("--robot") + 1 :][:8] == study.graded_robots[-8:]
+    assert estimate(study, steps)["generate"].amount == 2 * 3 * (18 + 12)
+
+
+def test_a_condition_may_stand_in_for_one_of_the_protocol() -> None:
+    study = load_study(BODIES)
+    model = build_experiment(study, study.planned_variants[0])["model"]
+    assert (model["action"], model["embodiment"]) == ("none", "robot_render_channels")
+    with pytest.raises(ConfigError, match="unknown condition of the protocol 'robot_rendr'; did you mean"):
+        check_study(replace(study, conditions={"robot_rendr": "none"}), BODIES)
+
+
+def test_a_model_of_bodies_is_trained_on_all_of_them_or_not_planned() -> None:
+    with pytest.raises(ConfigError, match="no variant of the parts scaling, bodies is left"):
+        load_study(BODIES, ["--robots", "ur5_wsg", "body:0-2", "body:64-65", "--variants", "scaling_bodies_4-*"])
+    with pytest.raises(ConfigError, match="unknown robot 'body_9999'"):
+        load_study(BODIES, ["--robots", "ur5_wsg", "body:9999"])
+
+
+def test_the_report_is_made_anew_when_the_study_in_the_other_motion_has_scores(study: Study, tmp_path: Path) -> None:
+    beside = replace(study, other_motion=tmp_path)
+    before = plan(beside)["analyse"].inputs
+    assert before == plan(study)["analyse"].inputs, "nothing to compare with yet"
+    (tmp_path / "scores.parquet").write_bytes(b"scores")
+    assert plan(beside)["analyse"].inputs != before and beside.other_scores == tmp_path / "scores.parquet"
 
 
 def test_every_training_seed_is_a_training_of_every_variant(study: Study) -> None:

@@ -186,6 +186,17 @@ def scatter(axes: Axes, distance: np.ndarray, score: np.ndarray, robots: Sequenc
     axes.set_ylabel(ylabel)
 
 
+def points(axes: Axes, x: np.ndarray, y: np.ndarray, xlabel: str, ylabel: str) -> None:
+    """Draw many points x [n], y [n] without names, and the line through all."""
+    ends = np.array([x.min(), x.max()])
+    axes.plot(ends, np.polyval(np.polyfit(x, y, 1), ends), color=SERIES[0], linewidth=2)
+    axes.scatter(x, y, color=INK, s=14, alpha=0.7, linewidths=0, zorder=3)
+    axes.locator_params(axis="x", nbins=5)
+    axes.set_ylim(top=y.max() + 0.2 * np.ptp(y))  # room for a line of text
+    axes.set_xlabel(xlabel)
+    axes.set_ylabel(ylabel)
+
+
 def lines(
     axes: Axes, series: Sequence[tuple[Series, np.ndarray, np.ndarray, np.ndarray | None]], xlabel: str, ylabel: str
 ) -> None:

@@ -12,13 +12,15 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
+from xew.analysis.beyond import Motions, body_errors, correlate_bodies, difficulty_table, motion_table, scaling_table
 from xew.analysis.paper import AXES, read_paper
 from xew.analysis.reports import page, pictures
 from xew.analysis.reports.charts import Chart, chart_files
+from xew.analysis.reports.study_beyond import body_charts
 from xew.analysis.reports.study_charts import study_charts
 from xew.analysis.reports.study_strips import Strip, study_strips
 from xew.analysis.scores import Scores, describe_scores, find_missing_scores
-from xew.analysis.statistics.grades import Grades, PaperGrades, StudyGrades, relative_gain
+from xew.analysis.statistics.grades import BODIES, Grades, PaperGrades, StudyGrades, relative_gain
 from xew.analysis.statistics.suites import StrictGrades
 from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables import formats
@@ -41,7 +43,7 @@ from xew.analysis.tables.layouts import build_tables, count_table
 from xew.analysis.tables.outside import outside_tables
 from xew.analysis.tables.table import MARKS, Table
 from xew.names import csv_text, plain_markdown
-from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
+from xew.protocol import BODY_SCALES, FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
 from xew.statistics import strict_metrics
 
 TITLE = "Can the model render a robot that it has never seen?"
@@ -52,6 +54,9 @@ PART_TITLES = {
     "few_shot": "Adaptation, and what it costs",
     "loeo": "Does distance predict difficulty?",
     "baselines": "Other world models",
+    "scaling": "More bodies in training",
+    "bodies": "Distance and difficulty over many bodies",
+    "motion": "Shared and own motion",
     "outside": "Outside the protocol",
 }
 SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]] = {
@@ -65,6 +70,9 @@ SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]]
         ("certainty", "distances", "features", "matrices"),
     ),
     "baselines": ((), ("baselines",), ()),
+    "scaling": (("scaling",), ("scaling",), ()),
+    "bodies": (("bodies",), ("bodies",), ()),
+    "motion": ((), ("motion",), ()),
     "outside": ((), ("outside",), ()),
 }
 """Content of each part's section: charts, tables that stand open, and tables that are folded away."""
@@ -104,7 +112,14 @@ class Content:
     """Sentence that says whether intervals are of one training or of several."""
 
 
-def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances: Path | None, footer: str) -> Report:
+def build(
+    scores: Scores,
+    data: Path | None,
+    rollouts: Sequence[Path],
+    distances: Path | None,
+    footer: str,
+    other_motion: Scores | None = None,
+) -> Report:
     """Make the report of a study.
 
     Args:
@@ -113,9 +128,10 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
         rollouts: trees of rollouts named after their variants, or folders that hold such trees; for pictures.
         distances: folder of the command of distances; the paper's printed ones where None.
         footer: text of the footer, versions.
+        other_motion: scores of the same study in the other kind of motion, if there are any.
 
     Raises:
-        ConfigError: a file that was named cannot be read.
+        ConfigError: a file that was named cannot be read, or both studies are of one kind of motion.
     """
     paper = read_paper()
     known = read_distances(distances) if distances else printed_distances(paper)
@@ -127,11 +143,16 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
     note = trainings_note(grades)
     scored = [*build_tables(builder), *outside_tables(builder, scores.rows)]
+    if builder.has_results("scaling"):
+        scored.append(scaling_table(builder))
     tables = [replace(table, caption=" ".join(filter(None, (table.caption, note, grades.notes)))) for table in scored]
     tables += [count_table(builder), *distance_tables(known)]
     if builder.has_results("loeo"):
         tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
         tables.append(certainty_table(grades, known, paper))
+    tables += filter(None, [difficulty_table(grades, known)])
+    if other_motion is not None:
+        tables.append(motion_table(Motions(scores, other_motion)))
     findings, by_paper = ask(StrictGrades(grades)), ask(grades)
     missing = find_missing_scores(scores.rows)
     content = Content(
@@ -140,7 +161,7 @@ def build(scores: Scores, data: Path | None, rollouts: Sequence[Path], distances
         by_paper,
         ask(printed),
         {table.name: table for table in tables},
-        study_charts(builder, known, scores.curves),
+        study_charts(builder, known, scores.curves) | body_charts(builder, known),
         strips,
         [*_missing_notes(builder, scores), *missing_note(missing)],
         missing,
@@ -164,13 +185,17 @@ def trainings_note(grades: StudyGrades) -> str:
     return f"Intervals are over scenes and the trainings of {named}{ending}."
 
 
-def _sentences(grades: Grades, distances: Distances, findings: Sequence[Finding], by_paper: Sequence[Finding]) -> list[str]:
+def _sentences(
+    grades: StudyGrades, distances: Distances, findings: Sequence[Finding], by_paper: Sequence[Finding]
+) -> list[str]:
     """The results in sentences, one for each question that was asked."""
     asked = [
         *_gap_sentence(grades),
         *_best_sentences(grades),
         *_adaptation_sentences(grades),
         *_distance_sentence(grades, distances),
+        *_scaling_sentence(grades),
+        *_bodies_sentence(grades, distances),
     ]
     return [
         _answer_sentence(findings),
@@ -284,6 +309,34 @@ def _distance_sentence(grades: Grades, distances: Distances) -> Iterator[str]:
     ]
     if parts:
         yield f"Over the five robots, each held out in turn, LPIPS goes with distance: {'; '.join(parts)}."
+
+
+def _scaling_sentence(grades: Grades) -> Iterator[str]:
+    """What the largest number of bodies beside the three robots is worth, on each held-out robot and on unseen bodies."""
+    rows = [f"scaling_seen_bodies_{count}" for count in BODY_SCALES]
+    known = [row for row in rows if _gain(grades, "scaling", row, "scaling_seen", BODIES) is not None]
+    if known:
+        targets = {**{robot: SHORT_ROBOTS[robot] for robot in HELD_OUT_ROBOTS}, BODIES: "unseen bodies"}
+        gains = {name: _gain(grades, "scaling", known[-1], "scaling_seen", robots) for robots, name in targets.items()}
+        parts = [f"{_format_change(-gain)} on {name}" for name, gain in gains.items() if gain is not None]
+        count = known[-1].rpartition("_")[2]
+        yield f"Training on {count} bodies beside the three robots changes LPIPS by {', '.join(parts)}."
+
+
+def _bodies_sentence(grades: StudyGrades, distances: Distances) -> Iterator[str]:
+    """How the error on bodies of the distance family goes with each of the paper's distances."""
+    if "lpips" not in grades.metrics:
+        return
+    found = correlate_bodies(body_errors(grades, distances, "lpips"), grades.metrics["lpips"].higher_is_better)
+    parts = [
+        f"r = {format_signed(result.r)} with {axis} distance ({format_signed(result.low)} to {format_signed(result.high)}, "
+        f"p = {result.p_value:.4f}; frozen first frame {format_signed(result.frozen)})"
+        for axis, result in found.items()
+        if axis in AXES
+    ]
+    if parts:
+        count = max(result.bodies for result in found.values())
+        yield f"Over {count} bodies that one model has never seen, LPIPS goes with distance: {'; '.join(parts)}."
 
 
 def _format_change(share: float) -> str:

@@ -20,7 +20,7 @@ import pandas as pd
 
 from xew.analysis.paper import Paper
 from xew.analysis.scores import TRAINING, TRUTH, MetricInfo, measure_power, name_graded
-from xew.protocol import BASELINES, CODEC_TRUTH, MULTI_VIEW, PARTS, ROBOT_NAMES, SPLITS, Variant
+from xew.protocol import BASELINES, CODEC_TRUTH, MULTI_VIEW, PARTS, ROBOT_NAMES, SPLITS, UNSEEN_BODIES, Variant, reference
 from xew.statistics import (
     DRAWS,
     LEVEL,
@@ -46,6 +46,8 @@ TOGETHER = {
 SEEN = "seen"
 REFERENCE = "reference"
 """The row of the few-shot part that stands for the model before adaptation, on the robots that it was trained on."""
+BODIES = "bodies"
+"""Name of the bodies that no model has seen, pooled."""
 
 
 class Grades(Protocol):
@@ -123,7 +125,9 @@ def find_variant(part: str, row: str) -> Variant:
 
 
 def pooled(variant: Variant, robots: str) -> tuple[str, ...]:
-    """The robots behind a name: 'seen' are those that the variant's split trains on."""
+    """The robots behind a name: 'seen' are those that the variant's split trains on, 'bodies' those that no split does."""
+    if robots == BODIES:
+        return UNSEEN_BODIES
     return SPLITS[variant.split].train_robots if robots == SEEN else (robots,)
 
 
@@ -253,7 +257,7 @@ class StudyGrades:
         return None if mean is None or other is None else (mean, other)
 
     def floor(self, robots: str, metric: str, *rows: tuple[str, str]) -> float:
-        info, names = self.metrics[metric], SPLITS["fixed"].train_robots if robots == SEEN else (robots,)
+        info, names = self.metrics[metric], pooled(reference(), robots)
         truth = self.baseline(TRUTH, names, metric)
         floors = []
         for variant in [find_variant(*row).name for row in rows] or [""]:

@@ -24,7 +24,9 @@ from xew.protocol import (
     TASK_COUNT,
     TEST_SEEDS_PER_TASK,
     TRAIN_SEEDS_PER_TASK,
+    VARIANTS,
     Variant,
+    expand_robots,
     expected_counts,
     split_key,
     training_counts,
@@ -33,6 +35,11 @@ from xew.sim_warp.tasks import get_task
 
 KINDS = ("generate", "latents", "baselines", "train", "adapt", "rollout", "evaluate", "distances", "analyse")
 """Kinds of steps, in the order of the work."""
+
+_KNOWN_ROBOTS = tuple(
+    dict.fromkeys(robot for split in SPLITS.values() for robot in (*split.train_robots, *split.held_out_robots))
+)
+_CONDITIONS = tuple(dict.fromkeys(name for variant in VARIANTS.values() for name in (variant.action, variant.embodiment)))
 
 Settings = dict[str, Any]
 """A part of an experiment's config, nested as in its file."""
@@ -124,8 +131,8 @@ class Study:
     """Patterns: only variants whose name matches one of them (as `loeo_*`), and what they start from; all where left out."""
     tasks: tuple[str, ...] = ()
     """Keys of tasks; all where left out."""
-    robots: tuple[str, ...] = ROBOT_NAMES
-    """Keys of robots."""
+    robots: tuple[str, ...] = ()
+    """Robots, bodies as body:0-15; all that the parts name where left out. Variants that train on other bodies are left out."""
     shots: tuple[int, ...] = SHOTS
     """Numbers of episodes of each task that models are adapted with (M)."""
     train_seeds: int = TRAIN_SEEDS_PER_TASK
@@ -146,14 +153,18 @@ class Study:
     """Settings laid over it for adaptations with replay or LoRA."""
     systems: dict[str, Settings] = field(default_factory=dict)
     """Settings laid over it for another project's system."""
+    conditions: dict[str, str] = field(default_factory=dict)
+    """Conditions of the model that stand in for those of the protocol, such as robot_render_channels for robot_render."""
     motion: str = SHARED_MOTION
     """Kind of motion of all episodes, one of protocol.MOTIONS."""
+    other_motion: Path | None = None
+    """Folder of the same study in the other kind of motion; the report sets action representations of both side by side."""
     generate: tuple[str, ...] = ()
     """Further arguments of `xew.sim_warp.generate`."""
     evaluate: tuple[str, ...] = ()
     """Further arguments of `xew.metrics.evaluate`, such as --masks sam2."""
     distances: tuple[str, ...] = ()
-    """Further arguments of `xew.analysis.distance`, which runs where the part loeo is planned."""
+    """Further arguments of `xew.analysis.distance`, which runs where the part loeo or bodies is planned."""
     environment: dict[str, str] = field(default_factory=dict)
     """Environment variables set for every step."""
     step_environment: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -173,9 +184,35 @@ class Study:
         """Score table of the baselines, which no variant has a name like."""
         return self.scores_path("baselines")
 
+    @property
+    def other_scores(self) -> Path | None:
+        """Score table of the study in the other kind of motion; None where there is none yet."""
+        path = self.other_motion / "scores.parquet" if self.other_motion else None
+        return path if path and path.is_file() else None
+
     def scores_path(self, variant: str) -> Path:
         """Score table of a variant's training."""
         return self.out / "scores" / f"{variant}.parquet"
+
+    @property
+    def robot_keys(self) -> tuple[str, ...]:
+        """Keys of the robots of the study: those that it names, else all of its parts, the five first."""
+        splits = [SPLITS[variant.split] for part in self.parts for variant in PARTS[part]]
+        named = expand_robots(self.robots) or [robot for s in splits for robot in (*s.train_robots, *s.held_out_robots)]
+        of_paper = tuple(robot for robot in ROBOT_NAMES if robot in named)
+        return (*of_paper, *dict.fromkeys(robot for robot in named if robot not in ROBOT_NAMES))
+
+    @property
+    def trained_robots(self) -> tuple[str, ...]:
+        """Robots that have training episodes: of the five all, so that parts may be added, and bodies that are asked for."""
+        asked = {robot for variant in self.planned_variants for robot in SPLITS[variant.split].train_robots}
+        return tuple(robot for robot in self.robot_keys if robot in ROBOT_NAMES or robot in asked)
+
+    @property
+    def graded_robots(self) -> tuple[str, ...]:
+        """Robots that have test episodes: likewise."""
+        asked = {robot for variant in self.planned_variants for robot in self.graded_counts(variant)}
+        return tuple(robot for robot in self.robot_keys if robot in ROBOT_NAMES or robot in asked)
 
     @property
     def task_count(self) -> int:
@@ -216,17 +253,19 @@ class Study:
     def _includes(self, variant: Variant) -> bool:
         """Whether a variant of a part is one of this study."""
         named = not self.variants or any(fnmatch.fnmatch(variant.name, pattern) for pattern in self.variants)
+        robots, split = self.robot_keys, SPLITS[variant.split]
         if variant.target is not None:
-            return named and variant.target in self.robots and variant.shots in self.shots
-        return named and any(robot in self.robots for robot in SPLITS[variant.split].held_out_robots)
+            return named and variant.target in robots and variant.shots in self.shots
+        bodies = {robot for robot in split.train_robots if robot not in ROBOT_NAMES}
+        return named and bodies <= set(robots) and any(robot in robots for robot in split.held_out_robots)
 
     def graded_counts(self, variant: Variant) -> dict[str, int]:
         """Number of episodes of each robot that a variant is graded on."""
-        return expected_counts(variant, self.task_count, self.test_seeds, self.robots)
+        return expected_counts(variant, self.task_count, self.test_seeds, self.robot_keys)
 
     def training_count(self, variant: Variant) -> int:
         """Number of episodes that a variant learns from."""
-        return sum(training_counts(variant, self.task_count, self.train_seeds, self.robots).values())
+        return sum(training_counts(variant, self.task_count, self.train_seeds, self.robot_keys).values())
 
 
 def load_study(path: Path, overrides: Iterable[str] = ()) -> Study:
@@ -264,7 +303,8 @@ def _check_names(study: Study, path: Path) -> None:
     shots, known_shots = tuple(map(str, study.shots)), tuple(map(str, SHOTS))
     for kind, names, known in (
         ("part", study.parts, tuple(PARTS)),
-        ("robot", study.robots, ROBOT_NAMES),
+        ("robot", expand_robots(study.robots), _KNOWN_ROBOTS),
+        ("condition of the protocol", tuple(study.conditions), _CONDITIONS),
         ("number of shots", shots, known_shots),
         ("kind of motion", (study.motion,), MOTIONS),
         ("task", study.tasks, study.tasks),  # known: checked above, and may be outside tasks
@@ -302,7 +342,10 @@ def build_experiment(study: Study, variant: Variant) -> Settings:
         "out": str(run_folder(study, variant)),
         "cache": str(study.out / "latents"),
         "split": split_key(variant.split, study.motion),
-        "model": {"action": variant.action, "embodiment": variant.embodiment},
+        "model": {
+            "action": study.conditions.get(variant.action, variant.action),
+            "embodiment": study.conditions.get(variant.embodiment, variant.embodiment),
+        },
     }
     return merge_settings(settings, given)
 

@@ -31,7 +31,8 @@ class Cost:
 def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     """The cost of every step from the study's rates, as if nothing were done."""
     rates, costs = study.rates, {}
-    episodes = study.task_count * (study.train_seeds + study.test_seeds) * len(study.robots)
+    tested = study.task_count * study.test_seeds * len(study.graded_robots)
+    episodes = study.task_count * study.train_seeds * len(study.trained_robots) + tested
     costs["generate"] = Cost(episodes, "episodes", rates.start_s + episodes * rates.episode_s, episodes * rates.episode_mb)
     encoded: set[tuple[str, ...]] = set()
     for variant in study.planned_runs:
@@ -50,7 +51,7 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
             ),
             f"evaluate/{variant.name}": Cost(graded, "videos", rates.start_s + graded * rates.grade_s),
         }
-    videos = study.task_count * study.test_seeds * len(study.robots) * len(BASELINES)
+    videos = tested * len(BASELINES)
     costs["baselines"] = Cost(videos, "videos", rates.start_s + videos * rates.grade_s)
     costs |= {"distances": Cost(1, "table", 2 * rates.start_s), "analyse": Cost(1, "report", 2 * rates.start_s)}
     return {name: costs[name] for name in steps}

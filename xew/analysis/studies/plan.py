@@ -21,8 +21,8 @@ import yaml
 import xew
 from xew.analysis.studies.config import Settings, Study, build_experiment, run_folder
 from xew.episode import SCHEMA_VERSION
-from xew.files import write_text
-from xew.protocol import GRADING_PROTOCOL, SHARED_MOTION, Variant
+from xew.files import file_digest, write_text
+from xew.protocol import DISTANCE_BODIES, GRADING_PROTOCOL, SHARED_MOTION, Variant
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def plan(study: Study) -> dict[str, Step]:
             _plan_evaluate(study, variant),
         ]
     steps.insert(2, _plan_baselines(study, study.planned_runs[0], experiments[study.planned_runs[0].name]))
-    if "loeo" in study.parts:
+    if {"loeo", "bodies"}.intersection(study.parts):
         steps.append(_plan_distances(study))
     steps.append(
         _plan_analyse(study, tuple(step.name for step in steps if step.kind in ("baselines", "evaluate", "distances")))
@@ -104,15 +104,23 @@ def _plan_generate(study: Study) -> Step:
     tasks = ("--tasks", *study.tasks) if study.tasks else ()
     seeds = ("--train-seeds", str(study.train_seeds), "--test-seeds", str(study.test_seeds))
     motion = () if study.motion == SHARED_MOTION else ("--motion", study.motion)
-    asked = (*tasks, "--robots", *study.robots, *seeds, *motion, *study.generate)
+    robots: tuple[str, ...] = ("--robots", *study.trained_robots)
+    if study.graded_robots != study.trained_robots:
+        robots += ("--test-robots", *study.graded_robots)
+    asked = (*tasks, *robots, *seeds, *motion, *study.generate)
     return Step(
         "generate",
         "",
         ("xew.sim_warp.generate", "--out", str(study.data_folder), *asked),
         needs=(),
-        inputs=[SCHEMA_VERSION, study.tasks, study.robots, study.train_seeds, study.test_seeds, *motion],
+        inputs=[SCHEMA_VERSION, study.tasks, *_robot_inputs(study), study.train_seeds, study.test_seeds, *motion],
         product=study.data_folder,
     )
+
+
+def _robot_inputs(study: Study) -> list[tuple[str, ...]]:
+    """The robots of a study's episodes: once where all have training and test episodes."""
+    return list(dict.fromkeys([study.trained_robots, study.graded_robots]))
 
 
 def _plan_latents(study: Study, variant: Variant, experiment: Settings, first: str) -> Step:
@@ -195,14 +203,16 @@ def _plan_evaluate(study: Study, variant: Variant) -> Step:
 
 
 def _plan_distances(study: Study) -> Step:
-    """Distances of the robots as they are rendered here, with which the errors of the LOEO folds are correlated."""
+    """Distances of the robots as they are rendered here, with which the errors of folds and bodies are correlated."""
     folder = study.out / "distances"
+    bodies = [robot for robot in study.graded_robots if robot in DISTANCE_BODIES] if "bodies" in study.parts else []
+    asked = (*(("--robot", *bodies) if bodies else ()), *study.distances)
     return Step(
         "distances",
         "",
-        ("xew.analysis.distance", "--out", str(folder), *study.distances),
+        ("xew.analysis.distance", "--out", str(folder), *asked),
         needs=(),
-        inputs=[study.distances, source_digest("analysis", "statistics")],
+        inputs=[asked, source_digest("analysis", "statistics")],
         product=folder / "distances.csv",
     )
 
@@ -217,6 +227,7 @@ def _plan_analyse(study: Study, needs: tuple[str, ...]) -> Step:
         inputs=[
             [asdict(variant) for variant in study.planned_variants],
             *study.training_seeds,
+            *([file_digest(study.other_scores)] if study.other_scores else []),
             source_digest("analysis", "statistics"),
         ],
         product=study.out / "report" / "index.html",

@@ -1,6 +1,6 @@
 """Bodies by their number: `body:17` is a candidate of the catalog with its place and homes.
 
-Reads  catalog.json, which `python -m xew.sim_warp.robots.bodies` writes: the candidates that pass its check, in order
+Reads  catalog.json, which `python -m xew.sim_warp.bodies` writes: the candidates that pass its check, in order
 Writes URDFs and meshes of bodies that are asked for, once, to the user's cache folder, under a digest of the code that makes
        them; a `RobotSpec` names the URDF there
 
@@ -67,7 +67,7 @@ def load_body(number: int) -> RobotSpec:
     entries = read_catalog()
     if number >= len(entries):
         raise ConfigError(
-            f"there is no body:{number}; expected body:0 to body:{len(entries) - 1}. `python -m xew.sim_warp.robots.bodies "
+            f"there is no body:{number}; expected body:0 to body:{len(entries) - 1}. `python -m xew.sim_warp.bodies "
             f"--count {number + 1}` extends the catalog."
         )
     return placed_body(entries[number], body_key(number), f"Body {number}")
@@ -87,9 +87,7 @@ def read_catalog(path: Path = CATALOG) -> tuple[Entry, ...]:
             for entry in entries
         )
     except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
-        raise ConfigError(
-            f"{path} is no catalog of bodies ({error}); write it by `python -m xew.sim_warp.robots.bodies`."
-        ) from error
+        raise ConfigError(f"{path} is no catalog of bodies ({error}); write it by `python -m xew.sim_warp.bodies`.") from error
 
 
 def catalog_text(entries: Sequence[Entry]) -> str:

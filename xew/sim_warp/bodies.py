@@ -4,14 +4,16 @@ Reads  the designs of candidates, in numeric order
 Writes the catalog: for every body the number of its candidate, base poses and homes, so that loading one searches for nothing
 
 A candidate that fails the check is skipped: from some place both of its arms must follow the plans of eight tasks and two seeds
-each (`trials.trial_plans`), within the limits and speeds of its joints, and at home each arm stays on its side. Numbers that
-are known keep their bodies: a longer catalog begins like a shorter one. Bodies are written as they are found; the command goes
-on from there unless it is told to begin anew.
+each (`trials.trial_plans`), within the limits and speeds of its joints, at home each arm stays on its side, and on two further
+seeds of each task it succeeds in physics. A seed of paired data counts only where all robots succeed, so that one body that
+never does would cost all others theirs. Numbers that are known keep their bodies: a longer catalog begins like a shorter one.
+Bodies are written as they are found; the command goes on from there unless it is told to begin anew. With --recheck known
+bodies are checked in physics again, and those that fail are replaced by further candidates.
 
 With --digest it prints SHA-256 digests of the URDF and meshes of each body of the catalog, and of all: two machines that print
 the same make the same bodies.
 
-Command: python -m xew.sim_warp.robots.bodies [--count 104 --anew --workers 2 --out FILE | --count 104 --digest]
+Command: python -m xew.sim_warp.bodies [--count 104 --anew --recheck --workers 2 --out FILE | --count 104 --digest]
 """
 
 import hashlib
@@ -35,11 +37,13 @@ from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import load_urdf
 from xew.sim_warp.geometry.poses import Pose, matrix_from_pose
 from xew.sim_warp.kinematics.forward import link_poses
+from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
 from xew.sim_warp.rendering.streams import home_action
-from xew.sim_warp.robots.procedural.bodies import CATALOG, Entry, catalog_text, read_catalog, unplaced_body
+from xew.sim_warp.robots.procedural.bodies import CATALOG, Entry, catalog_text, placed_body, read_catalog, unplaced_body
 from xew.sim_warp.robots.procedural.design import WIDE, BodyDesign, design_body
 from xew.sim_warp.robots.procedural.urdf_files import body_files
 from xew.sim_warp.robots.user.placement import YAW_90, move_apart, move_to, place
+from xew.sim_warp.robots.user.trials import PLAN_TASKS
 
 BODY_COUNT = 168
 """Number of bodies in the packaged catalog."""
@@ -47,6 +51,8 @@ FIRST_FAMILY = 104
 """Number of bodies of the first family of designs; those after them are of the wide family."""
 LEAST_SHARE = 1.0
 """Least share of the trial plans that a body follows."""
+PHYSICS_SEEDS = (2, 3)
+"""Seeds of each task of the trial plans on which a body has to succeed in physics; its place is chosen by those before."""
 LEAST_GAP = 0.002
 """Least distance of an arm at home from the plane between both [m]."""
 GAPS, BASE_Y = (0.6, 0.45, 0.75), (-0.45, -0.55, -0.65)
@@ -82,7 +88,20 @@ def try_candidate(number: int) -> tuple[int, Entry | str]:
     if (gap := gap_between_arms(placed.robot)) < LEAST_GAP:
         return number, f"its arms come within {1000 * gap:.0f} mm of the middle between them at home"
     left, right = placed.robot.arms
-    return number, Entry(number, (_rounded(left.root_pose), _rounded(right.root_pose)), (left.home, right.home))
+    entry = Entry(number, (_rounded(left.root_pose), _rounded(right.root_pose)), (left.home, right.home))
+    return number, find_failure(entry) or entry
+
+
+def find_failure(entry: Entry) -> str | None:
+    """Why the body of an entry fails in physics on one of the trial tasks; None if it succeeds on all of PHYSICS_SEEDS."""
+    key = f"candidate_{entry.candidate}"
+    robots = {key: placed_body(entry, key, key)}
+    for task in PLAN_TASKS:
+        planned = plan_cells([Job(task, seed, (key,)) for seed in PHYSICS_SEEDS], robots)
+        for (cell,) in simulate_cells(planned, "cpu"):
+            if cell.failure:
+                return f"{task}, seed {cell.scene.seed}: {cell.failure[1]}"
+    return None
 
 
 def gap_between_arms(robot: RobotSpec) -> float:
@@ -109,6 +128,27 @@ def find_bodies(known: tuple[Entry, ...], count: int, workers: int) -> Iterator[
             found += isinstance(result[1], Entry)
             if found == end:
                 break
+
+
+def replace_failing(known: Sequence[Entry], workers: int) -> Iterator[tuple[int, str, Entry]]:
+    """Further candidates for those known bodies that fail in physics: the number of each body, why it fails, and its successor.
+
+    Successors are of the same family of designs. All other bodies keep their numbers.
+    """
+    with Workers(workers) as pool:
+        checked = pool.run(_check_entry, known)
+        problems = dict(tqdm(checked, total=len(known), desc="check", unit="body"))
+    for first, numbers in ((0, range(FIRST_FAMILY)), (WIDE, range(FIRST_FAMILY, len(known)))):
+        family = [(number, known[number].candidate) for number in numbers if number < len(known)]
+        failing = [(number, problem) for number, candidate in family if (problem := problems[candidate])]
+        begin = 1 + max((candidate for _, candidate in family), default=first - 1)
+        works = ((n, entry) for n, entry in _try_in_order(count_from(begin), workers) if isinstance(entry, Entry))
+        for (number, problem), (_, entry) in zip(failing, works, strict=False):
+            yield number, problem, entry
+
+
+def _check_entry(entry: Entry) -> tuple[int, str | None]:
+    return entry.candidate, find_failure(entry)
 
 
 def _try_in_order(numbers: Iterator[int], workers: int) -> Iterator[tuple[int, Entry | str]]:
@@ -146,6 +186,8 @@ class Args:
     """Number of bodies in the catalog, or of those whose digests are printed."""
     anew: bool = False
     """Forget the bodies that the file knows."""
+    recheck: bool = False
+    """Replace the bodies that the file knows and that fail in physics; all others keep their numbers."""
     workers: int = os.cpu_count() or 1
     out: Path = CATALOG
     """File of the catalog."""
@@ -169,6 +211,11 @@ def fill_catalog(args: Args) -> None:
     """Find bodies until the catalog has as many as are asked for; it is written at each."""
     entries = list(read_catalog(args.out)) if args.out.is_file() and not args.anew else []
     skipped = 0
+    if args.recheck:
+        for number, problem, entry in replace_failing(entries, args.workers):
+            print(f"body:{number} is replaced by candidate {entry.candidate}: {problem}")
+            entries[number] = entry
+            _write(args.out, entries)
     with tqdm(total=args.count, initial=len(entries), desc="bodies", unit="body") as bar:
         for number, result in find_bodies(tuple(entries), args.count, args.workers):
             if isinstance(result, str):
@@ -176,10 +223,14 @@ def fill_catalog(args: Args) -> None:
                 bar.write(f"candidate {number} is skipped: {result}")
                 continue
             entries.append(result)
-            with replacing(args.out) as path:
-                path.write_text(catalog_text(entries), encoding="utf-8", newline="\n")
+            _write(args.out, entries)
             bar.update()
     print(f"{args.out}: {len(entries)} bodies; {skipped} candidates were skipped")
+
+
+def _write(path: Path, entries: Sequence[Entry]) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text(catalog_text(entries), encoding="utf-8", newline="\n")
 
 
 if __name__ == "__main__":

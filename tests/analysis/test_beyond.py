@@ -1,0 +1,204 @@
+"""What goes beyond the paper: the gap by number of training bodies, error against distance over bodies, kinds of motion."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.analysis.synthetic_study import TASKS, attributes, paper_axes, write_study
+from xew.analysis.beyond import (
+    Motions,
+    body_errors,
+    correlate_bodies,
+    difficulty_table,
+    motion_table,
+    scaling_frame,
+    scaling_table,
+)
+from xew.analysis.beyond.difficulty import LEAST_BODIES
+from xew.analysis.beyond.scaling import ALONE, GROUPS, WITH_ROBOTS
+from xew.analysis.paper import read_paper
+from xew.analysis.report import Args, main
+from xew.analysis.scores import read_scores
+from xew.analysis.statistics.grades import BODIES, PaperGrades, StudyGrades
+from xew.analysis.tables.builder import Builder
+from xew.analysis.tables.distances import Distances, printed_distances, read_distances
+from xew.config import ConfigError
+from xew.protocol import DISTANCE_BODIES, HELD_OUT_ROBOTS, PARTS, SEEN_ROBOTS, TEST_SEED_START, UNSEEN_BODIES
+
+SCENES = [(task, TEST_SEED_START + i) for task in ("place_empty_cup", "beat_block_hammer") for i in range(3)]
+RUN = ("scaling_seen", "scaling_seen_bodies_4", "scaling_seen_bodies_16", "scaling_bodies_16")
+ERRORS = {"scaling_seen": 0.3, "scaling_seen_bodies_4": 0.25, "scaling_seen_bodies_16": 0.2, "scaling_bodies_16": 0.28}
+"""Mean LPIPS of each variant that was run, on robots that it has not seen."""
+DISTANCES = dict(zip(DISTANCE_BODIES, np.linspace(0.02, 0.3, len(DISTANCE_BODIES)), strict=True))
+"""Kinematic distance of each body to all robots of the training."""
+rng = np.random.default_rng(5)
+LOOKS = dict(zip(DISTANCE_BODIES, rng.permutation(np.linspace(0.1, 0.9, len(DISTANCE_BODIES))), strict=True))
+"""Appearance distance of each body, which has nothing to do with the other."""
+
+
+@pytest.fixture(scope="module")
+def scores(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A score table in which more bodies help, and error goes with kinematic distance."""
+    path, rows = tmp_path_factory.mktemp("bodies") / "scores.parquet", []
+    hardness = rng.normal(0, 0.01, len(SCENES))
+
+    def add(variant: str, model: str, robot: str, lpips: float, psnr: float) -> None:
+        for (task, seed), harder in zip(SCENES, hardness, strict=True):
+            names = {"variant": variant, "model": model, "condition": variant, "task": task, "seed": seed, "robot": robot}
+            noise = rng.normal(0, 0.003)
+            rows.append(names | {"metric": "lpips", "value": lpips + harder + noise})
+            rows.append(names | {"metric": "psnr", "value": psnr - 10 * (harder + noise)})
+
+    for split, error in ERRORS.items():
+        for robot in (*HELD_OUT_ROBOTS, *UNSEEN_BODIES[:4]):
+            add(f"{split}-optical_flow-robot_render", "reference", robot, error, 20.0)
+    for body in DISTANCE_BODIES:
+        error = 0.2 + 0.5 * DISTANCES[body]
+        add("scaling_seen-optical_flow-robot_render", "reference", body, error, 40 * (1 - error))
+        add("", "copy_first_frame", body, 0.4 - 0.1 * LOOKS[body], 15.0)
+    table = pd.DataFrame(rows).assign(frames=9, exact_frames=0)
+    table.attrs = attributes()
+    table.attrs["metrics"] = {name: table.attrs["metrics"][name] for name in ("lpips", "psnr")}
+    table.to_parquet(path, index=False)
+    curves = table.assign(frame=1).drop(columns=["frames", "exact_frames"])
+    curves.to_parquet(path.with_suffix(".curves.parquet"), index=False)
+    return path
+
+
+def distances_of(bodies: Mapping[str, float], looks: Mapping[str, float]) -> Distances:
+    """The paper's distances, with those of bodies to the three robots of the training."""
+    printed = printed_distances(read_paper())
+    rows = [
+        {"axis": axis, "robot": body, "other": robot, "value": value, "spread": 0.0, "published": np.nan}
+        for axis, values in (("kinematic", bodies), ("appearance", looks))
+        for body, value in values.items()
+        for robot in SEEN_ROBOTS
+    ]
+    return Distances(pd.concat([printed.pairs, pd.DataFrame(rows)], ignore_index=True), printed.robots, measured=True)
+
+
+def grades_of(scores: Path) -> StudyGrades:
+    paper = read_paper()
+    infos = [info for info in paper.infos if info.name in ("lpips", "psnr")]
+    return StudyGrades(pd.read_parquet(scores), infos, paper_axes(paper))
+
+
+def test_bodies_that_help_are_seen_to_help(scores: Path) -> None:
+    builder = Builder(grades_of(scores), PaperGrades(read_paper(), []))
+    frame = scaling_frame(builder, "lpips")
+    assert set(frame["robots"]) == set(GROUPS)
+    for robots in GROUPS:
+        own = frame[(frame["robots"] == robots) & (frame["trained_on"] == WITH_ROBOTS)]
+        assert own["bodies"].tolist() == [0, 4, 16] and own["value"].is_monotonic_decreasing
+        assert (own["low"] < own["value"]).all() and (own["value"] < own["high"]).all()
+        assert frame[(frame["robots"] == robots) & (frame["trained_on"] == ALONE)]["bodies"].tolist() == [16]
+    table = scaling_table(builder)
+    first = {row.labels[0]: row.cells[-1] for row in table.sections[0].rows}
+    assert first["three robots and bodies, K = 16"].verdict == "better" and not first["three robots and bodies, K = 0"].verdict
+    assert first["three robots and bodies, K = 64"].text == "–", "it was not run"
+    assert "Not run: three robots and bodies, K = 64" in table.sections[0].note
+    assert table.sections[-1].rows[0].cells[0].episodes == 4 * len(SCENES), "four of 32 bodies were graded"
+
+
+def test_error_that_goes_with_one_distance_is_found_there_alone(scores: Path) -> None:
+    errors = body_errors(grades_of(scores), distances_of(DISTANCES, LOOKS), "lpips")
+    assert (
+        list(errors.index) == sorted(DISTANCE_BODIES)
+        and errors.loc[DISTANCE_BODIES[3], "kinematic"] == DISTANCES[DISTANCE_BODIES[3]]
+    )
+    found = correlate_bodies(errors, higher_is_better=False)
+    kinematic, looks = found["kinematic"], found["appearance"]
+    assert kinematic.r > 0.95 and kinematic.low > 0.9 and kinematic.p_value < 0.001 and kinematic.bodies == 64
+    assert abs(looks.r) < 0.35 and looks.low < 0 < looks.high and looks.p_value > 0.05
+    assert looks.frozen < -0.95, "the frozen frame is made to be better on odd looks"
+    up = correlate_bodies(body_errors(grades_of(scores), distances_of(DISTANCES, LOOKS), "psnr"), higher_is_better=True)
+    assert up["kinematic"].r > 0.9, "positive is worse whatever the metric"
+
+
+def test_what_the_frozen_frame_explains_is_taken_out() -> None:
+    """Both errors are the same hardness with noise of their own, and distance goes with that hardness."""
+    distance = rng.normal(size=400)
+    hardness = distance + 0.3 * rng.normal(size=400)
+    errors = pd.DataFrame({"value": hardness + 0.05 * rng.normal(size=400), "frozen": hardness, "kinematic": distance})
+    result = correlate_bodies(errors, higher_is_better=False)["kinematic"]
+    assert result.r > 0.9 and result.frozen > 0.9 and abs(result.partial) < 0.15
+    expected = np.corrcoef(
+        *(y - np.polyval(np.polyfit(hardness, y, 1), hardness) for y in errors[["kinematic", "value"]].to_numpy().T)
+    )
+    assert result.partial == pytest.approx(expected[0, 1], abs=1e-9), "the correlation of what regressions leave"
+    unknown = correlate_bodies(errors.assign(frozen=np.nan), higher_is_better=False)["kinematic"]
+    assert np.isnan(unknown.partial) and unknown.r == result.r
+
+
+def test_a_few_bodies_are_not_correlated(scores: Path) -> None:
+    few = {body: DISTANCES[body] for body in DISTANCE_BODIES[: LEAST_BODIES - 1]}
+    distances = distances_of(few, {body: LOOKS[body] for body in few})
+    assert correlate_bodies(body_errors(grades_of(scores), distances, "lpips"), higher_is_better=False) == {}
+    assert difficulty_table(grades_of(scores), distances) is None
+    assert difficulty_table(grades_of(scores), printed_distances(read_paper())) is None, "five robots are no bodies"
+
+
+def test_the_report_shows_both(scores: Path, tmp_path: Path) -> None:
+    measured = distances_of(DISTANCES, LOOKS)
+    measured.pairs.to_csv(tmp_path / "distances.csv", index=False)
+    measured.robots.to_csv(tmp_path / "robots.csv", index=False)
+    assert read_distances(tmp_path).measured
+    main(Args(scores, distances=tmp_path, out=tmp_path / "report"))
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "## More bodies in training" in text and "## Distance and difficulty over many bodies" in text
+    assert "Training on 16 bodies beside the three robots changes LPIPS by −3" in text
+    assert "Over 64 bodies that one model has never seen, LPIPS goes with distance: r = +1.000 with kinematic" in text
+    for name in ("scaling", "bodies"):
+        assert (tmp_path / "report" / "figures" / f"{name}.png").stat().st_size > 1000
+    assert BODIES in set(pd.read_csv(tmp_path / "report" / "figures" / "scaling.csv")["robots"])
+
+
+# --- Shared and own motion.
+
+
+@pytest.fixture(scope="module")
+def both_motions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Score tables of shared motion, and of own motion in which joint poses fail and one scene is missing."""
+    root, names = tmp_path_factory.mktemp("motions"), [variant.name for variant in PARTS["actions"]]
+    shared = write_study(root / "shared.parquet", names, TASKS[:3])
+    rows = pd.read_parquet(shared)
+    worse = (rows["variant"] == "fixed-joints-none") & (rows["metric"] == "lpips")
+    own = rows.assign(value=rows["value"].where(~worse, 2 * rows["value"]))
+    own = own[(own["task"] != TASKS[0]) | (own["seed"] != TEST_SEED_START)]
+    own.attrs = {**rows.attrs, "motion": "own"}
+    own.to_parquet(root / "own.parquet", index=False)
+    curves = pd.read_parquet(shared.with_suffix(".curves.parquet"))
+    curves.to_parquet(root / "own.curves.parquet", index=False)
+    return shared, root / "own.parquet"
+
+
+def test_motions_are_compared_on_the_scenes_that_both_have(both_motions: tuple[Path, Path]) -> None:
+    shared, own = map(read_scores, both_motions)
+    table = motion_table(Motions(own, shared))
+    assert [column.group for column in table.columns[:2]] == ["LPIPS ↓"] * 2
+    assert [column.title for column in table.columns[:2]] == ["shared", "own"]
+    for section in table.sections:
+        joints, *others = section.rows
+        assert joints.cells[1].value == pytest.approx(2 * joints.cells[0].value) and joints.cells[1].verdict == "worse"
+        assert all(row.cells[1].verdict == "unresolved" and row.cells[1].value == row.cells[0].value for row in others)
+    scenes = len(shared.rows[["task", "seed"]].drop_duplicates())
+    assert [section.rows[0].cells[0].episodes for section in table.sections] == [3 * (scenes - 1), scenes - 1, scenes - 1]
+
+
+def test_two_tables_of_one_motion_are_not_compared(both_motions: tuple[Path, Path]) -> None:
+    shared, own = map(read_scores, both_motions)
+    with pytest.raises(ConfigError, match="of shared and of shared motion are compared; expected one table of each kind"):
+        Motions(shared, shared)
+    own.attributes["protocol"] = 99
+    with pytest.raises(ConfigError, match="graded by protocols 1 and 99"):
+        Motions(shared, own)
+
+
+def test_the_report_sets_both_motions_side_by_side(both_motions: tuple[Path, Path], tmp_path: Path) -> None:
+    main(Args(both_motions[0], other_motion=both_motions[1], out=tmp_path))
+    text = (tmp_path / "report.md").read_text()
+    assert "## Shared and own motion" in text and "one tool path" in text
+    assert "Shared and own motion" in (tmp_path / "index.html").read_text()

@@ -1,0 +1,21 @@
+"""What five robots in one motion cannot answer: tables beyond the paper.
+
+`scaling.py` compares models by the number of bodies that they were trained on, `difficulty.py` correlates the error of one
+model on many bodies with how far these are from the robots that it was trained on, and `motion.py` sets a study in shared
+motion beside the same study in motion of each robot's own. `reports/study_beyond.py` draws them.
+"""
+
+from xew.analysis.beyond.difficulty import BodyCorrelation, body_errors, correlate_bodies, difficulty_table
+from xew.analysis.beyond.motion import Motions, motion_table
+from xew.analysis.beyond.scaling import scaling_frame, scaling_table
+
+__all__ = [
+    "BodyCorrelation",
+    "Motions",
+    "body_errors",
+    "correlate_bodies",
+    "difficulty_table",
+    "motion_table",
+    "scaling_frame",
+    "scaling_table",
+]

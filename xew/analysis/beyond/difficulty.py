@@ -1,0 +1,143 @@
+"""Error of one model on many bodies that it has never seen, against how far these are from the robots that it was trained on.
+
+Five robots give a correlation of five points; here each body is a point. All bodies are graded on the same scenes. How hard a
+body's pictures are by themselves shows in the frozen first frame, which learned nothing: its correlation stands beside the
+model's, and the partial correlation says what is left of the model's once that is taken out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+from scipy.stats import BootstrapMethod, PermutationMethod, pearsonr, spearmanr
+
+from xew.analysis.paper import PAPER_TITLES
+from xew.analysis.scores import COPY
+from xew.analysis.statistics.grades import StudyGrades
+from xew.analysis.tables.distances import AXIS_TITLES, Distances, format_signed
+from xew.analysis.tables.labels import PAPER_METRICS
+from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection
+from xew.protocol import DISTANCE_BODIES, PARTS, SPLITS
+from xew.statistics import DRAWS, LEVEL, holm
+
+VARIANT = PARTS["bodies"][0]
+"""The model whose errors are correlated."""
+LEAST_BODIES = 8
+"""Smallest number of bodies that are correlated."""
+
+
+@dataclass(frozen=True)
+class BodyCorrelation:
+    """Pearson's r of distance with error over bodies. Positive: farther is worse."""
+
+    r: float
+    low: float
+    """Lower end of its 95 % interval over bodies (bootstrap, BCa)."""
+    high: float
+    """Upper end."""
+    p_value: float
+    """Two-sided, by permutation of the bodies, corrected by Holm for the kinds of distance."""
+    spearman: float
+    frozen: float
+    """Pearson's r of distance with the error of the frozen first frame; NaN where that was not graded or does not vary."""
+    partial: float
+    """Partial correlation of distance with error, given the error of the frozen first frame; NaN where that is not known."""
+    bodies: int
+    """Number of bodies."""
+
+
+def body_errors(grades: StudyGrades, distances: Distances, metric: str) -> pd.DataFrame:
+    """Errors of the model on each body of the distance family, with its distances; bodies that lack either are left out.
+
+    Args:
+        grades: of the study.
+        distances: that were measured with these bodies.
+        metric: its key.
+
+    Returns:
+        Table by body with the columns value (mean over its episodes, in the metric's unit), frozen (that of the frozen first
+        frame) and one for each kind of distance: the mean over the robots that the model was trained on.
+    """
+    trained = SPLITS[VARIANT.split].train_robots
+    pairs = distances.pairs
+    both = pd.concat([pairs, pairs.rename(columns={"robot": "other", "other": "robot"})])
+    chosen = both[both["robot"].isin(DISTANCE_BODIES) & both["other"].isin(trained)]
+    by_axis = chosen.pivot_table(index="robot", columns="axis", values="value", aggfunc="mean")
+    rows = {}
+    for body in by_axis.index:
+        own, frozen = (grades.variant_mean(name, (body,), metric) for name in (VARIANT.name, COPY))
+        if own is not None:
+            rows[body] = {"value": own.value, "frozen": frozen.value if frozen else np.nan}
+    found = pd.DataFrame.from_dict(rows, orient="index", columns=["value", "frozen"])
+    return found.join(by_axis[[axis for axis in AXIS_TITLES if axis in by_axis]], how="inner").rename_axis("body")
+
+
+def correlate_bodies(errors: pd.DataFrame, higher_is_better: bool) -> dict[str, BodyCorrelation]:
+    """Correlations of errors with distances by kind of distance; none for fewer than LEAST_BODIES bodies.
+
+    Args:
+        errors: table of `body_errors`.
+        higher_is_better: of the metric; its sign is turned, so that a positive r always means that farther is worse.
+    """
+    axes = [axis for axis in AXIS_TITLES if axis in errors and np.ptp(errors[axis]) > 0] if len(errors) >= LEAST_BODIES else []
+    sign = -1.0 if higher_is_better else 1.0
+    score, frozen = sign * errors["value"].to_numpy(np.float64), sign * errors["frozen"].to_numpy(np.float64)
+    if not len(score) or np.ptp(score) == 0:
+        return {}
+    found = {axis: _correlate(errors[axis].to_numpy(np.float64), score, frozen) for axis in axes}
+    adjusted = holm([result.p_value for result in found.values()])
+    return {axis: replace(result, p_value=float(p)) for (axis, result), p in zip(found.items(), adjusted, strict=True)}
+
+
+def _correlate(distance: np.ndarray, score: np.ndarray, frozen: np.ndarray) -> BodyCorrelation:
+    """Correlation of n distances with n scores and those of the frozen first frame, each [n] float64."""
+    result = pearsonr(distance, score, method=PermutationMethod(n_resamples=DRAWS, rng=np.random.default_rng(0)))
+    resampling = BootstrapMethod(n_resamples=DRAWS, method="BCa", rng=np.random.default_rng(0))
+    interval = result.confidence_interval(LEVEL, method=resampling)
+    r, with_frozen, partial = float(result.statistic), np.nan, np.nan
+    if np.isfinite(frozen).all() and np.ptp(frozen) > 0:
+        with_frozen, between = float(pearsonr(distance, frozen).statistic), float(pearsonr(score, frozen).statistic)
+        partial = (r - with_frozen * between) / np.sqrt((1 - with_frozen**2) * (1 - between**2))
+    spearman = float(spearmanr(distance, score).statistic)
+    low, high = map(float, interval)
+    return BodyCorrelation(r, low, high, float(result.pvalue), spearman, with_frozen, float(partial), len(score))
+
+
+def difficulty_table(grades: StudyGrades, distances: Distances) -> Table | None:
+    """Correlation of each metric with each kind of distance over bodies; None where too few bodies were graded."""
+    shown = [metric for metric in grades.metrics if metric in PAPER_METRICS or grades.metrics[metric].reported]
+    found = {
+        metric: correlate_bodies(body_errors(grades, distances, metric), grades.metrics[metric].higher_is_better)
+        for metric in shown
+    }
+    axes = [axis for axis in AXIS_TITLES if any(axis in results for results in found.values())]
+    if not axes:
+        return None
+    rows = []
+    for metric in shown:
+        cells = [cell for axis in axes for cell in _cells(found[metric].get(axis))]
+        rows.append(TableRow((PAPER_TITLES.get(metric, grades.metrics[metric].title),), tuple(cells)))
+    count = max(result.bodies for results in found.values() for result in results.values())
+    heads = ("r", "p", "frozen", "partial")
+    return Table(
+        "bodies",
+        f"Error on {count} bodies against their distance",
+        "Pearson's r of a body's mean distance to the robots of the training with the model's score on it, with its 95 % "
+        "interval over bodies. Positive: farther is worse. p is by permutation, corrected by Holm for the kinds of distance; "
+        "LPIPS is the primary outcome, all else exploratory. Frozen: the same r of the frozen first frame, which learned "
+        "nothing. Partial: what is left of r given the frozen frame's score.",
+        ("metric",),
+        tuple(Column(head, AXIS_TITLES[axis]) for axis in axes for head in heads),
+        (TableSection("", tuple(rows)),),
+    )
+
+
+def _cells(result: BodyCorrelation | None) -> Sequence[TableCell]:
+    """The cells of one correlation: r with its interval, p, and the two that the frozen first frame gives."""
+    if result is None:
+        return (TableCell(),) * 4
+    ends = f"{format_signed(result.low)} to {format_signed(result.high)}"
+    whole = TableCell(format_signed(result.r), ends, value=result.r, low=result.low, high=result.high, episodes=result.bodies)
+    rest = (TableCell() if np.isnan(v) else TableCell(format_signed(v), value=v) for v in (result.frozen, result.partial))
+    return (whole, TableCell(f"{result.p_value:.4f}", value=result.p_value), *rest)

@@ -1,0 +1,124 @@
+"""Scores of two studies that differ in the kind of motion alone: all robots on one tool path, and each in motion of its own.
+
+In shared motion an unseen robot is new in its body alone. What an action representation loses in own motion is what it owed to
+tool paths that it knew.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+
+from xew.analysis.scores import TRAINING, TRUTH, VARIANT, MetricInfo, Scores, name_graded
+from xew.analysis.statistics.grades import SEEN, StudyGrades
+from xew.analysis.statistics.summary import ROBOT_TITLES
+from xew.analysis.tables.labels import ACTIONS, SEEN_TITLE
+from xew.analysis.tables.table import (
+    Column,
+    Table,
+    TableCell,
+    TableRow,
+    TableSection,
+    format_interval,
+    format_number,
+    metric_title,
+)
+from xew.config import ConfigError
+from xew.protocol import HELD_OUT_ROBOTS, MOTIONS, OWN_MOTION, SEEN_ROBOTS, SHARED_MOTION, reference
+from xew.statistics import Mean, combine, noise_floor, strict_metrics, verdict
+
+METRICS = ("lpips", "mask_iou", "pck")
+"""Metrics of the table, one of each dimension that it can tell apart; a metric of the suite strict stands for the paper's."""
+GROUPS = {SEEN: SEEN_ROBOTS, **{robot: (robot,) for robot in HELD_OUT_ROBOTS}}
+"""Robots that are graded together."""
+TITLES = {SEEN: SEEN_TITLE, **{robot: f"Held-out {ROBOT_TITLES[robot]}" for robot in HELD_OUT_ROBOTS}}
+CELL = ["task", "seed", "robot"]
+
+
+class Motions:
+    """Both studies as one table, over the episodes that both have, so that differences are paired by scene.
+
+    Args:
+        scores: of a study in one kind of motion.
+        other: of the same study in the other kind.
+
+    Raises:
+        ConfigError: both are of the same kind, or of other graders.
+    """
+
+    def __init__(self, scores: Scores, other: Scores) -> None:
+        found = {table.motion: table for table in (scores, other)}
+        if set(found) != set(MOTIONS):
+            raise ConfigError(
+                f"scores of {scores.motion} and of {other.motion} motion are compared; expected one table of each kind."
+            )
+        if (one := scores.attributes["protocol"]) != (two := other.attributes["protocol"]):
+            raise ConfigError(f"the tables of both motions were graded by protocols {one} and {two}; grade one of them anew.")
+        shared = found[SHARED_MOTION].rows[CELL].drop_duplicates().merge(found[OWN_MOTION].rows[CELL].drop_duplicates())
+        rows = [_name_motion(table.rows, motion).merge(shared, on=CELL) for motion, table in found.items()]
+        infos = {metric.name: metric for metric in scores.metrics}
+        self.metrics: Mapping[str, MetricInfo] = {m.name: infos[m.name] for m in other.metrics if m.name in infos}
+        axes: Mapping[str, np.ndarray] = {}
+        self._grades = StudyGrades(pd.concat(rows, ignore_index=True), tuple(self.metrics.values()), axes)
+
+    def mean(self, motion: str, action: str, robots: Sequence[str], metric: str) -> Mean | None:
+        """The mean of an action representation's model on some robots in a kind of motion; None where it was not graded."""
+        return self._grades.variant_mean(_named(reference(action=action).name, motion), tuple(robots), metric)
+
+    def floor(self, robots: Sequence[str], metric: str) -> float:
+        """The larger of both noise floors, by the truth through codecs where it was graded; NaN where one is not known."""
+        info, names = self.metrics[metric], self._grades.codec_truths or [_named(TRUTH, motion) for motion in MOTIONS]
+        truths = [self._grades.variant_mean(name, tuple(robots), metric) for name in names]
+        return float(np.max([noise_floor(mean.value if mean else None, info.best, info.estimated) for mean in truths]))
+
+
+def motion_table(motions: Motions) -> Table:
+    """Each action representation in shared and in own motion, on robots seen and unseen."""
+    strict = strict_metrics(motions.metrics)
+    shown = [name for metric in METRICS if (name := strict.get(metric, metric)) in motions.metrics]
+
+    def row(action: str, robots: Sequence[str]) -> TableRow:
+        return TableRow((ACTIONS[action],), tuple(c for metric in shown for c in _cells(motions, action, robots, metric)))
+
+    sections = [TableSection(TITLES[name], tuple(row(action, robots) for action in ACTIONS)) for name, robots in GROUPS.items()]
+    return Table(
+        "motion",
+        "Action representation in shared and in own motion",
+        "Shared: all robots follow one tool path, so that the body alone is new. Own: each robot moves as its own planner "
+        "would have it. Both have models of their own, graded on the same scenes. Marks: own against shared.",
+        ("action representation",),
+        tuple(Column(motion, metric_title(motions.metrics[metric])) for metric in shown for motion in MOTIONS),
+        tuple(sections),
+    )
+
+
+def _cells(motions: Motions, action: str, robots: Sequence[str], metric: str) -> Sequence[TableCell]:
+    """The scores in shared and in own motion, the latter with the verdict on their difference."""
+    means = [motions.mean(motion, action, robots, metric) for motion in (SHARED_MOTION, OWN_MOTION)]
+    shared, own = (_cell(mean, motions.metrics[metric]) for mean in means)
+    if means[0] is None or means[1] is None:
+        return shared, own
+    difference = combine(np.subtract, means[1], means[0])
+    ends, floor = difference.interval(), motions.floor(robots, metric)
+    mark = verdict(difference.value, ends, floor, motions.metrics[metric].higher_is_better)
+    return shared, TableCell(
+        own.text, own.interval, verdict=mark, value=own.value, low=own.low, high=own.high, episodes=own.episodes
+    )
+
+
+def _cell(mean: Mean | None, metric: MetricInfo) -> TableCell:
+    if mean is None:
+        return TableCell()
+    ends = mean.interval()
+    text = format_number(mean.value, metric), format_interval(ends, metric)
+    return TableCell(*text, value=mean.value, low=ends[0], high=ends[1], episodes=mean.count)
+
+
+def _named(name: str, motion: str) -> str:
+    return f"{name} {motion}"
+
+
+def _name_motion(rows: pd.DataFrame, motion: str) -> pd.DataFrame:
+    """Rows of a study whose variants and baselines are named by the motion, too."""
+    names = [_named(name, motion) for name in name_graded(rows)]
+    return rows.assign(**{VARIANT: names, TRAINING: rows.get(TRAINING, 0)})

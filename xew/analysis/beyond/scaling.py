@@ -1,0 +1,61 @@
+"""Scores of robots that no model has seen, by the number of bodies that it was trained on."""
+
+import numpy as np
+import pandas as pd
+
+from xew.analysis.statistics.grades import BODIES, find_variant, pooled
+from xew.analysis.statistics.summary import ROBOT_TITLES
+from xew.analysis.tables.builder import Builder
+from xew.analysis.tables.table import Table, TableSection, metric_columns
+from xew.protocol import BODY_SCALES, HELD_OUT_ROBOTS
+
+PART = "scaling"
+BASE = "scaling_seen"
+"""Row that all others are compared with: the three robots alone."""
+WITH_ROBOTS, ALONE = "three robots and bodies", "bodies alone"
+ROWS = {
+    BASE: (WITH_ROBOTS, 0),
+    **{f"scaling_seen_bodies_{count}": (WITH_ROBOTS, count) for count in BODY_SCALES},
+    **{f"scaling_bodies_{count}": (ALONE, count) for count in BODY_SCALES},
+}
+"""Rows of the part, with what a model was trained on and the number of bodies (K)."""
+GROUPS = {**{robot: f"Held-out {ROBOT_TITLES[robot]}" for robot in HELD_OUT_ROBOTS}, BODIES: "Bodies that no model has seen"}
+"""Titles of the robots that are graded."""
+
+
+def scaling_table(builder: Builder) -> Table:
+    """All metrics of each held-out robot and of the unseen bodies, by what the model was trained on."""
+    metrics = builder.reported
+
+    def section(robots: str, title: str) -> TableSection:
+        rows = [builder.row(PART, key, robots, metrics, (f"{kind}, K = {count}",), BASE) for key, (kind, count) in ROWS.items()]
+        below = builder.baselines(pooled(find_variant(PART, BASE), robots), metrics)
+        note = builder.note(PART, ((key, robots, f"{kind}, K = {count}") for key, (kind, count) in ROWS.items()))
+        return TableSection(title, (*rows, *below), note)
+
+    return Table(
+        "scaling",
+        "Bodies in training, robots never seen",
+        "K is the number of procedural bodies that a model was trained on; all models have the same number of steps. Marks: "
+        "against the three robots alone.",
+        ("trained on",),
+        metric_columns(builder.ours.metrics, metrics),
+        tuple(section(robots, title) for robots, title in GROUPS.items()),
+    )
+
+
+def scaling_frame(builder: Builder, metric: str) -> pd.DataFrame:
+    """Means of a metric with the ends of their intervals, over the episodes that all models have.
+
+    Returns:
+        Table with the columns robots (a key of GROUPS), trained_on (WITH_ROBOTS or ALONE), bodies (K), value, low, high; rows
+        that were not run are left out.
+    """
+    rows = []
+    for robots in GROUPS:
+        for key, (kind, count) in ROWS.items():
+            mean = builder.ours.mean(PART, key, robots, metric, shared=True)
+            if mean is not None:
+                low, high = mean.interval(builder.ours.level) if mean.scenes is not None else (np.nan, np.nan)
+                rows.append((robots, kind, count, mean.value, low, high))
+    return pd.DataFrame(rows, columns=["robots", "trained_on", "bodies", "value", "low", "high"])

@@ -1,0 +1,78 @@
+"""Charts of what procedural bodies answer: the gap by number of training bodies, error by distance."""
+
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from xew.analysis.beyond import BodyCorrelation, body_errors, correlate_bodies, scaling_frame
+from xew.analysis.beyond.scaling import ALONE, GROUPS, WITH_ROBOTS
+from xew.analysis.reports import charts
+from xew.analysis.reports.charts import SERIES, Chart, Panel, Series
+from xew.analysis.statistics.grades import StudyGrades
+from xew.analysis.tables.builder import Builder
+from xew.analysis.tables.distances import AXIS_TITLES, Distances, format_signed
+from xew.analysis.tables.table import metric_title
+
+METRIC = "lpips"
+"""Metric that both charts draw, the paper's primary outcome."""
+KINDS = {WITH_ROBOTS: Series(WITH_ROBOTS, SERIES[0]), ALONE: Series(ALONE, SERIES[1])}
+
+
+def body_charts(builder: Builder, distances: Distances) -> dict[str, Chart]:
+    """Both charts by name, as far as there is something to draw."""
+    if not isinstance(builder.ours, StudyGrades) or METRIC not in builder.ours.metrics:
+        return {}
+    made = {}
+    if builder.has_results("scaling"):
+        made["scaling"] = scaling_chart(builder)
+    errors = body_errors(builder.ours, distances, METRIC)
+    found = correlate_bodies(errors, builder.ours.metrics[METRIC].higher_is_better)
+    if found:
+        made["bodies"] = difficulty_chart(errors, found, metric_title(builder.ours.metrics[METRIC]))
+    return made
+
+
+def scaling_chart(builder: Builder) -> Chart:
+    """LPIPS by the number of training bodies, a panel for each group of robots that no model has seen."""
+    data = scaling_frame(builder, METRIC)
+
+    def draw(axes: Axes, robots: str) -> None:
+        lines = []
+        for kind, style in KINDS.items():
+            chosen = data[(data["robots"] == robots) & (data["trained_on"] == kind)].sort_values("bodies")
+            if len(chosen):
+                band = chosen[["low", "high"]].to_numpy() if chosen["low"].notna().all() else None
+                lines.append((style, _positions(chosen["bodies"]), chosen["value"].to_numpy(), band))
+        charts.lines(axes, lines, "bodies in training, K", metric_title(builder.ours.metrics[METRIC]))
+        counts = sorted(data["bodies"].unique())
+        axes.set_xticks(_positions(pd.Series(counts)), [str(count) for count in counts])
+
+    panels = [Panel(title, partial(draw, robots=robots)) for robots, title in GROUPS.items() if robots in set(data["robots"])]
+    caption = "What more bodies in training are worth, at equal numbers of steps. Bands: 95 % intervals over scenes."
+    used = [style for kind, style in KINDS.items() if kind in set(data["trained_on"])]
+    return Chart("scaling", caption, panels, data, used)
+
+
+def _positions(counts: pd.Series) -> np.ndarray:
+    """Places [n] of numbers of bodies on the axis: powers of four lie at equal distances, and 0 one before 1."""
+    numbers = counts.to_numpy(np.float64)
+    return np.where(numbers > 0, np.log(np.maximum(numbers, 1)) / np.log(4), -1.0)
+
+
+def difficulty_chart(errors: pd.DataFrame, found: Mapping[str, BodyCorrelation], title: str) -> Chart:
+    """Error of one model on each body by the body's distance, a panel for each kind of distance."""
+
+    def draw(axes: Axes, axis: str) -> None:
+        result, distance = found[axis], errors[axis].to_numpy(np.float64)
+        charts.points(
+            axes, distance, errors["value"].to_numpy(np.float64), "mean distance to the robots of the training", title
+        )
+        text = f"r = {format_signed(result.r)} ({format_signed(result.low)} to {format_signed(result.high)})"
+        axes.text(0.02, 0.98, text, transform=axes.transAxes, va="top", fontsize=8)
+
+    panels = [Panel(AXIS_TITLES[axis], partial(draw, axis=axis)) for axis in found]
+    caption = "One model on bodies that it has never seen, a point each; r with its 95 % interval over bodies."
+    return Chart("bodies", caption, panels, errors.reset_index())
