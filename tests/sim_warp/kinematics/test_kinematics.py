@@ -12,7 +12,6 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from xew.sim_warp.kinematics import (
-    expert,
     finger_positions,
     forward_kinematics,
     joint_positions,
@@ -21,13 +20,11 @@ from xew.sim_warp.kinematics import (
     tool_pose,
 )
 from xew.sim_warp.kinematics.batched import BatchedKinematics
-from xew.sim_warp.kinematics.expert import joint_commands
-from xew.sim_warp.kinematics.inverse import ArmSolver, Solution, arm_solver
+from xew.sim_warp.kinematics.inverse import ArmSolver, arm_solver
 from xew.sim_warp.plan import tool
 from xew.sim_warp.robots import ROBOTS, RobotSpec, load_urdf
 from xew.sim_warp.robots.reach import main as reach
 from xew.sim_warp.robots.reach import work_reach
-from xew.sim_warp.robots.user.trials import trial_plans
 
 CHAINS = json.loads((Path(__file__).parents[1] / "data" / "chains.json").read_text())["robots"]
 robots = pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
@@ -217,26 +214,6 @@ def test_arms_that_differ_beyond_their_bases_are_solved_each() -> None:
     assert solution.position_error.max() < 2e-4 and solution.rotation_error.max() < 1e-3
     path = ArmSolver(robot).solve_path([0, 1], wanted[None, :2], seed[:2])
     assert path.position_error.max() < 2e-4
-
-
-def test_what_a_gpu_does_not_solve_the_cpu_solves_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A solver that says it is on a GPU and loses its way in every other plan."""
-
-    class Lost(ArmSolver):
-        is_on_gpu = True
-
-        def solve_path(self, arm: np.ndarray, pose: np.ndarray, start: np.ndarray) -> Solution:
-            found = super().solve_path(arm, pose, start)
-            found.position_error[:, 2:] = 1.0
-            return found
-
-    robot, few = ROBOTS["piper"], list(trial_plans()[:2])
-    honest = joint_commands(robot, few)
-    lost = Lost(robot)
-    monkeypatch.setattr(expert, "arm_solver", lambda robot, device=None: lost if device is None else arm_solver(robot, device))
-    found = joint_commands(robot, few)
-    assert [one.problem for one in found] == [None, None]
-    assert all(np.array_equal(one.action, two.action) for one, two in zip(found, honest, strict=True))
 
 
 def test_out_of_reach_is_reported() -> None:

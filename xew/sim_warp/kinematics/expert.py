@@ -4,19 +4,15 @@ Reads  ToolPath, RobotSpec
 Writes `Commands`: canonical joint targets at every stored frame, or the finding that this robot cannot follow
 """
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
 from xew.protocol import ACTION_DIM, ARMS, FRAME_RATE
 from xew.sim_warp.embodiment.spec import RobotSpec
-from xew.sim_warp.kinematics.inverse import ArmSolver, arm_solver
+from xew.sim_warp.kinematics.inverse import arm_solver
 from xew.sim_warp.plan import LEFT, RIGHT, ToolPath
 
-Plan = TypeVar("Plan")
-Found = TypeVar("Found")
 POSITION_TOLERANCE = 0.003
 """Largest distance between commanded and planned tool [m]."""
 ROTATION_TOLERANCE = 0.03
@@ -35,39 +31,10 @@ class Commands:
 
 def joint_commands(robot: RobotSpec, paths: list[ToolPath]) -> list[Commands]:
     """Joint commands [t 16] of one robot for many plans, solved together: each frame near the one before it, from home on."""
-    return solve_plans(robot, paths, _solve_paths, lambda commands: commands.problem)
-
-
-def solve_plans(
-    robot: RobotSpec,
-    plans: Sequence[Plan],
-    solve: Callable[[RobotSpec, ArmSolver, Sequence[Plan]], list[Found]],
-    problem: Callable[[Found], str | None],
-) -> list[Found]:
-    """Plans solved by inverse kinematics on the default device. Those that a GPU does not solve are solved once more on the
-    CPU, whose answer counts: a GPU adds up in another order, and now and then fails where a CPU does not.
-
-    Args:
-        robot: that is to follow them.
-        plans: many, solved together.
-        solve: what becomes of each of some plans.
-        problem: why one was not solved, None if it was.
-    """
-    solver = arm_solver(robot)
-    found = solve(robot, solver, plans)
-    failed = [number for number, one in enumerate(found) if problem(one) is not None]
-    if failed and solver.is_on_gpu:
-        again = solve(robot, arm_solver(robot, "cpu"), [plans[number] for number in failed])
-        for number, one in zip(failed, again, strict=True):
-            found[number] = one
-    return found
-
-
-def _solve_paths(robot: RobotSpec, solver: ArmSolver, paths: Sequence[ToolPath]) -> list[Commands]:
     longest = max(path.frame_count for path in paths)
     targets = np.stack([_extend_path(path.pose, longest) for path in paths], 1).reshape(longest, -1, 7)
     arms = np.tile([LEFT, RIGHT], len(paths))
-    solution = solver.solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
+    solution = arm_solver(robot).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
     commands = []
     for index, path in enumerate(paths):
         columns, frames = slice(2 * index, 2 * index + 2), slice(path.frame_count)

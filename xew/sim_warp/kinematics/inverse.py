@@ -72,11 +72,6 @@ class ArmSolver:
         self.lower, self.upper = np.array(robot.joint_lower), np.array(robot.joint_upper)
         self._problems: dict[tuple[int, int], _Problems] = {}
 
-    @property
-    def is_on_gpu(self) -> bool:
-        """Does it solve on a GPU?"""
-        return bool(self.model.device.is_cuda)
-
     def solve(self, arm: int | np.ndarray, tool_pose: np.ndarray, seed: np.ndarray) -> Solution:
         """Joint positions for tool poses, near a seed.
 

@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from xew.sim_warp.embodiment.spec import RobotSpec
-from xew.sim_warp.kinematics.expert import Commands, canonical_commands, find_too_fast, find_unreached, solve_plans
+from xew.sim_warp.kinematics.expert import Commands, canonical_commands, find_too_fast, find_unreached
 from xew.sim_warp.kinematics.forward import tool_poses
-from xew.sim_warp.kinematics.inverse import ANCHOR_STRIDE, ArmSolver
+from xew.sim_warp.kinematics.inverse import ANCHOR_STRIDE, arm_solver
 from xew.sim_warp.plan import HOME, LEFT, RIGHT, SHORTEST_MOVE, Segment, Timeline, ToolPath, frame_times, minimum_jerk
 
 SPEED_SHARE = 0.3
@@ -49,14 +49,10 @@ def own_commands(robot: RobotSpec, timelines: Sequence[Timeline]) -> list[tuple[
 
     They are the same bits whatever is solved beside them.
     """
-    return solve_plans(robot, timelines, _solve_timelines, lambda found: found[1].problem)
-
-
-def _solve_timelines(robot: RobotSpec, solver: ArmSolver, timelines: Sequence[Timeline]) -> list[tuple[ToolPath, Commands]]:
     longest = max(len(timeline.steps) for timeline in timelines) * SAMPLES + 1
     targets = np.stack([_lines(timeline.steps, longest) for timeline in timelines], 1).reshape(longest, -1, 7)
     arms = np.tile([LEFT, RIGHT], len(timelines))
-    solution = solver.solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
+    solution = arm_solver(robot).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
     found = []
     for index, timeline in enumerate(timelines):
         columns = slice(2 * index, 2 * index + 2)
