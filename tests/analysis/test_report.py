@@ -141,6 +141,9 @@ def test_a_cell_of_the_paper_has_a_mark_only_where_its_verdict_is_another() -> N
     assert marks == {
         "pck": ("", "better"), "pck_strict": ("worse", ""), "ndtw": ("", ""), "ndtw_strict": ("better", ""), "psnr": ("worse", ""),
     }  # fmt: skip
+    assert "In parentheses: the verdict by the paper's definition" in shown.caption
+    agreeing = replace(row, verdicts=dict.fromkeys(names, "better"))
+    assert "In parentheses" not in run_table(RobotTable("Piper", ("piper",), (agreeing,), None), metrics).caption
 
 
 def test_markdown_and_figures_stand_beside_the_page(report: Path) -> None:

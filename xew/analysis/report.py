@@ -37,7 +37,16 @@ from xew.analysis.reports.study_charts import run_chart
 from xew.analysis.scores import TRUTH, MetricInfo, Scores, find_missing_scores, read_scores
 from xew.analysis.statistics.summary import RobotTable, Row, finding, flat_summary, robot_table, robot_title
 from xew.analysis.tables import formats
-from xew.analysis.tables.table import Table, TableCell, TableRow, TableSection, format_interval, format_number, metric_columns
+from xew.analysis.tables.table import (
+    Table,
+    TableCell,
+    TableRow,
+    TableSection,
+    format_interval,
+    format_number,
+    metric_columns,
+    parting_note,
+)
 from xew.config import ConfigError, user_errors
 from xew.dataset import count_motions, demand_one_motion, find_records
 from xew.episode import Record, episode_folder, read_video
@@ -266,13 +275,14 @@ def run_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> Table:
         TableRow((row.title,), tuple(_run_cell(row, metric, named) for metric in shown), row.model in BASELINES)
         for row in table.rows
     ]
+    sections = (TableSection("", tuple(rows), "" if table.complete else f"Incomplete: {of} are scored."),)
     return Table(
         "_".join(table.robots),
         table.title,
-        " ".join(filter(None, (f"{of[0].upper()}{of[1:]}.", table.notes))),
+        " ".join(filter(None, (f"{of[0].upper()}{of[1:]}.", parting_note(sections), table.notes))),
         ("model",),
         metric_columns({metric.name: metric for metric in shown}, [metric.name for metric in shown]),
-        (TableSection("", tuple(rows), "" if table.complete else f"Incomplete: {of} are scored."),),
+        sections,
     )
 
 

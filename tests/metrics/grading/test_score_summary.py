@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from xew.metrics.grading.power import power_section
 from xew.metrics.grading.summary import summarize, to_markdown
 
 ROBOTS = ("aloha_agilex", "piper")
@@ -83,3 +84,17 @@ def test_many_models_leave_the_pairs_to_their_file() -> None:
     assert few.count("paired:") == 2 * 3
     many = to_markdown(summarize(table({f"m{i}": {"ssim": 0.1 * i} for i in range(5)}, scenes=4)))
     assert "paired:" not in many and many.count("10 pairs of models") == 2
+
+
+def test_the_power_of_tasks_is_a_section_of_a_page() -> None:
+    """Of the frozen frame and the true video on two tasks, one of which tells them apart."""
+    rows = pd.DataFrame(
+        {"model": model, "condition": "", "task": task, "seed": 800000, "robot": robot, "metric": "pck_strict", "value": value}
+        for task, scores in {"lift": (0.2, 0.9), "rest": (0.85, 0.9)}.items()
+        for model, value in zip(("copy_first_frame", "ground_truth"), scores, strict=True)
+        for robot in ROBOTS
+    )
+    text = power_section(summarize(rows).power, rows)
+    assert "means over 2 robots, seed 800000 of each task, 4 episodes" in text
+    assert "true video, leave the mean of pck_strict: rest. The least power, 1.5 times, is that of `rest` for `pck_strict`." in text
+    assert "| `lift` | 8 |" in text and "| `lift` | 0.2 (0.9) |" in text and "| `rest` | 0.85 (0.9) |" in text

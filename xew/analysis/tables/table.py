@@ -93,6 +93,12 @@ class Table:
         return not any(section.note for section in self.sections)
 
 
+def parting_note(sections: Sequence[TableSection]) -> str:
+    """Sentence that explains the marks in parentheses of a table with these sections; '' where it has none."""
+    parts = any(cell.parting for section in sections for row in section.rows for cell in row.cells)
+    return "In parentheses: the verdict by the paper's definition, where the suite strict has another." if parts else ""
+
+
 def format_number(value: float, metric: MetricInfo) -> str:
     """A value with the digits that mean something: 0.01 dB, 0.1 px, else 0.001."""
     return f"{value:.{ {'dB': 2, 'px': 1}.get(metric.unit, 3) }f}"
