@@ -23,9 +23,7 @@ CHEAP = (*ORDERED, "pck_strict", "coverage_strict", "object_coverage_strict", "p
 ROBOT, THING = (34, 26), (15, 13)
 """Width and height [pixels] of the robot, a rectangle, and of the thing that moves, one too."""
 MEASURED = Path(__file__).with_name("predictors.parquet")
-"""Rows of `calibrate --predictors` on seed 800000 of five tasks, with both held-out robots and one with the PiPER alone.
-
-The attributes say the protocol."""
+"""Rows of `calibrate --predictors` on seed 800000 of five tasks, with both held-out robots. The attributes say the protocol."""
 rng = np.random.default_rng(11)
 
 
@@ -109,7 +107,8 @@ def measured() -> pd.DataFrame:
     rows = pd.read_parquet(MEASURED)
     assert rows.attrs["protocol"] == GRADING_PROTOCOL
     assert rows["task"].nunique() == 5 and set(rows["robot"]) == set(HELD_OUT_ROBOTS)
-    assert len(rows) == 9 * len(PREDICTORS) * len(METRICS)
+    assert len(rows) == 5 * len(HELD_OUT_ROBOTS) * len(PREDICTORS) * len(METRICS)
+    assert (rows.groupby(["task", "robot"]).size() == len(PREDICTORS) * len(METRICS)).all()
     return rows
 
 
