@@ -113,8 +113,8 @@ def write_section(path: Path, heading: str, text: str) -> None:
 
     Args:
         path: of the page.
-        heading: of the section, such as '## Results', which ends before the next heading of its level or above. Where there is no
-            such section, it comes to the page's end.
+        heading: of the section, such as '## Results', which ends before the next heading of its level or above. Where there
+            is no such section, it comes to the page's end.
         text: what stands below the heading.
 
     Raises:

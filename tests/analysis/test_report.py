@@ -139,7 +139,8 @@ def test_a_cell_of_the_paper_has_a_mark_only_where_its_verdict_is_another() -> N
     shown = run_table(RobotTable("Piper", ("piper",), (row,), None), metrics)
     marks = dict(zip(names, ((cell.verdict, cell.parting) for cell in shown.sections[0].rows[0].cells), strict=True))
     assert marks == {
-        "pck": ("", "better"), "pck_strict": ("worse", ""), "ndtw": ("", ""), "ndtw_strict": ("better", ""), "psnr": ("worse", ""),
+        "pck": ("", "better"), "pck_strict": ("worse", ""), "ndtw": ("", ""), "ndtw_strict": ("better", ""),
+        "psnr": ("worse", ""),
     }  # fmt: skip
     assert "In parentheses: the verdict by the paper's definition" in shown.caption
     agreeing = replace(row, verdicts=dict.fromkeys(names, "better"))

@@ -28,9 +28,9 @@ from xew.sim_warp.inspect import (
     strip,
     tile,
 )
+from xew.sim_warp.inspection.visibility import visibility_section
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import produce
-from xew.sim_warp.inspection.visibility import visibility_section
 from xew.sim_warp.production.surfaces import Seen, Visibility, count_visible, read_surfaces
 from xew.sim_warp.rendering.render import Renderer
 
@@ -220,7 +220,7 @@ def test_what_is_seen_too_little_is_named_with_its_size() -> None:
     found = {("pour", name): [Visibility(robot, things)] for name, things in cells.items()}
     text = visibility_section(found | {("rest", "piper"): [Visibility(Seen(np.arange(20), np.arange(20)), {})]})
     lines = text.splitlines()
-    assert "The first is met in 2 of 3 cells, with 9 to 10 points in the mean, the second in 2." in lines
+    assert "The first is met in 2 of 3 cells, with 9 to 10 points in the mean, the second in 2." in text
     assert [line for line in lines if line.startswith("| `")] == [
         "| `pour` | 100 / 80 | 100 / 100 | red can |",
         "| `rest` | – | 60 / 100 | nothing moves |",

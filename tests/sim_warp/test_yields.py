@@ -9,10 +9,10 @@ import pytest
 
 from tests.sim_warp.small import CLOSE, TASK, plan, success
 from xew.episode import EpisodeError, Record
-from xew.sim_warp.scene import Scene
-from xew.sim_warp.tasks import Task
 from xew.metrics.grading.power import HEADING as POWER
 from xew.sim_warp.inspection.visibility import HEADING as SEEN
+from xew.sim_warp.scene import Scene
+from xew.sim_warp.tasks import Task
 from xew.sim_warp.yields import YIELDS, Args, describe_task, find_kept, markdown, page, task_section, write_page
 
 

@@ -241,8 +241,8 @@ def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo
         page.paragraph(
             "Means over episodes with 95 % bootstrap intervals; scenes (task and seed) are resampled. Against the frozen first "
             "frame, paired by episode: ▲ better, ▼ worse, ≈ not resolved. The suite strict decides: where one of its metrics "
-            "stands beside the paper's, that has the mark, and the paper's has one in parentheses where its verdict is another. "
-            "The ceiling is the true video graded in the model's "
+            "stands beside the paper's, that has the mark, and the paper's has one in parentheses where its verdict is "
+            "another. The ceiling is the true video graded in the model's "
             "place: what it lacks is the estimators' own error, and a smaller difference is not resolved."
         ),
         *map(page.note, _caution_notes(tables)),

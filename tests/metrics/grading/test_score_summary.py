@@ -90,11 +90,12 @@ def test_the_power_of_tasks_is_a_section_of_a_page() -> None:
     """Of the frozen frame and the true video on two tasks, one of which tells them apart."""
     rows = pd.DataFrame(
         {"model": model, "condition": "", "task": task, "seed": 800000, "robot": robot, "metric": "pck_strict", "value": value}
-        for task, scores in {"lift": (0.2, 0.9), "rest": (0.85, 0.9)}.items()
+        for task, scores in {"lift": (0.2, 0.9), "rest": (0.85, 0.9), "best": (0.5, 1.0), "both": (1.0, 1.0)}.items()
         for model, value in zip(("copy_first_frame", "ground_truth"), scores, strict=True)
         for robot in ROBOTS
     )
     text = power_section(summarize(rows).power, rows)
-    assert "means over 2 robots, seed 800000 of each task, 4 episodes" in text
-    assert "true video, leave the mean of pck_strict: rest. The least power, 1.5 times, is that of `rest` for `pck_strict`." in text
+    assert "8 episodes of `aloha_agilex`, `piper`, seed 800000 of each task" in text
+    assert "leave the mean of pck_strict: both, rest. The least power, 1.5 times, is that of `rest` for `pck_strict`." in text
+    assert "| `both` | none |" in text and "| `best` | over 10,000 |" in text
     assert "| `lift` | 8 |" in text and "| `lift` | 0.2 (0.9) |" in text and "| `rest` | 0.85 (0.9) |" in text

@@ -128,8 +128,8 @@ def _escape(text: str) -> str:
 def table_frame(table: Table) -> pd.DataFrame:
     """A tidy frame, one row per cell: table block note row column text value low high verdict parting paper episodes.
 
-    `block` is the title of the section, `note` says what it lacks, `parting` is the verdict by the paper's definition where that
-    of the suite strict is another one.
+    `block` is the title of the section, `note` says what it lacks, `parting` is the verdict by the paper's definition where
+    that of the suite strict is another one.
     """
     columns = column_heads(table)[len(table.stubs) :]
     return pd.DataFrame(

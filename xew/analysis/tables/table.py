@@ -13,9 +13,9 @@ from xew.statistics import MIN_SCENES
 
 MARKS = (
     "▲ better, ▼ worse, ≈ not resolved: the interval of the paired difference holds 0, the difference is inside the noise "
-    f"floor or the floor is not known, or there are fewer than {MIN_SCENES} scenes. A mark in parentheses shows where the suites "
-    "part: it is the verdict by the paper's definition, where that is another than the verdict by the metric of the suite strict "
-    "beside it, which decides"
+    f"floor or the floor is not known, or there are fewer than {MIN_SCENES} scenes. A mark in parentheses shows where the "
+    "suites part: it is the verdict by the paper's definition, where that is another than the verdict by the metric of the "
+    "suite strict beside it, which decides"
 )
 """Explanation of the marks behind values; captions name the row that a value is compared with."""
 
@@ -32,7 +32,7 @@ class TableCell:
     verdict: str = ""
     """Verdict on the difference from the row that the caption names: better, worse or unresolved; '' where there is none."""
     parting: str = ""
-    """Verdict by the paper's definition where that of the suite strict, which decides, is another one; '' where there is none."""
+    """Verdict by the paper's definition where that of the suite strict, which decides, is another one; else ''."""
     agrees: bool | None = None
     """Whether a recomputed value prints like the paper's; None where this is not asked."""
     best: bool = False

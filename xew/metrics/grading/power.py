@@ -1,5 +1,6 @@
 """What the metrics can tell on each task, as a section of a Markdown page: their power, and the scores that it comes from."""
 
+import numpy as np
 import pandas as pd
 
 from xew.metrics import METRICS
@@ -7,6 +8,8 @@ from xew.statistics import LEAST_POWER, describe_power
 
 HEADING = "## What the metrics can tell"
 """Heading of the section on the page of the tasks."""
+MOST_SHOWN = 10_000
+"""Largest power that is written; where the true video has the best score there is no number."""
 
 
 def power_section(power: pd.DataFrame, rows: pd.DataFrame) -> str:
@@ -18,23 +21,28 @@ def power_section(power: pd.DataFrame, rows: pd.DataFrame) -> str:
     """
     least = power.loc[power["power"].idxmin()]
     seeds = ", ".join(map(str, sorted(rows["seed"].unique())))
+    robots = ", ".join(f"`{robot}`" for robot in sorted(rows["robot"].unique()))
     episodes = len(rows[["task", "seed", "robot"]].drop_duplicates())
     introduction = (
-        "Power: how many times as far from a metric's best score the frozen first frame is as the true video, which `evaluate` shows "
-        f"softened to its estimators; means over {rows['robot'].nunique()} robots, seed {seeds} of each task, {episodes} episodes.\n"
+        "Power: how many times as far from a metric's best score the frozen first frame is as the true video, which `evaluate` "
+        f"shows softened to its estimators; {episodes} episodes of {robots}, seed {seeds} of each task.\n"
         f"A task leaves a metric's mean where that is not above {LEAST_POWER:g}. "
         f"{describe_power(power, {}) or 'None of these does.'} The least power, {_times(least['power'])} times, is that of "
         f"`{least['task']}` for `{least['metric']}`."
     )
-    scores = power.assign(text=[f"{frozen:.3g} ({truth:.3g})" for frozen, truth in zip(power["frozen"], power["truth"], strict=True)])
+    scores = power.assign(
+        text=[f"{frozen:.3g} ({truth:.3g})" for frozen, truth in zip(power["frozen"], power["truth"], strict=True)]
+    )
     parts = [introduction, _table(power.assign(text=power["power"].map(_times)))]
     parts += ["The scores behind it, of the frozen first frame, and in parentheses of the true video:", _table(scores)]
     return "\n\n".join(parts)
 
 
 def _times(power: float) -> str:
-    """A power with two digits; where the true video has the best score there is no number."""
-    return f"{float(f'{power:.2g}'):.4g}" if power < 1e4 else "over 10,000"
+    """A power with two digits; 'none' where both the frozen frame and the true video have the best score."""
+    if np.isnan(power):
+        return "none"
+    return f"{float(f'{power:.2g}'):.4g}" if power < MOST_SHOWN else f"over {MOST_SHOWN:,}"
 
 
 def _table(power: pd.DataFrame) -> str:

@@ -57,8 +57,8 @@ def _introduction(found: Found, of_robot: Mapping[tuple[str, str], _Share], of_t
     met = [sum(share.share >= aim for share in of.values()) for of, aim in ((of_robot, ROBOT_SHARE), (of_thing, THING_SHARE))]
     return (
         f"Share of frames [%] with at least {NEEDED_OF_ROBOT} visible points of the robot / share of the moving frames of the "
-        f"object that is seen least, with at least {NEEDED_OF_THING} visible points of it; {_count_episodes(found)}. The aims are "
-        f"{100 * ROBOT_SHARE:.0f} and {100 * THING_SHARE:.0f}.\nThe first is met in {met[0]} of {len(found)} cells, with "
+        f"object that is seen least, with at least {NEEDED_OF_THING} visible points of it; {_count_episodes(found)}.\nThe aims "
+        f"are {100 * ROBOT_SHARE:.0f} and {100 * THING_SHARE:.0f}. The first is met in {met[0]} of {len(found)} cells, with "
         f"{min(points):.0f} to {max(points):.0f} points in the mean, the second in {met[1]}."
     )
 
