@@ -19,7 +19,7 @@ def power_section(power: pd.DataFrame, rows: pd.DataFrame) -> str:
         power: as of `xew.statistics.find_power`, of at least one task.
         rows: score table that it was found in; columns task seed robot.
     """
-    least = power.loc[power["power"].idxmin()]
+    least = power.sort_values("power").iloc[0]
     seeds = ", ".join(map(str, sorted(rows["seed"].unique())))
     robots = ", ".join(f"`{robot}`" for robot in sorted(rows["robot"].unique()))
     episodes = len(rows[["task", "seed", "robot"]].drop_duplicates())
