@@ -15,10 +15,11 @@ from matplotlib.figure import Figure
 
 from tests.analysis.conftest import FRAMES, SEEDS, TASKS, Study
 from tests.analysis.reports.browser import find_faults, needs_chromium
-from xew.analysis.report import Args, Picture, _strip_section, _write_explorer, main
+from xew.analysis.report import Args, Picture, _strip_section, _write_explorer, main, run_table
 from xew.analysis.reports import pictures
 from xew.analysis.reports.study_charts import run_chart
 from xew.analysis.scores import MetricInfo, read_scores
+from xew.analysis.statistics.summary import Interval, RobotTable, Row
 from xew.config import ConfigError
 from xew.episode import write_video
 from xew.metrics import evaluate
@@ -127,6 +128,23 @@ def test_the_numbers_are_those_of_the_scores(report: Path, study: Study) -> None
         cell = table[table["row"].str.startswith("late") & table["column"].str.contains("LPIPS")]
         assert cell["value"].item() == pytest.approx(mean, rel=1e-9) and cell["episodes"].item() == 6
     assert "6 of 6 test episodes" in text and "Incomplete" not in text
+
+
+def test_a_cell_of_the_paper_has_a_mark_only_where_its_verdict_is_another() -> None:
+    """The suite strict decides, and has the mark in any case."""
+    names = {"pck": "", "pck_strict": "pck", "ndtw": "", "ndtw_strict": "ndtw", "psnr": ""}
+    metrics = [MetricInfo(name, "kinematics", "", True, 0, 1, "", name, counterpart=paper) for name, paper in names.items()]
+    verdicts = {"pck": "better", "pck_strict": "worse", "ndtw": "better", "ndtw_strict": "better", "psnr": "worse"}
+    row = Row("mine", "", {name: Interval(0.5, 0.4, 0.6, 6) for name in names}, verdicts)
+    shown = run_table(RobotTable("Piper", ("piper",), (row,), None), metrics)
+    marks = dict(zip(names, ((cell.verdict, cell.parting) for cell in shown.sections[0].rows[0].cells), strict=True))
+    assert marks == {
+        "pck": ("", "better"), "pck_strict": ("worse", ""), "ndtw": ("", ""), "ndtw_strict": ("better", ""),
+        "psnr": ("worse", ""),
+    }  # fmt: skip
+    assert "In parentheses: the verdict by the paper's definition" in shown.caption
+    agreeing = replace(row, verdicts=dict.fromkeys(names, "better"))
+    assert "In parentheses" not in run_table(RobotTable("Piper", ("piper",), (agreeing,), None), metrics).caption
 
 
 def test_markdown_and_figures_stand_beside_the_page(report: Path) -> None:

@@ -190,6 +190,15 @@ def test_a_seed_that_there_is_not_is_said(data: Path) -> None:
     assert {(record.seed, record.robot) for _, record in first} == {(0, "franka_panda"), (1, "piper")}
 
 
+def test_predictors_may_be_chosen(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = Args(data=data, out=tmp_path, episodes=1, predictors=True, metrics=("psnr",))
+    main(replace(args, cases=("gray", "frozen")))
+    assert pd.read_parquet(tmp_path / "predictors.parquet")["case"].tolist() == ["gray", "frozen"]
+    with pytest.raises(SystemExit):
+        main(replace(args, cases=("frozn",)))
+    assert "unknown predictor 'frozn'; did you mean 'frozen'?" in capsys.readouterr().err
+
+
 def test_calibration_reads_validation_seeds_and_no_test_seed_unless_it_is_named() -> None:
     def chosen(*seeds: int, **named: tuple[int, ...]) -> set[int]:
         episodes = [(Path(str(seed)), Record("lift_pot", seed, "piper", True)) for seed in seeds]

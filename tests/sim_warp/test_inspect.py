@@ -28,9 +28,10 @@ from xew.sim_warp.inspect import (
     strip,
     tile,
 )
+from xew.sim_warp.inspection.visibility import visibility_section
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import produce
-from xew.sim_warp.production.surfaces import count_visible, read_surfaces
+from xew.sim_warp.production.surfaces import Seen, Visibility, count_visible, read_surfaces
 from xew.sim_warp.rendering.render import Renderer
 
 ROBOTS = ("franka_panda", SLOW)
@@ -200,21 +201,43 @@ def test_nothing_there_is_told_with_the_way_to_make_it(made: Path, data: Path, t
     assert code == 2 and "Choose another folder with --grid." in told
 
 
-def test_visibility_is_counted_by_task_and_robot(data: Path, inspect: Inspect) -> None:
+def test_visibility_is_counted_by_task_and_robot(data: Path, tmp_path: Path, inspect: Inspect) -> None:
     """The block of the small task never moves; so only the robot's points are asked for."""
-    code, out, _ = inspect(data, "--visibility")
-    rows = [line for line in out.splitlines() if line.startswith(f"| `{TASK}`")]
-    assert code == 0 and len(rows) == len(ROBOTS) and all("| nothing moves | 100% |" in row for row in rows)
+    page = tmp_path / "page.md"
+    code, out, _ = inspect(data, "--visibility", "--visibility-page", page)
+    (row,) = [line for line in out.splitlines() if line.startswith(f"| `{TASK}`")]
+    assert code == 0 and row == f"| `{TASK}` | 100 / 100 | 100 / 100 | nothing moves |"
+    assert "Below the aims" not in out and out.rstrip().endswith(page.read_text().rpartition("`. ")[2].rstrip())
+    code, _, told = inspect(data, "--visibility", "--visibility-page", tmp_path)
+    assert code == 2 and "Choose another file with --visibility-page" in told
+
+
+def test_what_is_seen_too_little_is_named_with_its_size() -> None:
+    """The can has too few points in one of five frames, where it is 40 pixels large, with one robot of two."""
+    robot, whole = Seen(np.full(20, 9), np.full(20, 500)), Seen(np.full(5, 4), np.full(5, 90))
+    hidden = Seen(np.array([4, 4, 4, 4, 3]), np.array([90, 90, 90, 90, 40]))
+    cells = {"piper": {"red_can": whole, "lid": whole}, "ur5_wsg": {"red_can": hidden, "lid": whole}}
+    found = {("pour", name): [Visibility(robot, things)] for name, things in cells.items()}
+    text = visibility_section(found | {("rest", "piper"): [Visibility(Seen(np.arange(20), np.arange(20)), {})]})
+    lines = text.splitlines()
+    assert "The first is met in 2 of 3 cells, with 9 to 10 points in the mean, the second in 2." in text
+    assert [line for line in lines if line.startswith("| `")] == [
+        "| `pour` | 100 / 80 | 100 / 100 | red can |",
+        "| `rest` | – | 60 / 100 | nothing moves |",
+        "| `pour` | `ur5_wsg` | red can | 80 | 40 |",
+        "| `rest` | `piper` | robot | 60 | 4 |",
+    ]
 
 
 def test_a_scene_that_its_task_makes_no_more_has_no_known_shapes(data: Path) -> None:
     folder = next(folder for folder, record in read_headers(data)[0] if record.success)
     tracks = read_surfaces(folder)
     assert tracks is not None and "block" in tracks.names
-    few = replace(tracks, visible=tracks.visible & (np.arange(len(tracks.body)) < 3))
-    assert count_visible(few).robot.max() <= 3 < count_visible(tracks).robot.min() and not count_visible(tracks).things
-    moved = replace(tracks, displacement=tracks.displacement + 1, step=tracks.step + 1)
-    assert set(count_visible(moved).things) == {"block"} and (count_visible(moved).things["block"] >= 4).all()
+    few, seen = replace(tracks, visible=tracks.visible & (np.arange(len(tracks.body)) < 3)), count_visible(tracks)
+    assert count_visible(few).robot.points.max() <= 3 < seen.robot.points.min() and not seen.things
+    moved = count_visible(replace(tracks, displacement=tracks.displacement + 1, step=tracks.step + 1))
+    assert set(moved.things) == {"block"} and (moved.things["block"].points >= 4).all()
+    assert (moved.things["block"].pixels > 20).all() and (seen.robot.pixels > moved.things["block"].pixels).all()
     for change in ({"scene_hash": "another"}, {"source": "elsewhere"}, {"task": "no_such_task"}):
         edit_header(folder, **change)
         assert read_surfaces(folder) is None

@@ -9,9 +9,11 @@ import pytest
 
 from tests.sim_warp.small import CLOSE, TASK, plan, success
 from xew.episode import EpisodeError, Record
+from xew.metrics.grading.power import HEADING as POWER
+from xew.sim_warp.inspection.visibility import HEADING as SEEN
 from xew.sim_warp.scene import Scene
 from xew.sim_warp.tasks import Task
-from xew.sim_warp.yields import KEPT, Args, describe_task, find_kept, markdown, page, task_section, write_page
+from xew.sim_warp.yields import YIELDS, Args, describe_task, find_kept, markdown, page, task_section, write_page
 
 
 def record(seed: int, robot: str, failure: str | None = None, task: str = "grab_roller") -> Record:
@@ -99,9 +101,11 @@ def test_the_page_says_by_which_command_it_is_made() -> None:
 def test_a_page_is_written_with_its_folder_or_the_option_is_named(tmp_path: Path) -> None:
     write_page(tmp_path / "new" / "tasks.md", "text")
     assert (tmp_path / "new" / "tasks.md").read_text() == "text"
-    measured = f"\n{KEPT}\nof metrics\n"
-    write_page(tmp_path / "tasks.md", "old\n" + measured)
+    measured = "\n## How much is seen\nof surfaces\n\n## What the metrics can tell\nof metrics\n"
+    write_page(tmp_path / "tasks.md", f"# Tasks\nold\n\n{YIELDS}\nold, too\n" + measured)
     assert find_kept(tmp_path / "tasks.md") == measured and find_kept(tmp_path / "new" / "tasks.md") == ""
+    kept = find_kept(Path(__file__).parents[2] / "docs" / "tasks.md")
+    assert [line for line in kept.splitlines() if line.startswith("## ")] == [SEEN, POWER], "the page keeps what others write"
     assert find_kept(tmp_path / "none.md") == ""
     with pytest.raises(EpisodeError, match="Choose another file with --page"):
         write_page(tmp_path / "new", "text")

@@ -37,7 +37,16 @@ from xew.analysis.reports.study_charts import run_chart
 from xew.analysis.scores import TRUTH, MetricInfo, Scores, find_missing_scores, read_scores
 from xew.analysis.statistics.summary import RobotTable, Row, finding, flat_summary, robot_table, robot_title
 from xew.analysis.tables import formats
-from xew.analysis.tables.table import Table, TableCell, TableRow, TableSection, format_interval, format_number, metric_columns
+from xew.analysis.tables.table import (
+    Table,
+    TableCell,
+    TableRow,
+    TableSection,
+    format_interval,
+    format_number,
+    metric_columns,
+    parting_note,
+)
 from xew.config import ConfigError, user_errors
 from xew.dataset import count_motions, demand_one_motion, find_records
 from xew.episode import Record, episode_folder, read_video
@@ -45,7 +54,7 @@ from xew.files import hold_lock, write_bytes, write_text
 from xew.names import csv_text, path_below, plain_markdown
 from xew.protocol import BASELINES, HELD_OUT_ROBOTS, MIXED_MOTION, ROBOT_NAMES, seed_split
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
-from xew.statistics import MIN_SCENES, strict_metrics
+from xew.statistics import MIN_SCENES, find_parting, strict_metrics
 
 TITLE = "Can the model render a robot that it has never seen?"
 STRIP_METRIC = "lpips"
@@ -232,7 +241,8 @@ def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo
         page.paragraph(
             "Means over episodes with 95 % bootstrap intervals; scenes (task and seed) are resampled. Against the frozen first "
             "frame, paired by episode: ▲ better, ▼ worse, ≈ not resolved. The suite strict decides: where one of its metrics "
-            "stands beside the paper's, that has the mark. The ceiling is the true video graded in the model's "
+            "stands beside the paper's, that has the mark, and the paper's has one in parentheses where its verdict is "
+            "another. The ceiling is the true video graded in the model's "
             "place: what it lacks is the estimators' own error, and a smaller difference is not resolved."
         ),
         *map(page.note, _caution_notes(tables)),
@@ -260,25 +270,26 @@ def run_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> Table:
     shown = [metric for metric in metrics if any(metric.name in row.scores for row in table.rows)]
     found = " to ".join(map(str, sorted({min(table.counts, default=0), max(table.counts, default=0)})))
     of = f"{found} episodes" if table.expected is None else f"{found} of {table.expected} test episodes"
-    beside = strict_metrics({metric.name: metric for metric in metrics})
+    named = {metric.name: metric for metric in metrics}
     rows = [
-        TableRow(
-            (row.title,), tuple(_run_cell(row, metric, metric.name not in beside) for metric in shown), row.model in BASELINES
-        )
+        TableRow((row.title,), tuple(_run_cell(row, metric, named) for metric in shown), row.model in BASELINES)
         for row in table.rows
     ]
+    sections = (TableSection("", tuple(rows), "" if table.complete else f"Incomplete: {of} are scored."),)
     return Table(
         "_".join(table.robots),
         table.title,
-        " ".join(filter(None, (f"{of[0].upper()}{of[1:]}.", table.notes))),
+        " ".join(filter(None, (f"{of[0].upper()}{of[1:]}.", parting_note(sections), table.notes))),
         ("model",),
         metric_columns({metric.name: metric for metric in shown}, [metric.name for metric in shown]),
-        (TableSection("", tuple(rows), "" if table.complete else f"Incomplete: {of} are scored."),),
+        sections,
     )
 
 
-def _run_cell(row: Row, metric: MetricInfo, decides: bool) -> TableCell:
-    score = row.scores.get(metric.name)
+def _run_cell(row: Row, metric: MetricInfo, metrics: Mapping[str, MetricInfo]) -> TableCell:
+    """A mean with its mark; of a metric beside one of the suite strict, with a mark only where the two part."""
+    score, verdict = row.scores.get(metric.name), row.verdicts.get(metric.name, "")
+    parts = any(paper == metric.name for _, paper in find_parting(row.verdicts, metrics))
     if score is None:
         return TableCell()
     if row.model == TRUTH and metric.name == "psnr":
@@ -286,7 +297,8 @@ def _run_cell(row: Row, metric: MetricInfo, decides: bool) -> TableCell:
     return TableCell(
         format_number(score.mean, metric),
         format_interval((score.low, score.high), metric),
-        verdict=row.verdicts.get(metric.name, "") if decides else "",
+        verdict="" if metric.name in strict_metrics(metrics) else verdict,
+        parting=verdict if parts else "",
         value=score.mean,
         low=score.low,
         high=score.high,

@@ -26,7 +26,7 @@ import tyro
 from scipy.stats import spearmanr
 from tqdm import tqdm
 
-from xew.config import ConfigError, admit, user_errors
+from xew.config import ConfigError, admit, suggestion, user_errors
 from xew.dataset import demand_one_motion, find_accepted
 from xew.episode import EpisodeError, Record, read_video
 from xew.files import hold_lock, replacing, write_text
@@ -34,6 +34,7 @@ from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
 from xew.metrics.calibration.matrix import grade_predictors, matrix, to_markdown
 from xew.metrics.calibration.perturbations import Perturbation, render_perturbations
+from xew.metrics.calibration.predictors import PREDICTORS
 from xew.metrics.grade import Comparison, Grades, grade, input_kind
 from xew.metrics.grading.codecs import OPENER, open_codec
 from xew.metrics.truth import NEEDS, Truth, read_truth
@@ -83,6 +84,8 @@ class Args:
     """Grade predictors made on purpose, in place of both tables."""
     metrics: tuple[str, ...] = tuple(METRICS)
     """Names of the metrics of the predictors' table."""
+    cases: tuple[str, ...] = tuple(PREDICTORS)
+    """Names of the predictors that are graded."""
     mixed_motion: bool = False
     """Calibrate on episodes of shared and of own motion together."""
     trust: tuple[str, ...] = ()
@@ -105,6 +108,9 @@ class Estimators:
 def main(args: Args) -> None:
     """Grade, write, and print both tables."""
     admit(args.trust)
+    if unknown := [name for name in args.cases if name not in PREDICTORS]:
+        near = suggestion(unknown[0], PREDICTORS)
+        raise ConfigError(f"unknown predictor {unknown[0]!r};{near} known: {', '.join(PREDICTORS)}: --cases.")
     estimators = Estimators(open_masker(args.masks, args.masks_checkpoint), open_tracker(args.tracks, args.tracks_checkpoint))
     through_codec = None if args.codec is None else open_codec(args.codec, args.codec_opener)
     episodes = find_accepted(args.data)
@@ -139,7 +145,7 @@ def grade_matrix(episodes: Sequence[Episode], args: Args, estimators: Estimators
     text = ""
     for folder, record in tqdm(choose(episodes, args), desc="predictors", unit="episode", disable=None):
         other = find_another(episodes, record, "robot")
-        rows += grade_predictors(folder, record, other, estimators.masker, estimators.tracker, args.metrics)
+        rows += grade_predictors(folder, record, other, estimators.masker, estimators.tracker, args.metrics, args.cases)
         table = pd.DataFrame(rows)
         text = to_markdown(matrix(table)) + "\n"
         write(args.out, text, {"predictors": table}, "predictors.md")

@@ -28,7 +28,7 @@ from xew.concurrency import map_in_order, map_in_processes
 from xew.config import ConfigError, pick, suggestion, user_errors
 from xew.dataset import demand_one_motion, find_accepted
 from xew.episode import EpisodeError, read_record, verify_episode
-from xew.files import hold_lock
+from xew.files import hold_lock, write_section
 from xew.metrics import METRICS
 from xew.metrics.backends import MASKERS, TRACKERS, identity
 from xew.metrics.grade import DIAGNOSTICS, input_kind
@@ -37,6 +37,7 @@ from xew.metrics.grading.bundle import Bundle, differences, disagreements, raise
 from xew.metrics.grading.codecs import OPENER, ModelCodec, open_codecs
 from xew.metrics.grading.grader import Graded, GraderOpener, Group, prepare_process
 from xew.metrics.grading.jobs import Job, list_baseline_jobs, list_jobs
+from xew.metrics.grading.power import HEADING, power_section
 from xew.metrics.grading.scores import (
     CellStore,
     baselines_folder,
@@ -102,6 +103,8 @@ class Args:
     `xew.model.train` may be named in place of a run."""
     codec_opener: str = OPENER
     """Function that opens these runs, as module:NAME (`xew.metrics.grading.codecs.open_codec`)."""
+    power_page: Path | None = None
+    """Markdown page whose section on what the metrics can tell on each task is written anew, such as docs/tasks.md."""
     diagnostics: bool = False
     """Also write scores.diagnostics.parquet: contact F1, which is too unreliable in predicted video to be reported."""
     resample: Literal["scene", "task"] = "scene"
@@ -125,6 +128,8 @@ class Args:
     """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
+POWER_COMMAND = "python -m xew.metrics.evaluate --data data --baselines-of validation --power-page docs/tasks.md"
+"""Command that the page of the tasks names."""
 WRITTEN = {
     "parquet": "scores",
     "curves.parquet": "the same by frame",
@@ -184,8 +189,20 @@ def _write_summary(args: Args, rows: pd.DataFrame) -> str:
     write_whole(path_beside(args.out, "summary.csv"), csv_text(summary.means).encode())
     write_whole(path_beside(args.out, "pairs.csv"), csv_text(summary.pairs).encode())
     write_whole(path_beside(args.out, "power.csv"), csv_text(summary.power).encode())
+    if args.power_page:
+        write_power(args.power_page, summary.power, rows)
     written = "\n".join(f"{path_beside(args.out, ending)}  {what}" for ending, what in WRITTEN.items())
     return f"{to_markdown(summary, with_pairs=False)}\n{written}"
+
+
+def write_power(page: Path, power: pd.DataFrame, rows: pd.DataFrame) -> None:
+    """Write what the metrics can tell on each task into a page. Raises ConfigError where the power is not known."""
+    if power.empty:
+        raise ConfigError("--power-page needs the frozen first frame and the true video in a metric of the suite strict.")
+    try:
+        write_section(page, HEADING, f"`{POWER_COMMAND}`.\n{power_section(power, rows)}")
+    except OSError as error:
+        raise EpisodeError(f"cannot write {page}: {error.strerror}. Choose another file with --power-page.") from error
 
 
 def choose_metrics(args: Args) -> tuple[str, ...]:

@@ -26,17 +26,21 @@ from tqdm import tqdm
 from xew.config import admit, user_errors
 from xew.dataset import explain_missing, read_dataset
 from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, encode_png, read_record, read_states, read_video, verify_episode
-from xew.files import hold_lock, replacing, write_bytes
+from xew.files import hold_lock, replacing, write_bytes, write_section
 from xew.names import folder_name, path_below
 from xew.sim_warp.devices.workers import Workers, find_device, quiet_warp, worker_count
 from xew.sim_warp.generate import yield_table
 from xew.sim_warp.inspection.explorer import Page, choose_scenes, find_predictions, write_page
+from xew.sim_warp.inspection.visibility import HEADING as VISIBILITY
+from xew.sim_warp.inspection.visibility import visibility_section
 from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
-from xew.sim_warp.production.surfaces import visibility_table
+from xew.sim_warp.production.surfaces import read_visibility
 from xew.sim_warp.production.warm_up import compile_kernels
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS
 
+COMMAND = "python -m xew.sim_warp.inspect data --visibility --visibility-page docs/tasks.md"
+"""Command that the page of the tasks names."""
 EPISODES_PER_WORKER = 32
 """Number of episodes that are verified, or fewer rendered, in the time in which a process starts."""
 STRIP_FRAMES = 8
@@ -59,7 +63,10 @@ class Args:
     verify: bool = False
     """Read everything and compare with the recorded hashes, and the motions with what is plausible."""
     visibility: bool = False
-    """Print in how many frames the camera sees enough points on the surfaces of each robot and of what moves."""
+    """Print in how many frames the camera sees enough points on the surfaces of each robot and of what moves. Points that
+    `xew.metrics.evaluate` has kept beside the data are not rendered again."""
+    visibility_page: Path | None = None
+    """With --visibility: Markdown page whose section on this is written anew, such as docs/tasks.md."""
     rerender: int = 0
     """Number of episodes to render again from their states and compare with the recorded hashes."""
     render: bool = False
@@ -102,7 +109,7 @@ def main() -> None:
     if not pictured and (args.visibility or args.rerender or args.render or args.pictures or args.grid or args.page):
         raise EpisodeError(f"no seed under {args.data} is accepted, so there is nothing to render or draw.")
     if args.visibility:
-        print(visibility_table([folder for folder, _ in pictured]))
+        show_visibility([folder for folder, _ in pictured], args)
     if args.rerender:
         rerender([folder for folder, _ in pictured], args.rerender)
     if args.render:
@@ -114,6 +121,20 @@ def main() -> None:
         draw_grid(pictured, args.grid)
     if args.page:
         make_page(pictured, args)
+
+
+def show_visibility(folders: list[Path], args: Args) -> None:
+    """Print how much of robots and of what moves is seen, and write it into the page that is named."""
+    kept = args.data.absolute().with_name(f"{args.data.absolute().name}-surfaces")
+    text = visibility_section(read_visibility(folders, kept if kept.is_dir() else None))
+    print(text)
+    if args.visibility_page:
+        try:
+            write_section(args.visibility_page, VISIBILITY, f"`{COMMAND}`. {text}")
+        except OSError as error:
+            raise EpisodeError(
+                f"cannot write {args.visibility_page}: {error.strerror}. Choose another file with --visibility-page."
+            ) from error
 
 
 def make_page(cells: list[tuple[Path, Record]], args: Args) -> None:

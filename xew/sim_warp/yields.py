@@ -36,8 +36,9 @@ from xew.sim_warp.tasks import TASKS, Task, get_task
 PARAGRAPHS = ("Task", "Randomization", "Success", "After")
 """Words with which the paragraphs of a task's module docstring begin."""
 COMMAND = "python -m xew.sim_warp.yields"
-KEPT = "## What the metrics can tell"
-"""Heading of the part of the page that this command keeps: it is measured by the metrics, of which this room knows nothing."""
+YIELDS = "## How often the experts succeed"
+"""Heading of the last section that this command writes. It keeps those that follow: `inspect --visibility-page` and
+`xew.metrics.evaluate --power-page` write them."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,7 @@ Words in braces are replaced by what the scene has: objects, their kinds and the
 
 {tasks}
 
-## How often the experts succeed
+{YIELDS}
 {seeds} of each task, in physics, on {device}:
 
 {markdown(records)}
@@ -200,10 +201,10 @@ def main() -> None:
 
 
 def find_kept(path: Path) -> str:
-    """The end of a page that this command does not write: from the heading KEPT on; '' where there is none."""
+    """The end of a page that this command does not write: from the first heading after YIELDS on; '' where there is none."""
     text = path.read_text() if path.exists() else ""
-    start = text.find(f"\n{KEPT}\n")
-    return text[start:] if start >= 0 else ""
+    start = text.find("\n## ", text.find(f"\n{YIELDS}\n") + 1)
+    return text[start:] if YIELDS in text and start >= 0 else ""
 
 
 def write_page(path: Path, text: str) -> None:

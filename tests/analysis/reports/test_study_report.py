@@ -17,7 +17,7 @@ from xew.analysis.paper import read_paper
 from xew.analysis.report import Args, main
 from xew.analysis.reports import page
 from xew.analysis.reports.study import trainings_note
-from xew.analysis.scores import read_scores
+from xew.analysis.scores import MetricInfo, read_scores
 from xew.analysis.statistics.grades import PaperGrades, StudyGrades
 from xew.analysis.tables import formats
 from xew.analysis.tables.builder import Builder
@@ -29,7 +29,7 @@ from xew.analysis.tables.distances import (
     read_distances,
 )
 from xew.analysis.tables.labels import PAPER_METRICS
-from xew.analysis.tables.layouts import build_tables
+from xew.analysis.tables.layouts import build_tables, ladder_table
 from xew.analysis.tables.table import Table
 from xew.episode import episode_folder, read_video
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, SEEN_ROBOTS, TEST_SEED_START, VARIANTS
@@ -169,6 +169,34 @@ def test_best_and_marks_follow_the_paired_differences(tables: dict[str, Table]) 
     forgetting = tables["forgetting_full"].sections[0].rows
     lpips = PAPER_METRICS.index("lpips")
     assert {row.cells[lpips].verdict for row in forgetting[1:7]} == {"worse"}
+
+
+def with_robot_lpips(path: Path, variant: str, factor: float) -> tuple[pd.DataFrame, tuple[MetricInfo, ...]]:
+    """A study's scores, and as a metric of the suite strict those of region LPIPS again, of one variant times a factor."""
+    scores = read_scores(path)
+    info = next(info for info in scores.metrics if info.name == "region_lpips")
+    own = scores.rows[scores.rows["metric"] == "region_lpips"].assign(metric="robot_lpips")
+    own["value"] *= np.where(own["variant"] == variant, factor, 1.0)
+    info = replace(info, name="robot_lpips", title="Robot LPIPS", counterpart="region_lpips")
+    return pd.concat([scores.rows, own]), (*scores.metrics, info)
+
+
+def test_cells_say_where_the_suites_part_in_every_format(folder: Path) -> None:
+    """On the robot itself the render harms, in the paper's region it helps: that is one cell, and nothing else parts."""
+    rows, metrics = with_robot_lpips(folder / "scores.parquet", "fixed-optical_flow-robot_render", 4.0)
+    made = Builder(StudyGrades(rows, metrics, paper_axes(read_paper())), PaperGrades(read_paper(), metrics))
+    ladder = ladder_table(made)
+    robot, region = (i for i, column in enumerate(ladder.columns) if column.title.startswith(("Robot LPIPS", "Region LPIPS")))
+    for section in ladder.sections:
+        strict, paper = section.rows[4].cells[robot], section.rows[4].cells[region]
+        assert (strict.verdict, strict.parting) == ("worse", "") and (paper.verdict, paper.parting) == ("", "better")
+        others = [cell for row in section.rows for cell in row.cells if cell is not paper]
+        assert not any(cell.parting for cell in others) and sum(bool(cell.verdict) for cell in others) == 4 * 3
+    assert formats.markdown(ladder).count("(▲)") == 2
+    assert formats.latex(ladder).count(r"$^{(\blacktriangle)}$") == 2
+    assert page.table(ladder).count("paper-better") == 2 and "td.paper-better .mean::after" in page.page("", [], [], "")
+    frame = formats.table_frame(ladder).query("parting != ''")
+    assert set(frame["parting"]) == {"better"} and set(frame["verdict"]) == {""} and len(frame) == 2
 
 
 def test_what_is_missing_is_said_in_the_table_in_every_format(folder: Path, tables: dict[str, Table]) -> None:

@@ -41,7 +41,7 @@ from xew.analysis.tables.findings import BEATS, FAILS, HOLDS, UNMEASURED, UNRESO
 from xew.analysis.tables.labels import ACTIONS, LADDER, SHORT_ROBOTS
 from xew.analysis.tables.layouts import build_tables, count_table
 from xew.analysis.tables.outside import outside_tables
-from xew.analysis.tables.table import MARKS, Table
+from xew.analysis.tables.table import MARKS, Table, parting_note
 from xew.names import csv_text, plain_markdown
 from xew.protocol import BODY_SCALES, FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
 from xew.statistics import strict_metrics
@@ -145,7 +145,10 @@ def build(
     scored = [*build_tables(builder), *outside_tables(builder, scores.rows)]
     if builder.has_results("scaling"):
         scored.append(scaling_table(builder))
-    tables = [replace(table, caption=" ".join(filter(None, (table.caption, note, grades.notes)))) for table in scored]
+    tables = [
+        replace(table, caption=" ".join(filter(None, (table.caption, parting_note(table.sections), note, grades.notes))))
+        for table in scored
+    ]
     tables += [count_table(builder), *distance_tables(known)]
     if builder.has_results("loeo"):
         tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]

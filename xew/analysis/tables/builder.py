@@ -18,7 +18,7 @@ from xew.protocol import (
     expected_counts,
     reference,
 )
-from xew.statistics import Mean, strict_metrics
+from xew.statistics import Mean, find_parting, strict_metrics
 
 
 @dataclass(frozen=True)
@@ -61,22 +61,32 @@ class Builder:
         if info is None or mean is None:
             return printed
         ends = _interval_ends(mean, self.ours.level)
+        verdict, parting = self._marks(part, row, base, robots, metric)
         return replace(
             printed,
             text=format_number(mean.value, info),
             interval=format_interval(ends, info),
-            verdict=self._mark(part, row, base, robots, metric),
+            verdict=verdict,
+            parting=parting,
             value=mean.value,
             low=ends[0],
             high=ends[1],
             episodes=mean.count,
         )
 
-    def _mark(self, part: str, row: str, base: str, robots: str, metric: str) -> str:
-        """Verdict on the difference from the row `base`; none of a metric beside one of the suite strict, which decides."""
-        if not base or base == row or metric in strict_metrics(self.ours.metrics):
-            return ""
-        return paired_verdict(self.ours, part, row, base, robots, metric)
+    def _marks(self, part: str, row: str, base: str, robots: str, metric: str) -> tuple[str, str]:
+        """Verdict on the difference from the row `base`, and `TableCell.parting`.
+
+        A metric beside one of the suite strict, which decides, has no verdict, but parting.
+        """
+        if not base or base == row:
+            return "", ""
+        strict = strict_metrics(self.ours.metrics).get(metric)
+        asked = {name: paired_verdict(self.ours, part, row, base, robots, name) for name in (metric, strict) if name}
+        if strict is None:
+            return asked[metric], ""
+        found = {name: word for name, word in asked.items() if word}
+        return "", asked[metric] if find_parting(found, self.ours.metrics) else ""
 
     def row(self, part: str, row: str, robots: str, metrics: Sequence[str], labels: Sequence[str], base: str = "") -> TableRow:
         """One cell for each metric."""

@@ -10,8 +10,9 @@ from xew.analysis.tables.table import Table, TableCell, TableRow
 from xew.names import plain_markdown
 
 MARK = {"better": "▲", "worse": "▼", "unresolved": "≈", "": ""}
+"""Mark of a verdict; that of the paper's definition, where it parts from the suite strict, stands in parentheses."""
 AGREES = {None: "", True: "✓", False: "✗"}
-LATEX_MARK = {"better": r"$^{\blacktriangle}$", "worse": r"$^{\blacktriangledown}$", "unresolved": r"$^{\approx}$", "": ""}
+LATEX_MARK = {"better": r"\blacktriangle", "worse": r"\blacktriangledown", "unresolved": r"\approx", "": ""}
 LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "−": "$-$", "–": "--",
@@ -46,7 +47,11 @@ def _markdown_cell(cell: TableCell) -> str:
     text = f"**{cell.text}**" if cell.best else cell.text
     interval = f"[{cell.interval}]" if cell.interval else ""
     paper = f"(paper {cell.published})" if cell.published else ""
-    return " ".join(filter(None, (text, interval, MARK[cell.verdict], paper, AGREES[cell.agrees])))
+    return " ".join(filter(None, (text, interval, _mark(cell), paper, AGREES[cell.agrees])))
+
+
+def _mark(cell: TableCell) -> str:
+    return f"({MARK[cell.parting]})" if cell.parting else MARK[cell.verdict]
 
 
 def latex(table: Table) -> str:
@@ -107,7 +112,8 @@ def _latex_rows(row: TableRow, above: TableRow | None) -> Iterator[str]:
 
 def _latex_cell(cell: TableCell) -> str:
     text = _escape(cell.text)
-    return (rf"\textbf{{{text}}}" if cell.best else text) + LATEX_MARK[cell.verdict]
+    mark = f"({LATEX_MARK[cell.parting]})" if cell.parting else LATEX_MARK[cell.verdict]
+    return (rf"\textbf{{{text}}}" if cell.best else text) + (f"$^{{{mark}}}$" if mark else "")
 
 
 def _latex_line(cells: Sequence[str]) -> str:
@@ -120,9 +126,10 @@ def _escape(text: str) -> str:
 
 
 def table_frame(table: Table) -> pd.DataFrame:
-    """A tidy frame, one row per cell: table block note row column text value low high verdict paper episodes.
+    """A tidy frame, one row per cell: table block note row column text value low high verdict parting paper episodes.
 
-    `block` is the title of the section, `note` says what it lacks.
+    `block` is the title of the section, `note` says what it lacks, `parting` is the verdict by the paper's definition where
+    that of the suite strict is another one.
     """
     columns = column_heads(table)[len(table.stubs) :]
     return pd.DataFrame(
@@ -137,6 +144,7 @@ def table_frame(table: Table) -> pd.DataFrame:
             "low": cell.low,
             "high": cell.high,
             "verdict": cell.verdict,
+            "parting": cell.parting,
             "paper": cell.printed,
             "episodes": cell.episodes,
         }

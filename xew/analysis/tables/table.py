@@ -13,7 +13,9 @@ from xew.statistics import MIN_SCENES
 
 MARKS = (
     "▲ better, ▼ worse, ≈ not resolved: the interval of the paired difference holds 0, the difference is inside the noise "
-    f"floor or the floor is not known, or there are fewer than {MIN_SCENES} scenes"
+    f"floor or the floor is not known, or there are fewer than {MIN_SCENES} scenes. A mark in parentheses shows where the "
+    "suites part: it is the verdict by the paper's definition, where that is another than the verdict by the metric of the "
+    "suite strict beside it, which decides"
 )
 """Explanation of the marks behind values; captions name the row that a value is compared with."""
 
@@ -29,6 +31,8 @@ class TableCell:
     """Paper's value as it is printed."""
     verdict: str = ""
     """Verdict on the difference from the row that the caption names: better, worse or unresolved; '' where there is none."""
+    parting: str = ""
+    """Verdict by the paper's definition where that of the suite strict, which decides, is another one; else ''."""
     agrees: bool | None = None
     """Whether a recomputed value prints like the paper's; None where this is not asked."""
     best: bool = False
@@ -87,6 +91,12 @@ class Table:
     def complete(self) -> bool:
         """Whether no section lacks anything."""
         return not any(section.note for section in self.sections)
+
+
+def parting_note(sections: Sequence[TableSection]) -> str:
+    """Sentence that explains the marks in parentheses of a table with these sections; '' where it has none."""
+    parts = any(cell.parting for section in sections for row in section.rows for cell in row.cells)
+    return "In parentheses: the verdict by the paper's definition, where the suite strict has another." if parts else ""
 
 
 def format_number(value: float, metric: MetricInfo) -> str:

@@ -42,6 +42,7 @@ def grade_predictors(
     masker: Masker,
     tracker: Tracker,
     metrics: Sequence[str] = tuple(METRICS),
+    cases: Sequence[str] = tuple(PREDICTORS),
 ) -> list[Row]:
     """Rows of one episode: the value of each metric for each predictor, NaN where it has none.
 
@@ -50,20 +51,26 @@ def grade_predictors(
         other: the folder of the same seed with another robot, if there is one.
         masker, tracker: estimators.
         metrics: names of METRICS.
+        cases: names of PREDICTORS.
     """
     truth = read_truth(folder, record.frame_count, {input_kind(name) for name in metrics})
-    still, erased = render_objects(folder)
+    still, erased = render_objects(folder) if {"object at rest", "object erased"} & set(cases) else (None, None)
     material = Material(truth.rgb, None if other is None else _cut(read_video(other / "rgb.mkv"), truth), still, erased)
     key = {"task": record.task, "seed": record.seed, "robot": record.robot}
-    return [key | row for row in grade_material(material, truth, masker, tracker, metrics)]
+    return [key | row for row in grade_material(material, truth, masker, tracker, metrics, cases)]
 
 
 def grade_material(
-    material: Material, truth: Truth, masker: Masker, tracker: Tracker, metrics: Sequence[str] = tuple(METRICS)
+    material: Material,
+    truth: Truth,
+    masker: Masker,
+    tracker: Tracker,
+    metrics: Sequence[str] = tuple(METRICS),
+    cases: Sequence[str] = tuple(PREDICTORS),
 ) -> list[Row]:
     """Rows (case metric value) of all predictors that can be made of the material; the truth is graded as by `evaluate`."""
     rows: list[Row] = []
-    for case in PREDICTORS:
+    for case in cases:
         video = predict(case, material)
         if video is None:
             continue

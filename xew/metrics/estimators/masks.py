@@ -199,9 +199,12 @@ def _flow(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return flow.calc(start, end, None)
 
 
+@functools.lru_cache(maxsize=4)
 def _grid(shape: tuple[int, ...]) -> np.ndarray:
-    """[h w 2] float32, x and y of each pixel."""
-    return np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1).astype(np.float32)
+    """[h w 2] float32, x and y of each pixel; not to be written to."""
+    grid = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1).astype(np.float32)
+    grid.setflags(write=False)
+    return grid
 
 
 def _sample(image: np.ndarray, points: np.ndarray) -> np.ndarray:

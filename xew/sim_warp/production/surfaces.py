@@ -29,20 +29,26 @@ MOVED = 0.01
 """Distance from its first place [m] from which on a body has moved."""
 MOVING = 0.001
 """Distance from one frame to the next [m] from which on a body is moving."""
-NEEDED_OF_ROBOT, NEEDED_OF_THING = 8, 4
-"""Numbers of visible points of a robot, and of an object that moves, that the visibility table asks for."""
-ROBOT_SHARE, THING_SHARE = 0.95, 0.90
-"""Shares of frames, and of an object's moving frames, in which there should be so many."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """How well one thing, or the robot, is seen in some frames."""
+
+    points: np.ndarray
+    """[m] int, visible points on it."""
+    pixels: np.ndarray
+    """[m] int, pixels that show it."""
 
 
 @dataclass(frozen=True)
 class Visibility:
     """How well an episode's surfaces are seen."""
 
-    robot: np.ndarray
-    """[t] int, visible points of the robot."""
-    things: dict[str, np.ndarray]
-    """Numbers of visible points [m] int in the m moving frames of each thing that moves, by name."""
+    robot: Seen
+    """In all frames."""
+    things: dict[str, Seen]
+    """Each thing that moves, in its moving frames, by name."""
 
 
 def scene_names(scene: Scene) -> tuple[str, ...]:
@@ -102,40 +108,22 @@ def _find_scene(record: Record) -> Scene | None:
 
 
 def count_visible(tracks: SurfaceTracks) -> Visibility:
-    """Visible points of the robot by frame, and of each thing that moves by moving frame."""
-    counts = np.stack([tracks.visible[:, tracks.body == b].sum(axis=1) for b in range(len(tracks.names))], axis=1)
+    """Visible points and pixels of the robot by frame, and of each thing that moves by moving frame."""
+    bodies = range(len(tracks.names))
+    points = np.stack([tracks.visible[:, tracks.body == b].sum(axis=1) for b in bodies], axis=1)
+    pixels = np.stack([np.sum(tracks.shown == b, axis=(1, 2)) for b in bodies], axis=1)
     things = np.flatnonzero(~tracks.is_robot & (tracks.displacement.max(axis=0) > MOVED))
     moving = tracks.step > MOVING
-    return Visibility(counts[:, tracks.is_robot].sum(axis=1), {tracks.names[b]: counts[moving[:, b], b] for b in things})
+    of_robot = Seen(*(counts[:, tracks.is_robot].sum(axis=1) for counts in (points, pixels)))
+    return Visibility(of_robot, {tracks.names[b]: Seen(points[moving[:, b], b], pixels[moving[:, b], b]) for b in things})
 
 
-def visibility_table(folders: Sequence[Path]) -> str:
-    """A Markdown table: for each task and robot, in how many frames enough points are seen. Raises as `read_surfaces`."""
+def read_visibility(folders: Sequence[Path], keep: Path | None = None) -> dict[tuple[str, str], list[Visibility]]:
+    """Visibility of episodes by task and robot, without those whose shapes are not known. Raises as `read_surfaces`."""
     found: dict[tuple[str, str], list[Visibility]] = defaultdict(list)
     for folder in folders:
-        tracks = read_surfaces(folder)
+        tracks = read_surfaces(folder, keep=keep)
         if tracks is not None:
             record = read_record(folder)
             found[record.task, record.robot].append(count_visible(tracks))
-    lines = [
-        f"| task | robot | visible points of the robot | frames with {NEEDED_OF_ROBOT} | worst thing that moves | "
-        f"its moving frames with {NEEDED_OF_THING} | |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    lines += [_row(*key, several) for key, several in sorted(found.items())]
-    return "\n".join(lines)
-
-
-def _row(task: str, robot: str, several: Sequence[Visibility]) -> str:
-    """The row of a task and robot; of the things that move, the one that is seen least."""
-    of_robot = np.concatenate([one.robot for one in several])
-    robot_share = float(np.mean(of_robot >= NEEDED_OF_ROBOT))
-    shares = [
-        (float(np.mean(counts >= NEEDED_OF_THING)) if len(counts) else 1.0, name)
-        for one in several
-        for name, counts in one.things.items()
-    ]
-    share, name = min(shares, default=(1.0, "nothing moves"))
-    short = "" if robot_share >= ROBOT_SHARE and share >= THING_SHARE else "below the aim"
-    cells = (f"`{task}`", f"`{robot}`", f"{of_robot.mean():.1f}", f"{robot_share:.0%}", name, f"{share:.0%}", short)
-    return f"| {' | '.join(cells)} |"
+    return dict(sorted(found.items()))

@@ -1,0 +1,54 @@
+"""What the metrics can tell on each task, as a section of a Markdown page: their power, and the scores that it comes from."""
+
+import numpy as np
+import pandas as pd
+
+from xew.metrics import METRICS
+from xew.statistics import LEAST_POWER, describe_power
+
+HEADING = "## What the metrics can tell"
+"""Heading of the section on the page of the tasks."""
+MOST_SHOWN = 10_000
+"""Largest power that is written; where the true video has the best score there is no number."""
+
+
+def power_section(power: pd.DataFrame, rows: pd.DataFrame) -> str:
+    """Markdown: the power of each task for each metric, and what the frozen first frame and the true video score.
+
+    Args:
+        power: as of `xew.statistics.find_power`, of at least one task.
+        rows: score table that it was found in; columns task seed robot.
+    """
+    least = power.sort_values("power").iloc[0]
+    seeds = ", ".join(map(str, sorted(rows["seed"].unique())))
+    robots = ", ".join(f"`{robot}`" for robot in sorted(rows["robot"].unique()))
+    episodes = len(rows[["task", "seed", "robot"]].drop_duplicates())
+    introduction = (
+        "Power: how many times as far from a metric's best score the frozen first frame is as the true video, which `evaluate` "
+        f"shows softened to its estimators; {episodes} episodes of {robots}, seed {seeds} of each task.\n"
+        f"A task leaves a metric's mean where that is not above {LEAST_POWER:g}. "
+        f"{describe_power(power, {}) or 'None of these does.'} The least power, {_times(least['power'])} times, is that of "
+        f"`{least['task']}` for `{least['metric']}`."
+    )
+    scores = power.assign(
+        text=[f"{frozen:.3g} ({truth:.3g})" for frozen, truth in zip(power["frozen"], power["truth"], strict=True)]
+    )
+    parts = [introduction, _table(power.assign(text=power["power"].map(_times)))]
+    parts += ["The scores behind it, of the frozen first frame, and in parentheses of the true video:", _table(scores)]
+    return "\n\n".join(parts)
+
+
+def _times(power: float) -> str:
+    """A power with two digits; 'none' where both the frozen frame and the true video have the best score."""
+    if np.isnan(power):
+        return "none"
+    return f"{float(f'{power:.2g}'):.4g}" if power < MOST_SHOWN else f"over {MOST_SHOWN:,}"
+
+
+def _table(power: pd.DataFrame) -> str:
+    """Tasks down, metrics across, the column `text` in the cells."""
+    table = power.pivot(index="task", columns="metric", values="text")
+    names = [name for name in METRICS if name in table.columns]
+    lines = [["task", *(f"`{name}`" for name in names)], ["---"] * (len(names) + 1)]
+    lines += [[f"`{task}`", *table.loc[task, names].fillna("–")] for task in table.index]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
