@@ -62,7 +62,11 @@ def test_the_quickstart_of_the_readme_passes_in_an_empty_environment(distributio
 def test_a_quickstart_that_runs_nothing_is_told(tmp_path: Path) -> None:
     script = runpy.run_path(str(ROOT / "benchmarks" / "fresh_environments.py"))
     commands = script["quickstart"]((ROOT / "README.md").read_text())
-    assert len(commands) == 6 and "xew.analysis.report" in commands[-1] and not any("pip install" in command for command in commands)
+    assert (
+        len(commands) == 6
+        and "xew.analysis.report" in commands[-1]
+        and not any("pip install" in command for command in commands)
+    )
     for readme in ("# xew\n", "## Quickstart\n```bash\npip install .\n```\n", "## Quickstart\n```bash\npython -m xew.x\n```\n"):
         with pytest.raises(RuntimeError, match="no section Quickstart"):
             script["quickstart"](readme)
