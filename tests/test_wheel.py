@@ -1,15 +1,20 @@
 """What a user of pip gets: the wheel, installed beside the present libraries, works in an empty folder like the clone."""
 
 import os
+import re
 import runpy
 import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
+
+import xew
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ("xew", "configs", "docs", "examples", "benchmarks", "requirements", "tests")
@@ -44,11 +49,23 @@ def test_distributions_hold_what_they_need(distributions: Path) -> None:
     (wheel,), (sdist,) = distributions.glob("*.whl"), distributions.glob("*.tar.gz")
     with zipfile.ZipFile(wheel) as archive:
         assert {f"xew/{name}" for name in configs} <= set(archive.namelist())
+        (metadata,) = (archive.read(name).decode() for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+    assert f"\nVersion: {xew.__version__}\n" in metadata and "\nAuthor: " in metadata and "\nClassifier: " in metadata
     with tarfile.open(sdist) as archive:
         members = [member for member in archive.getmembers() if member.isfile()]
     held = {member.name.partition("/")[2] for member in members}
     helpers = {"tests/conftest.py", "tests/synthetic.py", "tests/metrics/small.py"}
     assert configs | helpers | {"docs/metrics.md", "docs/glossary.md", "examples/own_model.py", "CHANGELOG.md"} <= held
+    linked = {link.partition("#")[0] for link in re.findall(r"\]\(([^)\s]+)\)", (ROOT / "README.md").read_text())}
+    assert {link for link in linked if "://" not in link} <= held, "the README's links lead somewhere in the sdist"
+
+
+def test_the_version_is_one_and_is_known_without_an_installation() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert project["version"] == xew.__version__ == str(citation["version"])
+    asked = [path for path in (ROOT / "xew").rglob("*.py") if re.search(r"version\(\s*[\"']xew", path.read_text())]
+    assert not asked, "a source tree that is not installed has no metadata"
 
 
 def test_the_quickstart_of_the_readme_passes_in_an_empty_environment(distributions: Path, tmp_path: Path) -> None:

@@ -11,6 +11,8 @@ import pytest
 import yaml
 
 from tests import synthetic
+from tests.commands import run_command
+from xew.analysis.studies.config import load_study
 from xew.config import ConfigError, check_finite, user_errors
 from xew.episode import EpisodeError, read_record, read_states, read_video, write_episode
 from xew.files import write_text
@@ -123,6 +125,30 @@ def test_workers_that_are_none_are_refused(number: int, tmp_path: Path) -> None:
         generate.generate(generate.Args(tasks=("lift_pot",), robots=("piper",), out=tmp_path / "data", workers=number))
     with pytest.raises(EpisodeError, match=f"--workers is {number}"):
         next(iter(yields.attempt_seeds(yields.Args(tasks=("lift_pot",), robots=("piper",), workers=number))))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "xew.sim_warp.robots.bodies --count 1 --out bodies.npz --workers 0",
+        "xew.analysis.distance --no-looks --out out --workers 0",
+        "xew.metrics.evaluate rollouts --data data --out scores.parquet --processes 0",
+    ],
+)
+def test_commands_without_workers_end_in_one_line(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    module, *options = command.split()
+    with pytest.raises(AssertionError, match=f"ended with 2:\n.*{options[-2]} is {options[-1]}") as told:
+        run_command(module, *options)
+    assert "Traceback" not in str(told.value) and not list(tmp_path.iterdir())
+
+
+def test_a_quote_that_is_not_closed_is_told_with_its_config(tmp_path: Path) -> None:
+    content = yaml.safe_load((REPOSITORY / "configs/study_debug.yaml").read_text())
+    content["machine"] = content.get("machine", {}) | {"train_launcher": "srun --comment='my study"}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(ConfigError, match=r"mine\.yaml: machine\.train_launcher is .*: No closing quotation"):
+        load_study(tmp_path / "mine.yaml")
 
 
 def test_an_output_that_is_a_file_is_told(tmp_path: Path) -> None:
