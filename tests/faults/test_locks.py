@@ -43,7 +43,7 @@ WRITERS: tuple[tuple[str, str, str], ...] = (
     ("sim_warp.inspect", "data --page out", "out"),
     ("sim_warp.manifest", "data --out out.json", "out.json"),
     ("sim_warp.robots.adopt", "mine.urdf --out out", "out/mine"),
-    ("sim_warp.robots.bodies", "--count 1 --out out.npz", "out.npz"),
+    ("sim_warp.bodies", "--count 1 --out out.npz", "out.npz"),
     ("sim_warp.robots.sheet", "--robots piper --out out", "out"),
     ("sim_warp.robots.sheet", "--robots piper --references out", "out"),
     ("sim_warp.robots.sheet", "--robots piper --grid out.png", "out.png"),

@@ -107,9 +107,9 @@ def find_failure(entry: Entry) -> str | None:
 
 def compile_for_checks(workers: Workers) -> None:
     """Compile the kernels that checks launch, where there are none yet; else each worker would compile them all."""
-    parts = {"physics": find_device("cpu"), "kinematics": find_device(None)}
-    for device in dict.fromkeys(parts.values()):
-        compile_kernels(workers, device, 1, [part for part, at in parts.items() if at == device])
+    devices = {"physics": "cpu", "kinematics": find_device(None).alias}
+    for name in dict.fromkeys(devices.values()):
+        compile_kernels(workers, find_device(name), 1, [part for part, alias in devices.items() if alias == name])
 
 
 def gap_between_arms(robot: RobotSpec) -> float:
