@@ -270,7 +270,7 @@ def test_missing_inputs_name_the_command_that_makes_them(study: Study, tmp_path:
         (Args(study.scores, tmp_path / "void"), "xew.sim_warp.generate"),
         (Args(study.scores, study.data, (tmp_path / "void",)), "xew.model.rollout"),
         (Args(study.scores, held_out=("panda",)), "franka_panda"),
-        (Args(study.scores, distances=tmp_path), "--distances is for the report of a study"),
+        (Args(study.scores, distances=tmp_path), "--distances and --other-motion are for the report of a study"),
         (Args(distances=tmp_path, paper=True), "leave out scores"),
     ):
         with pytest.raises(SystemExit):
