@@ -5,7 +5,8 @@
 #                    networks (SLOW in tests/conftest.py lists what is left out); make test-fast TESTS=tests/metrics for one room
 #   make test-faults   hostile and broken inputs, kills, full disks: all of tests/faults, with the counts of what was tried
 #   make docs    the site of the documentation, site/index.html
-#   make test-fresh   the wheel with the newest releases of everything, in a fresh environment of each Python that is there
+#   make test-fresh   the README's quickstart with the wheel and the newest releases of everything, in a fresh environment of each Python that
+#                     is there; make test does it by one Python at the versions of requirements/test.txt
 #   make lint    ruff and mypy
 #   make setup   only the environment (.venv, at the versions of requirements/test.txt)
 

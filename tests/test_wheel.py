@@ -1,45 +1,30 @@
 """What a user of pip gets: the wheel, installed beside the present libraries, works in an empty folder like the clone."""
 
 import os
+import re
+import runpy
 import shutil
 import subprocess
 import sys
-import sysconfig
 import tarfile
-import venv
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
+
+import xew
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ("xew", "configs", "docs", "examples", "benchmarks", "requirements", "tests")
 FILES = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "Makefile")
 BUILD = "import setuptools.build_meta as build; build.build_sdist('dist'); build.build_wheel('dist')"
-FIRST_STEPS = """
-import sys
-from pathlib import Path
-
-import numpy as np
-
-import xew
-from xew.config import find_config
-from xew.metrics import psnr
-from xew.model import train
-from xew.sim_warp.robots import ROBOTS, load_urdf
-
-assert not Path(xew.__file__).is_relative_to(sys.argv[1]), xew.__file__
-assert find_config("configs/fixed.yaml") == find_config("xew:fixed")
-assert all(load_urdf(robot.urdf).links for robot in ROBOTS.values())
-video = np.zeros((1, 8, 8, 3), np.uint8)
-assert psnr(video, video).shape == (1,)
-train.main(["xew:fixed", "--help"])
-"""
 
 
 def run(*command: str | Path, folder: Path) -> str:
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {"COLUMNS": "120"}
-    done = subprocess.run([*map(str, command)], cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+    done = subprocess.run([*map(str, command)], cwd=folder, env=environment, capture_output=True, text=True, timeout=1800)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -64,33 +49,43 @@ def test_distributions_hold_what_they_need(distributions: Path) -> None:
     (wheel,), (sdist,) = distributions.glob("*.whl"), distributions.glob("*.tar.gz")
     with zipfile.ZipFile(wheel) as archive:
         assert {f"xew/{name}" for name in configs} <= set(archive.namelist())
+        (metadata,) = (archive.read(name).decode() for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+    assert f"\nVersion: {xew.__version__}\n" in metadata and "\nAuthor: " in metadata and "\nClassifier: " in metadata
     with tarfile.open(sdist) as archive:
         members = [member for member in archive.getmembers() if member.isfile()]
     held = {member.name.partition("/")[2] for member in members}
     helpers = {"tests/conftest.py", "tests/synthetic.py", "tests/metrics/small.py"}
     assert configs | helpers | {"docs/metrics.md", "docs/glossary.md", "examples/own_model.py", "CHANGELOG.md"} <= held
+    linked = {link.partition("#")[0] for link in re.findall(r"\]\(([^)\s]+)\)", (ROOT / "README.md").read_text())}
+    assert {link for link in linked if "://" not in link} <= held, "the README's links lead somewhere in the sdist"
 
 
-@pytest.fixture(scope="module")
-def python(distributions: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel in an environment that has its own site-packages and, behind them, the libraries of this one."""
-    home = tmp_path_factory.mktemp("environment")
-    venv.create(home, symlinks=True)
+def test_the_version_is_one_and_is_known_without_an_installation() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert project["version"] == xew.__version__ == str(citation["version"])
+    asked = [path for path in (ROOT / "xew").rglob("*.py") if re.search(r"version\(\s*[\"']xew", path.read_text())]
+    assert not asked, "a source tree that is not installed has no metadata"
+
+
+def test_the_quickstart_of_the_readme_passes_in_an_empty_environment(distributions: Path, tmp_path: Path) -> None:
+    """The wheel and what it needs, at the versions that are tested; packages come from the index, or from pip's cache."""
     (wheel,) = distributions.glob("*.whl")
-    install = ("install", "--no-deps", "--no-index", "-q", wheel)
-    run(sys.executable, "-m", "pip", "--python", home / "bin" / "python", *install, folder=home)
-    (site,) = home.glob("lib/python*/site-packages")
-    (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    return home / "bin" / "python"
+    script = ROOT / "benchmarks" / "fresh_environments.py"
+    options = ("--pythons", sys.executable, "--wheel", wheel, "--constraints", ROOT / "requirements" / "test.txt")
+    assert ": passed with jax " in run(sys.executable, script, *options, folder=tmp_path)
 
 
-def test_functions_and_configs_work_in_an_empty_folder(python: Path, tmp_path: Path) -> None:
-    assert "--train.steps" in run(python, "-c", FIRST_STEPS, ROOT, folder=tmp_path)
-    plan = run(python, "-m", "xew.analysis.study", "configs/study_debug.yaml", "--dry-run", "--out", "study", folder=tmp_path)
-    assert "with 1 at once" in plan
-
-
-def test_the_first_command_of_the_readme_makes_an_episode_in_an_empty_folder(python: Path, tmp_path: Path) -> None:
-    few = ("--tasks", "press_stapler", "--robots", "piper", "--train-seeds", "1", "--test-seeds", "0")
-    run(python, "-m", "xew.sim_warp.generate", *few, "--out", "data", folder=tmp_path)
-    assert (tmp_path / "data" / "press_stapler" / "0000000" / "piper" / "episode.json").is_file()
+def test_a_quickstart_that_runs_nothing_is_told(tmp_path: Path) -> None:
+    script = runpy.run_path(str(ROOT / "benchmarks" / "fresh_environments.py"))
+    commands = script["quickstart"]((ROOT / "README.md").read_text())
+    assert (
+        len(commands) == 6
+        and "xew.analysis.report" in commands[-1]
+        and not any("pip install" in command for command in commands)
+    )
+    for readme in ("# xew\n", "## Quickstart\n```bash\npip install .\n```\n", "## Quickstart\n```bash\npython -m xew.x\n```\n"):
+        with pytest.raises(RuntimeError, match="no section Quickstart"):
+            script["quickstart"](readme)
+    with pytest.raises(RuntimeError, match="false"):
+        script["run"]("bash", "-c", "false", folder=tmp_path)

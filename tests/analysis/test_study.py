@@ -25,6 +25,7 @@ from xew.analysis.studies.processes import last_lines, start_step
 from xew.analysis.studies.runner import Budget, StudyRunner, complete_command
 from xew.analysis.studies.status import exit_with_failures
 from xew.config import ConfigError
+from xew.episode import EpisodeError
 
 ROOT = Path(__file__).parents[2]
 STEPS = "tests.analysis.steps"
@@ -304,7 +305,10 @@ def waiting_study(study: Study) -> Iterator[subprocess.Popen[bytes]]:
 def test_killed_studies_leave_nobody_behind(study: Study, waiting_study: subprocess.Popen[bytes]) -> None:
     lock = study.out / "logs" / "train" / "data.lock"
     assert alive(lock)
-    with pytest.raises(ConfigError, match="another process runs the study"), runner.lock_study(study.out):
+    with (
+        pytest.raises(EpisodeError, match=rf"is being written by process {waiting_study.pid} on"),
+        runner.lock_study(study.out),
+    ):
         pass
     waiting_study.kill()
     waiting_study.wait()

@@ -10,6 +10,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -84,20 +85,23 @@ class Server:
 
 
 def die_at_rename(death: Death, counter: int) -> None:
-    """Let this process write a byte to the pipe `counter` at each rename, and end at the one that is named."""
-    count = 0
+    """Let this process write a byte to the pipe `counter` at each rename, and end at the one that is named.
+
+    Threads rename one after another: none gets to its rename while the process dies at that of another.
+    """
+    count, one_at_a_time = 0, threading.Lock()
 
     def watch(rename: Callable[..., None]) -> Callable[..., None]:
         def watched(*args: Any, **kwargs: Any) -> None:
             nonlocal count
-            count += 1
-            own = count
-            os.write(counter, b".")
-            if own == death.at and not death.after:
-                os._exit(KILLED)
-            rename(*args, **kwargs)
-            if own == death.at:
-                os._exit(KILLED)
+            with one_at_a_time:
+                count += 1
+                os.write(counter, b".")
+                if count == death.at and not death.after:
+                    os._exit(KILLED)
+                rename(*args, **kwargs)
+                if count == death.at:
+                    os._exit(KILLED)
 
         return watched
 

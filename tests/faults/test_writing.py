@@ -27,8 +27,7 @@ MAY_WRITE_IN_PLACE = {
     "xew/sim_warp/embodiment/prepared.py": ("write_prepared",),  # into such a folder
     "xew/sim_warp/generate.py": ("_prepare_folder",),  # whether anything can be written
     "xew/sim_warp/robots/author.py": ("main",),  # the project's own files, for its developers
-    "xew/analysis/study.py": ("lock_study",),  # locks
-    "xew/analysis/studies/processes.py": ("_run", "wait_for_lock"),  # a log, and a lock
+    "xew/analysis/studies/processes.py": ("_run", "wait_for_lock"),  # a log, and its lock
 }
 """Functions that write otherwise, by file, with why."""
 

@@ -97,6 +97,8 @@ def main(args: Args) -> None:
     """Measure the distances, write both tables and print them."""
     if args.seeds < 1:
         raise ConfigError(f"--seeds is {args.seeds}; expected 1 or more.")
+    if args.workers != -1 and args.workers < 1:
+        raise ConfigError(f"--workers is {args.workers}; expected 1 or more, or -1 for all cores.")
     distance = _import_image_distance(args.perceptual) if args.looks and args.perceptual else None
     robots = find_robots((*ROBOT_NAMES, *args.robot))
     with hold_lock(args.out):

@@ -115,14 +115,15 @@ class Picture:
 @user_errors
 def main(args: Args) -> None:
     """Read the scores, make the report and write it."""
-    if args.paper:
-        _report_paper(args)
-    elif args.scores:
-        scores = read_scores(args.scores, _own_robots(args.data))
-        _check_motion(args, scores)
-        (_report_study if scores.of_study else _report_scores)(args, scores)
-    else:
-        raise ConfigError("no score table was named: give the one that xew.metrics.evaluate wrote, or --paper.")
+    with hold_lock(args.out):
+        if args.paper:
+            _report_paper(args)
+        elif args.scores:
+            scores = read_scores(args.scores, _own_robots(args.data))
+            _check_motion(args, scores)
+            (_report_study if scores.of_study else _report_scores)(args, scores)
+        else:
+            raise ConfigError("no score table was named: give the one that xew.metrics.evaluate wrote, or --paper.")
     print(f"report: {args.out / 'index.html'}")
 
 
@@ -468,12 +469,11 @@ def _write_report(out: Path, html: str, markdown: tuple[str, Mapping[str, bytes]
     """Write all files, the page last, so that everything it speaks of exists once it does."""
     text, files = markdown
     try:
-        with hold_lock(out):
-            for name, content in files.items():
-                write_bytes(path_below(out, name), content)
-            write_text(out / "report.md", text)
-            write_text(out / "summary.csv", csv_text(summary))
-            write_text(out / "index.html", html)
+        for name, content in files.items():
+            write_bytes(path_below(out, name), content)
+        write_text(out / "report.md", text)
+        write_text(out / "summary.csv", csv_text(summary))
+        write_text(out / "index.html", html)
     except OSError as error:
         raise ConfigError(f"cannot write the report to {out}: {error}. Choose another --out.") from error
 

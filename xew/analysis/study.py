@@ -10,7 +10,6 @@ named with its log; the others go on, and the exit status is 1.
 """
 
 import contextlib
-import fcntl
 import fnmatch
 import signal
 import subprocess
@@ -31,7 +30,7 @@ from xew.analysis.studies.plan import Step, plan, write_configs
 from xew.analysis.studies.runner import Budget, StudyRunner
 from xew.analysis.studies.status import exit_with_failures, format_cost, format_status
 from xew.config import ConfigError, admit_named, load, read_yaml, save, user_errors
-from xew.files import write_text
+from xew.files import hold_lock, write_text
 
 CHECK_CONFIGS = """
 import sys
@@ -155,19 +154,17 @@ def select_steps(steps: Mapping[str, Step], patterns: Sequence[str]) -> list[Ste
 
 @contextlib.contextmanager
 def lock_study(out: Path) -> Iterator[None]:
-    """Hold the lock of a study's folder. Raises ConfigError while another process runs a study in it."""
+    """Make a study's folder and hold its lock.
+
+    Raises:
+        ConfigError: it cannot be made.
+        EpisodeError: another process runs a study in it; the message says which.
+    """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        lock = (out / ".lock").open("w")
     except OSError as error:
         raise ConfigError(f"cannot write the study {out}: {error}; choose another --out.") from error
-    with lock as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise ConfigError(
-                f"another process runs the study {out}; wait for it, stop it, or choose another --out."
-            ) from error
+    with hold_lock(out):
         yield
 
 

@@ -18,7 +18,7 @@ from xew.analysis import report
 from xew.analysis.scores import TRAINING, VARIANT, Scores, merge_scores, write_scores
 from xew.analysis.studies.config import Study, load_study
 from xew.config import ConfigError, admit, demand_admitted, load, user_errors
-from xew.files import remove_written
+from xew.files import hold_lock, remove_written
 from xew.protocol import TASK_COUNT, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expected_counts
 
 
@@ -47,7 +47,12 @@ def main(args: Args) -> None:
     path = args.study / "study.yaml"
     demand_admitted(load(Study, path), str(path))
     study = load_study(path)
-    study = replace(study, out=args.study)
+    with hold_lock(args.study / "scores.parquet"):  # a study that runs this as its last step holds the folder's
+        merge_and_report(args, replace(study, out=args.study))
+
+
+def merge_and_report(args: Args, study: Study) -> None:
+    """Write the merged table of what is graded, and its report. Raises ConfigError where nothing is."""
     planned = {run.name: run for run in study.planned_runs}
     graded = args.variants or tuple(name for name in planned if study.scores_path(name).exists())
     if not graded:

@@ -149,6 +149,8 @@ def main(args: Args) -> None:
     if args.check is not None:
         check(args, args.check)
         return
+    if args.processes < 1:
+        raise ConfigError(f"--processes is {args.processes}; expected at least 1.")
     check_out(args.out)
     with hold_lock(args.out):
         grade_tables(args)

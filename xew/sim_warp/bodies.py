@@ -32,12 +32,13 @@ from tqdm import tqdm
 from xew.config import ConfigError, user_errors
 from xew.files import hold_lock, replacing
 from xew.protocol import body_key
-from xew.sim_warp.devices.workers import Workers, quiet_warp
+from xew.sim_warp.devices.workers import Workers, find_device, quiet_warp
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import load_urdf
 from xew.sim_warp.geometry.poses import Pose, matrix_from_pose
 from xew.sim_warp.kinematics.forward import link_poses
 from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
+from xew.sim_warp.production.warm_up import compile_kernels
 from xew.sim_warp.rendering.streams import home_action
 from xew.sim_warp.robots.procedural.bodies import CATALOG, Entry, catalog_text, placed_body, read_catalog, unplaced_body
 from xew.sim_warp.robots.procedural.design import WIDE, BodyDesign, design_body
@@ -104,6 +105,13 @@ def find_failure(entry: Entry) -> str | None:
     return None
 
 
+def compile_for_checks(workers: Workers) -> None:
+    """Compile the kernels that checks launch, where there are none yet; else each worker would compile them all."""
+    devices = {"physics": "cpu", "kinematics": find_device(None).alias}
+    for name in dict.fromkeys(devices.values()):
+        compile_kernels(workers, find_device(name), 1, [part for part, alias in devices.items() if alias == name])
+
+
 def gap_between_arms(robot: RobotSpec) -> float:
     """Least distance of a link from the plane between the two arms, at home [m]; negative where one is on the other's side."""
     urdf, row = load_urdf(robot.urdf), home_action(robot)[None]
@@ -136,6 +144,7 @@ def replace_failing(known: Sequence[Entry], workers: int) -> Iterator[tuple[int,
     Successors are of the same family of designs. All other bodies keep their numbers.
     """
     with Workers(workers) as pool:
+        compile_for_checks(pool)
         checked = pool.run(_check_entry, known)
         problems = dict(tqdm(checked, total=len(known), desc="check", unit="body"))
     for first, numbers in ((0, range(FIRST_FAMILY)), (WIDE, range(FIRST_FAMILY, len(known)))):
@@ -157,6 +166,7 @@ def _try_in_order(numbers: Iterator[int], workers: int) -> Iterator[tuple[int, E
         yield from map(try_candidate, numbers)
         return
     with Workers(workers) as pool:
+        compile_for_checks(pool)
         while True:
             yield from sorted(pool.run(try_candidate, list(islice(numbers, 2 * workers))), key=lambda result: result[0])
 
@@ -203,6 +213,8 @@ def main() -> None:
         for line in digest_lines(read_catalog(args.out)[: args.count]):
             print(line)
         return
+    if args.workers < 1:
+        raise ConfigError(f"--workers is {args.workers}; expected at least 1.")
     with hold_lock(args.out):
         fill_catalog(args)
 

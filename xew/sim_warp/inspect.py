@@ -116,9 +116,11 @@ def main() -> None:
         with hold_lock(args.data):
             render_videos([folder for folder, record in pictured if not record.videos])
     if args.pictures:
-        draw_pictures(pictured, args.pictures, args.seeds)
+        with hold_lock(args.pictures):
+            draw_pictures(pictured, args.pictures, args.seeds)
     if args.grid:
-        draw_grid(pictured, args.grid)
+        with hold_lock(args.grid):
+            draw_grid(pictured, args.grid)
     if args.page:
         make_page(pictured, args)
 

@@ -23,7 +23,7 @@ import tyro
 from xew.config import user_errors
 from xew.dataset import explain_missing, find_records
 from xew.episode import EpisodeError, Record
-from xew.files import read_json, replacing
+from xew.files import hold_lock, read_json, replacing
 from xew.names import check_name
 from xew.protocol import TEST_SEED_START, seed_split
 
@@ -167,7 +167,7 @@ def main() -> None:
     if not manifest.tasks:
         raise explain_missing(args.data)
     try:
-        with replacing(args.out) as file:
+        with hold_lock(args.out), replacing(args.out) as file:
             file.write_text(to_json(manifest))
     except OSError as error:
         raise EpisodeError(f"cannot write {args.out}: {error.strerror}. Choose another file with --out.") from error

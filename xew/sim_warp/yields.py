@@ -8,6 +8,7 @@ Unlike generate this tries every seed on every robot and stores no episode.
 Command: python -m xew.sim_warp.yields [--tasks … --robots … --seeds 20 --first-seed 0 --page docs/tasks.md]
 """
 
+import contextlib
 import importlib
 import inspect
 from collections import defaultdict
@@ -24,7 +25,7 @@ from tqdm import tqdm
 
 from xew.config import user_errors
 from xew.episode import EpisodeError, Record
-from xew.files import write_text
+from xew.files import hold_lock, write_text
 from xew.protocol import SHARED_MOTION, expand_robots
 from xew.sim_warp.devices.workers import Workers, find_device, quiet_warp, worker_count
 from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
@@ -190,6 +191,12 @@ A seed belongs to the data set only when all robots succeed on it.
 def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
+    with hold_lock(args.page) if args.page else contextlib.nullcontext():
+        try_and_print(args)
+
+
+def try_and_print(args: Args) -> None:
+    """Try all seeds, print the table, and write the page if there is to be one."""
     records: list[Record] = []
     with tqdm(total=args.seeds * len(set(args.tasks)), desc="trying seeds", unit="seed") as bar:
         for seed in attempt_seeds(args):

@@ -55,11 +55,16 @@ def test_what_is_compiled_together_is_loaded_and_then_launched() -> None:
     np.testing.assert_array_equal(values.numpy(), 0.5)
 
 
-def test_the_smallest_pieces_launch_all_that_episodes_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_smallest_pieces_launch_all_that_episodes_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
     monkeypatch.setattr(warm_up, "has_kernels", lambda device: False)
     device = wp.get_device("cpu")
     with launched_modules(monkeypatch) as compiled:
         warm_up.compile_kernels(InlineWorkers(2), device, batch=1)  # type: ignore[arg-type]
+    said = capsys.readouterr()
+    assert wp.config.kernel_cache_dir in said.out
+    assert "compiling kernels" in said.err and "0/3" in said.err and "3/3" in said.err
     with launched_modules(monkeypatch) as used:
         produce([Job(TASK, 0, ("piper",))], tmp_path, Renderer("cpu"))
     assert len(used) > 3

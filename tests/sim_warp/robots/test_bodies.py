@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 
 from tests.sim_warp.robots.own_robot import write_urdf
 from tests.sim_warp.robots.test_own_robots import at_home
-from tests.sim_warp.small import TASK
+from tests.sim_warp.small import TASK, InlineWorkers
 from xew.analysis.distance import find_robots
 from xew.config import ConfigError
 from xew.dataset import read_dataset
@@ -202,6 +203,21 @@ def test_a_cache_that_cannot_be_written_is_told(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     with pytest.raises(ConfigError, match="Name another cache folder by XDG_CACHE_HOME"):
         keep_files(design_body(0))
+
+
+def test_workers_begin_when_the_kernels_of_their_checks_are_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled: list[str] = []
+    begun: list[set[str]] = []
+
+    class Inline(InlineWorkers):
+        def run(self, function: Callable, jobs: Sequence[int]) -> Iterator[tuple[int, str]]:
+            begun.append(set(compiled))
+            return iter([(job, "skipped") for job in jobs])
+
+    monkeypatch.setattr(bodies, "Workers", Inline)
+    monkeypatch.setattr(bodies, "compile_kernels", lambda pool, device, batch, parts: compiled.extend(parts))
+    assert next(find_bodies((), 1, workers=2)) == (0, "skipped")
+    assert begun == [{"physics", "kinematics"}]
 
 
 @pytest.mark.slow

@@ -25,6 +25,7 @@ from tqdm import tqdm
 
 from xew.config import ConfigError, user_errors
 from xew.episode import complete_folder
+from xew.files import hold_lock
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
@@ -69,12 +70,17 @@ def adopt(args: Args) -> Path:
 
     Raises:
         ConfigError: it cannot be read, or it cannot do what every robot must.
-        EpisodeError: the folder holds something else.
+        EpisodeError: the folder holds something else, or another process writes it.
     """
     source = find_description(args.robot).resolve()
     draft = RobotDraft(source.name) if source.suffix in (".urdf", ".xacro") else read_draft(source)
     key = robot_key(source.with_name(source.name.split(".")[0] + ".urdf") if source.suffix == ".xacro" else source)
-    with tqdm(total=len(STAGES), desc=STAGES[0], unit="stage") as bar, tempfile.TemporaryDirectory() as work:
+    folder = args.out / key
+    with (
+        hold_lock(folder),
+        tqdm(total=len(STAGES), desc=STAGES[0], unit="stage") as bar,
+        tempfile.TemporaryDirectory() as work,
+    ):
 
         def begin(stage: int) -> None:
             bar.update(stage - bar.n)
@@ -91,7 +97,6 @@ def adopt(args: Args) -> Path:
         begin(4)
         reach = [float(work_reach(robot, arm).mean()) for arm in (0, 1)]
         begin(5)
-        folder = args.out / key
         _write(robot, draft, folder)
         if args.sheet:
             save(args.out / f"{key}.png", sheet(nine_views(load_robot(folder))))

@@ -157,11 +157,11 @@ def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
     robots = [get_robot(name) for name in expand_robots(args.robots)]
-    if args.grid is not None:
-        write_grid(robots, args.grid)
-        print(args.grid)
-        return
-    with hold_lock(args.references or args.out):
+    with hold_lock(args.grid or args.references or args.out):
+        if args.grid is not None:
+            write_grid(robots, args.grid)
+            print(args.grid)
+            return
         if args.references is None:
             print(*write_sheets(robots, args.out), sep="\n")
             return

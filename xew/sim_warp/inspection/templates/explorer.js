@@ -277,7 +277,7 @@
   }
   film.addEventListener("loadeddata", () => { if (scene) seek(wanted); });
   film.addEventListener("error", () => {
-    if (chosen) complain(`The video ${chosen.file} cannot be played; it needs to lie beside this page, and a browser with H.264.`);
+    if (chosen) complain(`The video ${chosen.file} cannot be played. It must lie beside this page, and the browser must know H.264.`);
   });
 
   function complain(text) {

@@ -1,11 +1,7 @@
-"""Two processes on one folder, full disks, folders that cannot be written: one line, and nothing half-written."""
+"""Disks that fail, kills at renames, outputs and numbers that mean nothing: one line, and nothing half-written."""
 
 import errno
-import multiprocessing
 import os
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,119 +11,19 @@ import pytest
 import yaml
 
 from tests import synthetic
-from xew.analysis import distance
+from tests.commands import run_command
+from xew.analysis.studies.config import load_study
 from xew.config import ConfigError, check_finite, user_errors
 from xew.episode import EpisodeError, read_record, read_states, read_video, write_episode
-from xew.exchange import lerobot
-from xew.files import hold_lock, write_text
+from xew.files import write_text
 from xew.metrics import calibrate
-from xew.model import export, latents, outside, release
+from xew.model import outside
 from xew.model.episodes.choice import select_episodes
 from xew.model.experiment import load_experiment
 from xew.model.runs.begin import claim_run
-from xew.protocol import SEEN_ROBOTS
 from xew.sim_warp import generate, yields
 
 REPOSITORY = Path(__file__).parents[2]
-
-
-def hold(path: Path, ready: "multiprocessing.synchronize.Event") -> None:
-    with hold_lock(path):
-        ready.set()
-        multiprocessing.Event().wait(60)
-
-
-@contextmanager
-def held_by_another(path: Path) -> Iterator[multiprocessing.Process]:
-    context = multiprocessing.get_context("fork")
-    ready = context.Event()
-    process = context.Process(target=hold, args=(path, ready))
-    process.start()
-    assert ready.wait(30)
-    yield process
-    process.kill()
-    process.join()
-
-
-def test_a_folder_is_written_by_one_process_and_the_message_names_it(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    with held_by_another(out) as process:
-        with (
-            pytest.raises(EpisodeError, match=rf"out is being written by process {process.pid} on .*; wait for it"),
-            hold_lock(out),
-        ):
-            pass
-        process.kill()  # the lock dies with it
-        process.join()
-        with hold_lock(out):
-            assert (tmp_path / ".out.lock").exists()
-    assert not list(tmp_path.iterdir())
-    with hold_lock(out), hold_lock(tmp_path / "other"):
-        pass
-
-
-def test_a_command_on_a_folder_that_another_writes_ends_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(str(REPOSITORY))
-    synthetic.write_synthetic_data(tmp_path / "data", seeds=(1_000_000,), robots=("piper",), frames=3)
-    with held_by_another(tmp_path / "out"), pytest.raises(SystemExit) as stop:
-        outside.main(["examples.own_model:freeze", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")])
-    said = capsys.readouterr().err
-    assert stop.value.code == 2 and "is being written by process" in said and "Traceback" not in said
-    assert not (tmp_path / "out").exists()
-
-
-WRITERS: dict[str, Callable[[str], object]] = {
-    "calibrate": lambda out: calibrate.main(calibrate.Args(data=Path("data"), out=Path(out))),
-    "distance": lambda out: distance.main(distance.Args(out=Path(out), looks=False)),
-    "export": lambda out: export.main(["run", "--out", out]),
-    "release": lambda out: release.main(["run", "--out", out]),
-    "LeRobot": lambda out: user_errors(lerobot.export)(lerobot.Args(Path("data"), Path(out))),
-}
-"""Commands that write a folder, by name; the others' locks are theirs, by the same function."""
-
-
-@pytest.mark.parametrize("name", WRITERS)
-def test_whoever_writes_a_folder_holds_its_lock(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    synthetic.write_synthetic_data(tmp_path / "data", seeds=(0,), robots=("piper",), frames=2)
-    with held_by_another(tmp_path / "out"), pytest.raises(SystemExit) as stop:
-        WRITERS[name]("out")
-    said = capsys.readouterr().err
-    assert stop.value.code == 2 and "is being written by process" in said and "Traceback" not in said
-    assert not (tmp_path / "out").exists()
-
-
-def test_who_waits_for_a_lock_says_for_whom_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    with held_by_another(tmp_path / "cache") as process:
-        stop = threading.Timer(0.5, process.kill)
-        stop.start()
-        with hold_lock(tmp_path / "cache", wait=True):
-            assert not process.is_alive() or process.join(5) is None
-        stop.join()
-    said = capsys.readouterr().err
-    assert said.count("waiting:") == 1 and f"is being written by process {process.pid}" in said
-
-
-def test_encoding_waits_for_who_fits_the_codec_of_the_same_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[str, bool]] = []
-
-    @contextmanager
-    def note(path: Path, *, wait: bool = False) -> Iterator[None]:
-        asked.append((path.name, wait))
-        yield
-
-    monkeypatch.setattr(latents, "hold_lock", note)
-    synthetic.write_synthetic_data(tmp_path / "data", seeds=(0,), robots=SEEN_ROBOTS, frames=5)
-    content = {"data": str(tmp_path / "data"), "out": str(tmp_path / "run"), "clip": {"frames": 5, "height": 32, "width": 48}}
-    content |= {"codec": {"spatial_factor": 8, "channels": 4}, "model": {"size": "tiny"}, "train": {"steps": 1, "batch": 1}}
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(content))
-    latents.main([str(tmp_path / "config.yaml")])
-    assert [wait for _, wait in asked] == [True, True]
-    assert asked[0][0] == "data-latents" and asked[1][0].startswith("data-latents-") and "rgb" in asked[1][0]
 
 
 def test_both_kinds_of_motion_are_mixed_on_purpose_only(
@@ -229,6 +125,30 @@ def test_workers_that_are_none_are_refused(number: int, tmp_path: Path) -> None:
         generate.generate(generate.Args(tasks=("lift_pot",), robots=("piper",), out=tmp_path / "data", workers=number))
     with pytest.raises(EpisodeError, match=f"--workers is {number}"):
         next(iter(yields.attempt_seeds(yields.Args(tasks=("lift_pot",), robots=("piper",), workers=number))))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "xew.sim_warp.bodies --count 1 --out bodies.npz --workers 0",
+        "xew.analysis.distance --no-looks --out out --workers 0",
+        "xew.metrics.evaluate rollouts --data data --out scores.parquet --processes 0",
+    ],
+)
+def test_commands_without_workers_end_in_one_line(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    module, *options = command.split()
+    with pytest.raises(AssertionError, match=f"ended with 2:\n.*{options[-2]} is {options[-1]}") as told:
+        run_command(module, *options)
+    assert "Traceback" not in str(told.value) and not list(tmp_path.iterdir())
+
+
+def test_a_quote_that_is_not_closed_is_told_with_its_config(tmp_path: Path) -> None:
+    content = yaml.safe_load((REPOSITORY / "configs/study_debug.yaml").read_text())
+    content["machine"] = content.get("machine", {}) | {"train_launcher": "srun --comment='my study"}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(ConfigError, match=r"mine\.yaml: machine\.train_launcher is .*: No closing quotation"):
+        load_study(tmp_path / "mine.yaml")
 
 
 def test_an_output_that_is_a_file_is_told(tmp_path: Path) -> None:
