@@ -150,6 +150,7 @@ def test_the_report_shows_both(scores: Path, tmp_path: Path) -> None:
     text = (tmp_path / "report" / "report.md").read_text()
     assert "## More bodies in training" in text and "## Distance and difficulty over many bodies" in text
     assert "Training on 16 bodies beside the three robots changes LPIPS by −3" in text
+    assert "## Claims" not in text and "No part of the paper was run" in text, "what was not asked is not listed claim by claim"
     assert "Over 64 bodies that one model has never seen, LPIPS goes with distance: r = +1.000 with kinematic" in text
     for name in ("scaling", "bodies"):
         assert (tmp_path / "report" / "figures" / f"{name}.png").stat().st_size > 1000
@@ -195,6 +196,16 @@ def test_two_tables_of_one_motion_are_not_compared(both_motions: tuple[Path, Pat
     own.attributes["protocol"] = 99
     with pytest.raises(ConfigError, match="graded by protocols 1 and 99"):
         Motions(shared, own)
+
+
+def test_one_model_on_many_bodies_is_no_comparison_of_trainings(scores: Path) -> None:
+    rows = pd.read_parquet(scores)
+    infos = [info for info in read_paper().infos if info.name in ("lpips", "psnr")]
+    alone = rows[rows["variant"].isin(["", "scaling_seen-optical_flow-robot_render"])]
+    parts = [
+        Builder(StudyGrades(chosen, infos, paper_axes(read_paper())), None).has_results("scaling") for chosen in (rows, alone)
+    ]
+    assert parts == [True, False]
 
 
 def test_the_report_sets_both_motions_side_by_side(both_motions: tuple[Path, Path], tmp_path: Path) -> None:

@@ -156,13 +156,15 @@ def build(
     tables += filter(None, [difficulty_table(grades, known)])
     if other_motion is not None:
         tables.append(motion_table(Motions(scores, other_motion)))
-    findings, by_paper = ask(StrictGrades(grades)), ask(grades)
+    # A study that has none of the paper's parts is asked none of its claims.
+    of_paper = any(builder.has_results(part) for part in PAPER_PARTS)
+    findings, by_paper, by_print = (ask(g) if of_paper else [] for g in (StrictGrades(grades), grades, printed))
     missing = find_missing_scores(scores.rows)
     content = Content(
         _sentences(grades, known, findings, by_paper),
         findings,
         by_paper,
-        ask(printed),
+        by_print,
         {table.name: table for table in tables},
         study_charts(builder, known, scores.curves) | body_charts(builder, known),
         strips,
@@ -201,7 +203,7 @@ def _sentences(
         *_bodies_sentence(grades, distances),
     ]
     return [
-        _answer_sentence(findings),
+        *([_answer_sentence(findings)] if findings else []),
         *pasting_sentence(findings),
         *parting_sentence(findings, by_paper, bool(strict_metrics(grades.metrics))),
         *asked,
@@ -355,7 +357,9 @@ def _gain(grades: Grades, part: str, row: str, base: str, robot: str) -> float |
 
 def _missing_notes(builder: Builder, scores: Scores) -> Iterator[str]:
     absent = [part.replace("_", " ") for part in PAPER_PARTS if not builder.has_results(part)]
-    if absent:
+    if len(absent) == len(PAPER_PARTS):
+        yield "No part of the paper was run in this study."
+    elif absent:
         yield f"Not run in this study: {', '.join(absent)}."
     unknown = set(scores.rows["variant"]) - {variant.name for variants in PARTS.values() for variant in variants} - {""}
     if unknown:
@@ -374,7 +378,7 @@ def missing_note(missing: pd.DataFrame) -> list[str]:
 
 def _write_html(content: Content, scores: Scores, footer: str) -> str:
     """The page."""
-    sections = {"Claims": _claims_section(content)}
+    sections = {"Claims": _claims_section(content)} if content.findings else {}
     sections |= {PART_TITLES[part]: text for part in SECTIONS if (text := _part_section(content, part))}
     sections["How it was measured"] = _method_section(content, scores)
     head = [page.contents(list(sections)), *map(page.note, content.lacks)]
@@ -445,13 +449,9 @@ def _write_markdown(content: Content) -> str:
         "",
         *(f"> {note}\n" for note in content.lacks),
     ]
-    lines += [
-        "## Claims",
-        "",
-        content.trainings,
-        "",
-        formats.findings_markdown(content.findings, content.printed, content.by_paper),
-    ]
+    if content.findings:
+        claims = formats.findings_markdown(content.findings, content.printed, content.by_paper)
+        lines += ["## Claims", "", content.trainings, "", claims]
     for part, (charts, shown, folded) in SECTIONS.items():
         if not any(name in content.tables for name in shown):
             continue
@@ -480,9 +480,10 @@ def _files(content: Content) -> Iterator[tuple[str, bytes]]:
             yield f"figures/{name}", data
     for part, strip in content.strips.items():
         yield f"figures/strip_{part}.png", strip.image
-    sources = {"here": content.findings, "here, paper's definitions": content.by_paper, "paper": content.printed}
-    both = pd.concat([findings_frame(found, of) for of, found in sources.items()])
     if len(content.missing):
         yield "missing.csv", csv_text(content.missing).encode()
-    yield "findings.csv", csv_text(both).encode()
-    yield "tables/findings.tex", formats.findings_latex(content.findings, content.printed, content.by_paper).encode()
+    if content.findings:
+        sources = {"here": content.findings, "here, paper's definitions": content.by_paper, "paper": content.printed}
+        together = pd.concat([findings_frame(found, of) for of, found in sources.items()])
+        yield "findings.csv", csv_text(together).encode()
+        yield "tables/findings.tex", formats.findings_latex(content.findings, content.printed, content.by_paper).encode()

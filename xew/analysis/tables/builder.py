@@ -50,7 +50,8 @@ class Builder:
         if not isinstance(self.ours, StudyGrades):
             return part in PAPER_PARTS
         adapted = [variant for variant in PARTS[part] if variant.target is not None]
-        own = adapted or [variant for variant in PARTS[part] if variant != reference()] or PARTS[part]
+        starts = (reference(), *PARTS["bodies"])
+        own = adapted or [variant for variant in PARTS[part] if variant not in starts] or PARTS[part]
         return any(self.ours.has(variant.name) for variant in own)
 
     def cell(self, part: str, row: str, robots: str, metric: str, base: str = "") -> TableCell:
