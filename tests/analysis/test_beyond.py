@@ -151,7 +151,7 @@ def test_the_report_shows_both(scores: Path, tmp_path: Path) -> None:
     assert "## More bodies in training" in text and "## Distance and difficulty over many bodies" in text
     assert "Training on 16 bodies beside the three robots changes LPIPS by −3" in text
     assert "## Claims" not in text and "No part of the paper was run" in text, "what was not asked is not listed claim by claim"
-    assert "Over 64 bodies that one model has never seen, LPIPS goes with distance: r = +1.000 with kinematic" in text
+    assert "Over 64 bodies that one model has never seen, its LPIPS correlates with kinematic distance at r = +1.000 (" in text
     for name in ("scaling", "bodies"):
         assert (tmp_path / "report" / "figures" / f"{name}.png").stat().st_size > 1000
     assert BODIES in set(pd.read_csv(tmp_path / "report" / "figures" / "scaling.csv")["robots"])

@@ -329,19 +329,21 @@ def _scaling_sentence(grades: Grades) -> Iterator[str]:
 
 
 def _bodies_sentence(grades: StudyGrades, distances: Distances) -> Iterator[str]:
-    """How the error on bodies of the distance family goes with each of the paper's distances."""
+    """How the error on bodies of the distance family goes with each of the paper's distances, and with the frozen frame's."""
     if "lpips" not in grades.metrics:
         return
-    found = correlate_bodies(body_errors(grades, distances, "lpips"), grades.metrics["lpips"].higher_is_better)
+    errors = body_errors(grades, distances, "lpips")
+    found = correlate_bodies(errors, grades.metrics["lpips"].higher_is_better)
     parts = [
-        f"r = {format_signed(result.r)} with {axis} distance ({format_signed(result.low)} to {format_signed(result.high)}, "
-        f"p = {result.p_value:.4f}; frozen first frame {format_signed(result.frozen)})"
+        f"with {axis} distance at r = {format_signed(result.r)} ({format_signed(result.low)} to {format_signed(result.high)}, "
+        f"p = {result.p_value:.4f})"
         for axis, result in found.items()
         if axis in AXES
     ]
     if parts:
-        count = max(result.bodies for result in found.values())
-        yield f"Over {count} bodies that one model has never seen, LPIPS goes with distance: {'; '.join(parts)}."
+        frozen = float(errors["value"].corr(errors["frozen"]))
+        last = "" if np.isnan(frozen) else f", and with that of the frozen first frame at r = {format_signed(frozen)}"
+        yield f"Over {len(errors)} bodies that one model has never seen, its LPIPS correlates {', '.join(parts)}{last}."
 
 
 def _format_change(share: float) -> str:

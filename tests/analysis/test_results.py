@@ -1,0 +1,27 @@
+"""What docs/results publishes is what its scores give, by the command that its pages name."""
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from xew.analysis.report import Args, main
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
+FOLDERS = sorted(path.parent for path in RESULTS.glob("*/scores.parquet"))
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_published_tables_and_sentences_are_those_of_the_scores(folder: Path, tmp_path: Path) -> None:
+    main(Args(folder / "scores.parquet", distances=folder / "distances", out=tmp_path))
+    published = sorted((folder / "tables").glob("*.csv"))
+    assert published, f"{folder} publishes no table"
+    for path in published:
+        pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "tables" / path.name), pd.read_csv(path), rtol=1e-6)
+    sentences = [line for line in (tmp_path / "report.md").read_text().splitlines() if line.startswith("- ")]
+    page = (folder / "README.md").read_text()
+    assert sentences and all(sentence in page for sentence in sentences)
+
+
+def test_there_are_results() -> None:
+    assert [folder.name for folder in FOLDERS] == ["bodies_debug"]
