@@ -74,7 +74,8 @@ def test_a_file_that_is_cut_off_is_no_video(folder: Path, name: str, share: floa
 def test_bits_that_are_lost_are_not_painted_over(folder: Path) -> None:
     write(folder / "rgb.mp4")
     content = bytearray((folder / "rgb.mp4").read_bytes())
-    content[len(content) // 2 : len(content) // 2 + 40] = bytes(40)
+    lost = len(content) // 4  # a few bytes less may by chance read as another picture
+    content[len(content) // 2 : len(content) // 2 + lost] = bytes(lost)
     (folder / "rgb.mp4").write_bytes(content)
     assert "make this rollout again" in refusal(folder)
 

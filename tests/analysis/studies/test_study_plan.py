@@ -95,12 +95,13 @@ def test_a_study_of_own_motion_makes_and_names_it(study: Study) -> None:
     assert build_experiment(study, variants[0])["split"] == "fixed"
 
 
-BODIES = CONFIGS / "study_bodies_debug.yaml"
+BODIES, BODIES_DEBUG = CONFIGS / "study_bodies.yaml", CONFIGS / "study_bodies_debug.yaml"
 
 
 def test_a_study_of_bodies_makes_what_its_variants_ask_for() -> None:
     """Bodies that train have training episodes, bodies that are graded have test episodes, and the five robots both."""
-    study = load_study(BODIES, ["--robots", "ur5_wsg", "piper", "body:0-15", "body:64-65", "body:104-111"])
+    robots = ["--robots", "ur5_wsg", "piper", "body:0-15", "body:64-65", "body:104-111"]
+    study = load_study(BODIES, [*robots, "--variants", "scaling_seen*"])
     names = [variant.name for variant in study.planned_variants]
     assert names == [f"scaling_seen{bodies}-optical_flow-robot_render" for bodies in ("", "_bodies_4", "_bodies_16")]
     assert study.trained_robots == ("ur5_wsg", "piper", *expand_robots(["body:0-15"]))
@@ -110,16 +111,16 @@ def test_a_study_of_bodies_makes_what_its_variants_ask_for() -> None:
     trained, tested = command[command.index("--robots") + 1 :], command[command.index("--test-robots") + 1 :]
     assert (trained[:18], tested[:12]) == (study.trained_robots, study.graded_robots)
     first, last = study.planned_variants[0], study.planned_variants[-1]
-    assert study.graded_counts(first) == dict.fromkeys(study.graded_robots, 6)
-    assert study.graded_counts(last) == dict.fromkeys(study.graded_robots[:4], 6), "one model alone is asked for distances"
-    assert [study.training_count(variant) for variant in (first, last)] == [6, 17 * 6]
+    assert study.graded_counts(first) == dict.fromkeys(study.graded_robots, 12)
+    assert study.graded_counts(last) == dict.fromkeys(study.graded_robots[:4], 12), "one model alone is asked for distances"
+    assert [study.training_count(variant) for variant in (first, last)] == [60, 17 * 60]
     command = steps["distances"].command
     assert command[command.index("--robot") + 1 :][:8] == study.graded_robots[-8:]
-    assert estimate(study, steps)["generate"].amount == 2 * 3 * (18 + 12)
+    assert estimate(study, steps)["generate"].amount == 6 * (10 * 18 + 2 * 12)
 
 
 def test_a_condition_may_stand_in_for_one_of_the_protocol() -> None:
-    study = load_study(BODIES)
+    study = load_study(BODIES_DEBUG)
     model = build_experiment(study, study.planned_variants[0])["model"]
     assert (model["action"], model["embodiment"]) == ("none", "robot_render_channels")
     with pytest.raises(ConfigError, match="unknown condition of the protocol 'robot_rendr'; did you mean"):

@@ -145,17 +145,14 @@ def build(
     scored = [*build_tables(builder), *outside_tables(builder, scores.rows)]
     if builder.has_results("scaling"):
         scored.append(scaling_table(builder))
-    tables = [
-        replace(table, caption=" ".join(filter(None, (table.caption, parting_note(table.sections), note, grades.notes))))
-        for table in scored
-    ]
+    captions = [(table.caption, parting_note(table.sections), note, grades.notes) for table in scored]
+    tables = [replace(t, caption=" ".join(filter(None, texts))) for t, texts in zip(scored, captions, strict=True)]
     tables += [count_table(builder), *distance_tables(known)]
     if builder.has_results("loeo"):
         tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
         tables.append(certainty_table(grades, known, paper))
-    tables += filter(None, [difficulty_table(grades, known)])
-    if other_motion is not None:
-        tables.append(motion_table(Motions(scores, other_motion)))
+    beyond = [difficulty_table(grades, known), motion_table(Motions(scores, other_motion)) if other_motion else None]
+    tables += filter(None, beyond)
     # A study that has none of the paper's parts is asked none of its claims.
     of_paper = any(builder.has_results(part) for part in PAPER_PARTS)
     findings, by_paper, by_print = (ask(g) if of_paper else [] for g in (StrictGrades(grades), grades, printed))
