@@ -100,6 +100,7 @@ def test_bodies_that_help_are_seen_to_help(scores: Path) -> None:
     assert first["three robots and bodies, K = 16"].verdict == "better" and not first["three robots and bodies, K = 0"].verdict
     assert first["three robots and bodies, K = 64"].text == "–", "it was not run"
     assert "Not run: three robots and bodies, K = 64" in table.sections[0].note
+    assert all("of 0 episodes" not in section.note for section in table.sections), "bodies are of the protocol, too"
     assert table.sections[-1].rows[0].cells[0].episodes == 4 * len(SCENES), "four of 32 bodies were graded"
 
 

@@ -125,7 +125,8 @@ class Builder:
         as_planned, as_paper = True, True
         for key, robots, label in rows:
             variant = find_variant(part, key)
-            paper = sum(expected_counts(variant).get(robot, 0) for robot in pooled(variant, robots))
+            protocol = expected_counts(variant, robots=variant.graded_robots)
+            paper = sum(protocol.get(robot, 0) for robot in pooled(variant, robots))
             planned = sum(self.planned.get(variant.name, {}).get(robot, 0) for robot in pooled(variant, robots)) or paper
             # A metric that is not defined for an episode lacks it; the episode is graded all the same.
             means = (self.ours.mean(part, key, robots, metric) for metric in self.ours.metrics)
