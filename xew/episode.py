@@ -12,6 +12,7 @@ Quaternions are x y z w; the world frame has its origin under the table's center
 """
 
 import hashlib
+import itertools
 import json
 import math
 import os
@@ -355,12 +356,15 @@ def open_video(path: Path) -> Any:
     return av.open(str(demand_regular(path).absolute()), container_options=options)
 
 
-def read_video(path: Path) -> np.ndarray:
-    """Read a video as uint8 RGB [t h w 3]. Raises EpisodeError if it is missing or holds no readable frame."""
+def read_video(path: Path, most: int | None = None) -> np.ndarray:
+    """Read a video, or its first `most` frames, as uint8 RGB [t h w 3].
+
+    Raises EpisodeError if it is missing or holds no readable frame.
+    """
     try:
         with open_video(path) as container:
             container.streams.video[0].codec_context.thread_count = 1
-            frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+            frames = [frame.to_ndarray(format="rgb24") for frame in itertools.islice(container.decode(video=0), most)]
     except (av.FFmpegError, OSError, IndexError):  # IndexError: a file without a video in it
         frames = []
     if not frames:

@@ -128,7 +128,7 @@ def read_inputs(episode: Episode, max_frames: int = 0, streams: bool = False) ->
         record.instruction,
         record.frame_rate,
         frames,
-        first_frame=np.array(read_video(folder / "rgb.mkv")[0]),
+        first_frame=np.array(read_video(folder / "rgb.mkv", most=1)[0]),
         joints=np.array(command.action[:frames]),
         tool_poses=np.array(command.tools[:frames]),
         intrinsics=np.array(command.intrinsics),

@@ -8,6 +8,7 @@ Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … 
 """
 
 import itertools
+import os
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -48,7 +49,7 @@ from xew.rollout import write_rollout
 
 Item = tuple[Episode, dict[str, Any]]
 """An episode to predict and the header that its rollout will have."""
-WRITERS = 2
+WRITERS = min(8, os.cpu_count() or 1)
 """Threads that compress videos."""
 WAITING = 16
 """Videos that may wait for a writer before predicting waits too."""

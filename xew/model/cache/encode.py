@@ -1,8 +1,10 @@
 """Encoding episodes into the latent cache: pixels are read or rendered ahead in threads, the codec works in batches."""
 
 import sys
+import threading
 from collections.abc import Sequence
 
+import jax
 import numpy as np
 from tqdm import tqdm
 
@@ -13,6 +15,9 @@ from xew.model.cache.clips import cut_clip, needed_pixels, read_streams
 from xew.model.cache.store import LatentCache
 from xew.model.codecs.contract import Codec, check_clip_shape, encode_pictures
 from xew.model.video.pixels import PixelSource, stored_pixels
+
+ENCODERS = 3
+"""Number of episodes that an accelerator encodes side by side: one computes while others are copied to it and back."""
 
 
 def encode_episodes(
@@ -30,13 +35,17 @@ def encode_episodes(
     progress = tqdm(total=len(episodes), initial=done, desc="encode", unit="episode", file=sys.stderr)
     written = 0
 
-    def load(episode: Episode) -> dict[str, np.ndarray]:
+    turns = threading.BoundedSemaphore(1 if jax.default_backend() == "cpu" else ENCODERS)
+
+    def encode(episode: Episode) -> int:
         missing = cache.missing(episode[1])
         pixels = source(*episode, needed_pixels(inputs.conditions, missing))
-        return read_streams(inputs.conditions, inputs.clip, *episode, missing, pixels)
+        videos = read_streams(inputs.conditions, inputs.clip, *episode, missing, pixels)
+        with turns:
+            return _encode_streams(cache, episode[1], videos, batch)
 
-    for (_, record), videos in zip(pending, map_in_order(load, pending), strict=True):
-        written += _encode_streams(cache, record, videos, batch)
+    for size in map_in_order(encode, pending):
+        written += size
         progress.update()
     progress.close()
     return written

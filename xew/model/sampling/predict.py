@@ -23,8 +23,10 @@ from flax import nnx
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from xew.concurrency import map_in_order
 from xew.config import pick
 from xew.dataset import Episode
+from xew.episode import read_video
 from xew.model.cache.clips import read_streams, take_frames
 from xew.model.cache.scales import Scale, apply_scales
 from xew.model.codecs.contract import Codec, encode_pictures, to_pictures, to_signed
@@ -34,6 +36,7 @@ from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES, NoiseSchedule
 from xew.model.network.dit import WorldModel, cast_params
 from xew.model.settings.parts import ClipInputs, Instructions
 from xew.model.settings.settings import RolloutSettings
+from xew.model.video.frames import to_model_size
 
 Streams = dict[str, np.ndarray]
 """Inputs of one whole episode by stream: uint8 [t h w 3] or float32 [t n]."""
@@ -107,10 +110,10 @@ class Predictor:
         filled = max(len(episodes), batch)
         filled += -filled % self._devices
         whole = [*episodes, *[episodes[-1]] * (filled - len(episodes))]
-        streams = [self._read(episode) for episode in episodes]
+        streams = list(map_in_order(self._read, episodes))
         streams += streams[-1:] * (filled - len(episodes))
         text, negative = self._encode_text(whole)
-        given = self._place(np.stack([stream["rgb"][:1] for stream in streams]))
+        given = self._place(np.stack([stream["rgb"] for stream in streams]))
         unaligned = self._encode_unaligned(streams)
         chunks: list[Array] = []
         for number, start in enumerate(range(0, max(frame_count - 1, 1), self.inputs.clip.frames - 1)):
@@ -130,8 +133,11 @@ class Predictor:
         return Sampling(settings.sampler, schedule, settings.guidance, self.inputs.latent_shape)
 
     def _read(self, episode: Episode) -> Streams:
-        conditions = {name: condition for name, condition in self.inputs.conditions.items() if condition.make is not None}
-        return read_streams(self.inputs.conditions, self.inputs.clip, *episode, ("rgb", *conditions))
+        """The first frame of an episode, and all of its conditions."""
+        inputs, (folder, _) = self.inputs, episode
+        made = [name for name, condition in inputs.conditions.items() if condition.make is not None]
+        first = to_model_size(read_video(folder / "rgb.mkv", most=1), inputs.clip.height, inputs.clip.width)
+        return {"rgb": first} | read_streams(inputs.conditions, inputs.clip, *episode, made)
 
     def _encode_text(self, episodes: Sequence[Episode]) -> tuple[Any, Any]:
         """Encode the instructions and, where there is guidance, as many negative prompts."""
