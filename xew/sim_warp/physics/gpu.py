@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from xew.protocol import FRAME_RATE
-from xew.sim_warp.devices.kernels import compile_together
+from xew.sim_warp.devices.kernels import Variant, compile_together, noted_launches
 from xew.sim_warp.devices.waiting import wait_for
 from xew.sim_warp.physics.kernels import advance_frame, record_contacts, record_joints, set_targets
 from xew.sim_warp.physics.worlds import (
@@ -87,6 +87,12 @@ class Batch:
         """
         with wp.ScopedDevice(self.device):
             return compile_together(self._begin_and_step, self.device)
+
+    def list_kernels(self) -> list[Variant]:
+        """The kernels that `run` launches."""
+        with wp.ScopedDevice(self.device), noted_launches() as found:
+            self._begin_and_step()
+        return list(found)
 
     def run(self) -> list[Motion]:
         """Step all worlds from their first command to the last of the longest."""
