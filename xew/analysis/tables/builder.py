@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from xew.protocol import (
     expected_counts,
     reference,
 )
-from xew.statistics import Mean, find_parting, strict_metrics
+from xew.statistics import Mean, strict_metrics
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,10 @@ class Builder:
     def reported(self) -> tuple[str, ...]:
         """Metrics of the full tables: the paper's suite, and whatever else the scores ask to be shown."""
         return tuple(name for name, info in self.ours.metrics.items() if name in PAPER_METRICS or info.reported)
+
+    @cached_property
+    def _strict(self) -> dict[str, str]:
+        return strict_metrics(self.ours.metrics)
 
     def has_results(self, part: str) -> bool:
         """Whether anything was measured that only this part asks for; models that comparisons start from do not count."""
@@ -72,12 +77,12 @@ class Builder:
         """
         if not base or base == row:
             return "", ""
-        strict = strict_metrics(self.ours.metrics).get(metric)
-        asked = {name: paired_verdict(self.ours, part, row, base, robots, name) for name in (metric, strict) if name}
+        own = paired_verdict(self.ours, part, row, base, robots, metric)
+        strict = self._strict.get(metric)
         if strict is None:
-            return asked[metric], ""
-        found = {name: word for name, word in asked.items() if word}
-        return "", asked[metric] if find_parting(found, self.ours.metrics) else ""
+            return own, ""
+        decides = paired_verdict(self.ours, part, row, base, robots, strict)
+        return "", own if own and decides and own != decides else ""
 
     def row(self, part: str, row: str, robots: str, metrics: Sequence[str], labels: Sequence[str], base: str = "") -> TableRow:
         """One cell for each metric."""
