@@ -13,6 +13,7 @@ from xew.analysis.beyond import (
     body_errors,
     correlate_bodies,
     difficulty_table,
+    find_difficulty,
     motion_table,
     scaling_frame,
     scaling_table,
@@ -138,8 +139,9 @@ def test_a_few_bodies_are_not_correlated(scores: Path) -> None:
     few = {body: DISTANCES[body] for body in DISTANCE_BODIES[: LEAST_BODIES - 1]}
     distances = distances_of(few, {body: LOOKS[body] for body in few})
     assert correlate_bodies(body_errors(grades_of(scores), distances, "lpips"), higher_is_better=False) == {}
-    assert difficulty_table(grades_of(scores), distances) is None
-    assert difficulty_table(grades_of(scores), printed_distances(read_paper())) is None, "five robots are no bodies"
+    grades = grades_of(scores)
+    for known in (distances, printed_distances(read_paper())):  # five robots are no bodies
+        assert difficulty_table(find_difficulty(grades, known), grades.metrics) is None
 
 
 def test_the_report_shows_both(scores: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from xew.analysis.beyond import Motions, body_errors, correlate_bodies, difficulty_table, motion_table, scaling_table
+from xew.analysis.beyond import Difficulty, Motions, difficulty_table, find_difficulty, motion_table, scaling_table
 from xew.analysis.paper import AXES, read_paper
 from xew.analysis.reports import page, pictures
 from xew.analysis.reports.charts import Chart, chart_files
@@ -141,29 +141,21 @@ def build(
     printed = PaperGrades(paper, scores.metrics)
     planned = scores.attributes.get("study", {}).get("variants", {})
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
-    note = trainings_note(grades)
-    scored = [*build_tables(builder), *outside_tables(builder, scores.rows)]
-    if builder.has_results("scaling"):
-        scored.append(scaling_table(builder))
-    captions = [(table.caption, parting_note(table.sections), note, grades.notes) for table in scored]
-    tables = [replace(t, caption=" ".join(filter(None, texts))) for t, texts in zip(scored, captions, strict=True)]
-    tables += [count_table(builder), *distance_tables(known)]
-    if builder.has_results("loeo"):
-        tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
-        tables.append(certainty_table(grades, known, paper))
-    beyond = [difficulty_table(grades, known), motion_table(Motions(scores, other_motion)) if other_motion else None]
-    tables += filter(None, beyond)
+    note, difficulty = trainings_note(grades), find_difficulty(grades, known)
+    tables = _make_tables(builder, scores, known, difficulty, (note, grades.notes))
+    if other_motion:
+        tables.append(motion_table(Motions(scores, other_motion)))
     # A study that has none of the paper's parts is asked none of its claims.
     of_paper = any(builder.has_results(part) for part in PAPER_PARTS)
     findings, by_paper, by_print = (ask(g) if of_paper else [] for g in (StrictGrades(grades), grades, printed))
     missing = find_missing_scores(scores.rows)
     content = Content(
-        _sentences(grades, known, findings, by_paper),
+        _sentences(grades, known, difficulty.get("lpips"), findings, by_paper),
         findings,
         by_paper,
         by_print,
         {table.name: table for table in tables},
-        study_charts(builder, known, scores.curves) | body_charts(builder, known),
+        study_charts(builder, known, scores.curves) | body_charts(builder, difficulty),
         strips,
         [*_missing_notes(builder, scores), *missing_note(missing)],
         missing,
@@ -171,6 +163,25 @@ def build(
     )
     html = _write_html(content, scores, footer)
     return Report(html, _write_markdown(content), formats.tables_frame(tables), dict(_files(content)))
+
+
+def _make_tables(
+    builder: Builder, scores: Scores, known: Distances, difficulty: Mapping[str, Difficulty], notes: Sequence[str]
+) -> list[Table]:
+    """All tables of a study in one kind of motion; `notes` are put behind the captions of those of scores."""
+    grades, paper = builder.ours, read_paper()
+    scored = [*build_tables(builder), *outside_tables(builder, scores.rows)]
+    if builder.has_results("scaling"):
+        scored.append(scaling_table(builder))
+    captions = [(table.caption, parting_note(table.sections), *notes) for table in scored]
+    tables = [replace(t, caption=" ".join(filter(None, texts))) for t, texts in zip(scored, captions, strict=True)]
+    tables += [count_table(builder), *distance_tables(known)]
+    if builder.has_results("loeo"):
+        tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
+        tables.append(certainty_table(grades, known, paper))
+    if correlated := difficulty_table(difficulty, grades.metrics):
+        tables.append(correlated)
+    return tables
 
 
 def trainings_note(grades: StudyGrades) -> str:
@@ -188,7 +199,11 @@ def trainings_note(grades: StudyGrades) -> str:
 
 
 def _sentences(
-    grades: StudyGrades, distances: Distances, findings: Sequence[Finding], by_paper: Sequence[Finding]
+    grades: StudyGrades,
+    distances: Distances,
+    difficulty: Difficulty | None,
+    findings: Sequence[Finding],
+    by_paper: Sequence[Finding],
 ) -> list[str]:
     """The results in sentences, one for each question that was asked."""
     asked = [
@@ -197,7 +212,7 @@ def _sentences(
         *_adaptation_sentences(grades),
         *_distance_sentence(grades, distances),
         *_scaling_sentence(grades),
-        *_bodies_sentence(grades, distances),
+        *_bodies_sentence(difficulty),
     ]
     return [
         *([_answer_sentence(findings)] if findings else []),
@@ -325,16 +340,15 @@ def _scaling_sentence(grades: Grades) -> Iterator[str]:
         yield f"Training on {count} bodies beside the three robots changes LPIPS by {', '.join(parts)}."
 
 
-def _bodies_sentence(grades: StudyGrades, distances: Distances) -> Iterator[str]:
-    """How the error on bodies of the distance family goes with each of the paper's distances, and with the frozen frame's."""
-    if "lpips" not in grades.metrics:
+def _bodies_sentence(difficulty: Difficulty | None) -> Iterator[str]:
+    """How LPIPS on bodies of the distance family goes with each of the paper's distances, and with the frozen frame's."""
+    if difficulty is None:
         return
-    errors = body_errors(grades, distances, "lpips")
-    found = correlate_bodies(errors, grades.metrics["lpips"].higher_is_better)
+    errors = difficulty.errors
     parts = [
         f"with {axis} distance at r = {format_signed(result.r)} ({format_signed(result.low)} to {format_signed(result.high)}, "
         f"p = {result.p_value:.4f})"
-        for axis, result in found.items()
+        for axis, result in difficulty.correlations.items()
         if axis in AXES
     ]
     if parts:

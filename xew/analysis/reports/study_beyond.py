@@ -7,13 +7,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from xew.analysis.beyond import BodyCorrelation, body_errors, correlate_bodies, scaling_frame
+from xew.analysis.beyond import Difficulty, scaling_frame
 from xew.analysis.beyond.scaling import ALONE, GROUPS, WITH_ROBOTS
 from xew.analysis.reports import charts
 from xew.analysis.reports.charts import SERIES, Chart, Panel, Series
-from xew.analysis.statistics.grades import StudyGrades
 from xew.analysis.tables.builder import Builder
-from xew.analysis.tables.distances import AXIS_TITLES, Distances, format_signed
+from xew.analysis.tables.distances import AXIS_TITLES, format_signed
 from xew.analysis.tables.table import metric_title
 
 METRIC = "lpips"
@@ -21,17 +20,15 @@ METRIC = "lpips"
 KINDS = {WITH_ROBOTS: Series(WITH_ROBOTS, SERIES[0]), ALONE: Series(ALONE, SERIES[1])}
 
 
-def body_charts(builder: Builder, distances: Distances) -> dict[str, Chart]:
-    """Both charts by name, as far as there is something to draw."""
-    if not isinstance(builder.ours, StudyGrades) or METRIC not in builder.ours.metrics:
+def body_charts(builder: Builder, difficulty: Mapping[str, Difficulty]) -> dict[str, Chart]:
+    """Both charts by name, as far as there is something to draw; `difficulty` by metric."""
+    if METRIC not in builder.ours.metrics:
         return {}
     made = {}
     if builder.has_results("scaling"):
         made["scaling"] = scaling_chart(builder)
-    errors = body_errors(builder.ours, distances, METRIC)
-    found = correlate_bodies(errors, builder.ours.metrics[METRIC].higher_is_better)
-    if found:
-        made["bodies"] = difficulty_chart(errors, found, metric_title(builder.ours.metrics[METRIC]))
+    if difficulty[METRIC].correlations:
+        made["bodies"] = difficulty_chart(difficulty[METRIC], metric_title(builder.ours.metrics[METRIC]))
     return made
 
 
@@ -62,17 +59,16 @@ def _positions(counts: pd.Series) -> np.ndarray:
     return np.where(numbers > 0, np.log(np.maximum(numbers, 1)) / np.log(4), -1.0)
 
 
-def difficulty_chart(errors: pd.DataFrame, found: Mapping[str, BodyCorrelation], title: str) -> Chart:
-    """Error of one model on each body by the body's distance, a panel for each kind of distance."""
+def difficulty_chart(difficulty: Difficulty, title: str) -> Chart:
+    """Error of one model on each body by the body's distance, a panel for each kind of distance; `title` is the metric's."""
+    errors, heading = difficulty.errors, "mean distance to the robots of the training"
 
     def draw(axes: Axes, axis: str) -> None:
-        result, distance = found[axis], errors[axis].to_numpy(np.float64)
-        charts.points(
-            axes, distance, errors["value"].to_numpy(np.float64), "mean distance to the robots of the training", title
-        )
+        result = difficulty.correlations[axis]
+        charts.points(axes, errors[axis].to_numpy(np.float64), errors["value"].to_numpy(np.float64), heading, title)
         text = f"r = {format_signed(result.r)} ({format_signed(result.low)} to {format_signed(result.high)})"
         axes.text(0.02, 0.98, text, transform=axes.transAxes, va="top", fontsize=8)
 
-    panels = [Panel(AXIS_TITLES[axis], partial(draw, axis=axis)) for axis in found]
+    panels = [Panel(AXIS_TITLES[axis], partial(draw, axis=axis)) for axis in difficulty.correlations]
     caption = "One model on bodies that it has never seen, a point each; r with its 95 % interval over bodies."
     return Chart("bodies", caption, panels, errors.reset_index())
