@@ -34,6 +34,7 @@ from xew.analysis.reports import paper as paper_report
 from xew.analysis.reports import study as report_study
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study_charts import run_chart
+from xew.analysis.reports.study_text import missing_note
 from xew.analysis.scores import TRUTH, MetricInfo, Scores, find_missing_scores, read_scores
 from xew.analysis.statistics.summary import RobotTable, Row, finding, flat_summary, robot_table, robot_title
 from xew.analysis.tables import formats
@@ -195,7 +196,7 @@ def _report_scores(args: Args, scores: Scores) -> None:
     curves = _curve_chart(scores, args.held_out)
     sheets = [_contact_sheet(args.data, records)] if args.data and any(record.success for record in records) else []
     sections = [
-        *map(page.note, report_study.missing_note(missing)),
+        *map(page.note, missing_note(missing)),
         _held_out_section(held_out, scores.metrics),
         _strip_section(strips, args),
         page.section("How the error grows with time", page.chart(curves)) if curves.panels else None,
@@ -205,7 +206,7 @@ def _report_scores(args: Args, scores: Scores) -> None:
     ]
     sentences = finding(held_out, seen, scores.metrics)
     html = page.page(TITLE, sentences, [part for part in sections if part], _format_footer(scores.versions))
-    notes = [*report_study.missing_note(missing), *_caution_notes(held_out)]
+    notes = [*missing_note(missing), *_caution_notes(held_out)]
     text, files = _write_markdown(sentences, notes, held_out, seen, scores, [*strips, *sheets], chart_files(curves))
     if len(missing):
         files["missing.csv"] = csv_text(missing).encode()
