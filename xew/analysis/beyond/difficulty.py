@@ -48,7 +48,7 @@ class BodyCorrelation:
 
 @dataclass(frozen=True)
 class Difficulty:
-    """One metric on the bodies of the distance family."""
+    """One metric on the bodies of the wide family."""
 
     errors: pd.DataFrame
     """Table of `body_errors`."""
@@ -67,7 +67,7 @@ def find_difficulty(grades: StudyGrades, distances: Distances) -> dict[str, Diff
 
 
 def body_errors(grades: StudyGrades, distances: Distances, metric: str) -> pd.DataFrame:
-    """Errors of the model on each body of the distance family, with its distances; bodies that lack either are left out.
+    """Errors of the model on each body of the wide family, with its distances; bodies that lack either are left out.
 
     Args:
         grades: of the study.
@@ -80,7 +80,7 @@ def body_errors(grades: StudyGrades, distances: Distances, metric: str) -> pd.Da
     """
     trained = SPLITS[VARIANT.split].train_robots
     pairs = distances.pairs
-    both = pd.concat([pairs, pairs.rename(columns={"robot": "other", "other": "robot"})])
+    both = pd.concat([pairs, pairs.rename(columns={"robot": "other", "other": "robot"})])  # each is listed once
     chosen = both[both["robot"].isin(DISTANCE_BODIES) & both["other"].isin(trained)]
     by_axis = chosen.pivot_table(index="robot", columns="axis", values="value", aggfunc="mean")
     rows = {}
@@ -93,18 +93,18 @@ def body_errors(grades: StudyGrades, distances: Distances, metric: str) -> pd.Da
 
 
 def correlate_bodies(errors: pd.DataFrame, higher_is_better: bool) -> dict[str, BodyCorrelation]:
-    """Correlations of errors with distances by kind of distance; none for fewer than LEAST_BODIES bodies.
+    """Correlations of errors with distances by kind of distance; none of fewer than LEAST_BODIES bodies or of equal errors.
 
     Args:
         errors: table of `body_errors`.
         higher_is_better: of the metric; its sign is turned, so that a positive r always means that farther is worse.
     """
-    axes = [axis for axis in AXIS_TITLES if axis in errors and np.ptp(errors[axis]) > 0] if len(errors) >= LEAST_BODIES else []
     sign = -1.0 if higher_is_better else 1.0
-    score, frozen = sign * errors["value"].to_numpy(np.float64), sign * errors["frozen"].to_numpy(np.float64)
-    if not len(score) or np.ptp(score) == 0:
+    score, frozen = (sign * errors[name].to_numpy(np.float64) for name in ("value", "frozen"))
+    if len(errors) < LEAST_BODIES or np.ptp(score) == 0:
         return {}
-    found = {axis: _correlate(errors[axis].to_numpy(np.float64), score, frozen) for axis in axes}
+    distances = {axis: errors[axis].to_numpy(np.float64) for axis in AXIS_TITLES if axis in errors}
+    found = {axis: _correlate(distance, score, frozen) for axis, distance in distances.items() if np.ptp(distance) > 0}
     adjusted = holm([result.p_value for result in found.values()])
     return {axis: replace(result, p_value=float(p)) for (axis, result), p in zip(found.items(), adjusted, strict=True)}
 

@@ -1,6 +1,6 @@
 """Charts of what procedural bodies answer: the gap by number of training bodies, error by distance."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -17,7 +17,8 @@ from xew.analysis.tables.table import metric_title
 
 METRIC = "lpips"
 """Metric that both charts draw, the paper's primary outcome."""
-KINDS = {WITH_ROBOTS: Series(WITH_ROBOTS, SERIES[0]), ALONE: Series(ALONE, SERIES[1])}
+KINDS = {kind: Series(kind, color) for kind, color in zip((WITH_ROBOTS, ALONE), SERIES, strict=False)}
+"""Lines of the chart of scaling, by what a model was trained on."""
 
 
 def body_charts(builder: Builder, difficulty: Mapping[str, Difficulty]) -> dict[str, Chart]:
@@ -45,7 +46,7 @@ def scaling_chart(builder: Builder) -> Chart:
                 lines.append((style, _positions(chosen["bodies"]), chosen["value"].to_numpy(), band))
         charts.lines(axes, lines, "bodies in training, K", metric_title(builder.ours.metrics[METRIC]))
         counts = sorted(data["bodies"].unique())
-        axes.set_xticks(_positions(pd.Series(counts)), [str(count) for count in counts])
+        axes.set_xticks(_positions(counts), [str(count) for count in counts])
 
     panels = [Panel(title, partial(draw, robots=robots)) for robots, title in GROUPS.items() if robots in set(data["robots"])]
     caption = "What more bodies in training are worth, at equal numbers of steps. Bands: 95 % intervals over scenes."
@@ -53,10 +54,9 @@ def scaling_chart(builder: Builder) -> Chart:
     return Chart("scaling", caption, panels, data, used)
 
 
-def _positions(counts: pd.Series) -> np.ndarray:
-    """Places [n] of numbers of bodies on the axis: powers of four lie at equal distances, and 0 one before 1."""
-    numbers = counts.to_numpy(np.float64)
-    return np.where(numbers > 0, np.log(np.maximum(numbers, 1)) / np.log(4), -1.0)
+def _positions(counts: Sequence[int] | pd.Series) -> np.ndarray:
+    """Places [n] of numbers of bodies on the axis: powers of four lie at equal distances, and 0 one step before 1."""
+    return np.array([np.log(count) / np.log(4) if count else -1.0 for count in counts])
 
 
 def difficulty_chart(difficulty: Difficulty, title: str) -> Chart:

@@ -176,7 +176,7 @@ def _scaling_sentence(grades: Grades) -> Iterator[str]:
 
 
 def _bodies_sentence(difficulty: Difficulty | None) -> Iterator[str]:
-    """How LPIPS on bodies of the distance family goes with each of the paper's distances, and with the frozen frame's."""
+    """How LPIPS on bodies of the wide family goes with each of the paper's distances, and with the frozen frame's."""
     if difficulty is None:
         return
     errors = difficulty.errors
