@@ -118,7 +118,7 @@ def test_splits_with_bodies_count_what_they_should() -> None:
     trained = {key: len(split.train_robots) for key, split in SCALING.items()}
     assert sorted(trained.values()) == [3, 4, 7, 16, 19, 64, 67]
     for key, split in SCALING.items():
-        tested = 34 + 64 * (key == "scaling_seen")  # with the bodies of the distance protocol
+        tested = 34 + 64 * (key == "scaling_seen")  # with the wide family, for error against distance
         assert len(split.held_out_robots) == tested and set(HELD_OUT_ROBOTS) < set(split.held_out_robots)
         assert split_counts(split) == (1250 * len(split.train_robots), tested * 500)
     assert SCALING["scaling_seen"].held_out_robots[34:] == DISTANCE_BODIES

@@ -92,7 +92,7 @@ LOEO = {held_out: Split(tuple(r for r in ROBOT_NAMES if r != held_out), (held_ou
 """Leave-one-embodiment-out (LOEO): five folds, each named by the robot that it holds out."""
 
 TRAINING_BODIES = expand_robots(["body:0-63"])
-"""Procedural bodies that models may train on, in the order in which a scaling protocol takes them."""
+"""Procedural bodies that models may train on, in the order in which the scaling protocol takes them."""
 UNSEEN_BODIES = expand_robots(["body:64-95"])
 """Bodies that no model trains on; test episodes of theirs are graded."""
 VALIDATION_BODIES = expand_robots(["body:96-103"])
@@ -108,7 +108,7 @@ SCALING = {
     **{f"scaling_seen_bodies_{count}": Split((*SEEN_ROBOTS, *TRAINING_BODIES[:count]), _TESTED) for count in BODY_SCALES},
 }
 """The scaling protocol: the three robots, K bodies, or both; all are tested on Panda, PiPER and 32 unseen bodies. The model of
-the three robots alone is tested on 64 bodies of the wide family too, error against distance, so that it is trained once."""
+the three robots alone is tested on 64 bodies of the wide family, too: one training serves error against distance as well."""
 VALIDATION = Split(SEEN_ROBOTS, VALIDATION_BODIES)
 """The fixed split's training robots, with the bodies by which choices are made in place of the held-out robots."""
 
@@ -177,8 +177,8 @@ class Variant:
 
     @property
     def graded_robots(self) -> tuple[str, ...]:
-        """Robots whose test episodes it predicts: the five and bodies that its split trains on or holds out, but no training
-        body; after an adaptation the target and FORGETTING_ROBOT."""
+        """Robots whose test episodes it predicts: those of the five that its split has, then the bodies that it holds out;
+        after an adaptation FORGETTING_ROBOT and the target. Bodies that it trains on have no test episodes."""
         if self.target is not None:
             return FORGETTING_ROBOT, self.target
         split = SPLITS[self.split]
@@ -238,7 +238,7 @@ PARTS: dict[str, tuple[Variant, ...]] = {
         adaptation(target, shots, remedy) for remedy in ("replay", "lora") for target in HELD_OUT_ROBOTS for shots in SHOTS
     ),
     "more_systems": (system("bwm"),),
-    # Ours; of procedural bodies, which the paper does not have. The model is told of looks by the robot's render.
+    # Ours, with procedural bodies, which the paper does not have. All models get the robot's render at every frame.
     "scaling": tuple(reference(split, embodiment="robot_render") for split in SCALING),
     "bodies": (reference("scaling_seen", embodiment="robot_render"),),
 }

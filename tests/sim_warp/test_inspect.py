@@ -212,6 +212,13 @@ def test_visibility_is_counted_by_task_and_robot(data: Path, tmp_path: Path, ins
     assert code == 2 and "Choose another file with --visibility-page" in told
 
 
+def test_shapes_that_are_not_known_cannot_be_counted(data: Path, inspect: Inspect) -> None:
+    for folder, _ in read_headers(data)[0]:
+        edit_header(folder, source="elsewhere")
+    code, _, told = inspect(data, "--visibility")
+    assert code == 2 and "has no episode whose shapes are known" in told
+
+
 def test_what_is_seen_too_little_is_named_with_its_size() -> None:
     """The can has too few points in one of five frames, where it is 40 pixels large, with one robot of two."""
     robot, whole = Seen(np.full(20, 9), np.full(20, 500)), Seen(np.full(5, 4), np.full(5, 90))

@@ -34,6 +34,7 @@ from xew.analysis.reports import paper as paper_report
 from xew.analysis.reports import study as report_study
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study_charts import run_chart
+from xew.analysis.reports.study_text import missing_note
 from xew.analysis.scores import TRUTH, MetricInfo, Scores, find_missing_scores, read_scores
 from xew.analysis.statistics.summary import RobotTable, Row, finding, flat_summary, robot_table, robot_title
 from xew.analysis.tables import formats
@@ -195,7 +196,7 @@ def _report_scores(args: Args, scores: Scores) -> None:
     curves = _curve_chart(scores, args.held_out)
     sheets = [_contact_sheet(args.data, records)] if args.data and any(record.success for record in records) else []
     sections = [
-        *map(page.note, report_study.missing_note(missing)),
+        *map(page.note, missing_note(missing)),
         _held_out_section(held_out, scores.metrics),
         _strip_section(strips, args),
         page.section("How the error grows with time", page.chart(curves)) if curves.panels else None,
@@ -205,7 +206,7 @@ def _report_scores(args: Args, scores: Scores) -> None:
     ]
     sentences = finding(held_out, seen, scores.metrics)
     html = page.page(TITLE, sentences, [part for part in sections if part], _format_footer(scores.versions))
-    notes = [*report_study.missing_note(missing), *_caution_notes(held_out)]
+    notes = [*missing_note(missing), *_caution_notes(held_out)]
     text, files = _write_markdown(sentences, notes, held_out, seen, scores, [*strips, *sheets], chart_files(curves))
     if len(missing):
         files["missing.csv"] = csv_text(missing).encode()
@@ -272,11 +273,8 @@ def run_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> Table:
     found = " to ".join(map(str, sorted({min(table.counts, default=0), max(table.counts, default=0)})))
     of = f"{found} episodes" if table.expected is None else f"{found} of {table.expected} test episodes"
     named = {metric.name: metric for metric in metrics}
-    rows = [
-        TableRow((row.title,), tuple(_run_cell(row, metric, named) for metric in shown), row.model in BASELINES)
-        for row in table.rows
-    ]
-    sections = (TableSection("", tuple(rows), "" if table.complete else f"Incomplete: {of} are scored."),)
+    rows = tuple(_run_row(row, shown, named) for row in table.rows)
+    sections = (TableSection("", rows, "" if table.complete else f"Incomplete: {of} are scored."),)
     return Table(
         "_".join(table.robots),
         table.title,
@@ -287,10 +285,19 @@ def run_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> Table:
     )
 
 
-def _run_cell(row: Row, metric: MetricInfo, metrics: Mapping[str, MetricInfo]) -> TableCell:
-    """A mean with its mark; of a metric beside one of the suite strict, with a mark only where the two part."""
-    score, verdict = row.scores.get(metric.name), row.verdicts.get(metric.name, "")
-    parts = any(paper == metric.name for _, paper in find_parting(row.verdicts, metrics))
+def _run_row(row: Row, shown: Sequence[MetricInfo], metrics: Mapping[str, MetricInfo]) -> TableRow:
+    """A model's means with their marks; a metric beside one of the suite strict has a mark only where the two part."""
+    strict, parting = strict_metrics(metrics), {paper for _, paper in find_parting(row.verdicts, metrics)}
+    cells = []
+    for metric in shown:
+        word = row.verdicts.get(metric.name, "")
+        cells.append(_run_cell(row, metric, word * (metric.name not in strict), word * (metric.name in parting)))
+    return TableRow((row.title,), tuple(cells), row.model in BASELINES)
+
+
+def _run_cell(row: Row, metric: MetricInfo, verdict: str, parting: str) -> TableCell:
+    """A mean with the marks of a `TableCell`."""
+    score = row.scores.get(metric.name)
     if score is None:
         return TableCell()
     if row.model == TRUTH and metric.name == "psnr":
@@ -298,8 +305,8 @@ def _run_cell(row: Row, metric: MetricInfo, metrics: Mapping[str, MetricInfo]) -
     return TableCell(
         format_number(score.mean, metric),
         format_interval((score.low, score.high), metric),
-        verdict="" if metric.name in strict_metrics(metrics) else verdict,
-        parting=verdict if parts else "",
+        verdict=verdict,
+        parting=parting,
         value=score.mean,
         low=score.low,
         high=score.high,
@@ -452,16 +459,16 @@ def _write_markdown(
     """The text of report.md, and the files beside it."""
     told = [f"- {plain_markdown(sentence)}" for sentence in sentences]
     lines = [f"# {TITLE}", "", *told, *(f"\n> {plain_markdown(note)}" for note in notes)]
+    made: list[Table] = []
     for heading, tables in (("Robots never seen in training", held_out), ("Robots seen in training", seen)):
+        shown = [run_table(table, scores.metrics) for table in tables]
         lines += ["", f"## {heading}"]
-        for table in tables:
-            made = run_table(table, scores.metrics)
-            lines += ["", f"### {table.title}", "", made.caption, "", formats.markdown(made)]
+        lines += [line for t in shown for line in ("", f"### {t.title}", "", t.caption, "", formats.markdown(t))]
+        made += shown
     files = {figure.name: figure.image for figure in figures} | dict(charts)
     lines += ["", "## Figures", "", *(f"![{name}](figures/{name})" for name in files if name.endswith(".png"))]
-    made_tables = [run_table(table, scores.metrics) for table in (*held_out, *seen)]
-    written = {f"tables/{table.name}.tex": formats.latex(table).encode() for table in made_tables}
-    written |= {f"tables/{table.name}.csv": csv_text(formats.table_frame(table)).encode() for table in made_tables}
+    written = {f"tables/{table.name}.tex": formats.latex(table).encode() for table in made}
+    written |= {f"tables/{table.name}.csv": csv_text(formats.table_frame(table)).encode() for table in made}
     return "\n".join(lines) + "\n", written | {f"figures/{name}": content for name, content in files.items()}
 
 

@@ -124,14 +124,11 @@ def format_coverage(described: dict[str, Any]) -> str:
         for name, counts in described["variants"].items()
         if name in described["incomplete"]
     ]
+    count = len(described["variants"])
     if not lines:
-        return f"all {len(described['variants'])} variants are complete"
-    return "\n".join(
-        [
-            f"INCOMPLETE, {len(lines)} of {len(described['variants'])} variants lack scored episodes:",
-            *(f"  {line}" for line in lines),
-        ]
-    )
+        return f"all {count} variants are complete" if count > 1 else "the one variant is complete"
+    lacking = f"{len(lines)} of {count} variants lack" if count > 1 else "the one variant lacks"
+    return "\n".join([f"INCOMPLETE, {lacking} scored episodes:", *(f"  {line}" for line in lines)])
 
 
 if __name__ == "__main__":

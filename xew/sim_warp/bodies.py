@@ -3,12 +3,14 @@
 Reads  the designs of candidates, in numeric order
 Writes the catalog: for every body the number of its candidate, base poses and homes, so that loading one searches for nothing
 
-A candidate that fails the check is skipped: from some place both of its arms must follow the plans of eight tasks and two seeds
-each (`trials.trial_plans`), within the limits and speeds of its joints, at home each arm stays on its side, and on two further
-seeds of each task it succeeds in physics. A seed of paired data counts only where all robots succeed, so that one body that
-never does would cost all others theirs. Numbers that are known keep their bodies: a longer catalog begins like a shorter one.
-Bodies are written as they are found; the command goes on from there unless it is told to begin anew. With --recheck known
-bodies are checked in physics again, and those that fail are replaced by further candidates.
+A candidate is skipped unless it passes three checks. From some place both of its arms follow the plans of eight tasks and two
+seeds each (`trials.trial_plans`) within the limits and speeds of its joints; at home each arm stays on its side; and it
+succeeds in physics on two further seeds of each task. A seed of paired data counts only where all robots succeed, so that one
+body that never does would cost all others theirs.
+
+Numbers that are known keep their bodies: a longer catalog begins like a shorter one. Bodies are written as they are found; the
+command goes on from there unless it is told to begin anew. With --recheck known bodies are checked in physics again, and those
+that fail are replaced by further candidates.
 
 With --digest it prints SHA-256 digests of the URDF and meshes of each body of the catalog, and of all: two machines that print
 the same make the same bodies.
@@ -30,7 +32,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from xew.config import ConfigError, user_errors
-from xew.files import hold_lock, replacing
+from xew.files import hold_lock, write_bytes
 from xew.protocol import body_key
 from xew.sim_warp.devices.workers import Workers, find_device, quiet_warp
 from xew.sim_warp.embodiment.spec import RobotSpec
@@ -124,8 +126,10 @@ def gap_between_arms(robot: RobotSpec) -> float:
 
 
 def find_bodies(known: tuple[Entry, ...], count: int, workers: int) -> Iterator[tuple[int, Entry | str]]:
-    """Candidates after the known ones in numeric order, until `count` bodies are known; skipped ones with the reason. The first
-    `FIRST_FAMILY` bodies are of the first family of designs, all others of the wide one."""
+    """Candidates after the known ones in numeric order, until `count` bodies are known; skipped ones with the reason.
+
+    The first `FIRST_FAMILY` bodies are of the first family of designs, all others of the wide one.
+    """
     found = len(known)
     for first, end in ((0, min(FIRST_FAMILY, count)), (WIDE, count)):
         if found >= end:
@@ -147,12 +151,12 @@ def replace_failing(known: Sequence[Entry], workers: int) -> Iterator[tuple[int,
         compile_for_checks(pool)
         checked = pool.run(_check_entry, known)
         problems = dict(tqdm(checked, total=len(known), desc="check", unit="body"))
-    for first, numbers in ((0, range(FIRST_FAMILY)), (WIDE, range(FIRST_FAMILY, len(known)))):
-        family = [(number, known[number].candidate) for number in numbers if number < len(known)]
-        failing = [(number, problem) for number, candidate in family if (problem := problems[candidate])]
-        begin = 1 + max((candidate for _, candidate in family), default=first - 1)
-        works = ((n, entry) for n, entry in _try_in_order(count_from(begin), workers) if isinstance(entry, Entry))
-        for (number, problem), (_, entry) in zip(failing, works, strict=False):
+    numbered = list(enumerate(known))
+    for first, family in ((0, numbered[:FIRST_FAMILY]), (WIDE, numbered[FIRST_FAMILY:])):
+        failing = [(number, problem) for number, entry in family if (problem := problems[entry.candidate])]
+        begin = max([first, *(entry.candidate + 1 for _, entry in family)])
+        successors = (entry for _, entry in _try_in_order(count_from(begin), workers) if isinstance(entry, Entry))
+        for (number, problem), entry in zip(failing, successors, strict=False):  # successors have no end
             yield number, problem, entry
 
 
@@ -227,7 +231,7 @@ def fill_catalog(args: Args) -> None:
         for number, problem, entry in replace_failing(entries, args.workers):
             print(f"body:{number} is replaced by candidate {entry.candidate}: {problem}")
             entries[number] = entry
-            _write(args.out, entries)
+            write_bytes(args.out, catalog_text(entries).encode())
     with tqdm(total=args.count, initial=len(entries), desc="bodies", unit="body") as bar:
         for number, result in find_bodies(tuple(entries), args.count, args.workers):
             if isinstance(result, str):
@@ -235,14 +239,9 @@ def fill_catalog(args: Args) -> None:
                 bar.write(f"candidate {number} is skipped: {result}")
                 continue
             entries.append(result)
-            _write(args.out, entries)
+            write_bytes(args.out, catalog_text(entries).encode())
             bar.update()
     print(f"{args.out}: {len(entries)} bodies; {skipped} candidates were skipped")
-
-
-def _write(path: Path, entries: Sequence[Entry]) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(catalog_text(entries), encoding="utf-8", newline="\n")
 
 
 if __name__ == "__main__":

@@ -128,7 +128,13 @@ def main() -> None:
 def show_visibility(folders: list[Path], args: Args) -> None:
     """Print how much of robots and of what moves is seen, and write it into the page that is named."""
     kept = args.data.absolute().with_name(f"{args.data.absolute().name}-surfaces")
-    text = visibility_section(read_visibility(folders, kept if kept.is_dir() else None))
+    found = read_visibility(folders, kept if kept.is_dir() else None)
+    if not found:
+        raise EpisodeError(
+            f"{args.data} has no episode whose shapes are known, so nothing can be counted: all are imported, or of tasks, "
+            "scenes or robots that are not here."
+        )
+    text = visibility_section(found)
     print(text)
     if args.visibility_page:
         try:

@@ -16,7 +16,7 @@ from tests.synthetic import write_synthetic_data
 from xew.analysis.paper import read_paper
 from xew.analysis.report import Args, main
 from xew.analysis.reports import page
-from xew.analysis.reports.study import trainings_note
+from xew.analysis.reports.study_text import trainings_note
 from xew.analysis.scores import MetricInfo, read_scores
 from xew.analysis.statistics.grades import PaperGrades, StudyGrades
 from xew.analysis.tables import formats

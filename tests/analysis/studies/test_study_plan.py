@@ -22,6 +22,7 @@ from xew.analysis.studies.cost import (
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import ThisMachine
 from xew.analysis.studies.plan import Step, plan, sort_steps, source_digest, step_key
+from xew.analysis.study_analyse import format_coverage
 from xew.config import ConfigError
 from xew.protocol import PAPER_PARTS, PARTS, VARIANTS, expand_robots
 
@@ -93,6 +94,16 @@ def test_a_study_of_own_motion_makes_and_names_it(study: Study) -> None:
     variants = (VARIANTS["fixed-irasim"], VARIANTS["loeo_piper-optical_flow-nine_views"])
     assert [build_experiment(own, variant)["split"] for variant in variants] == ["fixed_own", "loeo_piper_own"]
     assert build_experiment(study, variants[0])["split"] == "fixed"
+
+
+def test_coverage_is_told_of_one_variant_and_of_many() -> None:
+    def said(names: str, incomplete: str = "") -> str:
+        variants = {name: {"expected": {"piper": 2}, "found": {"piper": 1}} for name in names}
+        return format_coverage({"variants": variants, "incomplete": list(incomplete)})
+
+    assert said("a") == "the one variant is complete" and said("ab") == "all 2 variants are complete"
+    assert said("a", "a") == "INCOMPLETE, the one variant lacks scored episodes:\n  a: piper 1 of 2"
+    assert said("ab", "b") == "INCOMPLETE, 1 of 2 variants lack scored episodes:\n  b: piper 1 of 2"
 
 
 BODIES, BODIES_DEBUG = CONFIGS / "study_bodies.yaml", CONFIGS / "study_bodies_debug.yaml"

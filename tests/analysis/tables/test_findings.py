@@ -9,7 +9,7 @@ import pytest
 
 from tests.analysis.synthetic_study import TASKS, attributes, paper_axes, write_study
 from xew.analysis.paper import read_paper
-from xew.analysis.reports.study import find_parting_claims, parting_sentence, pasting_sentence
+from xew.analysis.reports.study_text import find_parting_claims, parting_sentence, pasting_sentence
 from xew.analysis.scores import MetricInfo, Scores, read_scores
 from xew.analysis.statistics.grades import PaperGrades, StudyGrades
 from xew.analysis.statistics.suites import StrictGrades

@@ -208,10 +208,14 @@ def test_hostile_names_are_shown_and_run_nothing(tab: Tab, browser_tab: tuple[Ta
 
 def test_what_is_missing_is_told(tab: Tab, page: Path) -> None:
     (script,) = page.parent.glob("scenes/001*.js")
-    content = script.read_bytes()
-    script.unlink()
-    other = tab.context.new_page()
-    other.goto(f"{page.resolve().as_uri()}#place_empty_cup/1")
-    expect(other.get_by_role("alert")).to_contain_text("is missing; copy the page's whole folder")
-    other.close()
-    script.write_bytes(content)
+    script.rename(page.parent / "away.js")
+    try:
+        other = tab.context.new_page()
+        other.goto(f"{page.resolve().as_uri()}#place_empty_cup/1")
+        alert = other.get_by_role("alert")
+        alert.wait_for(timeout=10_000)
+        assert alert.inner_text() == (f"scenes/{script.name} is missing; copy the page's whole folder, or make the page again.")
+        assert other.locator("figure").count() == 0, "nothing of it is drawn"
+        other.close()
+    finally:
+        (page.parent / "away.js").rename(script)

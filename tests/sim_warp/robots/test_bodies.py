@@ -122,17 +122,34 @@ def test_a_body_that_fails_in_physics_is_told() -> None:
     assert problem == "place_empty_cup, seed 2: an arm pressed 2.8 mm into the table"
 
 
-def test_bodies_that_fail_are_replaced_and_all_others_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    def entry(number: int) -> Entry:
-        return Entry(number, (POSE, POSE), ((0.0,), (0.0,)))
+def entry(number: int) -> Entry:
+    return Entry(number, (POSE, POSE), ((0.0,), (0.0,)))
 
+
+@pytest.fixture
+def odd_numbers_are_too_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Families of three bodies, in which candidates 1 and 2 and the wide family's first fail in physics."""
     monkeypatch.setattr(Workers, "run", lambda self, function, jobs: map(function, reversed(jobs)))  # in any order
     monkeypatch.setattr(bodies, "FIRST_FAMILY", 3)
     monkeypatch.setattr(bodies, "find_failure", lambda known: "it falls" if known.candidate in (1, 2, WIDE) else None)
     monkeypatch.setattr(bodies, "try_candidate", lambda n: (n, "too short" if n % 2 else entry(n)))
+
+
+@pytest.mark.usefixtures("odd_numbers_are_too_short")
+def test_bodies_that_fail_are_replaced_and_all_others_stay() -> None:
     known = [entry(number) for number in (0, 1, 2, WIDE, WIDE + 1)]
     made = [(number, problem, entry.candidate) for number, problem, entry in bodies.replace_failing(known, 1)]
     assert made == [(1, "it falls", 4), (2, "it falls", 6), (3, "it falls", WIDE + 2)]
+
+
+@pytest.mark.usefixtures("odd_numbers_are_too_short")
+def test_a_catalog_that_was_checked_again_is_filled_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "catalog.json"
+    path.write_text(catalog_text([entry(0), entry(1)]))
+    bodies.fill_catalog(bodies.Args(count=4, recheck=True, workers=1, out=path))
+    assert path.read_text() == catalog_text([entry(number) for number in (0, 2, 4, WIDE)])
+    out = capsys.readouterr().out
+    assert "body:1 is replaced by candidate 2: it falls" in out and "candidate 3 is skipped: too short" in out
 
 
 def test_a_catalog_is_read_as_it_was_written(tmp_path: Path) -> None:

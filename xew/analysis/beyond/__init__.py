@@ -5,16 +5,17 @@ model on many bodies with how far these are from the robots that it was trained 
 motion beside the same study in motion of each robot's own. `reports/study_beyond.py` draws them.
 """
 
-from xew.analysis.beyond.difficulty import BodyCorrelation, body_errors, correlate_bodies, difficulty_table
+from xew.analysis.beyond.difficulty import Difficulty, body_errors, correlate_bodies, difficulty_table, find_difficulty
 from xew.analysis.beyond.motion import Motions, motion_table
 from xew.analysis.beyond.scaling import scaling_frame, scaling_table
 
 __all__ = [
-    "BodyCorrelation",
+    "Difficulty",
     "Motions",
     "body_errors",
     "correlate_bodies",
     "difficulty_table",
+    "find_difficulty",
     "motion_table",
     "scaling_frame",
     "scaling_table",

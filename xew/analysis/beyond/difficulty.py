@@ -5,15 +5,15 @@ body's pictures are by themselves shows in the frozen first frame, which learned
 model's, and the partial correlation says what is left of the model's once that is taken out.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from scipy.stats import BootstrapMethod, PermutationMethod, pearsonr, spearmanr
+from scipy.stats import BootstrapMethod, PermutationMethod, pearsonr
 
 from xew.analysis.paper import PAPER_TITLES
-from xew.analysis.scores import COPY
+from xew.analysis.scores import COPY, MetricInfo
 from xew.analysis.statistics.grades import StudyGrades
 from xew.analysis.tables.distances import AXIS_TITLES, Distances, format_signed
 from xew.analysis.tables.labels import PAPER_METRICS
@@ -38,7 +38,6 @@ class BodyCorrelation:
     """Upper end."""
     p_value: float
     """Two-sided, by permutation of the bodies, corrected by Holm for the kinds of distance."""
-    spearman: float
     frozen: float
     """Pearson's r of distance with the error of the frozen first frame; NaN where that was not graded or does not vary."""
     partial: float
@@ -47,8 +46,28 @@ class BodyCorrelation:
     """Number of bodies."""
 
 
+@dataclass(frozen=True)
+class Difficulty:
+    """One metric on the bodies of the wide family."""
+
+    errors: pd.DataFrame
+    """Table of `body_errors`."""
+    correlations: Mapping[str, BodyCorrelation]
+    """Correlations by kind of distance; none where bodies are too few."""
+
+
+def find_difficulty(grades: StudyGrades, distances: Distances) -> dict[str, Difficulty]:
+    """How each reported metric goes with distance over bodies, by the metric's key."""
+    found = {}
+    for name, metric in grades.metrics.items():
+        if name in PAPER_METRICS or metric.reported:
+            errors = body_errors(grades, distances, name)
+            found[name] = Difficulty(errors, correlate_bodies(errors, metric.higher_is_better))
+    return found
+
+
 def body_errors(grades: StudyGrades, distances: Distances, metric: str) -> pd.DataFrame:
-    """Errors of the model on each body of the distance family, with its distances; bodies that lack either are left out.
+    """Errors of the model on each body of the wide family, with its distances; bodies that lack either are left out.
 
     Args:
         grades: of the study.
@@ -61,7 +80,7 @@ def body_errors(grades: StudyGrades, distances: Distances, metric: str) -> pd.Da
     """
     trained = SPLITS[VARIANT.split].train_robots
     pairs = distances.pairs
-    both = pd.concat([pairs, pairs.rename(columns={"robot": "other", "other": "robot"})])
+    both = pd.concat([pairs, pairs.rename(columns={"robot": "other", "other": "robot"})])  # each is listed once
     chosen = both[both["robot"].isin(DISTANCE_BODIES) & both["other"].isin(trained)]
     by_axis = chosen.pivot_table(index="robot", columns="axis", values="value", aggfunc="mean")
     rows = {}
@@ -74,18 +93,18 @@ def body_errors(grades: StudyGrades, distances: Distances, metric: str) -> pd.Da
 
 
 def correlate_bodies(errors: pd.DataFrame, higher_is_better: bool) -> dict[str, BodyCorrelation]:
-    """Correlations of errors with distances by kind of distance; none for fewer than LEAST_BODIES bodies.
+    """Correlations of errors with distances by kind of distance; none of fewer than LEAST_BODIES bodies or of equal errors.
 
     Args:
         errors: table of `body_errors`.
         higher_is_better: of the metric; its sign is turned, so that a positive r always means that farther is worse.
     """
-    axes = [axis for axis in AXIS_TITLES if axis in errors and np.ptp(errors[axis]) > 0] if len(errors) >= LEAST_BODIES else []
     sign = -1.0 if higher_is_better else 1.0
-    score, frozen = sign * errors["value"].to_numpy(np.float64), sign * errors["frozen"].to_numpy(np.float64)
-    if not len(score) or np.ptp(score) == 0:
+    score, frozen = (sign * errors[name].to_numpy(np.float64) for name in ("value", "frozen"))
+    if len(errors) < LEAST_BODIES or np.ptp(score) == 0:
         return {}
-    found = {axis: _correlate(errors[axis].to_numpy(np.float64), score, frozen) for axis in axes}
+    distances = {axis: errors[axis].to_numpy(np.float64) for axis in AXIS_TITLES if axis in errors}
+    found = {axis: _correlate(distance, score, frozen) for axis, distance in distances.items() if np.ptp(distance) > 0}
     adjusted = holm([result.p_value for result in found.values()])
     return {axis: replace(result, p_value=float(p)) for (axis, result), p in zip(found.items(), adjusted, strict=True)}
 
@@ -99,26 +118,25 @@ def _correlate(distance: np.ndarray, score: np.ndarray, frozen: np.ndarray) -> B
     if np.isfinite(frozen).all() and np.ptp(frozen) > 0:
         with_frozen, between = float(pearsonr(distance, frozen).statistic), float(pearsonr(score, frozen).statistic)
         partial = (r - with_frozen * between) / np.sqrt((1 - with_frozen**2) * (1 - between**2))
-    spearman = float(spearmanr(distance, score).statistic)
     low, high = map(float, interval)
-    return BodyCorrelation(r, low, high, float(result.pvalue), spearman, with_frozen, float(partial), len(score))
+    return BodyCorrelation(r, low, high, float(result.pvalue), with_frozen, float(partial), len(score))
 
 
-def difficulty_table(grades: StudyGrades, distances: Distances) -> Table | None:
-    """Correlation of each metric with each kind of distance over bodies; None where too few bodies were graded."""
-    shown = [metric for metric in grades.metrics if metric in PAPER_METRICS or grades.metrics[metric].reported]
-    found = {
-        metric: correlate_bodies(body_errors(grades, distances, metric), grades.metrics[metric].higher_is_better)
-        for metric in shown
-    }
-    axes = [axis for axis in AXIS_TITLES if any(axis in results for results in found.values())]
+def difficulty_table(found: Mapping[str, Difficulty], metrics: Mapping[str, MetricInfo]) -> Table | None:
+    """Correlation of each metric with each kind of distance over bodies; None where bodies are too few.
+
+    Args:
+        found: of `find_difficulty`.
+        metrics: of the study, by key.
+    """
+    axes = [axis for axis in AXIS_TITLES if any(axis in one.correlations for one in found.values())]
     if not axes:
         return None
     rows = []
-    for metric in shown:
-        cells = [cell for axis in axes for cell in _cells(found[metric].get(axis))]
-        rows.append(TableRow((PAPER_TITLES.get(metric, grades.metrics[metric].title),), tuple(cells)))
-    count = max(result.bodies for results in found.values() for result in results.values())
+    for metric, one in found.items():
+        cells = [cell for axis in axes for cell in _cells(one.correlations.get(axis))]
+        rows.append(TableRow((PAPER_TITLES.get(metric, metrics[metric].title),), tuple(cells)))
+    count = max(result.bodies for one in found.values() for result in one.correlations.values())
     heads = ("r", "p", "frozen", "partial")
     return Table(
         "bodies",

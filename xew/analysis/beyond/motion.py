@@ -5,33 +5,22 @@ tool paths that it knew.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
 from xew.analysis.scores import TRAINING, TRUTH, VARIANT, MetricInfo, Scores, name_graded
-from xew.analysis.statistics.grades import SEEN, StudyGrades
-from xew.analysis.statistics.summary import ROBOT_TITLES
-from xew.analysis.tables.labels import ACTIONS, SEEN_TITLE
-from xew.analysis.tables.table import (
-    Column,
-    Table,
-    TableCell,
-    TableRow,
-    TableSection,
-    format_interval,
-    format_number,
-    metric_title,
-)
+from xew.analysis.statistics.grades import StudyGrades, pooled
+from xew.analysis.tables.builder import mean_cell
+from xew.analysis.tables.labels import ACTIONS, GROUP_TITLES
+from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, metric_title
 from xew.config import ConfigError
-from xew.protocol import HELD_OUT_ROBOTS, MOTIONS, OWN_MOTION, SEEN_ROBOTS, SHARED_MOTION, reference
-from xew.statistics import Mean, combine, noise_floor, strict_metrics, verdict
+from xew.protocol import MOTIONS, OWN_MOTION, SHARED_MOTION, reference
+from xew.statistics import LEVEL, Mean, combine, noise_floor, strict_metrics, verdict
 
 METRICS = ("lpips", "mask_iou", "pck")
 """Metrics of the table, one of each dimension that it can tell apart; a metric of the suite strict stands for the paper's."""
-GROUPS = {SEEN: SEEN_ROBOTS, **{robot: (robot,) for robot in HELD_OUT_ROBOTS}}
-"""Robots that are graded together."""
-TITLES = {SEEN: SEEN_TITLE, **{robot: f"Held-out {ROBOT_TITLES[robot]}" for robot in HELD_OUT_ROBOTS}}
 CELL = ["task", "seed", "robot"]
 
 
@@ -61,14 +50,18 @@ class Motions:
         axes: Mapping[str, np.ndarray] = {}
         self._grades = StudyGrades(pd.concat(rows, ignore_index=True), tuple(self.metrics.values()), axes)
 
-    def mean(self, motion: str, action: str, robots: Sequence[str], metric: str) -> Mean | None:
-        """The mean of an action representation's model on some robots in a kind of motion; None where it was not graded."""
-        return self._grades.variant_mean(_named(reference(action=action).name, motion), tuple(robots), metric)
+    def mean(self, motion: str, action: str, robots: str, metric: str) -> Mean | None:
+        """The mean of an action representation's model on some robots in a kind of motion; None where it was not graded.
 
-    def floor(self, robots: Sequence[str], metric: str) -> float:
+        Robots are a key of GROUP_TITLES.
+        """
+        variant = reference(action=action)
+        return self._grades.variant_mean(_named(variant.name, motion), pooled(variant, robots), metric)
+
+    def floor(self, robots: str, metric: str) -> float:
         """The larger of both noise floors, by the truth through codecs where it was graded; NaN where one is not known."""
         info, names = self.metrics[metric], self._grades.codec_truths or [_named(TRUTH, motion) for motion in MOTIONS]
-        truths = [self._grades.variant_mean(name, tuple(robots), metric) for name in names]
+        truths = [self._grades.variant_mean(name, pooled(reference(), robots), metric) for name in names]
         return float(np.max([noise_floor(mean.value if mean else None, info.best, info.estimated) for mean in truths]))
 
 
@@ -77,10 +70,10 @@ def motion_table(motions: Motions) -> Table:
     strict = strict_metrics(motions.metrics)
     shown = [name for metric in METRICS if (name := strict.get(metric, metric)) in motions.metrics]
 
-    def row(action: str, robots: Sequence[str]) -> TableRow:
+    def row(action: str, robots: str) -> TableRow:
         return TableRow((ACTIONS[action],), tuple(c for metric in shown for c in _cells(motions, action, robots, metric)))
 
-    sections = [TableSection(TITLES[name], tuple(row(action, robots) for action in ACTIONS)) for name, robots in GROUPS.items()]
+    sections = [TableSection(title, tuple(row(action, name) for action in ACTIONS)) for name, title in GROUP_TITLES.items()]
     return Table(
         "motion",
         "Action representation in shared and in own motion",
@@ -92,26 +85,16 @@ def motion_table(motions: Motions) -> Table:
     )
 
 
-def _cells(motions: Motions, action: str, robots: Sequence[str], metric: str) -> Sequence[TableCell]:
+def _cells(motions: Motions, action: str, robots: str, metric: str) -> Sequence[TableCell]:
     """The scores in shared and in own motion, the latter with the verdict on their difference."""
+    info = motions.metrics[metric]
     means = [motions.mean(motion, action, robots, metric) for motion in (SHARED_MOTION, OWN_MOTION)]
-    shared, own = (_cell(mean, motions.metrics[metric]) for mean in means)
+    shared, own = (mean_cell(mean, info, LEVEL) if mean else TableCell() for mean in means)
     if means[0] is None or means[1] is None:
         return shared, own
     difference = combine(np.subtract, means[1], means[0])
-    ends, floor = difference.interval(), motions.floor(robots, metric)
-    mark = verdict(difference.value, ends, floor, motions.metrics[metric].higher_is_better)
-    return shared, TableCell(
-        own.text, own.interval, verdict=mark, value=own.value, low=own.low, high=own.high, episodes=own.episodes
-    )
-
-
-def _cell(mean: Mean | None, metric: MetricInfo) -> TableCell:
-    if mean is None:
-        return TableCell()
-    ends = mean.interval()
-    text = format_number(mean.value, metric), format_interval(ends, metric)
-    return TableCell(*text, value=mean.value, low=ends[0], high=ends[1], episodes=mean.count)
+    mark = verdict(difference.value, difference.interval(), motions.floor(robots, metric), info.higher_is_better)
+    return shared, replace(own, verdict=mark)
 
 
 def _named(name: str, motion: str) -> str:

@@ -1,13 +1,12 @@
 """Scores of robots that no model has seen, by the number of bodies that it was trained on."""
 
-import numpy as np
 import pandas as pd
 
 from xew.analysis.statistics.grades import BODIES, find_variant, pooled
-from xew.analysis.statistics.summary import ROBOT_TITLES
-from xew.analysis.tables.builder import Builder
+from xew.analysis.tables.builder import Builder, interval_ends
+from xew.analysis.tables.labels import HELD_OUT_TITLES
 from xew.analysis.tables.table import Table, TableSection, metric_columns
-from xew.protocol import BODY_SCALES, HELD_OUT_ROBOTS
+from xew.protocol import BODY_SCALES
 
 PART = "scaling"
 BASE = "scaling_seen"
@@ -19,7 +18,7 @@ ROWS = {
     **{f"scaling_bodies_{count}": (ALONE, count) for count in BODY_SCALES},
 }
 """Rows of the part, with what a model was trained on and the number of bodies (K)."""
-GROUPS = {**{robot: f"Held-out {ROBOT_TITLES[robot]}" for robot in HELD_OUT_ROBOTS}, BODIES: "Bodies that no model has seen"}
+GROUPS = {**HELD_OUT_TITLES, BODIES: "Bodies that no model has seen"}
 """Titles of the robots that are graded."""
 
 
@@ -56,6 +55,5 @@ def scaling_frame(builder: Builder, metric: str) -> pd.DataFrame:
         for key, (kind, count) in ROWS.items():
             mean = builder.ours.mean(PART, key, robots, metric, shared=True)
             if mean is not None:
-                low, high = mean.interval(builder.ours.level) if mean.scenes is not None else (np.nan, np.nan)
-                rows.append((robots, kind, count, mean.value, low, high))
+                rows.append((robots, kind, count, mean.value, *interval_ends(mean, builder.ours.level)))
     return pd.DataFrame(rows, columns=["robots", "trained_on", "bodies", "value", "low", "high"])

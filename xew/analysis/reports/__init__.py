@@ -1,3 +1,3 @@
-"""One offline page from score tables: its sections, charts, pictures and HTML."""
+"""One offline page from score tables: its sections, sentences, charts, pictures and HTML."""
 
-__all__ = ["charts", "page", "paper", "pictures", "study", "study_charts", "study_strips"]
+__all__ = ["charts", "page", "paper", "pictures", "study", "study_beyond", "study_charts", "study_strips", "study_text"]

@@ -1,37 +1,35 @@
 """Charts of what procedural bodies answer: the gap by number of training bodies, error by distance."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from xew.analysis.beyond import BodyCorrelation, body_errors, correlate_bodies, scaling_frame
+from xew.analysis.beyond import Difficulty, scaling_frame
 from xew.analysis.beyond.scaling import ALONE, GROUPS, WITH_ROBOTS
 from xew.analysis.reports import charts
 from xew.analysis.reports.charts import SERIES, Chart, Panel, Series
-from xew.analysis.statistics.grades import StudyGrades
 from xew.analysis.tables.builder import Builder
-from xew.analysis.tables.distances import AXIS_TITLES, Distances, format_signed
+from xew.analysis.tables.distances import AXIS_TITLES, format_signed
 from xew.analysis.tables.table import metric_title
 
 METRIC = "lpips"
 """Metric that both charts draw, the paper's primary outcome."""
-KINDS = {WITH_ROBOTS: Series(WITH_ROBOTS, SERIES[0]), ALONE: Series(ALONE, SERIES[1])}
+KINDS = {kind: Series(kind, color) for kind, color in zip((WITH_ROBOTS, ALONE), SERIES, strict=False)}
+"""Lines of the chart of scaling, by what a model was trained on."""
 
 
-def body_charts(builder: Builder, distances: Distances) -> dict[str, Chart]:
-    """Both charts by name, as far as there is something to draw."""
-    if not isinstance(builder.ours, StudyGrades) or METRIC not in builder.ours.metrics:
+def body_charts(builder: Builder, difficulty: Mapping[str, Difficulty]) -> dict[str, Chart]:
+    """Both charts by name, as far as there is something to draw; `difficulty` by metric."""
+    if METRIC not in builder.ours.metrics:
         return {}
     made = {}
     if builder.has_results("scaling"):
         made["scaling"] = scaling_chart(builder)
-    errors = body_errors(builder.ours, distances, METRIC)
-    found = correlate_bodies(errors, builder.ours.metrics[METRIC].higher_is_better)
-    if found:
-        made["bodies"] = difficulty_chart(errors, found, metric_title(builder.ours.metrics[METRIC]))
+    if difficulty[METRIC].correlations:
+        made["bodies"] = difficulty_chart(difficulty[METRIC], metric_title(builder.ours.metrics[METRIC]))
     return made
 
 
@@ -48,7 +46,7 @@ def scaling_chart(builder: Builder) -> Chart:
                 lines.append((style, _positions(chosen["bodies"]), chosen["value"].to_numpy(), band))
         charts.lines(axes, lines, "bodies in training, K", metric_title(builder.ours.metrics[METRIC]))
         counts = sorted(data["bodies"].unique())
-        axes.set_xticks(_positions(pd.Series(counts)), [str(count) for count in counts])
+        axes.set_xticks(_positions(counts), [str(count) for count in counts])
 
     panels = [Panel(title, partial(draw, robots=robots)) for robots, title in GROUPS.items() if robots in set(data["robots"])]
     caption = "What more bodies in training are worth, at equal numbers of steps. Bands: 95 % intervals over scenes."
@@ -56,23 +54,21 @@ def scaling_chart(builder: Builder) -> Chart:
     return Chart("scaling", caption, panels, data, used)
 
 
-def _positions(counts: pd.Series) -> np.ndarray:
-    """Places [n] of numbers of bodies on the axis: powers of four lie at equal distances, and 0 one before 1."""
-    numbers = counts.to_numpy(np.float64)
-    return np.where(numbers > 0, np.log(np.maximum(numbers, 1)) / np.log(4), -1.0)
+def _positions(counts: Sequence[int] | pd.Series) -> np.ndarray:
+    """Places [n] of numbers of bodies on the axis: powers of four lie at equal distances, and 0 one step before 1."""
+    return np.array([np.log(count) / np.log(4) if count else -1.0 for count in counts])
 
 
-def difficulty_chart(errors: pd.DataFrame, found: Mapping[str, BodyCorrelation], title: str) -> Chart:
-    """Error of one model on each body by the body's distance, a panel for each kind of distance."""
+def difficulty_chart(difficulty: Difficulty, title: str) -> Chart:
+    """Error of one model on each body by the body's distance, a panel for each kind of distance; `title` is the metric's."""
+    errors, heading = difficulty.errors, "mean distance to the robots of the training"
 
     def draw(axes: Axes, axis: str) -> None:
-        result, distance = found[axis], errors[axis].to_numpy(np.float64)
-        charts.points(
-            axes, distance, errors["value"].to_numpy(np.float64), "mean distance to the robots of the training", title
-        )
+        result = difficulty.correlations[axis]
+        charts.points(axes, errors[axis].to_numpy(np.float64), errors["value"].to_numpy(np.float64), heading, title)
         text = f"r = {format_signed(result.r)} ({format_signed(result.low)} to {format_signed(result.high)})"
         axes.text(0.02, 0.98, text, transform=axes.transAxes, va="top", fontsize=8)
 
-    panels = [Panel(AXIS_TITLES[axis], partial(draw, axis=axis)) for axis in found]
+    panels = [Panel(AXIS_TITLES[axis], partial(draw, axis=axis)) for axis in difficulty.correlations]
     caption = "One model on bodies that it has never seen, a point each; r with its 95 % interval over bodies."
     return Chart("bodies", caption, panels, errors.reset_index())

@@ -14,7 +14,7 @@ from xew.analysis.reports.charts import SERIES, SOFT, Chart, Panel, Series
 from xew.analysis.scores import COPY, TRUTH, VARIANT, MetricInfo
 from xew.analysis.statistics.grades import Grades, PaperGrades, find_variant, relative_gain
 from xew.analysis.statistics.summary import ROBOT_TITLES
-from xew.analysis.tables.builder import Builder
+from xew.analysis.tables.builder import Builder, interval_ends
 from xew.analysis.tables.distances import AXIS_TITLES, Distances
 from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, SHORT_ROBOTS
 from xew.analysis.tables.table import metric_title
@@ -271,4 +271,4 @@ def _relative_gain(grades: Grades | PaperGrades, part: str, row: str, base: str,
 def _mean_and_ends(mean: Mean | None, level: float) -> tuple[float, float, float]:
     if mean is None:
         return np.nan, np.nan, np.nan
-    return mean.value, *(mean.interval(level) if mean.scenes is not None else (np.nan, np.nan))
+    return mean.value, *interval_ends(mean, level)

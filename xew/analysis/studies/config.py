@@ -204,13 +204,13 @@ class Study:
 
     @property
     def trained_robots(self) -> tuple[str, ...]:
-        """Robots that have training episodes: of the five all, so that parts may be added, and bodies that are asked for."""
+        """Robots that have training episodes: of the five all, so that parts may be added; bodies that a variant trains on."""
         asked = {robot for variant in self.planned_variants for robot in SPLITS[variant.split].train_robots}
         return tuple(robot for robot in self.robot_keys if robot in ROBOT_NAMES or robot in asked)
 
     @property
     def graded_robots(self) -> tuple[str, ...]:
-        """Robots that have test episodes: likewise."""
+        """Robots that have test episodes: of the five all; bodies that a variant is graded on."""
         asked = {robot for variant in self.planned_variants for robot in self.graded_counts(variant)}
         return tuple(robot for robot in self.robot_keys if robot in ROBOT_NAMES or robot in asked)
 

@@ -104,23 +104,17 @@ def _plan_generate(study: Study) -> Step:
     tasks = ("--tasks", *study.tasks) if study.tasks else ()
     seeds = ("--train-seeds", str(study.train_seeds), "--test-seeds", str(study.test_seeds))
     motion = () if study.motion == SHARED_MOTION else ("--motion", study.motion)
-    robots: tuple[str, ...] = ("--robots", *study.trained_robots)
-    if study.graded_robots != study.trained_robots:
-        robots += ("--test-robots", *study.graded_robots)
-    asked = (*tasks, *robots, *seeds, *motion, *study.generate)
+    robots = dict.fromkeys((study.trained_robots, study.graded_robots))  # once where all are both trained on and graded
+    named = tuple(text for option, keys in zip(("--robots", "--test-robots"), robots, strict=False) for text in (option, *keys))
+    asked = (*tasks, *named, *seeds, *motion, *study.generate)
     return Step(
         "generate",
         "",
         ("xew.sim_warp.generate", "--out", str(study.data_folder), *asked),
         needs=(),
-        inputs=[SCHEMA_VERSION, study.tasks, *_robot_inputs(study), study.train_seeds, study.test_seeds, *motion],
+        inputs=[SCHEMA_VERSION, study.tasks, *robots, study.train_seeds, study.test_seeds, *motion],
         product=study.data_folder,
     )
-
-
-def _robot_inputs(study: Study) -> list[tuple[str, ...]]:
-    """The robots of a study's episodes: once where all have training and test episodes."""
-    return list(dict.fromkeys([study.trained_robots, study.graded_robots]))
 
 
 def _plan_latents(study: Study, variant: Variant, experiment: Settings, first: str) -> Step:

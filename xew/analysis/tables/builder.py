@@ -2,11 +2,12 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from xew import statistics
-from xew.analysis.scores import TRUTH
+from xew.analysis.scores import TRUTH, MetricInfo
 from xew.analysis.statistics.grades import Grades, PaperGrades, StudyGrades, find_variant, pooled
 from xew.analysis.tables.labels import PAPER_METRICS, TRUE
 from xew.analysis.tables.table import TableCell, TableRow, format_interval, format_number
@@ -18,7 +19,7 @@ from xew.protocol import (
     expected_counts,
     reference,
 )
-from xew.statistics import Mean, find_parting, strict_metrics
+from xew.statistics import Mean, strict_metrics
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,10 @@ class Builder:
         """Metrics of the full tables: the paper's suite, and whatever else the scores ask to be shown."""
         return tuple(name for name, info in self.ours.metrics.items() if name in PAPER_METRICS or info.reported)
 
+    @cached_property
+    def _strict(self) -> dict[str, str]:
+        return strict_metrics(self.ours.metrics)
+
     def has_results(self, part: str) -> bool:
         """Whether anything was measured that only this part asks for; models that comparisons start from do not count."""
         if not isinstance(self.ours, StudyGrades):
@@ -61,19 +66,9 @@ class Builder:
         printed = self._printed_cell(part, row, robots, metric)
         if info is None or mean is None:
             return printed
-        ends = _interval_ends(mean, self.ours.level)
         verdict, parting = self._marks(part, row, base, robots, metric)
-        return replace(
-            printed,
-            text=format_number(mean.value, info),
-            interval=format_interval(ends, info),
-            verdict=verdict,
-            parting=parting,
-            value=mean.value,
-            low=ends[0],
-            high=ends[1],
-            episodes=mean.count,
-        )
+        own = mean_cell(mean, info, self.ours.level)
+        return replace(own, verdict=verdict, parting=parting, published=printed.published, printed=printed.printed)
 
     def _marks(self, part: str, row: str, base: str, robots: str, metric: str) -> tuple[str, str]:
         """Verdict on the difference from the row `base`, and `TableCell.parting`.
@@ -82,12 +77,12 @@ class Builder:
         """
         if not base or base == row:
             return "", ""
-        strict = strict_metrics(self.ours.metrics).get(metric)
-        asked = {name: paired_verdict(self.ours, part, row, base, robots, name) for name in (metric, strict) if name}
+        own = paired_verdict(self.ours, part, row, base, robots, metric)
+        strict = self._strict.get(metric)
         if strict is None:
-            return asked[metric], ""
-        found = {name: word for name, word in asked.items() if word}
-        return "", asked[metric] if find_parting(found, self.ours.metrics) else ""
+            return own, ""
+        decides = paired_verdict(self.ours, part, row, base, robots, strict)
+        return "", own if own and decides and own != decides else ""
 
     def row(self, part: str, row: str, robots: str, metrics: Sequence[str], labels: Sequence[str], base: str = "") -> TableRow:
         """One cell for each metric."""
@@ -154,15 +149,7 @@ class Builder:
             return TableCell()
         if model == TRUTH and metric == "psnr":
             return TableCell("exact", episodes=mean.count)
-        ends = _interval_ends(mean, self.ours.level)
-        return TableCell(
-            format_number(mean.value, info),
-            format_interval(ends, info),
-            value=mean.value,
-            low=ends[0],
-            high=ends[1],
-            episodes=mean.count,
-        )
+        return mean_cell(mean, info, self.ours.level)
 
     def _printed_cell(self, part: str, row: str, robots: str, metric: str) -> TableCell:
         text = self.paper.print(part, row, robots, metric) if self.paper else ""
@@ -183,6 +170,13 @@ def paired_verdict(grades: Grades, part: str, row: str, base: str, robots: str, 
     return statistics.verdict(difference.value, difference.interval(grades.level), floor, info.higher_is_better)
 
 
-def _interval_ends(mean: Mean, level: float) -> tuple[float, float]:
+def mean_cell(mean: Mean, metric: MetricInfo, level: float) -> TableCell:
+    """A mean and its interval at this level."""
+    ends = interval_ends(mean, level)
+    text, between = format_number(mean.value, metric), format_interval(ends, metric)
+    return TableCell(text, between, value=mean.value, low=ends[0], high=ends[1], episodes=mean.count)
+
+
+def interval_ends(mean: Mean, level: float) -> tuple[float, float]:
     """Ends of a mean's interval; NaN where there are too few scenes, or where none is known (the paper)."""
     return mean.interval(level) if mean.scenes is not None else (np.nan, np.nan)

@@ -4,10 +4,10 @@ They live on the entries of the registries. What a registry does not hold is sho
 """
 
 from xew.analysis.paper import PAPER_TITLES
-from xew.analysis.statistics.grades import REFERENCE
+from xew.analysis.statistics.grades import REFERENCE, SEEN
 from xew.model.conditions import ACTIONS as REPRESENTATIONS
 from xew.model.conditions import CONDITIONS
-from xew.protocol import PARTS, SEEN_ROBOTS
+from xew.protocol import HELD_OUT_ROBOTS, PARTS, SEEN_ROBOTS
 from xew.sim_warp.robots import ROBOTS
 
 PAPER_METRICS = tuple(PAPER_TITLES)
@@ -16,6 +16,10 @@ SHORT_ROBOTS = {key: robot.label for key, robot in ROBOTS.items()}
 """Label of each robot by its key."""
 SEEN_TITLE = "Seen pool: {}, {} and {}".format(*(ROBOTS[robot].title.partition(" with ")[0] for robot in SEEN_ROBOTS))
 """Title of what is pooled over the robots that the fixed split trains on."""
+HELD_OUT_TITLES = {robot: f"Held-out {ROBOTS[robot].title}" for robot in HELD_OUT_ROBOTS}
+"""Title of each robot that the fixed split holds out."""
+GROUP_TITLES = {SEEN: SEEN_TITLE, **HELD_OUT_TITLES}
+"""Titles of the robots that tables of the fixed split grade together, by their names in addresses."""
 
 
 def action_title(key: str) -> str:

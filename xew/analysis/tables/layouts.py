@@ -14,7 +14,17 @@ from xew.analysis.scores import TRUTH
 from xew.analysis.statistics.grades import REFERENCE, SEEN, StudyGrades, find_variant, pooled
 from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables.builder import Builder
-from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, SEEN_TITLE, SHORT_ROBOTS, SYSTEM_ACTIONS, SYSTEMS, TRUE
+from xew.analysis.tables.labels import (
+    ACTIONS,
+    GROUP_TITLES,
+    HELD_OUT_TITLES,
+    LADDER,
+    REMEDIES,
+    SHORT_ROBOTS,
+    SYSTEM_ACTIONS,
+    SYSTEMS,
+    TRUE,
+)
 from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, metric_columns, metric_title
 from xew.protocol import (
     FORGETTING_ROBOT,
@@ -136,8 +146,7 @@ def recovery_full(builder: Builder) -> Table:
     sections = [TableSection("Seen pool, before adaptation", (seen,), builder.note("few_shot", [(REFERENCE, SEEN, REFERENCE)]))]
     for robot in HELD_OUT_ROBOTS:
         keys = {f"{robot}-{shots}": f"M = {shots}" for shots in (0, *SHOTS)}
-        title = f"Held-out {ROBOT_TITLES[robot]}"
-        sections.append(_build_section(builder, title, "few_shot", keys, robot, metrics, f"{robot}-0"))
+        sections.append(_build_section(builder, HELD_OUT_TITLES[robot], "few_shot", keys, robot, metrics, f"{robot}-0"))
     caption = "Marks: against M = 0."
     columns = metric_columns(builder.ours.metrics, metrics)
     return Table(
@@ -257,8 +266,7 @@ def _count_cell(builder: Builder, part: str, place: int, printed: int) -> TableC
 def _full_table(builder: Builder, name: str, title: str, part: str, stub: str, keys: dict[str, str], base: str) -> Table:
     """Ten metrics; the seen pool and each held-out robot a section."""
     metrics = builder.reported
-    groups = {SEEN: SEEN_TITLE, **{robot: f"Held-out {ROBOT_TITLES[robot]}" for robot in HELD_OUT_ROBOTS}}
-    sections = tuple(_build_section(builder, text, part, keys, robots, metrics, base) for robots, text in groups.items())
+    sections = tuple(_build_section(builder, text, part, keys, robots, metrics, base) for robots, text in GROUP_TITLES.items())
     caption = f"Marks: against {keys[base].lower()}." if base else ""
     return Table(name, title, caption, (stub,), metric_columns(builder.ours.metrics, metrics), sections)
 

@@ -9,7 +9,7 @@ from xew.statistics import LEAST_POWER, describe_power
 HEADING = "## What the metrics can tell"
 """Heading of the section on the page of the tasks."""
 MOST_SHOWN = 10_000
-"""Largest power that is written; where the true video has the best score there is no number."""
+"""Power from which on no number is written; it is infinite where the true video has a metric's best score."""
 
 
 def power_section(power: pd.DataFrame, rows: pd.DataFrame) -> str:
@@ -39,7 +39,7 @@ def power_section(power: pd.DataFrame, rows: pd.DataFrame) -> str:
 
 
 def _times(power: float) -> str:
-    """A power with two digits; 'none' where both the frozen frame and the true video have the best score."""
+    """A power with two digits; 'none' where it is not defined: the frozen frame and the true video have the best score."""
     if np.isnan(power):
         return "none"
     return f"{float(f'{power:.2g}'):.4g}" if power < MOST_SHOWN else f"over {MOST_SHOWN:,}"

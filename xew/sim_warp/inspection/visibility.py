@@ -1,7 +1,6 @@
 """How much of robots and of what moves the camera sees, as a section of a Markdown page.
 
-Reads  `Visibility` of episodes, by task and robot
-Writes a table of all tasks and robots, and one of those that are below the aims
+It is a table of all tasks and robots, and one of what is below the aims.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,6 +18,7 @@ NEEDED_OF_ROBOT, NEEDED_OF_THING = 8, 4
 ROBOT_SHARE, THING_SHARE = 0.95, 0.90
 """Shares of frames, and of an object's moving frames, in which there should be so many."""
 Found = Mapping[tuple[str, str], Sequence[Visibility]]
+"""Visibility of each episode, by task and robot."""
 
 
 @dataclass(frozen=True)
@@ -36,18 +36,19 @@ def visibility_section(found: Found) -> str:
     """Markdown: in how many frames enough points are seen, by task and robot, and what is below the aims, with its size there.
 
     Args:
-        found: visibility of the episodes of each task and robot.
+        found: of at least one task and robot.
     """
-    robots = sorted({robot for _, robot in found}, key=lambda name: (list(ROBOTS).index(name) if name in ROBOTS else 99, name))
+    present = {robot for _, robot in found}
+    robots = [robot for robot in ROBOTS if robot in present] + sorted(present - set(ROBOTS))
     tasks = sorted({task for task, _ in found})
     of_robot = {cell: _share("robot", [one.robot for one in several], NEEDED_OF_ROBOT) for cell, several in found.items()}
     of_thing = {cell: _least(several) for cell, several in found.items()}
     lines = [f"| task | {' | '.join(f'`{robot}`' for robot in robots)} | seen least |", "|---" * (len(robots) + 2) + "|"]
     for task in tasks:
-        cells = [(task, robot) for robot in robots if (task, robot) in found]
-        text = {cell: f"{100 * of_robot[cell].share:.0f} / {100 * of_thing[cell].share:.0f}" for cell in cells}
-        least = min((of_thing[cell] for cell in cells), key=lambda share: share.share)
-        lines.append(f"| `{task}` | {' | '.join(text.get((task, robot), '–') for robot in robots)} | {least.name} |")
+        cells = [(task, robot) for robot in robots]
+        text = (f"{100 * of_robot[c].share:.0f} / {100 * of_thing[c].share:.0f}" if c in found else "–" for c in cells)
+        least = min((of_thing[cell] for cell in cells if cell in found), key=lambda share: share.share)
+        lines.append(f"| `{task}` | {' | '.join(text)} | {least.name} |")
     return "\n".join([_introduction(found, of_robot, of_thing), "", *lines, *_below_lines(of_robot, of_thing)])
 
 
@@ -81,7 +82,7 @@ def _below_lines(of_robot: Mapping[tuple[str, str], _Share], of_thing: Mapping[t
 
 
 def _share(name: str, several: Sequence[Seen], needed: int) -> _Share:
-    """Of one thing in several episodes."""
+    """Share of one thing, over the frames of several episodes together."""
     points, pixels = (np.concatenate([getattr(seen, of) for seen in several]) for of in ("points", "pixels"))
     enough = points >= needed
     missed = float(np.median(pixels[~enough])) if not enough.all() else np.nan
@@ -89,6 +90,6 @@ def _share(name: str, several: Sequence[Seen], needed: int) -> _Share:
 
 
 def _least(several: Sequence[Visibility]) -> _Share:
-    """Of the thing that is seen least in any of the episodes."""
+    """Share of the thing that is seen least, in the episode in which it is seen least."""
     shares = [_share(name.replace("_", " "), [seen], NEEDED_OF_THING) for one in several for name, seen in one.things.items()]
     return min(shares, key=lambda share: share.share, default=_Share("nothing moves", 1.0, np.nan))
