@@ -7,7 +7,8 @@ import pytest
 import warp as wp
 
 from tests.sim_warp.small import TASK, InlineWorkers, launched_modules
-from xew.sim_warp.devices.kernels import compile_together, noted_launches
+from xew.sim_warp.devices.kernels import Variant, compile_for, compile_together, noted_launches, watched_launches
+from xew.sim_warp.physics.kernels import set_targets
 from xew.sim_warp.production import warm_up
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import produce
@@ -76,3 +77,40 @@ def test_what_is_compiled_is_not_compiled_again(monkeypatch: pytest.MonkeyPatch)
     with launched_modules(monkeypatch) as compiled:
         warm_up.compile_kernels(InlineWorkers(2), wp.get_device("cpu"), batch=1)  # type: ignore[arg-type]
     assert not compiled
+
+
+@pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="this build of Warp has no compiler for CUDA")
+def test_kernels_are_compiled_for_a_gpu_that_is_not_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    values = wp.zeros(3, dtype=float, device="cpu")
+    with watched_launches() as found:
+        wp.launch(add_one, 3, [values], device="cpu")
+        wp.launch(halve, 3, [values], block_dim=64, device="cpu")
+    np.testing.assert_array_equal(values.numpy(), 0.5)
+    assert list(found) == [(add_one.module, 256), (halve.module, 64)]
+    assert compile_for([*found, (add_one.module, 32), (add_one.module, 32)], 90) == 3
+    names = {module.get_module_identifier(size) for module, size in (*found, (add_one.module, 32))}
+    assert {path.name for path in tmp_path.glob("*/*.cubin")} == {f"{name}.sm90.cubin" for name in names}
+    assert all((tmp_path / name / f"{name}.meta").exists() for name in names)
+    assert add_one.module.options["block_dim"] == 256
+
+
+def test_the_pieces_compiled_for_a_gpu_are_all_that_episodes_launch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found: dict[str, list[Variant]] = {}
+    for part in warm_up.PARTS:
+        monkeypatch.setattr(warm_up, "compile_for", lambda variants, arch, part=part: found.update({part: [*variants]}))
+        warm_up.compile_piece(part, arch=90, batch=2)
+    names = {module.name for variants in found.values() for module, _ in variants}
+    assert (set_targets.module, 256) in found["physics"] and len(found["physics"]) > 50
+    assert any(block_dim == 32 for _, block_dim in found["kinematics"]), "products of small matrices, by a warp"
+    with launched_modules(monkeypatch) as used:
+        produce([Job(TASK, 0, ("piper",))], tmp_path, Renderer("cpu"))
+    assert len(used) > 3
+    assert used <= names
+
+
+def test_an_architecture_that_warp_does_not_know_is_refused_in_a_line(capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit) as left:
+        warm_up.main(warm_up.Args(arch=13))
+    assert left.value.code == 2
+    assert "--arch is 13; Warp's compiler knows" in capsys.readouterr().err

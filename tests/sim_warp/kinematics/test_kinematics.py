@@ -216,6 +216,19 @@ def test_arms_that_differ_beyond_their_bases_are_solved_each() -> None:
     assert path.position_error.max() < 2e-4
 
 
+def test_robots_that_share_buffers_are_not_mixed_up() -> None:
+    solvers = [ArmSolver(ROBOTS[name]) for name in ("piper", "ur5_wsg", "aloha_agilex")]
+    seeds = [np.array([arm.home for arm in solver.robot.arms]) for solver in solvers]
+    paths = [
+        np.stack([tool_pose(solver.robot, side, row[None] + 0.05)[0] for side, row in enumerate(seed)])[None].repeat(9, 0)
+        for solver, seed in zip(solvers, seeds, strict=True)
+    ]
+    first = [solver.solve_path([0, 1], *given).joint_pos for solver, *given in zip(solvers, paths, seeds, strict=True)]
+    again = [solver.solve_path([0, 1], *given).joint_pos for solver, *given in zip(solvers, paths, seeds, strict=True)]
+    assert all(np.array_equal(one, two) for one, two in zip(first, again, strict=True))
+    assert np.abs(first[0] - first[2]).max() > 0.1
+
+
 def test_out_of_reach_is_reported() -> None:
     robot = ROBOTS["piper"]
     far = np.array([[5.0, 5.0, 5.0, 0, 0, 0, 1]])

@@ -194,7 +194,7 @@ def test_arms_that_mirror_each_other_get_the_same_limits(tmp_path: Path) -> None
         RobotDraft("changed.urdf"), arms=(replace(RobotDraft("a").arms[0], root_pose=tuple(ROOT), home=tuple(HOMES[0])),) * 2
     )
     robot = complete_draft(draft, after, "twins", "here")
-    assert len(ArmSolver(robot)._models) == 2, "axes differ, so each arm has a model"
+    assert len(ArmSolver(robot).models) == 2, "axes differ, so each arm has a model"
 
 
 # --- Files.

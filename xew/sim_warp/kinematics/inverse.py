@@ -1,7 +1,8 @@
 """Tool poses to joint positions: batched Levenberg-Marquardt of newton.ik, on the CPU or a GPU.
 
-Every arm is posed as seven joints (six-joint arms get a last one that moves nothing), so that one set of kernels
-serves all robots. Arms that differ by their bases alone share a model; those that mirror each other have one each.
+Every arm is posed as seven joints (six-joint arms get a last one that moves nothing), so that one set of kernels, and on a
+GPU one recording of their launches, serves all robots. Arms that differ by their bases alone are solved together; those that
+mirror each other each for itself.
 """
 
 from dataclasses import dataclass
@@ -65,12 +66,11 @@ class ArmSolver:
         self.iterations = iterations
         self.posture_weight = posture_weight if robot.arm_joint_count == JOINT_COUNT else 0.0
         self.base = arm_bases(robot)
+        self.device = wp.get_device(device)
         alike = _are_alike(robot)
-        self._models = [_arm_model(robot, arm, device) for arm in robot.arms[: 1 if alike else 2]]
-        self._homes = [np.mean([arm.home for arm in robot.arms], 0)] if alike else [np.array(arm.home) for arm in robot.arms]
-        self.model = self._models[0][0]
+        homes = [np.mean([arm.home for arm in robot.arms], 0)] if alike else [np.array(arm.home) for arm in robot.arms]
+        self.models = [_pose_as_seven(robot, arm, home) for arm, home in zip(robot.arms, homes, strict=False)]
         self.lower, self.upper = np.array(robot.joint_lower), np.array(robot.joint_upper)
-        self._problems: dict[tuple[int, int], _Problems] = {}
 
     def solve(self, arm: int | np.ndarray, tool_pose: np.ndarray, seed: np.ndarray) -> Solution:
         """Joint positions for tool poses, near a seed.
@@ -89,7 +89,7 @@ class ArmSolver:
 
     def solve_in_base(self, arm: np.ndarray, tool_pose: np.ndarray, seed: np.ndarray) -> Solution:
         """As `solve`, for poses [n 7] in the frame in which an arm's first joint turns, wherever each stands."""
-        side = arm if len(self._models) > 1 else np.zeros_like(arm)
+        side = arm if len(self.models) > 1 else np.zeros_like(arm)
         joint_pos = self._nearest(side, tool_pose, seed)
         reached = np.linalg.inv(self.base)[side] @ self._reached(side, joint_pos)
         return Solution(joint_pos, *_pose_errors(reached, tool_pose))
@@ -125,7 +125,7 @@ class ArmSolver:
 
     def _nearest(self, arm: np.ndarray, target: np.ndarray, seed: np.ndarray) -> np.ndarray:
         """[n d] joint positions of arms [n] for poses [n 7] in their bases, found from seeds [n d]."""
-        if len(self._models) == 1:
+        if len(self.models) == 1:
             return self._solve(0, target, seed)
         found = np.empty(seed.shape)
         for side in np.unique(arm).tolist():
@@ -134,14 +134,13 @@ class ArmSolver:
 
     def _solve(self, number: int, target: np.ndarray, seed: np.ndarray) -> np.ndarray:
         """As `_nearest`, for the arms of one model."""
-        if len(target) > LARGEST_BATCH and not self.model.device.is_cuda:
+        if len(target) > LARGEST_BATCH and not self.device.is_cuda:
             parts = [slice(first, first + LARGEST_BATCH) for first in range(0, len(target), LARGEST_BATCH)]
             return np.concatenate([self._solve(number, target[part], seed[part]) for part in parts])
         size = 1 << max(0, len(target) - 1).bit_length()
-        if (number, size) not in self._problems:
-            (model, tool), home = self._models[number], self._homes[number]
-            self._problems[number, size] = _Problems(model, tool, home, size, self.iterations, self.posture_weight)
-        return np.clip(self._problems[number, size].solve(target, seed), self.lower, self.upper)
+        problems = _problems(self.device.alias, seed.shape[1], size, self.iterations, self.posture_weight)
+        problems.set_arm(self.models[number])
+        return np.clip(problems.solve(target, seed), self.lower, self.upper)
 
     def _errors(self, arm: np.ndarray, tool_pose: np.ndarray, joint_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return _pose_errors(self._reached(arm, joint_pos), tool_pose)
@@ -200,47 +199,65 @@ def _are_alike(robot: RobotSpec) -> bool:
     return np.allclose(left[1:], right[1:], atol=1e-6) and np.allclose(axes, others, atol=1e-6)
 
 
-def _arm_model(robot: RobotSpec, arm: Arm, device: str | None) -> tuple[newton.Model, np.ndarray]:
-    """An arm from its first joint on as a Newton model of seven joints, and its tool frame [7] in the last real link."""
+@dataclass(frozen=True)
+class _SevenJoints:
+    """An arm from its first joint on, posed as seven joints; those that it has not move nothing."""
+
+    parents: np.ndarray
+    """[7 7] poses of the joints in the links before them, xyz [m] and quaternion xyzw."""
+    axes: np.ndarray
+    """[7 3] axes of the joints, of length 1."""
+    children: np.ndarray
+    """[7 7] poses of the joints in the links behind them; the last real link's frame is thus the tool's."""
+    lower: np.ndarray
+    upper: np.ndarray
+    """[7] limits [rad]."""
+    home: np.ndarray
+    """[7] posture that a seven-joint arm is pulled toward [rad]."""
+
+
+def _pose_as_seven(robot: RobotSpec, arm: Arm, home: np.ndarray) -> _SevenJoints:
+    """An arm of a robot, and the posture [d] rad that it is pulled toward, as seven joints."""
     segments = _segments(robot, arm)
-    joints = [load_urdf(robot.urdf).joints[name] for name in arm.joints]
-    builder = newton.ModelBuilder()
-    handles = []
-    for index in range(JOINT_COUNT):
-        real = index < len(joints)
-        segment = segments[index] if 0 < index < len(joints) else np.eye(4)
-        handles.append(
-            builder.add_joint_revolute(
-                parent=index - 1,
-                child=builder.add_link(mass=1.0, inertia=wp.mat33(*np.eye(3).ravel())),
-                parent_xform=wp.transform(*pose_from_matrix(segment)),
-                axis=wp.vec3(*(joints[index].axis if real else (0.0, 0.0, 1.0))),
-                limit_lower=robot.joint_lower[index] if real else 0.0,
-                limit_upper=robot.joint_upper[index] if real else 0.0,
-            )
-        )
-    builder.add_articulation(handles)
-    return builder.finalize(device=device), pose_from_matrix(segments[-1])
+    count = len(arm.joints)
+    parents = np.tile(pose_from_matrix(np.eye(4)), (JOINT_COUNT, 1))
+    parents[1:count] = [pose_from_matrix(segment) for segment in segments[1:count]]
+    children = np.tile(pose_from_matrix(np.eye(4)), (JOINT_COUNT, 1))
+    children[count - 1] = pose_from_matrix(np.linalg.inv(segments[-1]))
+    axes = np.tile([0.0, 0.0, 1.0], (JOINT_COUNT, 1))
+    axes[:count] = [load_urdf(robot.urdf).joints[name].axis for name in arm.joints]
+    limits = np.zeros((3, JOINT_COUNT))
+    limits[:, :count] = robot.joint_lower, robot.joint_upper, home
+    return _SevenJoints(parents, axes / np.linalg.norm(axes, axis=1, keepdims=True), children, *limits)
+
+
+@lru_cache(maxsize=64)
+def _problems(device: str | None, joints: int, size: int, iterations: int, posture_weight: float) -> "_Problems":
+    """The process's problems of one kind, which serve all arms of so many joints."""
+    return _Problems(device, joints, size, iterations, posture_weight)
 
 
 class _Problems:
-    """A fixed number of problems of one arm model, with their buffers and, on a GPU, their captured graph."""
+    """A fixed number of problems of one arm, whichever it is, with their buffers and, on a GPU, their captured graph.
 
-    def __init__(
-        self, model: newton.Model, tool: np.ndarray, home: np.ndarray, size: int, iterations: int, posture_weight: float
-    ) -> None:
-        device = model.device
-        link = len(home) - 1
-        posture = wp.array(home.tolist() + [0.0] * (JOINT_COUNT - len(home)), dtype=wp.float32, device=device)
+    What tells arms apart lies in arrays that the graph reads, so that no arm needs a graph of its own.
+    """
+
+    def __init__(self, device: str | None, joints: int, size: int, iterations: int, posture_weight: float) -> None:
+        self.model = _chain(device)
+        self.device = self.model.device
+        self.arm: _SevenJoints | None = None
+        self.home = wp.zeros(JOINT_COUNT, dtype=wp.float32, device=device)
         self.positions = wp.zeros(size, dtype=wp.vec3, device=device)
         self.rotations = wp.zeros(size, dtype=wp.vec4, device=device)
         self.joint_pos = wp.zeros((size, JOINT_COUNT), dtype=wp.float32, device=device)
         self.iterations = iterations
-        self.posture = newton.ik.IKObjectiveJointLimit(posture, posture)
+        self.posture = newton.ik.IKObjectiveJointLimit(self.home, self.home)
         self.posture_weight = posture_weight
+        model, link = self.model, joints - 1
         objectives = [
-            newton.ik.IKObjectivePosition(link, wp.vec3(*tool[:3]), self.positions, weight=POSITION_WEIGHT),
-            newton.ik.IKObjectiveRotation(link, wp.quat(*tool[3:]), self.rotations),
+            newton.ik.IKObjectivePosition(link, wp.vec3(), self.positions, weight=POSITION_WEIGHT),
+            newton.ik.IKObjectiveRotation(link, wp.quat_identity(), self.rotations),
             newton.ik.IKObjectiveJointLimit(model.joint_limit_lower, model.joint_limit_upper, weight=LIMIT_WEIGHT),
             self.posture,
         ]
@@ -249,7 +266,22 @@ class _Problems:
         )
         self.has_run = False
         self.graph: wp.Graph | None = None
-        self.device = device
+
+    def set_arm(self, arm: _SevenJoints) -> None:
+        """Make the problems those of an arm."""
+        if arm is self.arm:
+            return
+        model = self.model
+        for array, values in (
+            (model.joint_X_p, arm.parents),
+            (model.joint_X_c, arm.children),
+            (model.joint_axis, arm.axes),
+            (model.joint_limit_lower, arm.lower),
+            (model.joint_limit_upper, arm.upper),
+            (self.home, arm.home),
+        ):
+            array.assign(values.astype(np.float32))
+        self.arm = arm
 
     def solve(self, target: np.ndarray, seed: np.ndarray) -> np.ndarray:
         """Joint positions [n d] for tool poses [n 7] in the arm's base frame; n may be less than the size."""
@@ -279,6 +311,23 @@ class _Problems:
         for weight, iterations in ((self.posture_weight, self.iterations - POLISH_STEPS), (0.0, POLISH_STEPS)):
             self.posture.weight = weight
             self.solver.step(self.joint_pos, self.joint_pos, iterations=iterations)
+
+
+def _chain(device: str | None) -> newton.Model:
+    """Seven joints one after another, each where the one before it is."""
+    builder = newton.ModelBuilder()
+    handles = [
+        builder.add_joint_revolute(
+            parent=index - 1,
+            child=builder.add_link(mass=1.0, inertia=wp.mat33(*np.eye(3).ravel())),
+            axis=wp.vec3(0.0, 0.0, 1.0),
+            limit_lower=0.0,
+            limit_upper=0.0,
+        )
+        for index in range(JOINT_COUNT)
+    ]
+    builder.add_articulation(handles)
+    return builder.finalize(device=device)
 
 
 def _pad(rows: np.ndarray, size: int) -> np.ndarray:
