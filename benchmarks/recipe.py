@@ -12,6 +12,7 @@ a line that says so, and the others go on; <out>/logs has what all commands prin
 import itertools
 import json
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -61,8 +62,8 @@ class Args:
     """Number of trainings at once. Their times tell nothing then."""
     batch: int = 15
     """Number of episodes that are rolled out at once."""
-    overrides: tuple[str, ...] = ()
-    """Further overrides of the config, such as --model.size tiny; last on the command line."""
+    overrides: str = ""
+    """Further overrides of the config, in one string, as --overrides="--model.size tiny"."""
     side: str = ""
     """Roll out one run in this process (the command calls itself with it)."""
 
@@ -75,10 +76,13 @@ def main(args: Args) -> int:
         return 0
     assert_workload(args.data)
     (args.out / "logs").mkdir(parents=True, exist_ok=True)
+    found: list[dict[str, Any]] = []
     with ThreadPoolExecutor(args.beside) as pool:
-        found = list(pool.map(lambda name: measure(name, args), args.changes))
+        for change in pool.map(lambda name: measure(name, args), args.changes):
+            found.append(change)
+            (args.out / "results.json").write_text(json.dumps(found, indent=1) + "\n")
+            print(f"{change['change']}: {change.get('failed', 'done')}", flush=True)
     print(table(found))
-    (args.out / "results.json").write_text(json.dumps(found, indent=1) + "\n")
     return sum("failed" in change for change in found)
 
 
@@ -98,7 +102,7 @@ def measure(name: str, args: Args) -> dict[str, Any]:
     run = args.out / "runs" / name.replace(" ", "_").replace(",", "")
     base = [str(args.config), "--data", str(args.data), "--out", str(run), *CHANGES[name]]
     base += ["--train.steps", str(args.steps), "--train.save-every", str(args.steps), "--train.sample-every", "0"]
-    base += ["--train.ema-decay", str(round(1 - 10 / args.steps, 6)), *args.overrides]
+    base += ["--train.ema-decay", str(round(1 - 10 / args.steps, 6)), *shlex.split(args.overrides)]
     begin = time.perf_counter()
     for module, extra in (("latents", ()), ("train", ("--overwrite",))):
         if run_logged([sys.executable, "-m", f"xew.model.{module}", *base, *extra], run, args):
@@ -177,7 +181,7 @@ def scores(video: np.ndarray, truth: np.ndarray) -> list[float]:
 def table(found: Sequence[dict[str, Any]]) -> str:
     """Markdown: a line a change and sampler, LPIPS and PSNR of seen / unseen robots."""
     lines = [
-        f"| change | loss | training [s] | sampler | LPIPS | PSNR [dB] | LPIPS, first {FRAMES} | last {FRAMES} | rollouts [s] |",
+        f"| change | loss | training [s] | sampler | LPIPS | PSNR [dB] | first {FRAMES} frames | last {FRAMES} | rollout [s] |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for change in found:

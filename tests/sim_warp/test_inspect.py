@@ -208,7 +208,7 @@ def test_visibility_is_counted_by_task_and_robot(data: Path, tmp_path: Path, ins
     (row,) = [line for line in out.splitlines() if line.startswith(f"| `{TASK}`")]
     assert code == 0 and row == f"| `{TASK}` | 100 / 100 | 100 / 100 | nothing moves |"
     assert "Below the aims" not in out and out.rstrip().endswith(page.read_text().rpartition("`. ")[2].rstrip())
-    code, _, told = inspect(data, "--visibility", "--visibility-page", tmp_path)
+    code, _, told = inspect(data, "--visibility-page", tmp_path)
     assert code == 2 and "Choose another file with --visibility-page" in told
 
 

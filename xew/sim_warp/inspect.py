@@ -66,7 +66,7 @@ class Args:
     """Print in how many frames the camera sees enough points on the surfaces of each robot and of what moves. Points that
     `xew.metrics.evaluate` has kept beside the data are not rendered again."""
     visibility_page: Path | None = None
-    """With --visibility: Markdown page whose section on this is written anew, such as docs/tasks.md."""
+    """Markdown page whose section on this is written anew, such as docs/tasks.md; as with --visibility it is printed, too."""
     rerender: int = 0
     """Number of episodes to render again from their states and compare with the recorded hashes."""
     render: bool = False
@@ -106,9 +106,10 @@ def main() -> None:
         damaged += verify([folder for folder, _ in pictured])
     if damaged:
         raise EpisodeError("\n".join([*damaged, f"{len(damaged)} damaged."]))
-    if not pictured and (args.visibility or args.rerender or args.render or args.pictures or args.grid or args.page):
+    visibility = args.visibility or args.visibility_page is not None
+    if not pictured and (visibility or args.rerender or args.render or args.pictures or args.grid or args.page):
         raise EpisodeError(f"no seed under {args.data} is accepted, so there is nothing to render or draw.")
-    if args.visibility:
+    if visibility:
         show_visibility([folder for folder, _ in pictured], args)
     if args.rerender:
         rerender([folder for folder, _ in pictured], args.rerender)
