@@ -9,8 +9,11 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Literal
 
 import pytest
+import warp as wp
 
 from tests.sim_warp.halves import half
 from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, fill_disk, work_inline
@@ -287,6 +290,26 @@ def test_test_seeds_may_be_of_other_robots() -> None:
     args = Args(tasks=("grab_roller",), train_seeds=2, test_seeds=1)
     families = plan_families(args, AB | {"test": ("b", "c")}, Manifest())
     assert [(family.first_seed, family.robots) for family in families] == [(0, ("a", "b")), (TEST_SEED_START, ("b", "c"))]
+
+
+@pytest.mark.parametrize(("physics", "sizes"), [(None, [4, 1]), ("cpu", [1] * 5)])
+def test_physics_on_the_cpu_leaves_the_gpu_to_the_pictures(
+    physics: Literal["cpu"] | None, sizes: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Five scenes of two robots on a GPU that steps eight worlds together: batches, devices of the jobs, compiled kernels."""
+    compiled: dict[str, str] = {}
+    made: list[tuple[int, object]] = []
+    gpu = SimpleNamespace(is_cuda=True, alias="cuda:0", total_memory=1e12)
+    monkeypatch.setattr(command, "find_device", lambda name: wp.get_device("cpu") if name == "cpu" else gpu)
+    monkeypatch.setattr(command, "compile_on_devices", lambda pool, devices, batch: compiled.update(devices))
+    monkeypatch.setattr(command, "_make", lambda jobs, devices, **_: made.append((len(jobs), devices)) or [])
+    work_inline(monkeypatch)
+    args = Args((TASK,), ("a", "b"), out=tmp_path, batch=8, physics=physics)
+    with command.start_workers(args, dict.fromkeys("ab", WITH_SLOW[SLOW])) as make:
+        assert list(make([Job(TASK, seed, ("a", "b")) for seed in range(5)])) == []
+    stepped = physics or "cuda:0"
+    assert made == [(size, ("cuda:0", stepped)) for size in sizes]
+    assert compiled == {"physics": stepped, "kinematics": stepped, "rendering": "cuda:0"}
 
 
 def test_unpaired_robots_share_no_seed(tmp_path: Path) -> None:

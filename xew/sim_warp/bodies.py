@@ -40,7 +40,7 @@ from xew.sim_warp.embodiment.urdf import load_urdf
 from xew.sim_warp.geometry.poses import Pose, matrix_from_pose
 from xew.sim_warp.kinematics.forward import link_poses
 from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
-from xew.sim_warp.production.warm_up import compile_kernels
+from xew.sim_warp.production.warm_up import compile_on_devices
 from xew.sim_warp.rendering.streams import home_action
 from xew.sim_warp.robots.procedural.bodies import CATALOG, Entry, catalog_text, placed_body, read_catalog, unplaced_body
 from xew.sim_warp.robots.procedural.design import WIDE, BodyDesign, design_body
@@ -109,9 +109,7 @@ def find_failure(entry: Entry) -> str | None:
 
 def compile_for_checks(workers: Workers) -> None:
     """Compile the kernels that checks launch, where there are none yet; else each worker would compile them all."""
-    devices = {"physics": "cpu", "kinematics": find_device(None).alias}
-    for name in dict.fromkeys(devices.values()):
-        compile_kernels(workers, find_device(name), 1, [part for part, alias in devices.items() if alias == name])
+    compile_on_devices(workers, {"physics": "cpu", "kinematics": find_device(None).alias}, 1)
 
 
 def gap_between_arms(robot: RobotSpec) -> float:

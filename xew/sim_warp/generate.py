@@ -40,7 +40,7 @@ from xew.sim_warp.devices.workers import Workers, find_device, quiet_warp, worke
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import produce
-from xew.sim_warp.production.warm_up import compile_kernels
+from xew.sim_warp.production.warm_up import compile_on_devices
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS, RobotSpec, adopt_robots, get_robot, is_path
 from xew.sim_warp.tasks import TASKS, get_task
@@ -79,6 +79,9 @@ class Args:
     """Number of processes; by default one a core, on a GPU one for two cores."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
     """Default: a GPU if Warp finds one."""
+    physics: Literal["cpu"] | None = None
+    """Plan and step physics on the CPU, which repeats to the bit where a GPU does not, and use the GPU for pictures alone:
+    every machine then makes the same data set. Takes a second or less of a core an episode."""
     unpaired: bool = False
     """Each robot gets seeds of its own, and no scene waits for another robot to succeed: more scenes for a codec to learn
     from, nothing to compare robots by."""
@@ -178,11 +181,20 @@ Made = tuple[list[Record], float]
 def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Callable[[Sequence[Job]], Iterator[Made]]]:
     """Start worker processes; what is given runs jobs in them, one at a time on a CPU, in large batches on a GPU."""
     device = find_device(args.device)
+    physics = find_device(args.physics or args.device)
     together = 1 if args.unpaired else len(robots)
-    size = max(1, args.batch // together) if device.is_cuda else 1
-    make = partial(_make, robots=robots, out=args.out, device=device.alias, batch=args.batch, videos=not args.states_only)
+    size = max(1, args.batch // together) if physics.is_cuda else 1
+    make = partial(
+        _make,
+        robots=robots,
+        out=args.out,
+        devices=(device.alias, physics.alias),
+        batch=args.batch,
+        videos=not args.states_only,
+    )
     with Workers(args.workers or worker_count(device)) as workers:
-        compile_kernels(workers, device, args.batch)
+        parts = {"physics": physics.alias, "kinematics": physics.alias, "rendering": device.alias}
+        compile_on_devices(workers, parts, args.batch)
 
         def run(jobs: Sequence[Job]) -> Iterator[Made]:
             batches = [jobs[start : start + size] for start in range(0, len(jobs), size)]
@@ -198,10 +210,13 @@ def _renderer(device: str) -> Renderer:
     return Renderer(device)
 
 
-def _make(jobs: Sequence[Job], robots: Mapping[str, RobotSpec], out: Path, device: str, batch: int, videos: bool) -> list[Made]:
-    """Make some jobs in a worker process."""
+def _make(
+    jobs: Sequence[Job], robots: Mapping[str, RobotSpec], out: Path, devices: tuple[str, str], batch: int, videos: bool
+) -> list[Made]:
+    """Make some jobs in a worker process, with pictures and physics on these devices."""
     begin = time.perf_counter()
-    seeds = produce(jobs, out, _renderer(device), batch, videos, robots)
+    pictures, physics = devices
+    seeds = produce(jobs, out, _renderer(pictures), batch, videos, robots, physics)
     seconds = (time.perf_counter() - begin) / len(jobs)
     return [(records, seconds) for records in seeds]
 

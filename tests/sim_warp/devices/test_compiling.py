@@ -72,6 +72,15 @@ def test_the_smallest_pieces_launch_all_that_episodes_do(
     assert used <= compiled
 
 
+def test_parts_are_compiled_on_the_devices_that_they_run_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled: list[tuple[str, list[str]]] = []
+    monkeypatch.setattr(wp, "get_device", lambda name: name)
+    monkeypatch.setattr(warm_up, "compile_kernels", lambda pool, device, batch, parts: compiled.append((device, parts)))
+    devices = {"physics": "cpu", "kinematics": "cpu", "rendering": "cuda:0"}
+    warm_up.compile_on_devices(InlineWorkers(1), devices, 1)  # type: ignore[arg-type]
+    assert compiled == [("cpu", ["physics", "kinematics"]), ("cuda:0", ["rendering"])]
+
+
 def test_what_is_compiled_is_not_compiled_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(warm_up, "has_kernels", lambda device: True)
     with launched_modules(monkeypatch) as compiled:

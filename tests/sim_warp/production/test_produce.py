@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -85,11 +86,23 @@ def test_the_same_bytes_alone_among_others_and_in_groups(
             assert record_of(tmp_path / "alone", job.seed, robot) == expected
 
 
+@pytest.mark.parametrize(("asked", "used"), [(None, "cuda:0"), ("cpu", "cpu")])
+def test_physics_is_stepped_where_it_is_asked_for(
+    asked: str | None, used: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    devices: list[tuple[str, str]] = []
+    monkeypatch.setattr(produce_module, "plan_cells", lambda jobs, robots, device: devices.append(("plan", device)) or [])
+    monkeypatch.setattr(produce_module, "simulate_cells", lambda cells, device, batch: devices.append(("step", device)) or [])
+    renderer = SimpleNamespace(device=SimpleNamespace(alias="cuda:0"))
+    assert produce([], tmp_path, renderer, physics=asked) == []  # type: ignore[arg-type]
+    assert devices == [("plan", used), ("step", used)]
+
+
 def shorten_plans(plan_cells: object) -> object:
     """Planning of which only the first frames are kept: company for the others, no whole episode."""
 
-    def first_frames(jobs: list[Job], robots: Mapping[str, RobotSpec]) -> list[list[Cell]]:
-        return [[cut(cell) for cell in cells] for cells in plan_cells(jobs, robots)]  # type: ignore[operator]
+    def first_frames(jobs: list[Job], robots: Mapping[str, RobotSpec], device: str) -> list[list[Cell]]:
+        return [[cut(cell) for cell in cells] for cells in plan_cells(jobs, robots, device)]  # type: ignore[operator]
 
     def cut(cell: Cell) -> Cell:
         return replace(cell, commands=replace(cell.commands, action=cell.commands.action[:12]))

@@ -232,7 +232,7 @@ def test_workers_begin_when_the_kernels_of_their_checks_are_compiled(monkeypatch
             return iter([(job, "skipped") for job in jobs])
 
     monkeypatch.setattr(bodies, "Workers", Inline)
-    monkeypatch.setattr(bodies, "compile_kernels", lambda pool, device, batch, parts: compiled.extend(parts))
+    monkeypatch.setattr(bodies, "compile_on_devices", lambda pool, devices, batch: compiled.extend(devices))
     assert next(find_bodies((), 1, workers=2)) == (0, "skipped")
     assert begun == [{"physics", "kinematics"}]
 

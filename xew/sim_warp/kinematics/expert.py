@@ -29,12 +29,18 @@ class Commands:
     """Reason for which this robot cannot follow the plan, in words; None if it can."""
 
 
-def joint_commands(robot: RobotSpec, paths: list[ToolPath]) -> list[Commands]:
-    """Joint commands [t 16] of one robot for many plans, solved together: each frame near the one before it, from home on."""
+def joint_commands(robot: RobotSpec, paths: list[ToolPath], device: str | None = None) -> list[Commands]:
+    """Joint commands [t 16] of one robot for many plans, solved together: each frame near the one before it, from home on.
+
+    Args:
+        robot: whose commands.
+        paths: tool paths of the plans.
+        device: Warp's name of the device that solves; its default if left out.
+    """
     longest = max(path.frame_count for path in paths)
     targets = np.stack([_extend_path(path.pose, longest) for path in paths], 1).reshape(longest, -1, 7)
     arms = np.tile([LEFT, RIGHT], len(paths))
-    solution = arm_solver(robot).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
+    solution = arm_solver(robot, device).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
     commands = []
     for index, path in enumerate(paths):
         columns, frames = slice(2 * index, 2 * index + 2), slice(path.frame_count)

@@ -44,15 +44,20 @@ class _Move:
     """Joints [d] rad over progress from 0 to 1, by arm."""
 
 
-def own_commands(robot: RobotSpec, timelines: Sequence[Timeline]) -> list[tuple[ToolPath, Commands]]:
+def own_commands(robot: RobotSpec, timelines: Sequence[Timeline], device: str | None = None) -> list[tuple[ToolPath, Commands]]:
     """A robot's own paths and joint commands [t 16] for many plans, solved together.
 
     They are the same bits whatever is solved beside them.
+
+    Args:
+        robot: whose commands.
+        timelines: the plans.
+        device: Warp's name of the device that solves; its default if left out.
     """
     longest = max(len(timeline.steps) for timeline in timelines) * SAMPLES + 1
     targets = np.stack([_lines(timeline.steps, longest) for timeline in timelines], 1).reshape(longest, -1, 7)
     arms = np.tile([LEFT, RIGHT], len(timelines))
-    solution = arm_solver(robot).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
+    solution = arm_solver(robot, device).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
     found = []
     for index, timeline in enumerate(timelines):
         columns = slice(2 * index, 2 * index + 2)

@@ -81,12 +81,13 @@ class Cell:
         return scene_recording(self.robot, self.scene, motion.joint_pos, motion.object_pose, motion.object_joint)
 
 
-def plan_cells(jobs: Sequence[Job], robots: Mapping[str, RobotSpec] = ROBOTS) -> list[list[Cell]]:
+def plan_cells(jobs: Sequence[Job], robots: Mapping[str, RobotSpec] = ROBOTS, device: str | None = None) -> list[list[Cell]]:
     """Scene, plan and commands of every cell, by job; the commands of all cells of a robot are solved together.
 
     Args:
         jobs: the seeds, and the names of the robots that do each.
         robots: all of these robots by name.
+        device: Warp's name of the device that solves; its default if left out.
     """
     tasks = [get_task(job.task) for job in jobs]
     scenes = [task.sample(scene_rng(job.task, job.seed), job.seed) for job, task in zip(jobs, tasks, strict=True)]
@@ -95,18 +96,28 @@ def plan_cells(jobs: Sequence[Job], robots: Mapping[str, RobotSpec] = ROBOTS) ->
     for name, kind in dict.fromkeys((robot, job.motion) for job in jobs for robot in job.robots):
         mine = [index for index, job in enumerate(jobs) if name in job.robots and job.motion == kind]
         robot = robots[name]
-        for index, (path, commands) in zip(mine, plan_motion(robot, [plans[index] for index in mine], kind), strict=True):
+        planned = plan_motion(robot, [plans[index] for index in mine], kind, device)
+        for index, (path, commands) in zip(mine, planned, strict=True):
             place = jobs[index].task, tasks[index], scenes[index]
             seeds[index].append(Cell(*place, path, name, robot, commands, motion_kind=kind))
     return seeds
 
 
-def plan_motion(robot: RobotSpec, plans: Sequence[Timeline], kind: str) -> list[tuple[ToolPath, Commands]]:
-    """A robot's tool paths and commands for many plans, in one kind of motion (`xew.protocol.MOTIONS`)."""
+def plan_motion(
+    robot: RobotSpec, plans: Sequence[Timeline], kind: str, device: str | None = None
+) -> list[tuple[ToolPath, Commands]]:
+    """A robot's tool paths and commands for many plans, in one kind of motion (`xew.protocol.MOTIONS`).
+
+    Args:
+        robot: whose commands.
+        plans: of the scenes.
+        kind: of motion.
+        device: Warp's name of the device that solves; its default if left out.
+    """
     if kind == OWN_MOTION:
-        return own_commands(robot, plans)
+        return own_commands(robot, plans, device)
     paths = [plan.path() for plan in plans]
-    return list(zip(paths, joint_commands(robot, paths), strict=True))
+    return list(zip(paths, joint_commands(robot, paths, device), strict=True))
 
 
 def simulate_cells(seeds: list[list[Cell]], device: str | None = None, batch: int | None = None) -> list[list[Cell]]:

@@ -28,6 +28,7 @@ def produce(
     batch: int | None = None,
     videos: bool = True,
     robots: Mapping[str, RobotSpec] = ROBOTS,
+    physics: str | None = None,
 ) -> list[list[Record]]:
     """Make all episodes of some seeds and write them under `out`; the headers of each job in the order of its robots.
 
@@ -36,13 +37,14 @@ def produce(
     Args:
         jobs: the seeds, and which robots do each.
         out: folder of the data set.
-        renderer: draws the pictures; its device steps the physics, too.
+        renderer: draws the pictures.
         batch: worlds that a GPU steps together, None for all.
         videos: store them; without, an episode has all states and hashes, and `rerender.add_videos` makes its videos.
         robots: the robots of the jobs by name.
+        physics: Warp's name of the device that plans and steps physics; the renderer's if left out.
     """
-    planned = plan_cells(jobs, robots)
-    seeds = simulate_cells(planned, renderer.device.alias, batch)
+    physics = physics or renderer.device.alias
+    seeds = simulate_cells(plan_cells(jobs, robots, physics), physics, batch)
     rejected = {(job.task, job.seed) for job in jobs if job.rejected}
     records: list[list[Record]] = []
     writing: list[list[Future[Record]]] = []

@@ -11,7 +11,7 @@ Command, on a machine without a GPU for one that has one: python -m xew.sim_warp
 """
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -95,6 +95,17 @@ def compile_kernels(workers: Workers, device: wp.Device, batch: int, parts: Sequ
     compiled = workers.run(partial(do_smallest_piece, device=device.alias, batch=batch), parts)
     for _ in tqdm(compiled, desc="compiling kernels", unit="part", total=len(parts)):
         pass
+
+
+def compile_on_devices(workers: Workers, devices: Mapping[str, str], batch: int) -> None:
+    """`compile_kernels`, where parts of the work are done on devices of their own.
+
+    Args:
+        workers, batch: as of `compile_kernels`.
+        devices: Warp's name of the device of each part.
+    """
+    for name in dict.fromkeys(devices.values()):
+        compile_kernels(workers, wp.get_device(name), batch, [part for part, alias in devices.items() if alias == name])
 
 
 def do_smallest_piece(part: str, device: str, batch: int) -> None:
