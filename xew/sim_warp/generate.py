@@ -80,8 +80,8 @@ class Args:
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
     """Default: a GPU if Warp finds one."""
     physics: Literal["cpu"] | None = None
-    """Plan and step physics on the CPU, which repeats to the bit where a GPU does not, and use the GPU for pictures alone:
-    every machine then makes the same data set. Takes a second or less of a core an episode."""
+    """Plan and step physics on the CPU, which repeats to the bit where a GPU does not, and use the GPU for pictures alone, so
+    that machines of a kind make the same data set (docs/performance.md). Takes about a second of a core an episode."""
     unpaired: bool = False
     """Each robot gets seeds of its own, and no scene waits for another robot to succeed: more scenes for a codec to learn
     from, nothing to compare robots by."""
