@@ -55,6 +55,7 @@ OTHERS = {
     "model.latents": "waits: see below",
     "model.rollout": "needs a trained run: see below",
     "sim_warp.motions": "prints",
+    "sim_warp.production.warm_up": "writes Warp's cache, whose folders Warp itself renames into place",
     "sim_warp.robots.author": "writes the project's own files, for its developers",
     "sim_warp.robots.reach": "prints",
 }
