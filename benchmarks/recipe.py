@@ -5,7 +5,8 @@
 
 Needs episodes with validation seeds (`python -m xew.sim_warp.generate --validation-seeds 1 …`); test seeds are not looked at.
 Prints a Markdown table, a line a change and sampler: loss over the last eighth of the steps, LPIPS and PSNR of whole
-validation episodes of seen and unseen robots, LPIPS of their first and last 32 frames, seconds. A training that fails has
+validation episodes of seen and unseen robots, LPIPS of their first and last 32 frames, and seconds of the commands that train
+and roll out, with their starts and compiling. A training that fails has
 a line that says so, and the others go on; <out>/logs has what all commands printed.
 """
 
@@ -16,7 +17,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +45,8 @@ CHANGES: dict[str, tuple[str, ...]] = {
 """Overrides of the config by the name of the change."""
 FRAMES = 32
 """Number of frames at the beginning and at the end of an episode whose LPIPS tells how a prediction drifts."""
+EPISODE = ["task", "seed", "robot"]
+"""Columns of score tables that name an episode."""
 
 
 @dataclass(frozen=True)
@@ -60,22 +63,15 @@ class Args:
     """Samplers with their number of steps."""
     beside: int = 1
     """Number of trainings at once. Their times tell nothing then."""
-    batch: int = 15
-    """Number of episodes that are rolled out at once."""
     overrides: str = ""
     """Further overrides of the config, in one string, as --overrides="--model.size tiny"."""
-    side: str = ""
-    """Roll out one run in this process (the command calls itself with it)."""
 
 
 def main(args: Args) -> int:
     """Train, roll out and print; the number of changes that failed."""
-    if args.side:
-        for result in roll_out(Path(args.side), args):
-            print("RESULT " + json.dumps(result), flush=True)
-        return 0
     assert_workload(args.data)
-    (args.out / "logs").mkdir(parents=True, exist_ok=True)
+    for folder in ("logs", "scores"):
+        (args.out / folder).mkdir(parents=True, exist_ok=True)
     found: list[dict[str, Any]] = []
     with ThreadPoolExecutor(args.beside) as pool:
         for change in pool.map(lambda name: measure(name, args), args.changes):
@@ -98,29 +94,66 @@ def assert_workload(data: Path) -> None:
 
 
 def measure(name: str, args: Args) -> dict[str, Any]:
-    """Train with one change and roll out."""
+    """Train with one change, roll out validation seeds by each sampler, and grade."""
     run = args.out / "runs" / name.replace(" ", "_").replace(",", "")
-    base = [str(args.config), "--data", str(args.data), "--out", str(run), *CHANGES[name]]
-    base += ["--train.steps", str(args.steps), "--train.save-every", str(args.steps), "--train.sample-every", "0"]
+    graded = {sampler: args.out / "scores" / f"{run.name}-{sampler.replace(':', '_')}.parquet" for sampler in args.samplers}
+    seconds = {}
+    for step, command in list_commands(run, name, graded, args).items():
+        begin = time.perf_counter()
+        if run_logged(command, run, args):
+            return {"change": name, "failed": f"{step}, see the log"}
+        seconds[step] = time.perf_counter() - begin
+    rollouts = [
+        {"sampler": sampler, "seconds": seconds[f"rollouts by {sampler}"], **summarize(path)}
+        for sampler, path in graded.items()
+    ]
+    return {"change": name, "loss": last_loss(run, args.steps), "train_s": seconds["training"], "rollouts": rollouts}
+
+
+def list_commands(run: Path, name: str, graded: Mapping[str, Path], args: Args) -> dict[str, list[str]]:
+    """The commands of a change, in their order, with modules of xew and their arguments.
+
+    Args:
+        run: folder of the run.
+        name: of the change.
+        graded: score table to write for each sampler.
+        args: of the benchmark.
+    """
+    data = ["--data", str(args.data)]
+    base = [str(args.config), *data, "--out", str(run), *CHANGES[name], "--train.steps", str(args.steps)]
+    base += ["--train.save-every", str(args.steps), "--train.sample-every", "0"]
     base += ["--train.ema-decay", str(round(1 - 10 / args.steps, 6)), *shlex.split(args.overrides)]
-    begin = time.perf_counter()
-    for module, extra in (("latents", ()), ("train", ("--overwrite",))):
-        if run_logged([sys.executable, "-m", f"xew.model.{module}", *base, *extra], run, args):
-            return {"change": name, "failed": f"{module}, see the log"}
-        begin = time.perf_counter() if module == "latents" else begin
-    seconds = time.perf_counter() - begin
-    this = [sys.executable, __file__, "--data", str(args.data), "--batch", str(args.batch), "--side", str(run)]
-    if run_logged([*this, "--samplers", *args.samplers], run, args):
-        return {"change": name, "failed": "rollouts, see the log"}
-    lines = (args.out / "logs" / f"{run.name}.log").read_text().splitlines()
-    rollouts = [json.loads(line.removeprefix("RESULT ")) for line in lines if line.startswith("RESULT ")]
-    return {"change": name, "loss": last_loss(run, args.steps), "train_s": seconds, "rollouts": rollouts[-len(args.samplers) :]}
+    commands = {"latents": ["model.latents", *base], "training": ["model.train", *base, "--overwrite"]}
+    for sampler, scores in graded.items():
+        rollouts, (kind, steps) = args.out / "rollouts" / scores.stem, sampler.split(":")
+        asked = ["--split", "validation", "--out", str(rollouts), "--rollout.sampler", kind, "--rollout.steps", steps]
+        commands[f"rollouts by {sampler}"] = ["model.rollout", str(run), *data, *asked]
+        asked = ["--out", str(scores), "--metrics", "lpips", "psnr", "--no-baselines"]
+        commands[f"grades by {sampler}"] = ["metrics.evaluate", str(rollouts), *data, *asked]
+    return commands
+
+
+def summarize(scores: Path) -> dict[str, list[float]]:
+    """LPIPS, PSNR [dB], LPIPS of the first and of the last frames: means over episodes of seen and of unseen robots."""
+    import pandas as pd
+
+    from xew.protocol import SPLITS
+
+    curves = pd.read_parquet(scores.with_suffix(".curves.parquet")).sort_values("frame")
+    lpips = curves[curves["metric"] == "lpips"].groupby(EPISODE)["value"]
+    whole = pd.read_parquet(scores).set_index(EPISODE)
+    found = pd.DataFrame({name: whole.loc[whole["metric"] == name, "value"] for name in ("lpips", "psnr")})
+    found["first"] = lpips.apply(lambda values: values.head(FRAMES).mean())
+    found["last"] = lpips.apply(lambda values: values.tail(FRAMES).mean())
+    seen = found.index.get_level_values("robot").isin(SPLITS["fixed"].train_robots)
+    return {kind: found[chosen].mean().tolist() for kind, chosen in (("seen", seen), ("unseen", ~seen))}
 
 
 def run_logged(command: Sequence[str], run: Path, args: Args) -> int:
-    """Run a command with its output appended to the run's log; its exit status."""
+    """Run a module of xew with its output appended to the run's log; its exit status."""
     environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | os.environ
     with (args.out / "logs" / f"{run.name}.log").open("a") as log:
+        command = [sys.executable, "-m", f"xew.{command[0]}", *command[1:]]
         return subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=environment).returncode
 
 
@@ -132,50 +165,6 @@ def last_loss(run: Path, steps: int) -> float:
     accumulator = EventAccumulator(str(folder))
     accumulator.Reload()
     return float(np.mean([event.value for event in accumulator.Scalars("train/loss") if event.step > 7 * steps // 8]))
-
-
-def roll_out(run: Path, args: Args) -> Iterator[dict[str, Any]]:
-    """Whole validation episodes by each sampler: means over robots that were seen, and that were not."""
-    from dataclasses import replace
-
-    from xew.compilation import keep_compiled_programs
-    from xew.episode import read_video
-    from xew.model.episodes.choice import select_episodes
-    from xew.model.rollout import load_predictor
-    from xew.model.runs.folder import load_run_config
-    from xew.protocol import SPLITS
-
-    keep_compiled_programs()
-    config = load_run_config(run)
-    episodes = sorted(select_episodes(args.data, "validation", None, False), key=lambda episode: episode[1].frame_count)
-    for choice in args.samplers:
-        sampler, steps = choice.split(":")
-        experiment = replace(config, rollout=replace(config.rollout, sampler=sampler, steps=int(steps), unroll=1))
-        predictor, _ = load_predictor(run, experiment)
-        rows: dict[str, list[list[float]]] = {"seen": [], "unseen": []}
-        seconds = 0.0
-        for first in range(0, len(episodes), args.batch):
-            group = episodes[first : first + args.batch]
-            begin = time.perf_counter()
-            size = min(args.batch, len(episodes))
-            videos = predictor.begin(group, max(record.frame_count for _, record in group), size).fetch()
-            seconds += time.perf_counter() - begin
-            for (folder, record), video in zip(group, videos, strict=True):
-                kind = "seen" if record.robot in SPLITS["fixed"].train_robots else "unseen"
-                rows[kind].append(scores(video[: record.frame_count], read_video(folder / "rgb.mkv")))
-        means = {kind: np.mean(values, axis=0).tolist() for kind, values in rows.items()}
-        yield {"sampler": choice, "episodes": len(episodes), "seconds": seconds, **means}
-
-
-def scores(video: np.ndarray, truth: np.ndarray) -> list[float]:
-    """LPIPS, PSNR [dB], LPIPS of the first and of the last frames of a prediction [t h w 3] at the model's size."""
-    from xew.metrics import lpips, psnr
-    from xew.model.video.frames import to_camera_size
-
-    predicted = to_camera_size(video)[1:]
-    by_frame = np.asarray(lpips(predicted, truth[1:]))
-    mean_psnr = np.asarray(psnr(predicted, truth[1:])).mean()
-    return [float(value) for value in (by_frame.mean(), mean_psnr, by_frame[:FRAMES].mean(), by_frame[-FRAMES:].mean())]
 
 
 def table(found: Sequence[dict[str, Any]]) -> str:
