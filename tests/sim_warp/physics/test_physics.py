@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from tests.sim_warp.small import launched_modules
 from xew.config import ConfigError
 from xew.protocol import ARMS, FRAME_RATE
-from xew.sim_warp.devices.kernels import noted_launches
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.kinematics.expert import joint_commands
 from xew.sim_warp.physics import gpu as physics_gpu
@@ -184,8 +183,7 @@ def test_all_that_a_batch_launches_is_known_before_it_runs(
 ) -> None:
     """So that a GPU's kernels can be compiled together: none is left that is compiled when it is launched."""
     short = physics_gpu.Batch([replace(world, action=world.action[:2]) for world in mixed], warp.get_device("cpu"))
-    with noted_launches() as noted:
-        short._begin_and_step()
+    noted = short.list_kernels()
     with launched_modules(monkeypatch) as launched:
         motions = short.run()
     assert len(launched) > 50

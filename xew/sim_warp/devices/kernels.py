@@ -1,7 +1,7 @@
 """Kernels of Warp: whether a device has any compiled yet, compiling many at once, and compiling for a GPU that is not here.
 
 Warp compiles a module of kernels when one of them is first launched, one module after another. What many launches need can be
-known before: `compile_together` lets them pass by without launching anything, and then compiles on all cores.
+known before: `noted_launches` lets them pass by without launching anything, and `compile_together` compiles on all cores.
 """
 
 import os
@@ -65,24 +65,16 @@ def watched_launches() -> Iterator[dict[Variant, None]]:
         yield found
 
 
-def compile_together(function: Callable[[], object], device: wp.Device) -> int:
-    """Compile and load all kernels that a function launches, on as many threads as there are cores.
+def compile_together(variants: Iterable[Variant], device: wp.Device) -> None:
+    """Compile and load kernels, on as many threads as there are cores.
 
-    Nothing depends on it: what is not found here is compiled when it is launched.
+    Nothing depends on it: what is not among them is compiled when it is launched.
 
     Args:
-        function: launches kernels and reads nothing of what they compute, as what is captured into a CUDA graph.
-        device: that it launches them on.
-
-    Returns:
-        Number of modules.
+        variants: what to compile, as `noted_launches` gives it.
+        device: that they will be launched on.
     """
-    with noted_launches() as found:
-        function()
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for load in [pool.submit(wp.force_load, device, [module], block_dim, 0) for module, block_dim in found]:
-            load.result()
-    return len(found)
+    _run_in_threads(lambda variant: wp.force_load(device, [variant[0]], variant[1], 0), variants)
 
 
 def compile_for(variants: Iterable[Variant], arch: int) -> int:
@@ -101,9 +93,7 @@ def compile_for(variants: Iterable[Variant], arch: int) -> int:
     blocks: dict[wp.Module, list[int]] = defaultdict(list)
     for module, block_dim in dict.fromkeys(variants):
         blocks[module].append(block_dim)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for compiling in [pool.submit(_compile_module, module, sizes, arch) for module, sizes in blocks.items()]:
-            compiling.result()
+    _run_in_threads(lambda item: _compile_module(item[0], item[1], arch), blocks.items())
     return sum(map(len, blocks.values()))
 
 
@@ -116,3 +106,10 @@ def _compile_module(module: wp.Module, blocks: Sequence[int], arch: int) -> None
             wp.compile_aot_module(module, arch=arch)
     finally:
         module.options["block_dim"] = before
+
+
+def _run_in_threads(function: Callable[[Any], object], items: Iterable[Any]) -> None:
+    """Call a function with each item, on as many threads as there are cores, and raise what one of the calls raises."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for _ in pool.map(function, items):
+            pass

@@ -232,7 +232,7 @@ def _pose_as_seven(robot: RobotSpec, arm: Arm, home: np.ndarray) -> _SevenJoints
 
 
 @lru_cache(maxsize=64)
-def _problems(device: str | None, joints: int, size: int, iterations: int, posture_weight: float) -> "_Problems":
+def _problems(device: str, joints: int, size: int, iterations: int, posture_weight: float) -> "_Problems":
     """The process's problems of one kind, which serve all arms of so many joints."""
     return _Problems(device, joints, size, iterations, posture_weight)
 
@@ -243,7 +243,7 @@ class _Problems:
     What tells arms apart lies in arrays that the graph reads, so that no arm needs a graph of its own.
     """
 
-    def __init__(self, device: str | None, joints: int, size: int, iterations: int, posture_weight: float) -> None:
+    def __init__(self, device: str, joints: int, size: int, iterations: int, posture_weight: float) -> None:
         self.model = _chain(device)
         self.device = self.model.device
         self.arm: _SevenJoints | None = None
@@ -313,7 +313,7 @@ class _Problems:
             self.solver.step(self.joint_pos, self.joint_pos, iterations=iterations)
 
 
-def _chain(device: str | None) -> newton.Model:
+def _chain(device: str) -> newton.Model:
     """Seven joints one after another, each where the one before it is."""
     builder = newton.ModelBuilder()
     handles = [

@@ -79,19 +79,15 @@ class Batch:
         self.penetration = self._array(np.zeros((*shape, objects)))
         self.overlap = self._array(np.zeros((len(worlds), 2)))
 
-    def compile(self) -> int:
-        """Compile all that `run` launches, many kernels at once, where Warp would compile one after another.
-
-        Returns:
-            Number of modules.
-        """
-        with wp.ScopedDevice(self.device):
-            return compile_together(self._begin_and_step, self.device)
+    def compile(self) -> None:
+        """Compile all that `run` launches, many kernels at once, where Warp would compile one after another."""
+        compile_together(self.list_kernels(), self.device)
 
     def list_kernels(self) -> list[Variant]:
         """The kernels that `run` launches."""
         with wp.ScopedDevice(self.device), noted_launches() as found:
-            self._begin_and_step()
+            self._begin()
+            self._step_frame()
         return list(found)
 
     def run(self) -> list[Motion]:
@@ -107,10 +103,6 @@ class Batch:
                 wp.capture_launch(graph) if graph else self._step_frame()
         wait_for(self.device)
         return self._motions()
-
-    def _begin_and_step(self) -> None:
-        self._begin()
-        self._step_frame()
 
     def _begin(self) -> None:
         mjw.forward(self.model, self.data)
