@@ -291,7 +291,8 @@ def _run_row(row: Row, shown: Sequence[MetricInfo], metrics: Mapping[str, Metric
     cells = []
     for metric in shown:
         word = row.verdicts.get(metric.name, "")
-        cells.append(_run_cell(row, metric, word * (metric.name not in strict), word * (metric.name in parting)))
+        own, beside = ("" if metric.name in strict else word), (word if metric.name in parting else "")
+        cells.append(_run_cell(row, metric, own, beside))
     return TableRow((row.title,), tuple(cells), row.model in BASELINES)
 
 
