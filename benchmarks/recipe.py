@@ -122,7 +122,7 @@ def list_commands(run: Path, name: str, graded: Mapping[str, Path], args: Args) 
     data = ["--data", str(args.data)]
     base = [str(args.config), *data, "--out", str(run), *CHANGES[name], "--train.steps", str(args.steps)]
     base += ["--train.save-every", str(args.steps), "--train.sample-every", "0"]
-    base += ["--train.ema-decay", str(round(1 - 10 / args.steps, 6)), *shlex.split(args.overrides)]
+    base += ["--train.ema-decay", str(round(max(0, 1 - 10 / args.steps), 6)), *shlex.split(args.overrides)]
     commands = {"latents": ["model.latents", *base], "training": ["model.train", *base, "--overwrite"]}
     for sampler, scores in graded.items():
         rollouts, (kind, steps) = args.out / "rollouts" / scores.stem, sampler.split(":")
