@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from tests import synthetic
 from xew.config import ConfigError
 from xew.episode import read_record, read_states, read_video, write_episode
+from xew.metrics.grading.baselines import paste_render
 from xew.model.cache.scales import apply_scales, dump_scales, fit_scales, read_scales
 from xew.model.conditions import (
     ACTIONS,
@@ -34,6 +35,7 @@ from xew.protocol import ACTION_DIM, ROBOT_NAMES
 from xew.sim_warp.robots import ROBOTS, keep_robot
 
 STORED = [condition for condition in (ACTIONS["joints"], CONDITIONS["robot_render"]) if isinstance(condition, Condition)]
+PASTED = list_conditions(CONDITIONS["pasted_render"])
 SYSTEMS = {name: entry for name, entry in ACTIONS.items() if isinstance(entry, System) and entry.conditions}
 NUMBERS = [condition for system in SYSTEMS.values() for condition in system if condition.make in (tool_poses, camera)]
 
@@ -44,9 +46,18 @@ def episode(tmp_path: Path) -> Path:
 
 
 def test_a_command_holds_nothing_measured() -> None:
-    """`rendered` is the video at `render_path`, at hand or rendered anew from the commands (pixels.py)."""
-    named = {"robot", "action", "intrinsics", "extrinsics", "render_path", "rendered", "data"}
+    """`rendered` is the video at `render_path`, at hand or rendered anew from the commands (pixels.py); of the scene there is
+    the first frame, whether its video is at hand or not."""
+    named = {"robot", "action", "intrinsics", "extrinsics", "render_path", "rendered", "data", "read_first"}
     assert {field.name for field in fields(Command)} == named
+
+
+def test_the_first_frame_is_all_of_the_scene_that_a_command_shows(episode: Path) -> None:
+    scene = read_video(episode / "rgb.mkv")
+    for given in (None, scene):
+        command = episode_command(episode, read_record(episode), scene=given)
+        np.testing.assert_array_equal(command.read_first(), scene[:1])
+        assert not any(np.shares_memory(command.read_first(), part) for part in (scene,))
 
 
 def test_robots_of_ones_own_are_those_of_the_data_set_of_the_episode(episode: Path, tmp_path: Path) -> None:
@@ -58,7 +69,7 @@ def test_robots_of_ones_own_are_those_of_the_data_set_of_the_episode(episode: Pa
     assert command.robot_spec.urdf.is_relative_to((tmp_path / "robots").resolve()) and dict(os.environ) == before
 
 
-@pytest.mark.parametrize("condition", [*STORED, *NUMBERS], ids=lambda condition: condition.name)
+@pytest.mark.parametrize("condition", [*STORED, *PASTED, *NUMBERS], ids=lambda condition: condition.name)
 def test_no_condition_sees_the_recorded_future(episode: Path, condition: object) -> None:
     """Turn everything that was recorded from frame 1 on upside down: the condition stays as it was."""
     record, states = read_record(episode), read_states(episode)
@@ -73,9 +84,19 @@ def test_no_condition_sees_the_recorded_future(episode: Path, condition: object)
         keypoints=states.keypoints[::-1],
         robot_mask=~states.robot_mask,
     )
-    write_episode(episode.parents[2], record, changed, 255 - read_video(episode / "rgb.mkv"), read_video(episode / "robot.mkv"))
+    scene = read_video(episode / "rgb.mkv")
+    scene[1:] = 255 - scene[1:]
+    write_episode(episode.parents[2], record, changed, scene, read_video(episode / "robot.mkv"))
     after = condition.make(make_command(episode, read_record(episode), read_states(episode)))
     np.testing.assert_array_equal(before, after)
+
+
+def test_a_pasted_render_is_the_baseline_of_that_name(episode: Path) -> None:
+    (condition,) = PASTED
+    made = condition.make(episode_command(episode, read_record(episode)))
+    expected = paste_render(read_video(episode / "rgb.mkv")[0], read_video(episode / "robot.mkv"))
+    np.testing.assert_array_equal(made, expected)
+    assert condition.is_guess and not any(other.is_guess for other in (*STORED, *NUMBERS))
 
 
 def test_joints_are_the_commands(episode: Path) -> None:

@@ -1,18 +1,18 @@
 """What the model is told of a robot's motion (ACTIONS) and looks (CONDITIONS), made from commands alone.
 
-Reads  a `Command`: which robot, its commanded joints, the camera, and the robot-only render of those commands
+Reads  a `Command`: which robot, its commanded joints, the camera, the robot-only render of those commands, and the first frame
 Writes uint8 [t h w 3] pictures for the codec, or float32 [t n] numbers
 To add one: a function of a Command and one line in ACTIONS or CONDITIONS; from outside the repo, `module:NAME` of a
 `Condition`, or of a tuple of them. Titles and labels stand here too, and tables and figures take them from here, so this
 file imports neither JAX nor Warp when it is loaded. The last entries of ACTIONS are the paper's other systems: each is a
 combination of mechanisms (network/mechanisms.py) in the same network.
 
-A Command holds nothing that was measured or seen in the scene, so that no condition can show the future.
+A Command holds nothing that was measured or seen in the scene after its first frame, so that no condition can show the future.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -51,6 +51,8 @@ class Command:
     """The same video [t h w 3] uint8, where it is in memory."""
     data: Path | None = None
     """Data set of the episode, which keeps robots of a user's own."""
+    read_first: Callable[[], Video] | None = None
+    """Function that reads the first frame of the scene [1 h w 3] uint8, which every model is given, and no other."""
 
     @cached_property
     def render(self) -> Video:
@@ -114,6 +116,9 @@ class Condition:
     """Normalization of numbers by those of the training episodes (cache/scales.py)."""
     with_history: bool = False
     """Whether earlier frames (`model.history`) are told theirs too, before the clip's."""
+    is_guess: bool = False
+    """Whether it is a first guess of the video itself, made of its first frame too: what a prediction of residuals
+    (`model.prediction`) then begins with, in the place of the first frame that stands still."""
     title: str = ""
     """Name at the head of a table's row or a figure."""
     label: str = ""
@@ -169,7 +174,9 @@ def clip_numbers(
     return np.concatenate([take_frames(start + np.asarray(history)), told])
 
 
-def make_command(folder: Path, record: Record, states: States, rendered: Video | None = None) -> Command:
+def make_command(
+    folder: Path, record: Record, states: States, rendered: Video | None = None, scene: Video | None = None
+) -> Command:
     """The part of an episode that conditions may see.
 
     Args:
@@ -177,9 +184,11 @@ def make_command(folder: Path, record: Record, states: States, rendered: Video |
         record: its header.
         states: its arrays.
         rendered: its robot-only video [t h w 3] uint8, where it is in memory.
+        scene: its video [t h w 3] uint8, where it is in memory; conditions can reach its first frame alone.
     """
-    data = data_folder(folder)
-    return Command(record.robot, states.action, states.intrinsics, states.extrinsics, folder / "robot.mkv", rendered, data)
+    render, data = folder / "robot.mkv", data_folder(folder)
+    first = partial(read_video, folder / "rgb.mkv", most=1) if scene is None else partial(np.copy, scene[:1])
+    return Command(record.robot, states.action, states.intrinsics, states.extrinsics, render, rendered, data, first)
 
 
 def joints(command: Command) -> Float[np.ndarray, "t 16"]:
@@ -190,6 +199,17 @@ def joints(command: Command) -> Float[np.ndarray, "t 16"]:
 def robot_render(command: Command) -> Video:
     """The robot alone at every frame: [t h w 3] uint8."""
     return command.render
+
+
+def pasted_render(command: Command) -> Video:
+    """The robot alone at every frame, pasted into the first frame of the scene: [t h w 3] uint8.
+
+    The same as the baseline of that name: what one can draw of the video without having learned anything.
+    """
+    from xew.metrics.grading.baselines import paste_render
+
+    assert command.read_first is not None, "a command of an episode has it"
+    return paste_render(command.read_first()[0], command.render)
 
 
 def robot_mask(command: Command) -> Video:
@@ -355,6 +375,11 @@ CONDITIONS: dict[str, Condition | System] = {
         (Condition("robot_render", "map_channels", robot_render),),
         title="Per-frame render as channels",
         label="per-frame render as channels",
+    ),
+    "pasted_render": System(
+        (Condition("pasted_render", "map_channels", pasted_render, is_guess=True),),
+        title="Per-frame render in the first frame",
+        label="per-frame render pasted into the first frame",
     ),
 }
 HISTORY = Condition("history", "history", None, title="Earlier frames", label="earlier frames")

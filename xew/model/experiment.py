@@ -79,7 +79,9 @@ class Experiment:
     def network(self) -> Network:
         words = VOCABULARY if self.text_encoder.learned else 0
         own = ("reference_channels",) if self.model.reference == "channels" else ()
-        return Network(self.size, self.codec.channels, (*self.conditions, *own), words, self.train.seed, self.model)
+        guess = next((name for name, condition in self.conditions.items() if condition.is_guess), "")
+        streams = (*self.conditions, *own)
+        return Network(self.size, self.codec.channels, streams, guess, words, self.train.seed, self.model)
 
     @property
     def sampling_network(self) -> Network:

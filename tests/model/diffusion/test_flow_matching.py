@@ -66,20 +66,23 @@ def test_the_target_is_the_video_behind_the_shown_reference(latents: jax.Array) 
     np.testing.assert_allclose((relative.velocity - plain.velocity)[:, 1:], np.repeat(change, 2, 1), atol=1e-5)
 
 
-def test_residuals_have_the_variance_one_at_every_level_and_give_the_velocity() -> None:
-    """Of latents that are as far from the first frame as is assumed; the residual is what the guess leaves, and no more."""
-    reference, spread, noise = (np.asarray(normal(seed, 6, 1 if seed == 1 else 4, 64, 64, 1)) for seed in (1, 2, 3))
-    later = reference + fm.REFERENCE_SPREAD * spread
+@pytest.mark.parametrize("guessed", [1, 4], ids=["that stands still", "that moves"])
+def test_residuals_have_the_variance_one_at_every_level_and_give_the_velocity(guessed: int) -> None:
+    """Of latents that are as far from the guess as is assumed; the residual is what their estimate leaves, and no more."""
+    reference, spread, noise = (
+        np.asarray(normal(seed, 6, frames, 64, 64, 1)) for seed, frames in ((1, guessed), (2, 4), (3, 4))
+    )
+    later, guess = reference + fm.GUESS_SPREAD * spread, jnp.asarray(reference)
     sigma = jnp.asarray([0.01, 0.2, 0.5, 0.8, 0.95, 1.0], jnp.float32)
     level = np.asarray(sigma)[:, None, None, None, None]
-    noisy = jnp.asarray(np.concatenate([reference, (1 - level) * later + level * noise], 1))
-    guessed, moved = (fm.velocity_of_residual(jnp.full(noisy.shape, fill), noisy, sigma)[:, 1:] for fill in (0.0, 1.0))
-    residual = (noise - later - guessed) / (moved - guessed)
+    noisy = jnp.asarray((1 - level) * later + level * noise)
+    expected, moved = (fm.velocity_of_residual(jnp.full(noisy.shape, fill), noisy, sigma, guess) for fill in (0.0, 1.0))
+    residual = (noise - later - expected) / (moved - expected)
     np.testing.assert_allclose(residual.std(axis=(1, 2, 3, 4)), np.ones(6), rtol=0.02)
-    seen = np.asarray(noisy[:, 1:] - (1 - level) * reference)
+    seen = np.asarray(noisy - (1 - level) * reference)
     assert np.abs((residual * seen).mean(axis=(1, 2, 3, 4))).max() < 0.03, "nothing linear is left to be guessed"
-    still = fm.velocity_of_residual(jnp.zeros(noisy.shape), noisy, sigma)[-1, 1:]
-    np.testing.assert_allclose(noisy[-1, 1:] - still, np.repeat(reference[-1], 4, 0), atol=1e-5)
+    still = fm.velocity_of_residual(jnp.zeros(noisy.shape), noisy, sigma, guess)[-1]
+    np.testing.assert_allclose(noisy[-1] - still, np.broadcast_to(reference[-1], still.shape), atol=1e-5)
 
 
 def test_velocity_of_clean_latents_is_the_pair_s(latents: jax.Array) -> None:

@@ -130,6 +130,19 @@ def test_the_reference_in_channels_is_its_first_frame_in_every_frame() -> None:
     assert np.abs(fed(LATENTS, {"map_channels": first + 1.0}, SIGMA, TEXT) - expected)[:, 1:].max() > 1e-3
 
 
+def test_a_network_at_its_start_predicts_the_guess_that_it_is_told() -> None:
+    """Its head starts at zero, so a prediction of residuals is the guess itself where nothing but noise is seen."""
+    noise, guess = jnp.ones((2,), jnp.float32), normal(9, *SHAPE)
+    model = WorldModel(
+        MODELS["tiny"], CHANNELS, ("map_channels",), prediction="residual", guess="map_channels", rngs=nnx.Rngs(0)
+    )
+    clean = LATENTS - model(LATENTS, {"map_channels": guess}, noise, TEXT)
+    np.testing.assert_allclose(clean, guess, atol=1e-5)
+    settings = load_experiment(ROOT / "configs" / "debug.yaml", ["--model.embodiment", "pasted_render"])
+    assert settings.network.guess == "map_channels" and settings.network.create().guess == "map_channels"
+    assert load_experiment(ROOT / "configs" / "fixed.yaml").network.guess == ""
+
+
 def test_no_condition_feeds_what_the_network_has_of_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(CONDITIONS, "wrong", Condition("wrong", "reference_channels", None, title="Wrong", label="wrong"))
     with pytest.raises(ConfigError, match=r"feeds 'reference_channels'; conditions feed action, embodiment, joints, history, "):

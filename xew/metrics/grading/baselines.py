@@ -42,18 +42,29 @@ def copy_first_frame(folder: Path, truth: Truth) -> np.ndarray:
 
 
 def pasted_render(folder: Path, truth: Truth) -> np.ndarray:
-    """The first frame with its robot filled in and the render of the robot's commands pasted on: uint8 [t h w 3].
+    """`paste_render` of an episode: uint8 [t h w 3]. No frame of the truth but the first is looked at."""
+    return paste_render(truth.rgb[0], read_video(folder / "robot.mkv")[: len(truth.rgb)])
 
-    The render and the first frame are what every model may be told; no other frame of the truth is looked at. What the arm
-    hid in the first frame is filled in from around by Telea's inpainting (2004).
+
+def paste_render(first: np.ndarray, render: np.ndarray) -> np.ndarray:
+    """The first frame with its robot filled in and the render of the robot's commands pasted on.
+
+    Both are what every model may be told. What the arm hid in the first frame is filled in from around by Telea's
+    inpainting (2004).
+
+    Args:
+        first: [h w 3] uint8, the first frame of an episode.
+        render: [t h w 3] uint8, its robot alone on a white ground, from the first frame on.
+
+    Returns:
+        [t h w 3] uint8, which begins with the first frame as it is.
     """
-    render = read_video(folder / "robot.mkv")[: len(truth.rgb)]
     robot = np.asarray((render < WHITE).any(axis=-1))
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * GROWN + 1, 2 * GROWN + 1))
     hole = cv2.dilate(robot[0].astype(np.uint8), disk)
-    scene = cv2.inpaint(truth.rgb[0], hole, FILL_RADIUS, cv2.INPAINT_TELEA)
+    scene = cv2.inpaint(first, hole, FILL_RADIUS, cv2.INPAINT_TELEA)
     pasted = np.where(robot[..., None], render, scene)
-    pasted[0] = truth.rgb[0]
+    pasted[0] = first
     return pasted
 
 

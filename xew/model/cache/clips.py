@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from xew.episode import Record
-from xew.model.conditions import Condition, clip_numbers, robot_render
+from xew.model.conditions import Condition, clip_numbers, pasted_render, robot_render
 from xew.model.episodes.commands import episode_command
 from xew.model.settings.settings import Clip
 from xew.model.video.frames import to_model_size
@@ -55,15 +55,15 @@ def read_streams(
     wanted = {name: condition for name, condition in conditions.items() if name in streams}
     videos = {name: pixels["rgb"] for name in streams if name == "rgb" or wanted[name].make is None}
     if len(videos) < len(streams):
-        command = episode_command(folder, record, pixels.get("robot"))
+        command = episode_command(folder, record, pixels.get("robot"), pixels.get("rgb"))
         videos |= {name: condition.make(command) for name, condition in wanted.items() if condition.make is not None}
     return {name: to_model_size(v, clip.height, clip.width) if v.ndim == 4 else v for name, v in videos.items()}
 
 
 def needed_pixels(conditions: Mapping[str, Condition], streams: Collection[str]) -> list[str]:
-    """Names of the videos of an episode that the named streams are made from, among rgb and robot."""
+    """Names of the videos of an episode that the named streams are made from whole, among rgb and robot."""
     scene = any(name == "rgb" or conditions[name].make is None for name in streams)
-    robot = any(name in conditions and conditions[name].make is robot_render for name in streams)
+    robot = any(name in conditions and conditions[name].make in (robot_render, pasted_render) for name in streams)
     return [name for name, needed in (("rgb", scene), ("robot", robot)) if needed]
 
 

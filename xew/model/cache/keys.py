@@ -27,6 +27,8 @@ def stream_path(encoding: Encoding, codec_hash: str, record: Record, stream: str
     name = condition.name if condition else stream
     of_scene = condition is None or condition.make is None
     sources = (record.hashes["rgb"],) if of_scene else (record.hashes["states"], record.hashes["robot"])
+    if condition is not None and condition.is_guess:
+        sources = (*sources, record.hashes["rgb"])
     if condition is not None and (of_scene or condition.with_history):
         sources = (*sources, str(inputs.history))
     cut = digest(inputs.clip) if inputs.chunks == 1 else (digest(inputs.clip), "chunks")

@@ -17,8 +17,9 @@ TRAIN_LEVELS = 1000
 """Number of noise levels that training draws from."""
 REFERENCE_NOISE = 0.1
 """Largest standard deviation of the noise that perturbs the reference latent in training; it is drawn uniformly (FlowWAM)."""
-REFERENCE_SPREAD = 0.7
-"""Standard deviation of latents round the clip's first frame that a prediction of residuals assumes."""
+GUESS_SPREAD = 0.7
+"""Standard deviation of latents round the guess that a prediction of residuals begins with. Of standardized latents of 18
+episodes it is .67 round the pasted render and 1.0 round the first frame."""
 SMALLEST_LEVEL = 0.05
 """Noise level under which a prediction of clean latents is divided by no less."""
 ReplaceReference = Callable[[Array, Array], Array]
@@ -106,16 +107,25 @@ def velocity_of_clean(
 
 
 def velocity_of_residual(
-    residual: Float[Array, "b t h w c"], noisy: Float[Array, "b t h w c"], sigma: Float[Array, " b"]
+    residual: Float[Array, "b t h w c"],
+    noisy: Float[Array, "b t h w c"],
+    sigma: Float[Array, " b"],
+    guess: Float[Array, "b k h w c"],
 ) -> Float[Array, "b t h w c"]:
-    """Velocity [b t h w c] of what is left of clean latents [b t h w c] behind a linear guess of them.
+    """Velocity [b t h w c] of what is left of clean latents behind their best linear estimate.
 
-    The guess is the best linear one of latents that are normally distributed round the first latent frame, with the standard
-    deviation `REFERENCE_SPREAD`, from noisy latents [b t h w c] at noise levels [b]. A residual of 0 is that guess (at level 1
-    the first frame, which stands still), and of such latents it has the variance 1 at every level: the preconditioning of
-    Karras et al. 2022 (arXiv 2206.00364, section 5), for flow matching and with a mean.
+    The estimate is the best linear one of latents that are normally distributed round a guess, with the standard deviation
+    `GUESS_SPREAD`, from noisy ones. A residual of 0 is that estimate (at level 1 the guess itself), and of such latents it
+    has the variance 1 at every level: the preconditioning of Karras et al. 2022 (arXiv 2206.00364, section 5), for flow
+    matching and with a mean.
+
+    Args:
+        residual: [b t h w c] what the network computes.
+        noisy: [b t h w c] noisy latents.
+        sigma: [b] their noise levels.
+        guess: [b k h w c] with k = t, or k = 1 where it stands still.
     """
-    level, reference, variance = sigma[:, None, None, None, None], noisy[:, :1], REFERENCE_SPREAD**2
+    level, variance = sigma[:, None, None, None, None], GUESS_SPREAD**2
     seen = (1 - level) ** 2 * variance + level**2
-    offset = noisy - (1 - level) * reference
-    return offset * (level - (1 - level) * variance) / seen - reference - REFERENCE_SPREAD / jnp.sqrt(seen) * residual
+    offset = noisy - (1 - level) * guess
+    return offset * (level - (1 - level) * variance) / seen - guess - GUESS_SPREAD / jnp.sqrt(seen) * residual

@@ -8,10 +8,13 @@ from xew.episode import Record, read_states
 from xew.model.conditions import Command, make_command
 
 
-def episode_command(folder: Path, record: Record, rendered: np.ndarray | None = None) -> Command:
+def episode_command(
+    folder: Path, record: Record, rendered: np.ndarray | None = None, scene: np.ndarray | None = None
+) -> Command:
     """Read what conditions may be made from, of an episode of a data set.
 
     Args:
         rendered: [t 240 320 3] uint8, the robot alone, where it is in memory; else its video is read when it is needed.
+        scene: [t 240 320 3] uint8, the episode's video, likewise; conditions see its first frame alone.
     """
-    return make_command(folder, record, read_states(folder), rendered)
+    return make_command(folder, record, read_states(folder), rendered, scene)

@@ -114,7 +114,8 @@ class WorldModel(nnx.Module):
         history: when the frames of the stream history were, in latent frames from the clip's first (negative).
         words: rows of a learned table of words; text is then ids [b l] instead of embeddings. 0 has none.
         prediction: what the head computes, from which the velocity follows: "velocity" itself, "clean" latents, or the
-            "residual" that a linear guess from the noisy latents and the first frame leaves of them.
+            "residual" that a linear estimate from the noisy latents and a guess leaves of them.
+        guess: stream or mechanism whose latents are that guess; "" takes the first frame, which stands still.
     """
 
     def __init__(
@@ -133,10 +134,11 @@ class WorldModel(nnx.Module):
         history: Sequence[float] = (),
         words: int = 0,
         prediction: Prediction = "velocity",
+        guess: str = "",
         rngs: nnx.Rngs,
     ) -> None:
         self.size, self.channels, self.dtype, self.residual = size, channels, dtype, residual
-        self.prediction = prediction
+        self.prediction, self.guess = prediction, guess
         self.remat, self.unroll, self.visibility, self.time = remat, unroll, visibility, time
         self.history = tuple(history)
         # Earlier frames come right after RGB's tokens, so that all frames that have a context of their own are one piece.
@@ -194,7 +196,9 @@ class WorldModel(nnx.Module):
         predicted = unpatchify(self.head(tokens[:, :rgb].astype(jnp.float32), time, levels[:rgb]), latents.shape)
         if self.prediction == "velocity":
             return predicted
-        return (velocity_of_clean if self.prediction == "clean" else velocity_of_residual)(predicted, latents, sigma)
+        if self.prediction == "clean":
+            return velocity_of_clean(predicted, latents, sigma)
+        return velocity_of_residual(predicted, latents, sigma, conditions[self.guess] if self.guess else latents[:, :1])
 
     def condition_cache(self, conditions: Conditions, text: Text) -> ConditionCache:
         """Keys and values of the condition tokens in every layer; they hold for all steps of sampling a clip.

@@ -25,6 +25,8 @@ class Network:
     """Channels of the latents."""
     streams: tuple[str, ...]
     """Streams and mechanisms beside RGB."""
+    guess: str
+    """The one of them that is a guess of the video; "" where none is."""
     words: int
     """Rows of the table of words that the network learns; 0 where a frozen encoder is used."""
     seed: int
@@ -57,6 +59,7 @@ class Network:
             history=tuple(frame / TEMPORAL_FACTOR for frame in settings.history),
             words=self.words,
             prediction=settings.prediction,
+            guess=self.guess,
             rngs=nnx.Rngs(self.seed),
         )
 
