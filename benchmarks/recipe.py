@@ -39,6 +39,9 @@ CHANGES: dict[str, tuple[str, ...]] = {
         *("--model.embodiment", "robot_render_channels", "--model.reference", "channels"),
         *("--model.prediction", "residual", "--model.action", "none"),
     ),
+    "pasted render": (
+        *("--model.embodiment", "pasted_render", "--model.reference", "channels", "--model.prediction", "residual"),
+    ),
     "shift 3": ("--train.shift", "3"),
     "two chunks": ("--train.chunks", "2", "--train.batch", "1"),
 }
