@@ -54,7 +54,7 @@ class _Episode:
         self.frames = wp.empty((2 * count, *size, 3), dtype=wp.uint8)
         self.soft = wp.empty_like(self.frames)
         self.gray = wp.empty((2 * count, *size), dtype=wp.uint8)
-        self._blur = wp.array(_fixed_kernel(reference.RESIDUAL_SOFTNESS), dtype=int)
+        self._blur = wp.array(fixed_kernel(reference.RESIDUAL_SOFTNESS), dtype=int)
         self.put(target, slice(count, None))
         self.distance = wp.empty(mask.shape, dtype=float)
         wp.launch(kernels.measure_distance, mask.shape, [wp.array(mask.astype(np.uint8)), 0], [self.distance])
@@ -76,7 +76,7 @@ class _Episode:
         wp.launch(kernels.take_gray, gray.shape, [frames], [gray])
 
 
-def _fixed_kernel(sigma: float) -> np.ndarray:
+def fixed_kernel(sigma: float) -> np.ndarray:
     """[k] int32, the Gaussian that OpenCV blurs uint8 with, in 256ths."""
     return np.rint(256 * cv2.getGaussianKernel(round(sigma * 6 + 1) | 1, sigma)[:, 0]).astype(np.int32)
 

@@ -1,0 +1,149 @@
+"""The default tracker (xew.metrics.estimators.tracks) on a device: all points of all frames at once.
+
+Proposals of flow and of search do not depend on the frame before, so they are made for all frames in a few launches; one
+more walks through the frames, a block of threads for each point.
+"""
+
+import functools
+
+import cv2
+import numpy as np
+import warp as wp
+
+from xew.concurrency import PARSING
+from xew.metrics.estimators import tracks as reference
+from xew.metrics.estimators.batched import mask_kernels
+from xew.metrics.estimators.batched import track_kernels as kernels
+from xew.metrics.estimators.batched.flow import Array
+from xew.metrics.estimators.batched.masks import fixed_kernel
+from xew.metrics.estimators.similarity import find_most_similar
+
+LEVELS = 4
+"""Most levels of the pyramid of Lucas-Kanade, the image itself among them."""
+THREADS = 128
+"""Threads that share the pixels round one point."""
+SEARCHES_AT_ONCE = {"cpu": 64, "cuda": 4096}
+"""Number of searches on the device at once; one takes 21 kB."""
+
+
+class BatchedTracker:
+    """`estimate_tracks` on a device; what it knows of two videos is computed once while the same arrays follow each other.
+
+    Args:
+        device: Warp's name of a device, None for Warp's default.
+    """
+
+    def __init__(self, device: str | None = None) -> None:
+        self._device = wp.get_device(device)
+        self._videos: _Videos | None = None
+
+    def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        """Tracks float32 [t k 2] of points [t k 2] where `visible` [t k], in a prediction [t h w 3] of a target [t h w 3]."""
+        points = np.nan_to_num(points).astype(np.float32)
+        if points.shape[1] == 0:
+            return points
+        with PARSING, wp.ScopedDevice(self._device):  # threads take turns at the device
+            if self._videos is None or self._videos.target is not target:
+                self._videos = _Videos(target)
+            if self._videos.prediction is not prediction:
+                self._videos.show(prediction)
+            return _track(self._videos, points, visible)
+
+
+class _Videos:
+    """A true video as a device has it, with room for a predicted video before it."""
+
+    def __init__(self, target: np.ndarray) -> None:
+        self.target = target
+        self.prediction: np.ndarray | None = None
+        count, height, width = target.shape[:3]
+        self._levels = [np.array([0, height, width])]
+        while len(self._levels) < LEVELS and min((self._levels[-1][1:] + 1) // 2) > int(kernels.WINDOW):
+            first = self._levels[-1][0] + self._levels[-1][1] * self._levels[-1][2]
+            self._levels.append(np.array([first, *(self._levels[-1][1:] + 1) // 2]))
+        size = int(self._levels[-1][0] + self._levels[-1][1] * self._levels[-1][2])
+        self.images = kernels.Images()
+        self.images.pyramid = wp.empty((2 * count, size), dtype=wp.uint8)
+        self.images.slope = wp.empty((2 * count, size), dtype=int)
+        self.images.level = wp.array(np.stack(self._levels).astype(np.int32), dtype=wp.vec3i)
+        self.images.soft = wp.empty((2 * count, height, width, 3), dtype=wp.uint8)
+        self.half = wp.empty((2 * count, height // 2, width // 2), dtype=int)
+        self._blur = wp.array(fixed_kernel(reference.SOFTNESS), dtype=int)
+        self.true_flow = self._put(target, slice(count, None))
+        for level in map(wp.vec3i, self._levels):
+            wp.launch(
+                kernels.take_slopes, (2 * count, level[1], level[2]), [self.images.pyramid, level], [self.images.slope]
+            )
+
+    def show(self, prediction: np.ndarray) -> None:
+        """Make a video [t h w 3] uint8 the predicted one."""
+        self.alike, self.difference = find_most_similar(prediction, self.target)
+        self.seen_flow = self._put(prediction, slice(0, len(prediction)))
+        self.prediction = prediction
+
+    def _put(self, video: np.ndarray, images: slice) -> Array:
+        """Make a video these images; [t-1 h w 2] float32, its optical flow from frame to frame."""
+        frames = wp.array(np.ascontiguousarray(video), dtype=wp.uint8)
+        soft, half, pyramid = self.images.soft[images], self.half[images], self.images.pyramid[images]
+        rows = wp.empty(frames.shape, dtype=wp.uint16)
+        wp.launch(mask_kernels.blur_rows, frames.shape[:3], [frames, self._blur], [rows])
+        wp.launch(mask_kernels.blur_columns, frames.shape[:3], [rows, self._blur], [soft])
+        wp.launch(kernels.halve_colors, half.shape, [soft], [half])
+        gray = np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in video])
+        wp.copy(pyramid[:, : gray[0].size], wp.array(gray.reshape(len(gray), -1), dtype=wp.uint8))
+        for above, below in zip(self._levels, self._levels[1:], strict=False):
+            inputs = [wp.vec3i(above), wp.vec3i(below)]
+            wp.launch(kernels.shrink, (len(video), below[1], below[2]), inputs, [pyramid])
+        return _flow(gray)
+
+
+def _flow(gray: np.ndarray) -> Array:
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    flow = [dis.calc(a, b, None) for a, b in zip(gray, gray[1:], strict=False)]
+    return wp.array(np.stack(flow or [np.zeros((*gray.shape[1:], 2), np.float32)]), dtype=wp.vec2)
+
+
+def _track(videos: _Videos, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """`estimate_tracks` of points without NaN."""
+    frames, count = visible.shape
+    truth = kernels.Truth()
+    truth.point = wp.array(points, dtype=wp.vec2)
+    truth.visible = wp.array(visible.astype(np.uint8))
+    truth.alike = wp.array(videos.alike.astype(np.int32))
+    proposal = wp.empty((frames, count, 2), dtype=wp.vec3)
+    launch = functools.partial(wp.launch_tiled, block_dim=THREADS)
+    launch(kernels.propose, dim=[frames, count, 2], inputs=[videos.images, truth], outputs=[proposal])
+    sure = proposal.numpy()[..., 2].min(axis=-1) <= 1 - reference.SURE
+    frame, index = np.nonzero(visible & ~sure)
+    search = np.full(visible.shape, -1, np.int32)
+    search[frame, index] = np.arange(len(frame))
+    peak = _search(videos, truth, frame, index, points)
+    repeats = wp.array((videos.difference < reference.SAME_MOMENT).astype(np.uint8))
+    states = int(kernels.PROPOSALS)
+    place = wp.empty((frames, count, states), dtype=wp.vec2)
+    origin = wp.empty((frames, count, states + 1), dtype=int)
+    track = wp.empty((frames, count), dtype=wp.vec2)
+    known = [videos.images, truth, repeats, videos.seen_flow, videos.true_flow, proposal, wp.array(search), peak]
+    launch(kernels.walk, dim=[count], inputs=known, outputs=[place, origin, track])
+    return track.numpy()
+
+
+def _search(videos: _Videos, truth: kernels.Truth, frame: np.ndarray, index: np.ndarray, points: np.ndarray) -> Array:
+    """[s PEAKS 3] float32, x, y and cost of the best places for points [s] in frames [s]."""
+    found = wp.zeros((max(len(frame), 1), reference.PEAKS), dtype=wp.vec3)
+    step = SEARCHES_AT_ONCE["cuda" if found.device.is_cuda else "cpu"]
+    side = 2 * int(kernels.REACH) + 1
+    for first in range(0, len(frame), step):
+        part = slice(first, min(first + step, len(frame)))
+        at, which = (wp.array(array[part].astype(np.int32)) for array in (frame, index))
+        point = wp.array(points[frame[part], index[part]], dtype=wp.vec2)
+        like = wp.empty((len(at), side, side), dtype=float)
+        wp.launch(kernels.match_patches, like.shape, [videos.half, at, point, len(points)], [like])
+        peak, place = wp.empty(like.shape, dtype=wp.uint8), wp.empty((len(at), reference.PEAKS), dtype=wp.vec3)
+        wp.launch(kernels.mark_peaks, like.shape, [like], [peak])
+        wp.launch(kernels.take_peaks, len(at), [like, peak, point], [place])
+        inputs = [videos.images, truth, at, which, place]
+        wp.launch_tiled(
+            kernels.improve_peaks, dim=list(place.shape), inputs=inputs, outputs=[found[part]], block_dim=THREADS
+        )
+    return found
