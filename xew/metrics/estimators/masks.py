@@ -239,7 +239,7 @@ def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def color_bins(video: np.ndarray) -> np.ndarray:
-    """Index of each pixel's Lab color among the bins."""
+    """Index of each pixel's Lab color among the bins, [t h w] or [h w] int32 of colors [t h w 3] or [h w 3] uint8."""
     flat = video.reshape(-1, video.shape[-2], 3)
     lab = cv2.cvtColor(flat, cv2.COLOR_RGB2LAB).reshape(video.shape).astype(np.int32) * COLOR_BINS // 256
     return (lab[..., 0] * COLOR_BINS + lab[..., 1]) * COLOR_BINS + lab[..., 2]

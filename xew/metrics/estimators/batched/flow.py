@@ -12,9 +12,12 @@ import numpy as np
 import warp as wp
 
 from xew.metrics.estimators.batched import flow_kernels as kernels
+from xew.metrics.estimators.batched import refinement_kernels as refinement
 
 PATCH = 8
 """Side of a patch [pixels]."""
+RELAXATIONS = 5
+"""Number of steps of relaxation that solve the equations of a refinement."""
 Array = Any
 """Array of Warp, on a device."""
 
@@ -29,6 +32,8 @@ class Search:
     """Distance from patch to patch [pixels]."""
     steps: int
     """Most steps of descent of a patch, half of them on the way there and half on the way back."""
+    refinements: int = 0
+    """Number of variational refinements at each level."""
 
 
 @dataclass(frozen=True)
@@ -48,33 +53,35 @@ class Pyramid:
     """Images as the search reads them."""
 
     levels: dict[int, Level]
-    """By level, from the finest."""
+    """Levels by their number, from the finest."""
     shape: tuple[int, int]
     """Height and width of the images [pixels]."""
     search: Search
 
 
 def coarsest_level(shape: tuple[int, int]) -> int:
-    """The coarsest level of the pyramid of images of this height and width [pixels]."""
+    """The coarsest level of the pyramid of images of this height and width [pixels]; -1 where they are smaller than a patch."""
+    if min(shape) < PATCH:
+        return -1
     return min(int(math.log2(max(shape) / (4 * PATCH)) + 0.5), int(math.log2(min(shape) // PATCH)))
 
 
-def build_pyramid(gray: Array, search: Search) -> Pyramid:
-    """The pyramid of gray images [n h w] uint8 on a device.
+def is_large_enough(shape: tuple[int, int], search: Search) -> bool:
+    """Whether images of this height and width [pixels] reach the search's finest level; for smaller ones OpenCV has others."""
+    return coarsest_level(shape) >= search.finest
 
-    Raises ValueError where they are too small for the search's finest level.
-    """
+
+def build_pyramid(gray: Array, search: Search) -> Pyramid:
+    """The pyramid of gray images [n h w] uint8 on a device, which are large enough for the search."""
     shape = (gray.shape[1], gray.shape[2])
-    if min(shape) < PATCH or coarsest_level(shape) < search.finest:
-        raise ValueError(f"images of {shape} are too small for flow at level {search.finest}.")
     device = gray.device
     levels = {}
-    for index in range(1, coarsest_level(shape) + 1):
-        half = wp.empty((gray.shape[0], gray.shape[1] // 2, gray.shape[2] // 2), dtype=wp.uint8, device=device)
-        wp.launch(kernels.halve, half.shape, [gray], [half], device=device)
-        gray = half
-        if index >= search.finest:
-            levels[index] = _prepare_level(gray, search)
+    for index in range(search.finest, coarsest_level(shape) + 1):
+        factor = 2**index if index == search.finest else 2
+        small = wp.empty((gray.shape[0], *(side // factor for side in gray.shape[1:])), dtype=wp.uint8, device=device)
+        wp.launch(kernels.shrink, small.shape, [gray], [small], device=device)
+        gray = small
+        levels[index] = _prepare_level(gray, search)
     return Pyramid(levels, shape, search)
 
 
@@ -107,6 +114,8 @@ def find_flow(pyramid: Pyramid, pairs: np.ndarray) -> Array:
         _search_level(level, pair, patch_flow, search)
         inputs = [level.packed, pair, patch_flow, search.stride]
         wp.launch(kernels.spread_patches, flow.shape, inputs, [flow], device=device)
+        if search.refinements:
+            flow = _refine(level, pair, flow, search.refinements)
         finer = index - 1 if index > search.finest else 0
         shape = pyramid.levels[finer].packed.shape[1:] if finer in pyramid.levels else pyramid.shape
         larger = wp.empty((len(pairs), *shape), dtype=wp.vec2, device=device)
@@ -124,3 +133,27 @@ def _search_level(level: Level, pair: Array, patch_flow: Array, search: Search) 
             settings = [search.stride, PATCH, diagonal, forward, search.steps // 2]
             inputs = [level.packed, pair, level.tensor, level.sums, *settings]
             wp.launch(kernels.search_diagonal, (count, rows), inputs, [patch_flow], device=patch_flow.device)
+
+
+def _refine(level: Level, pair: Array, flow: Array, refinements: int) -> Array:
+    """The flow [p h w 2] after some variational refinements."""
+    device, shape = flow.device, flow.shape
+
+    def launch(kernel: Any, inputs: list[Any], *dtypes: Any) -> list[Array]:
+        outputs = [wp.empty(shape, dtype=dtype, device=device) for dtype in dtypes]
+        wp.launch(kernel, shape, inputs, outputs, device=device)
+        return outputs
+
+    (blended,) = launch(refinement.blend, [level.packed, pair, flow], wp.vec2)
+    slope_x, slope_y = launch(refinement.differentiate, [blended], wp.vec2, wp.vec2)
+    slope_xx, slope_xy = launch(refinement.differentiate, [slope_x], wp.vec2, wp.vec2)
+    _, slope_yy = launch(refinement.differentiate, [slope_y], wp.vec2, wp.vec2)
+    slopes = [blended, slope_x, slope_y, slope_xy, slope_xx, slope_yy]
+    change, changed = wp.zeros(shape, dtype=wp.vec2, device=device), flow
+    for _ in range(refinements):
+        (weight,) = launch(refinement.weigh_smoothness, [changed], float)
+        matrix, side = launch(refinement.build_system, [*slopes, weight, flow, change], wp.vec3, wp.vec2)
+        for step in range(2 * RELAXATIONS):
+            wp.launch(refinement.relax, shape, [matrix, side, weight, step % 2], [change], device=device)
+        (changed,) = launch(refinement.add_change, [flow, change], wp.vec2)
+    return changed

@@ -22,12 +22,12 @@ ROW = wp.types.vector(length=9, dtype=float)
 STRIPES = wp.constant(8)
 """Number of stripes; flow is not handed on from one to another."""
 GRADIENT = wp.constant(1024)
-"""What is added to a gradient, so that it is packed without its sign."""
+"""Number added to a gradient, so that it is packed without its sign."""
 SMALL = wp.constant(0.001)
 """Least determinant of a structure tensor, and what a place keeps away from the last pixel."""
 MOST = wp.constant(1.0e10)
 BORDER = wp.constant(16.0)
-"""What places are counted from while they are rounded, beyond the first pixel: the border that OpenCV adds."""
+"""Width of the border that OpenCV adds, which places are counted from, for the same rounding [pixels]."""
 
 
 @wp.func
@@ -56,30 +56,30 @@ def mirror(i: int, size: int) -> int:
 
 
 @wp.kernel
-def halve(
+def shrink(
     # In:
     image: wp.array3d(dtype=wp.uint8),  # [n H W] uint8
     # Out:
-    half_out: wp.array3d(dtype=wp.uint8),  # [n h w] uint8, means of the areas that its pixels cover
+    small_out: wp.array3d(dtype=wp.uint8),  # [n h w] uint8, means of the areas that its pixels cover
 ):
     n, y, x = wp.tid()
-    height, width = half_out.shape[1], half_out.shape[2]
+    height, width = small_out.shape[1], small_out.shape[2]
     if 2 * height == image.shape[1] and 2 * width == image.shape[2]:
-        total = int(2)
+        total = wp.int32(2)
         for i in range(2):
             for j in range(2):
                 total += int(image[n, 2 * y + i, 2 * x + j])
-        half_out[n, y, x] = wp.uint8(total >> 2)
+        small_out[n, y, x] = wp.uint8(total >> 2)
         return
     step_y, step_x = float(image.shape[1]) / float(height), float(image.shape[2]) / float(width)
     top, left = float(y) * step_y, float(x) * step_x
-    mean = float(0.0)
+    mean = wp.float32(0.0)
     for i in range(int(top), wp.min(int(wp.ceil(top + step_y)), image.shape[1])):
         tall = wp.min(float(i + 1), top + step_y) - wp.max(float(i), top)
         for j in range(int(left), wp.min(int(wp.ceil(left + step_x)), image.shape[2])):
             wide = wp.min(float(j + 1), left + step_x) - wp.max(float(j), left)
             mean += tall * wide * float(image[n, i, j])
-    half_out[n, y, x] = wp.uint8(wp.rint(mean / (step_y * step_x)))
+    small_out[n, y, x] = wp.uint8(wp.rint(mean / (step_y * step_x)))
 
 
 @wp.kernel
@@ -93,10 +93,10 @@ def pack_gradients(
     height, width = image.shape[1], image.shape[2]
     above, below = mirror(y - 1, height), mirror(y + 1, height)
     left, right = mirror(x - 1, width), mirror(x + 1, width)
-    corners_x = int(image[n, above, right]) + int(image[n, below, right]) - int(image[n, above, left]) - int(image[n, below, left])
-    corners_y = int(image[n, below, left]) + int(image[n, below, right]) - int(image[n, above, left]) - int(image[n, above, right])
-    along_x = corners_x + 2 * (int(image[n, y, right]) - int(image[n, y, left]))
-    along_y = corners_y + 2 * (int(image[n, below, x]) - int(image[n, above, x]))
+    falling = int(image[n, below, right]) - int(image[n, above, left])
+    rising = int(image[n, above, right]) - int(image[n, below, left])
+    along_x = falling + rising + 2 * (int(image[n, y, right]) - int(image[n, y, left]))
+    along_y = falling - rising + 2 * (int(image[n, below, x]) - int(image[n, above, x]))
     packed_out[n, y, x] = int(image[n, y, x]) | ((along_x + GRADIENT) << 8) | ((along_y + GRADIENT) << 20)
 
 
@@ -111,7 +111,7 @@ def sum_gradients(
     sums_out: wp.array3d(dtype=wp.vec2),  # [n r c 2] float32, sums of the gradients
 ):
     n, row, column = wp.tid()
-    xx, xy, yy, sum_x, sum_y = float(0.0), float(0.0), float(0.0), float(0.0), float(0.0)
+    xx, xy, yy, sum_x, sum_y = wp.float32(0.0), wp.float32(0.0), wp.float32(0.0), wp.float32(0.0), wp.float32(0.0)
     for i in range(size):
         for j in range(size):
             pixel = packed[n, row * stride + i, column * stride + j]
@@ -175,6 +175,16 @@ def misfit(sums: wp.vec4) -> float:
     return sums[1] - sums[0] * sums[0] / 64.0
 
 
+@wp.func
+def invert(tensor: wp.vec3) -> wp.mat22:
+    """The inverse of a structure tensor."""
+    determinant = tensor[0] * tensor[2] - tensor[1] * tensor[1]
+    if wp.abs(determinant) < SMALL:
+        determinant = SMALL
+    beside = -tensor[1] / determinant
+    return wp.mat22(tensor[2] / determinant, beside, beside, tensor[0] / determinant)
+
+
 @wp.kernel
 def search_diagonal(
     # In:
@@ -217,21 +227,15 @@ def search_diagonal(
         found = misfit(compare_patches(packed, start, end, top, left, other, size))
         if found < least:
             best = other
-    shape = tensor[start, row, column]
-    determinant = shape[0] * shape[2] - shape[1] * shape[1]
-    if wp.abs(determinant) < SMALL:
-        determinant = SMALL
     slope = sums[start, row, column]
+    inverse = invert(tensor[start, row, column])
     flow = best
     least = float(MOST)
     for _ in range(steps):
         found_sums = compare_patches(packed, start, end, top, left, flow, size)
         along_x = found_sums[2] - found_sums[0] * slope[0] / 64.0
         along_y = found_sums[3] - found_sums[0] * slope[1] / 64.0
-        flow = flow - wp.vec2(
-            shape[2] / determinant * along_x - shape[1] / determinant * along_y,
-            shape[0] / determinant * along_y - shape[1] / determinant * along_x,
-        )
+        flow = flow - inverse * wp.vec2(along_x, along_y)
         found = misfit(found_sums)
         if found >= least:
             break
@@ -271,7 +275,7 @@ def spread_patches(
     first_row = wp.clamp((y - PATCH + stride) // stride, 0, last_row)
     first_column = wp.clamp((x - PATCH + stride) // stride, 0, last_column)
     here = level(packed[start, y, x])
-    total, weights = wp.vec2(), float(0.0)
+    total, weights = wp.vec2(), wp.float32(0.0)
     for row in range(first_row, last_row + 1):
         for column in range(first_column, last_column + 1):
             flow = patch_flow[p, row, column]

@@ -52,7 +52,7 @@ def blur_rows(
     n, y, x = wp.tid()
     reach = weight.shape[0] // 2
     for channel in range(3):
-        total = int(0)
+        total = wp.int32(0)
         for i in range(weight.shape[0]):
             total += weight[i] * int(frame[n, y, mirror(x + i - reach, frame.shape[2]), channel])
         sum_out[n, y, x, channel] = wp.uint16(total)
@@ -69,7 +69,7 @@ def blur_columns(
     n, y, x = wp.tid()
     reach = weight.shape[0] // 2
     for channel in range(3):
-        total = int(32768)
+        total = wp.int32(32768)
         for i in range(weight.shape[0]):
             total += weight[i] * int(row_sum[n, mirror(y + i - reach, row_sum.shape[1]), x, channel])
         frame_out[n, y, x, channel] = wp.uint8(total >> 16)
@@ -142,7 +142,7 @@ def weigh_carriers(
     source = wp.vec2(float(x), float(y)) + there
     place = find_place(source, height, width)
     closure = wp.length(there + read_flow(flow, pair.shape[0] + c, place))
-    residual = float(0.0)
+    residual = wp.float32(0.0)
     for channel in range(3):
         here = float(soft[pair[c][0], y, x, channel])
         residual = wp.max(residual, wp.abs(here - read_color(soft, pair[c][1], place, channel)))
@@ -156,13 +156,13 @@ def weigh_carriers(
 def measure_distance(
     # In:
     mask: wp.array3d(dtype=wp.uint8),  # [n h w] uint8, 0 or 1
-    n: int,  # the first that is measured
+    first: int,  # the first that is measured
     # Out:
-    distance_out: wp.array3d(dtype=float),  # [. h w] float32 distance to the contour [pixels], positive inside, cut off
+    distance_out: wp.array3d(dtype=float),  # [t h w] float32 distance to the contour [pixels], positive inside, cut off
 ):
     t, y, x = wp.tid()
     height, width = mask.shape[1], mask.shape[2]
-    own = mask[n + t, y, x]
+    own = mask[first + t, y, x]
     nearest = float(WINDOW) * STRAIGHT
     for ring in range(1, WINDOW + 1):
         if float(ring) * STRAIGHT >= nearest:
@@ -179,9 +179,9 @@ def measure_distance(
                     j = along
                 if side == 3:
                     i = -ring
-                if y + i >= 0 and y + i < height and x + j >= 0 and x + j < width:
-                    if mask[n + t, y + i, x + j] != own:
-                        nearest = wp.min(nearest, length)
+                inside = y + i >= 0 and y + i < height and x + j >= 0 and x + j < width
+                if inside and mask[first + t, y + i, x + j] != own:
+                    nearest = wp.min(nearest, length)
     nearest = nearest - 0.5
     if own == wp.uint8(0):
         nearest = -nearest
@@ -201,9 +201,9 @@ def carry_true(
     shape_out: wp.array3d(dtype=float),  # [t h w] float32, -1 to 1, the mask that it carries
 ):
     t, y, x = wp.tid()
-    chosen = int(0)
+    chosen = wp.int32(0)
     if gate[carrier[t, 1], y, x] > gate[carrier[t, 0], y, x]:
-        chosen = int(1)
+        chosen = 1
     c = carrier[t, chosen]
     place = find_place(source[c, y, x], distance.shape[1], distance.shape[2])
     gate_out[t, y, x] = gate[c, y, x]
@@ -226,7 +226,7 @@ def weigh_looks(
     looks_out: wp.array3d(dtype=float),  # [t h w] float32, evidence of both
 ):
     t, y, x = wp.tid()
-    code, most = int(0), int(0)
+    code, most = wp.int32(0), wp.int32(0)
     for channel in range(3):
         value = int(frame[t, y, x, channel])
         code = code * 256 + value
@@ -248,7 +248,7 @@ def blur_numbers(
 ):
     t, y, x = wp.tid()
     reach = weight.shape[0] // 2
-    total = float(0.0)
+    total = wp.float32(0.0)
     for i in range(weight.shape[0]):
         if vertical == 1:
             total += weight[i] * image[t, mirror(y + i - reach, image.shape[1]), x]
@@ -296,7 +296,7 @@ def take_median(
     mask_out: wp.array2d(dtype=wp.uint8),  # [h w] uint8, what most of a pixel and its eight neighbors are
 ):
     y, x = wp.tid()
-    count = int(0)
+    count = wp.int32(0)
     for i in range(-1, 2):
         for j in range(-1, 2):
             count += int(mask[wp.clamp(y + i, 0, mask.shape[0] - 1), wp.clamp(x + j, 0, mask.shape[1] - 1)])
@@ -316,7 +316,7 @@ def is_large(mask: wp.array2d(dtype=wp.uint8), y: int, x: int) -> bool:
     width = mask.shape[1]
     piece = Piece()
     piece[0] = y * width + x
-    count, at = int(1), int(0)
+    count, at = wp.int32(1), wp.int32(0)
     while at < count:
         row, column = piece[at] // width, piece[at] % width
         at += 1
@@ -324,7 +324,7 @@ def is_large(mask: wp.array2d(dtype=wp.uint8), y: int, x: int) -> bool:
             for j in range(-1, 2):
                 if is_in(mask, row + i, column + j):
                     code = (row + i) * width + column + j
-                    known = bool(False)
+                    known = wp.bool(False)
                     for k in range(count):
                         if piece[k] == code:
                             known = True
@@ -346,7 +346,6 @@ def drop_specks(
 ):
     y, x = wp.tid()
     kept = wp.uint8(0)
-    if mask[y, x] != wp.uint8(0):
-        if is_large(mask, y, x):
-            kept = wp.uint8(1)
+    if mask[y, x] != wp.uint8(0) and is_large(mask, y, x):
+        kept = wp.uint8(1)
     mask_out[t, y, x] = kept

@@ -13,7 +13,7 @@ import warp as wp
 from xew.concurrency import PARSING
 from xew.metrics.estimators import masks as reference
 from xew.metrics.estimators.batched import mask_kernels as kernels
-from xew.metrics.estimators.batched.flow import Array, Search, build_pyramid, find_flow
+from xew.metrics.estimators.batched.flow import Array, Search, build_pyramid, find_flow, is_large_enough
 from xew.metrics.estimators.similarity import find_most_similar
 
 SEARCH = Search(finest=1, stride=4, steps=16)
@@ -35,6 +35,8 @@ class BatchedMasker:
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:
         """Masks bool [t h w] of a prediction [t h w 3] uint8, from the true video [t h w 3] uint8 and masks [t h w] bool."""
+        if not is_large_enough(target.shape[1:3], SEARCH):
+            return reference.estimate_masks(prediction, target, target_mask)
         known = self._known
         if known is None or known.target is not target or known.mask is not target_mask:
             appearance = reference.learn_appearance(target, target_mask)

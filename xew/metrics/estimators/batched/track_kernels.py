@@ -1,10 +1,10 @@
-"""Warp kernels of the default tracker (xew.metrics.estimators.tracks), for all points and frames; tracks.py launches them.
+"""Warp kernels of the default tracker (xew.metrics.estimators.tracks): Lucas-Kanade, likeness and search, for tracks.py.
 
 Lucas-Kanade and likeness follow OpenCV's arithmetic as `tracks` calls it. The threads of a block share the pixels round one
-point; on a CPU a block is one thread. A point's path depends on no other point, so one block walks through all frames.
+point; on a CPU a block is one thread.
 
-Letters of shapes: n images (t predicted frames, then t true ones), t frames, k points, s searches, h w an image, P all pixels
-of a pyramid, l its levels, q the proposals of a frame, of which the first three are flow's and the rest a search's.
+Letters of shapes: n images (t predicted frames, then t true ones), t frames, k points, q searches of r r places, h w an image,
+P all pixels of a pyramid, l its levels.
 """
 
 # Annotations of kernels are types of Warp, which mypy does not know.
@@ -14,7 +14,7 @@ import warp as wp
 
 from xew.metrics.estimators import tracks
 from xew.metrics.estimators.batched.flow_kernels import mirror
-from xew.metrics.estimators.batched.mask_kernels import Place, find_place, read_flow
+from xew.metrics.estimators.batched.mask_kernels import Place, find_place
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -29,7 +29,7 @@ SWINGING = wp.constant(0.01)
 LEAST_EIGENVALUE = wp.constant(1.0e-4)
 SCALE = wp.constant(1.0 / 1048576.0)
 ONE = wp.constant(16384)
-"""What weights of pixels add up to."""
+"""Number that weights of pixels add up to."""
 PATCH = wp.constant(tracks.PATCH)
 PATCH_STEP = wp.constant(tracks.PATCH_STEP)
 SIDE = wp.constant(2 * tracks.PATCH // tracks.PATCH_STEP + 1)
@@ -38,12 +38,6 @@ FLATNESS = wp.constant(tracks.FLATNESS)
 REFINEMENT = wp.constant(tracks.REFINEMENT)
 STANDING = wp.constant(tracks.STANDING)
 GIVEN_UP = wp.constant(tracks.GIVEN_UP)
-SURE = wp.constant(tracks.SURE)
-STRAYING = wp.constant(tracks.STRAYING)
-JUMP = wp.constant(wp.float64(tracks.JUMP))
-LOST = wp.constant(wp.float64(tracks.LOST))
-HIDDEN = wp.constant(tracks.HIDDEN)
-INNER_MOTION = wp.constant(tracks.INNER_MOTION)
 SPACING = wp.constant(tracks.SPACING)
 PEAKS = wp.constant(tracks.PEAKS)
 PROPOSALS = wp.constant(3 + tracks.PEAKS)
@@ -54,9 +48,6 @@ MARGIN = wp.constant(tracks.PATCH // 2)
 
 Sums = wp.types.vector(length=10, dtype=int)
 """Of two patches: how many pixels are compared, sums of both by channel, sums of their squares, and of their difference's."""
-Places = wp.types.matrix(shape=(3 + tracks.PEAKS, 2), dtype=float)
-Costs = wp.types.vector(length=4 + tracks.PEAKS, dtype=wp.float64)
-"""Costs of the proposals and, last, of being lost."""
 
 
 @wp.struct
@@ -90,10 +81,10 @@ def shrink(
     pyramid_out: wp.array2d(dtype=wp.uint8),  # [n P] uint8; holds the larger level
 ):
     n, y, x = wp.tid()
-    total = int(128)
+    total = wp.int32(128)
     for i in range(-2, 3):
         row = mirror(2 * y + i, above[1])
-        line = int(0)
+        line = wp.int32(0)
         for j in range(-2, 3):
             weight = wp.where(j == 0, 6, wp.where(wp.abs(j) == 1, 4, 1))
             line += weight * int(pyramid_out[n, above[0] + row * above[2] + mirror(2 * x + j, above[2])])
@@ -155,7 +146,7 @@ def slope_at(images: Images, n: int, level: wp.vec3i, y: int, x: int) -> int:
 
 @wp.func
 def read_slope(images: Images, n: int, level: wp.vec3i, y: int, x: int, weight: wp.vec4i) -> wp.vec2:
-    along_x, along_y = int(8192), int(8192)
+    along_x, along_y = wp.int32(8192), wp.int32(8192)
     for i in range(4):
         slope = slope_at(images, n, level, y + i // 2, x + i % 2)
         along_x += (slope >> 16) * weight[i]
@@ -177,9 +168,7 @@ def is_far(corner: wp.vec2, level: wp.vec3i) -> bool:
 
 
 @wp.func
-def follow_level(
-    images: Images, source: int, seen: int, level: wp.vec3i, point: wp.vec2, guess: wp.vec2, lane: int
-) -> wp.vec2:
+def follow_level(images: Images, source: int, seen: int, level: wp.vec3i, point: wp.vec2, guess: wp.vec2, lane: int) -> wp.vec2:
     """Where a point of one image is in another, from a guess, at one level of their pyramids."""
     corner = point - wp.vec2(HALF, HALF)
     if is_far(corner, level):
@@ -222,18 +211,15 @@ def follow_level(
         found = at + wp.vec2(HALF, HALF)
         if wp.dot(delta, delta) <= CONVERGED:
             break
-        if step > 0:
-            if wp.abs(delta[0] + last[0]) < SWINGING and wp.abs(delta[1] + last[1]) < SWINGING:
-                found = found - delta * 0.5
-                break
+        if step > 0 and wp.abs(delta[0] + last[0]) < SWINGING and wp.abs(delta[1] + last[1]) < SWINGING:
+            found = found - delta * 0.5
+            break
         last = delta
     return found
 
 
 @wp.func
-def follow(
-    images: Images, source: int, seen: int, coarsest: int, point: wp.vec2, start: wp.vec2, lane: int
-) -> wp.vec2:
+def follow(images: Images, source: int, seen: int, coarsest: int, point: wp.vec2, start: wp.vec2, lane: int) -> wp.vec2:
     """Where a point of one image is in another, from a first guess at the coarsest level down to the image itself."""
     found = start / float(1 << coarsest)
     for i in range(coarsest + 1):
@@ -263,9 +249,7 @@ def is_inside(place: wp.vec2, height: int, width: int) -> bool:
 
 
 @wp.func
-def compare(
-    soft: wp.array4d(dtype=wp.uint8), seen: int, place: wp.vec2, source: int, point: wp.vec2, lane: int
-) -> float:
+def compare(soft: wp.array4d(dtype=wp.uint8), seen: int, place: wp.vec2, source: int, point: wp.vec2, lane: int) -> float:
     """How alike the patches round a place of one image and a point of another are (`tracks.likeness`)."""
     height, width = soft.shape[1], soft.shape[2]
     part = Sums()
@@ -285,7 +269,7 @@ def compare(
     total_tile = wp.tile_sum(wp.tile(part, preserve_type=True))
     total = total_tile[0]
     count = wp.max(total[0], 1)
-    spread = float(0.0)
+    spread = wp.float32(0.0)
     for side in range(2):
         sums = wp.vec3i(total[1 + 3 * side], total[2 + 3 * side], total[3 + 3 * side])
         square = wp.int64(sums[0]) * wp.int64(sums[0]) + wp.int64(sums[1]) * wp.int64(sums[1])
@@ -299,9 +283,7 @@ def compare(
 
 
 @wp.func
-def improve(
-    images: Images, source: int, seen: int, point: wp.vec2, proposal: wp.vec3, lane: int
-) -> wp.vec3:
+def improve(images: Images, source: int, seen: int, point: wp.vec2, proposal: wp.vec3, lane: int) -> wp.vec3:
     """A proposal (x, y, cost) shifted to its best fit to a true frame, where it fits better there than before."""
     height, width = images.soft.shape[1], images.soft.shape[2]
     start = wp.vec2(proposal[0], proposal[1])
@@ -311,8 +293,7 @@ def improve(
     like = compare(images.soft, seen, fitted, source, point, lane)
     possible = is_inside(fitted, height, width)
     if wp.length(fitted - point) > float(PATCH):
-        if compare(images.soft, seen, fitted, source, fitted, lane) > like - STANDING:
-            possible = False
+        possible = possible and compare(images.soft, seen, fitted, source, fitted, lane) <= like - STANDING
     price = wp.where(possible, wp.clamp(1.0 - like, 0.0, 1.0), GIVEN_UP)
     if price < proposal[2]:
         return wp.vec3(fitted[0], fitted[1], price)
@@ -320,18 +301,15 @@ def improve(
 
 
 @wp.func
-def improve_by_both(
-    images: Images, truth: Truth, t: int, k: int, start: wp.vec2, lane: int
-) -> wp.vec3:
+def improve_by_both(images: Images, truth: Truth, t: int, k: int, start: wp.vec2, lane: int) -> wp.vec3:
     """A proposal improved by the true frame of the same time and by the most similar one, as far as they show the point."""
     frames = truth.point.shape[0]
     proposal = wp.vec3(start[0], start[1], GIVEN_UP)
     if truth.visible[t, k] != wp.uint8(0):
         proposal = improve(images, frames + t, t, truth.point[t, k], proposal, lane)
     other = truth.alike[t]
-    if other != t:
-        if truth.visible[other, k] != wp.uint8(0):
-            proposal = improve(images, frames + other, t, truth.point[other, k], proposal, lane)
+    if other != t and truth.visible[other, k] != wp.uint8(0):
+        proposal = improve(images, frames + other, t, truth.point[other, k], proposal, lane)
     return proposal
 
 
@@ -348,11 +326,10 @@ def propose(
     frames = truth.point.shape[0]
     source = wp.where(which == 0, t, truth.alike[t])
     proposal = wp.vec3(0.0, 0.0, GIVEN_UP)
-    if which == 0 or source != t:
-        if truth.visible[source, k] != wp.uint8(0):
-            point = truth.point[source, k]
-            start = follow(images, frames + source, t, images.level.shape[0] - 1, point, point, lane)
-            proposal = improve_by_both(images, truth, t, k, start, lane)
+    if (which == 0 or source != t) and truth.visible[source, k] != wp.uint8(0):
+        point = truth.point[source, k]
+        start = follow(images, frames + source, t, images.level.shape[0] - 1, point, point, lane)
+        proposal = improve_by_both(images, truth, t, k, start, lane)
     if lane == 0:
         proposal_out[t, k, which] = proposal
 
@@ -365,7 +342,7 @@ def halve_colors(
     half_out: wp.array3d(dtype=int),  # [n h/2 w/2] int32, means of four pixels, three channels of 8 bits
 ):
     n, y, x = wp.tid()
-    code = int(0)
+    code = wp.int32(0)
     for channel in range(3):
         total = int(frame[n, 2 * y, 2 * x, channel]) + int(frame[n, 2 * y, 2 * x + 1, channel])
         total += int(frame[n, 2 * y + 1, 2 * x, channel]) + int(frame[n, 2 * y + 1, 2 * x + 1, channel])
@@ -377,11 +354,11 @@ def halve_colors(
 def match_patches(
     # In:
     half: wp.array3d(dtype=int),  # [n h/2 w/2] int32
-    frame: wp.array(dtype=int),  # [s] int32, the frame that is searched
-    point: wp.array(dtype=wp.vec2),  # [s 2] float32 pixels, where the point truly is
+    frame: wp.array(dtype=int),  # [q] int32, the frame that is searched
+    point: wp.array(dtype=wp.vec2),  # [q 2] float32 pixels, where the point truly is
     frames: int,  # number of predicted frames, which come before the true ones
     # Out:
-    likeness_out: wp.array3d(dtype=float),  # [s r r] float32, of the places within REACH; of a point outside the image -1e9
+    likeness_out: wp.array3d(dtype=float),  # [q r r] float32, of the places within REACH; of a point outside the image -1e9
 ):
     s, row, column = wp.tid()
     height, width = half.shape[1], half.shape[2]
@@ -404,7 +381,7 @@ def match_patches(
                 part[7] += seen * seen
                 part[8] += true * true
                 part[9] += (seen - true) * (seen - true)
-    spread = float(0.0)
+    spread = wp.float32(0.0)
     for channel in range(3):
         total = wp.int64(part[1 + channel])
         spread -= float(total * total)
@@ -428,9 +405,9 @@ def is_peak(likeness: wp.array3d(dtype=float), s: int, y: int, x: int) -> bool:
 @wp.kernel
 def mark_peaks(
     # In:
-    likeness: wp.array3d(dtype=float),  # [s r r] float32
+    likeness: wp.array3d(dtype=float),  # [q r r] float32
     # Out:
-    peak_out: wp.array3d(dtype=wp.uint8),  # [s r r] uint8, 1 where no place within SPACING is more alike
+    peak_out: wp.array3d(dtype=wp.uint8),  # [q r r] uint8, 1 where no place within SPACING is more alike
 ):
     s, y, x = wp.tid()
     peak_out[s, y, x] = wp.where(is_peak(likeness, s, y, x), wp.uint8(1), wp.uint8(0))
@@ -439,16 +416,16 @@ def mark_peaks(
 @wp.kernel
 def take_peaks(
     # In:
-    likeness: wp.array3d(dtype=float),  # [s r r] float32
-    peak: wp.array3d(dtype=wp.uint8),  # [s r r] uint8
-    point: wp.array(dtype=wp.vec2),  # [s 2] float32 pixels
+    likeness: wp.array3d(dtype=float),  # [q r r] float32
+    peak: wp.array3d(dtype=wp.uint8),  # [q r r] uint8
+    point: wp.array(dtype=wp.vec2),  # [q 2] float32 pixels
     # Out:
-    place_out: wp.array2d(dtype=wp.vec3),  # [s PEAKS 3] float32 x and y of the best peaks, and 1, or 0 where there are fewer
+    place_out: wp.array2d(dtype=wp.vec3),  # [q PEAKS 3] float32 x and y of the best peaks, and 1, or 0 where there are fewer
 ):
     s = wp.tid()
     best = wp.vec4(-1.0e9, -1.0e9, -1.0e9, -1.0e9)
     where = wp.vec4i()
-    count = int(0)
+    count = wp.int32(0)
     for y in range(likeness.shape[1]):
         for x in range(likeness.shape[2]):
             if peak[s, y, x] != wp.uint8(0):
@@ -475,11 +452,11 @@ def improve_peaks(
     # In:
     images: Images,
     truth: Truth,
-    frame: wp.array(dtype=int),  # [s] int32
-    index: wp.array(dtype=int),  # [s] int32, the point
-    place: wp.array2d(dtype=wp.vec3),  # [s PEAKS 3] float32
+    frame: wp.array(dtype=int),  # [q] int32
+    index: wp.array(dtype=int),  # [q] int32, the point
+    place: wp.array2d(dtype=wp.vec3),  # [q PEAKS 3] float32
     # Out:
-    proposal_out: wp.array2d(dtype=wp.vec3),  # [s PEAKS 3] float32 x, y and cost
+    proposal_out: wp.array2d(dtype=wp.vec3),  # [q PEAKS 3] float32 x, y and cost
 ):
     s, i, lane = wp.tid()
     proposal = wp.vec3(0.0, 0.0, GIVEN_UP)
@@ -488,122 +465,3 @@ def improve_peaks(
         proposal = improve_by_both(images, truth, frame[s], index[s], start, lane)
     if lane == 0:
         proposal_out[s, i] = proposal
-
-
-# ---- the cheapest path
-
-
-@wp.func
-def move(flow: wp.array3d(dtype=wp.vec2), n: int, place: wp.vec2) -> wp.vec2:
-    return place + read_flow(flow, n, find_place(place, flow.shape[1], flow.shape[2]))
-
-
-@wp.func
-def stray(offset: wp.vec2, inner: wp.vec2) -> wp.float64:
-    """0 to 1, how far a place is from where one before was carried, with or without `inner`."""
-    square = wp.min(wp.dot(offset, offset), wp.dot(offset - inner, offset - inner))
-    return wp.float64(square / (square + STRAYING * STRAYING))
-
-
-@wp.func
-def cheapest(total: Costs, count: int) -> int:
-    best = int(0)
-    for i in range(count):
-        if total[i] < total[best]:
-            best = i
-    return best
-
-
-@wp.kernel
-def walk(
-    # In:
-    images: Images,
-    truth: Truth,
-    repeats: wp.array(dtype=wp.uint8),  # [t] uint8, 1 where the most similar frame is the same moment, hidden points included
-    seen_flow: wp.array3d(dtype=wp.vec2),  # [t-1 h w 2] float32 pixels, of the predicted video to the following frame
-    true_flow: wp.array3d(dtype=wp.vec2),  # [t-1 h w 2] float32 pixels, of the true video
-    proposal: wp.array3d(dtype=wp.vec3),  # [t k 2 3] float32
-    search: wp.array2d(dtype=int),  # [t k] int32, the search for a point, -1 where there was none
-    peak: wp.array2d(dtype=wp.vec3),  # [s PEAKS 3] float32
-    # Out:
-    place_out: wp.array3d(dtype=wp.vec2),  # [t k q 2] float32 pixels, all proposals
-    origin_out: wp.array3d(dtype=int),  # [t k q+1] int32, the state before, on the cheapest path to each
-    track_out: wp.array2d(dtype=wp.vec2),  # [t k 2] float32 pixels, NaN where lost
-):
-    """The cheapest path of each point through all frames (Viterbi)."""
-    k, lane = wp.tid()
-    frames = truth.point.shape[0]
-    total = Costs()
-    place = Places()
-    for t in range(frames):
-        now = truth.visible[t, k] != wp.uint8(0)
-        other = truth.alike[t]
-        carried = Places()
-        inner = wp.vec2()
-        for i in range(PROPOSALS):
-            carried[i, 0] = truth.point[0, k][0]
-            carried[i, 1] = truth.point[0, k][1]
-        if t > 0:
-            for i in range(PROPOSALS):
-                moved = move(seen_flow, t - 1, wp.vec2(place[i, 0], place[i, 1]))
-                carried[i, 0] = moved[0]
-                carried[i, 1] = moved[1]
-            apart = truth.point[t, k] - move(true_flow, t - 1, truth.point[t - 1, k])
-            if now and truth.visible[t - 1, k] != wp.uint8(0) and wp.length(apart) < INNER_MOTION:
-                inner = apart
-        # The proposals of this frame and what they cost.
-        likeliest = cheapest(total, PROPOSALS)
-        cost = Costs()
-        third = improve_by_both(images, truth, t, k, wp.vec2(carried[likeliest, 0], carried[likeliest, 1]), lane)
-        least = wp.min(wp.min(proposal[t, k, 0][2], proposal[t, k, 1][2]), third[2])
-        unsure = now and least > 1.0 - SURE and search[t, k] >= 0
-        for i in range(PROPOSALS):
-            given = wp.vec3(0.0, 0.0, GIVEN_UP)
-            if i < 2:
-                given = proposal[t, k, wp.min(i, 1)]
-            elif i == 2:
-                given = third
-            elif unsure:
-                given = peak[search[t, k], wp.max(i - 3, 0)]
-            if i == 1 and other != t and repeats[t] != wp.uint8(0) and truth.visible[other, k] == wp.uint8(0):
-                given = wp.vec3(truth.point[other, k][0], truth.point[other, k][1], HIDDEN)
-            if not now:
-                given = wp.vec3(carried[i, 0], carried[i, 1], 0.0)
-            place[i, 0] = given[0]
-            place[i, 1] = given[1]
-            cost[i] = wp.float64(given[2])
-        cost[PROPOSALS] = wp.where(now, LOST, wp.float64(0.0))
-        # The cheapest way to each state.
-        known_before = truth.visible[wp.max(t - 1, 0), k] != wp.uint8(0)
-        charge = wp.where(known_before or not now, JUMP, wp.float64(0.0))
-        following = Costs()
-        for i in range(PROPOSALS + 1):
-            origin = int(0)
-            least_sum = wp.float64(1.0e30)
-            for j in range(PROPOSALS + 1):
-                step = JUMP
-                if i < PROPOSALS and j < PROPOSALS:
-                    offset = wp.vec2(place[i, 0] - carried[j, 0], place[i, 1] - carried[j, 1])
-                    step = charge * stray(offset, inner)
-                if i == PROPOSALS and j == PROPOSALS:
-                    step = wp.float64(0.0)
-                if total[j] + step < least_sum:
-                    least_sum = total[j] + step
-                    origin = j
-            following[i] = cost[i]
-            if t > 0:
-                following[i] = cost[i] + least_sum
-            if lane == 0:
-                origin_out[t, k, i] = origin
-                if i < PROPOSALS:
-                    place_out[t, k, i] = wp.vec2(place[i, 0], place[i, 1])
-        total = following
-    if lane == 0:
-        state = cheapest(total, PROPOSALS + 1)
-        for back in range(frames):
-            t = frames - 1 - back
-            found = wp.vec2(wp.nan, wp.nan)
-            if state < PROPOSALS and truth.visible[t, k] != wp.uint8(0):
-                found = place_out[t, k, wp.min(state, PROPOSALS - 1)]
-            track_out[t, k] = found
-            state = origin_out[t, k, state]
