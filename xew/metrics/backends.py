@@ -49,6 +49,28 @@ class Tracker(Protocol):
 
 
 @runtime_checkable
+class Confirmer(Protocol):
+    """A tracker that also says where what it found does not show a point's body, as `presence.confirm_tracks`."""
+
+    def confirm(
+        self,
+        found: np.ndarray,
+        prediction: np.ndarray,
+        target: np.ndarray,
+        points: np.ndarray,
+        visible: np.ndarray,
+        shown: np.ndarray,
+        body: np.ndarray,
+    ) -> np.ndarray:
+        """Tracks [t k 2] without the places that do not show the point's body.
+
+        Args:
+            found: [t k 2] float32 pixels, as the tracker gave them for the same videos and points.
+            prediction, target, points, visible, shown, body: as of `presence.confirm_tracks`.
+        """
+
+
+@runtime_checkable
 class Flow(Protocol):
     """Optical flow between pairs of images."""
 

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from xew.metrics import mask_iou
-from xew.metrics.backends import open_masker, open_tracker
+from xew.metrics.backends import Confirmer, open_masker, open_tracker
 from xew.metrics.calibration.matrix import grade_material
 from xew.metrics.calibration.predictors import Material, delay, predict
 from xew.metrics.estimators.batched import masks as batched_masks
@@ -17,6 +17,7 @@ from xew.metrics.estimators.batched.masks import BatchedMasker
 from xew.metrics.estimators.batched.tracks import SEARCH as TRACK_SEARCH
 from xew.metrics.estimators.batched.tracks import BatchedTracker
 from xew.metrics.estimators.masks import _flow, estimate_masks
+from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.estimators.tracks import estimate_tracks
 from xew.metrics.truth import Points, Surfaces, Truth
 
@@ -117,6 +118,24 @@ def test_points_are_found_where_opencv_finds_them(truth: Truth) -> None:
         assert (lost != expected_lost).mean() < 0.01, case
         apart = np.linalg.norm(found - expected, axis=-1)[~lost & ~expected_lost]
         assert np.percentile(apart, 95) < 0.05 and apart.mean() < 0.1, case
+
+
+def test_places_of_other_things_are_told_as_opencv_tells_them(truth: Truth) -> None:
+    surfaces = truth.surfaces
+    assert surfaces is not None and surfaces.shown is not None
+    points, visible = surfaces.robot.pixels, surfaces.robot.visible
+    known = truth.rgb, points, visible, surfaces.shown, np.zeros(9, int)
+    tracker = BatchedTracker("cpu")
+    assert isinstance(tracker, Confirmer)
+    video = np.ascontiguousarray(predict("8 frames late", Material(truth.rgb)))
+    tracker(video, truth.rgb, points, visible)
+    apart = np.random.default_rng(0).normal(0, 8, points.shape).astype(np.float32)
+    found = np.where(visible[..., None], points + apart, np.nan)
+    expected = confirm_tracks(found, video, *known)
+    lost, were_lost = np.isnan(expected).any(axis=-1), np.isnan(found).any(axis=-1)
+    assert 0.1 < (lost & ~were_lost).sum() / (~were_lost).sum() < 0.9
+    np.testing.assert_array_equal(tracker.confirm(found, video, *known), expected)
+    np.testing.assert_array_equal(tracker.confirm(found, video[:, ::-1], *known), confirm_tracks(found, video[:, ::-1], *known))
 
 
 def test_scores_of_the_predictors_are_the_same(truth: Truth) -> None:

@@ -1,4 +1,4 @@
-"""Warp kernels of the default tracker (xew.metrics.estimators.tracks): Lucas-Kanade, likeness and search, for tracks.py.
+"""Warp kernels of the default tracker (xew.metrics.estimators.tracks): Lucas-Kanade, likeness, search, presence, for tracks.py.
 
 Lucas-Kanade and likeness follow OpenCV's arithmetic as `tracks` calls it. The threads of a block share the pixels round one
 point; on a CPU a block is one thread.
@@ -12,9 +12,9 @@ P all pixels of a pyramid, l its levels.
 
 import warp as wp
 
-from xew.metrics.estimators import tracks
+from xew.metrics.estimators import presence, tracks
 from xew.metrics.estimators.batched.flow_kernels import mirror
-from xew.metrics.estimators.batched.mask_kernels import Place, find_place
+from xew.metrics.estimators.batched.mask_kernels import Place, find_place, read_color
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -45,6 +45,10 @@ REACH = wp.constant(tracks.REACH // 2)
 """Largest distance that is searched [pixels of half the size]."""
 MARGIN = wp.constant(tracks.PATCH // 2)
 """Half the side of the patch that is searched for [pixels of half the size]."""
+
+BODY_REACH = wp.constant(presence.REACH)
+OTHER_COLOR = wp.constant(float(presence.OTHER_COLOR))
+SAME_COLOR = wp.constant(float(presence.SAME_COLOR))
 
 Sums = wp.types.vector(length=10, dtype=int)
 """Of two patches: how many pixels are compared, sums of both by channel, sums of their squares, and of their difference's."""
@@ -465,3 +469,57 @@ def improve_peaks(
         proposal = improve_by_both(images, truth, frame[s], index[s], start, lane)
     if lane == 0:
         proposal_out[s, i] = proposal
+
+
+# ---- presence
+
+
+@wp.func
+def body_at(shown: wp.array3d(dtype=wp.int16), t: int, place: wp.vec2) -> int:
+    """The body that the pixel of a place shows; of a place outside, the nearest pixel's."""
+    row, column = int(wp.rint(place[1])), int(wp.rint(place[0]))
+    return int(shown[t, wp.clamp(row, 0, shown.shape[1] - 1), wp.clamp(column, 0, shown.shape[2] - 1)])
+
+
+@wp.func
+def color_difference(soft: wp.array4d(dtype=wp.uint8), seen: int, place: wp.vec2, source: int, point: wp.vec2) -> float:
+    """The largest difference of the three channels of two images' colors, each at a place of its own."""
+    here, there = find_place(place, soft.shape[1], soft.shape[2]), find_place(point, soft.shape[1], soft.shape[2])
+    most = wp.float32(0.0)
+    for channel in range(3):
+        most = wp.max(most, wp.abs(read_color(soft, seen, here, channel) - read_color(soft, source, there, channel)))
+    return most
+
+
+@wp.kernel
+def confirm(
+    # In:
+    soft: wp.array4d(dtype=wp.uint8),  # [n h w 3] uint8
+    found: wp.array2d(dtype=wp.vec2),  # [t k 2] float32 pixels, NaN where lost
+    point: wp.array2d(dtype=wp.vec2),  # [t k 2] float32 pixels, where the points truly are
+    visible: wp.array2d(dtype=wp.uint8),  # [t k] uint8
+    shown: wp.array3d(dtype=wp.int16),  # [t h w] int16, the body that a pixel of the true frame shows
+    body: wp.array(dtype=int),  # [k] int32, the body that each point lies on
+    # Out:
+    wrong_out: wp.array2d(dtype=wp.uint8),  # [t k] uint8, 1 where the place that was found does not show the point's body
+):
+    t, k = wp.tid()
+    wrong_out[t, k] = wp.uint8(0)
+    at, true = found[t, k], point[t, k]
+    if visible[t, k] == wp.uint8(0) or not wp.isfinite(at[0]) or not wp.isfinite(at[1]):
+        return
+    height, width, source = soft.shape[1], soft.shape[2], found.shape[0] + t
+    count, different, standing = wp.int32(0), wp.int32(0), wp.int32(0)
+    for row in range(-BODY_REACH, BODY_REACH + 1):
+        for column in range(-BODY_REACH, BODY_REACH + 1):
+            offset = wp.vec2(float(column), float(row))
+            own = body_at(shown, t, true + offset) == body[k]
+            if own and is_inside(at + offset, height, width) and is_inside(true + offset, height, width):
+                count += 1
+                if color_difference(soft, t, at + offset, source, true + offset) > OTHER_COLOR:
+                    different += 1
+                elsewhere = body_at(shown, t, at + offset) != body[k]
+                if elsewhere and color_difference(soft, t, at + offset, source, at + offset) <= SAME_COLOR:
+                    standing += 1
+    if 2 * different > count or 2 * standing > count:
+        wrong_out[t, k] = wp.uint8(1)

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from xew.concurrency import PARSING
+from xew.metrics.estimators import presence
 from xew.metrics.estimators import tracks as reference
 from xew.metrics.estimators.batched import mask_kernels, path_kernels
 from xew.metrics.estimators.batched import track_kernels as kernels
@@ -65,6 +66,31 @@ class BatchedTracker:
                 videos.show(prediction, *similar)
             return _track(videos, points, visible)
 
+    def confirm(
+        self,
+        found: np.ndarray,
+        prediction: np.ndarray,
+        target: np.ndarray,
+        points: np.ndarray,
+        visible: np.ndarray,
+        shown: np.ndarray,
+        body: np.ndarray,
+    ) -> np.ndarray:
+        """`confirm_tracks` [t k 2] of places [t k 2] that were found in a prediction [t h w 3] of a target [t h w 3].
+
+        Args:
+            found, prediction, target, points, visible, shown, body: as of `presence.confirm_tracks`.
+        """
+        videos = self._videos
+        if videos is None or videos.target is not target or videos.prediction is not prediction or not found.size:
+            return presence.confirm_tracks(found, prediction, target, points, visible, shown, body)
+        with PARSING, wp.ScopedDevice(self._device):
+            places = [wp.array(np.ascontiguousarray(array, np.float32), dtype=wp.vec2) for array in (found, points)]
+            known = [wp.array(visible.astype(np.uint8)), videos.put_bodies(shown), wp.array(body.astype(np.int32))]
+            wrong = wp.empty(visible.shape, dtype=wp.uint8)
+            _launch(kernels.confirm, wrong.shape, [videos.images.soft, *places, *known], [wrong])
+            return np.where(wrong.numpy().astype(bool)[..., None], np.float32(np.nan), found)
+
 
 class _Videos:
     """A true video as a device has it, with room for a predicted video before it."""
@@ -72,6 +98,7 @@ class _Videos:
     def __init__(self, target: np.ndarray) -> None:
         self.target = target
         self.prediction: np.ndarray | None = None
+        self._bodies: tuple[np.ndarray, Array] | None = None
         count, height, width = target.shape[:3]
         self._levels = [np.array([0, height, width])]
         while len(self._levels) < LEVELS and min((self._levels[-1][1:] + 1) // 2) > int(kernels.WINDOW):
@@ -95,6 +122,12 @@ class _Videos:
         self.alike, self.difference = alike, difference
         self.seen_flow = self._put(prediction, slice(0, len(prediction)))
         self.prediction = prediction
+
+    def put_bodies(self, shown: np.ndarray) -> Array:
+        """[t h w] int16 on the device, the bodies that the true video's pixels show; put there once for the same array."""
+        if self._bodies is None or self._bodies[0] is not shown:
+            self._bodies = shown, wp.array(np.ascontiguousarray(shown, np.int16), dtype=wp.int16)
+        return self._bodies[1]
 
     def _put(self, video: np.ndarray, images: slice) -> Array:
         """Make a video these images; [t-1 h w 2] float32, its optical flow from frame to frame."""
