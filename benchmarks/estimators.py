@@ -1,15 +1,15 @@
 """How long it takes to find robot and points in a video: OpenCV frame by frame on one core, and the same in Warp kernels.
 
-    python benchmarks/estimators.py [--frames 100]                     # both on the CPU
-    python benchmarks/estimators.py --device cuda --kernels            # Warp on the GPU, and which kernels take how long
-    python benchmarks/estimators.py --device cuda --threads 1 4 8      # and videos a second of threads that share the GPU
+    python -m benchmarks.estimators [--frames 100]                     # both on the CPU
+    python -m benchmarks.estimators --device cuda --kernels            # Warp on the GPU, and which kernels take how long
+    python -m benchmarks.estimators --device cuda --threads 1 4 8      # and videos a second of threads that share the GPU
 
 The videos are those of benchmarks/metrics.py, an arm of five links before a wall, 320x240: late, blurred and grainy, as a model
 errs; the first frame frozen; the frames shuffled; the truth softened. Each is found masks and 16 points along the links for,
 which are seen in every frame. An episode's looks are learnt, and its true video's flow is found, once for all its videos.
 Before a figure is told, masks and points of both are compared: mean IoU with the true mask within .005, mean distance of
-points, at most 100 pixels and as much where lost, within 3 %. Then contenders take turns, and medians are told: by the clock, and of
-the process's time. The first calls, which compile kernels, are told by themselves.
+points, at most 100 pixels and as much where lost, within 3 %. Then contenders take turns, and medians are told: by the clock,
+and of the process's time. The first call, which compiles kernels, is told by itself.
 """
 
 import platform
@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from typing import Annotated, Any
 
@@ -102,8 +103,8 @@ def measure(contenders: dict[str, Contender], videos: dict[str, np.ndarray], pai
             for name, contender in contenders.items():
                 # A copy is another video to estimators, which keep what they know of one.
                 fresh = video.copy()
-                times[name][0].append(clock(lambda: contender.find_masks(fresh, pair)))
-                times[name][1].append(clock(lambda: contender.find_points(fresh, pair)))
+                times[name][0].append(clock(partial(contender.find_masks, fresh, pair)))
+                times[name][1].append(clock(partial(contender.find_points, fresh, pair)))
         for name, (masks, points) in times.items():
             values = np.concatenate([np.median(masks, axis=0), np.median(points, axis=0)]) * 1e3 / len(video)
             print(f"| {case} | {name} | " + " | ".join(f"{value:.3f}" for value in values) + " |")
@@ -116,9 +117,8 @@ def tell_kernels(contender: Contender, video: np.ndarray, pair: Pair) -> None:
     totals: dict[str, list[float]] = {}
     for result in wp.timing_end():
         totals.setdefault(result.name, []).append(result.elapsed)
-    print(
-        f"kernels and copies of one video: {sum(map(sum, totals.values())):.1f} ms\n| kernel | launches | ms |\n|---|---|---|"
-    )
+    print(f"kernels and copies of one video: {sum(map(sum, totals.values())):.1f} ms")
+    print("| kernel | launches | ms |\n|---|---|---|")
     for name, elapsed in sorted(totals.items(), key=lambda item: -sum(item[1]))[:SHOWN_KERNELS]:
         print(f"| {name} | {len(elapsed)} | {sum(elapsed):.2f} |")
 
