@@ -14,6 +14,7 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
+from xew.concurrency import PARSING
 from xew.config import ConfigError, pick
 from xew.files import digest_tree
 from xew.metrics.estimators.cotracker import open_cotracker
@@ -144,24 +145,27 @@ class ReferenceMasker:
 
 
 def _find_gpu() -> str | None:
-    # Only here and in what follows: the metrics load without Warp.
-    from xew.metrics.estimators.batched.devices import find_gpu
+    # Only here and in what follows: the metrics load without Warp, whose kernels are parsed as they are imported.
+    with PARSING:
+        from xew.metrics.estimators.batched.devices import find_gpu
 
-    return find_gpu()
+        return find_gpu()
 
 
 def open_batched_masker() -> Masker:
     """The default masker in Warp kernels, on the calling thread's GPU, or on the CPU where there is none."""
-    from xew.metrics.estimators.batched.masks import BatchedMasker
+    with PARSING:
+        from xew.metrics.estimators.batched.masks import BatchedMasker
 
-    return BatchedMasker(_find_gpu() or "cpu")
+        return BatchedMasker(_find_gpu() or "cpu")
 
 
 def open_batched_tracker() -> Tracker:
     """The default tracker in Warp kernels, on the calling thread's GPU, or on the CPU where there is none."""
-    from xew.metrics.estimators.batched.tracks import BatchedTracker
+    with PARSING:
+        from xew.metrics.estimators.batched.tracks import BatchedTracker
 
-    return BatchedTracker(_find_gpu() or "cpu")
+        return BatchedTracker(_find_gpu() or "cpu")
 
 
 MASKERS: Mapping[str, Backend[Masker]] = {

@@ -4,6 +4,7 @@ Reads  gray images on a device, and which of them are pairs
 Writes flow on the device
 """
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +21,10 @@ RELAXATIONS = 5
 """Number of steps of relaxation that solve the equations of a refinement."""
 Array = Any
 """Array of Warp, on a device."""
+
+THREADS = 64
+"""Threads of a block: few, because a diagonal has few patches, and a GPU many processors."""
+_launch = functools.partial(wp.launch, block_dim=THREADS)  # as all launches of the module, else it is compiled twice
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ def build_pyramid(gray: Array, search: Search) -> Pyramid:
     for index in range(search.finest, coarsest_level(shape) + 1):
         factor = 2**index if index == search.finest else 2
         small = wp.empty((gray.shape[0], *(side // factor for side in gray.shape[1:])), dtype=wp.uint8, device=device)
-        wp.launch(kernels.shrink, small.shape, [gray], [small], device=device)
+        _launch(kernels.shrink, small.shape, [gray], [small], device=device)
         gray = small
         levels[index] = _prepare_level(gray, search)
     return Pyramid(levels, shape, search)
@@ -88,10 +93,10 @@ def build_pyramid(gray: Array, search: Search) -> Pyramid:
 def _prepare_level(gray: Array, search: Search) -> Level:
     device = gray.device
     packed = wp.empty(gray.shape, dtype=int, device=device)
-    wp.launch(kernels.pack_gradients, gray.shape, [gray], [packed], device=device)
+    _launch(kernels.pack_gradients, gray.shape, [gray], [packed], device=device)
     patches = (gray.shape[0], *(1 + (side - PATCH) // search.stride for side in gray.shape[1:]))
     tensor, sums = (wp.empty(patches, dtype=dtype, device=device) for dtype in (wp.vec3, wp.vec2))
-    wp.launch(kernels.sum_gradients, patches, [packed, search.stride, PATCH], [tensor, sums], device=device)
+    _launch(kernels.sum_gradients, patches, [packed, search.stride, PATCH], [tensor, sums], device=device)
     return Level(packed, tensor, sums)
 
 
@@ -110,16 +115,16 @@ def find_flow(pyramid: Pyramid, pairs: np.ndarray) -> Array:
     for index in range(coarsest, search.finest - 1, -1):
         level = pyramid.levels[index]
         patch_flow = wp.empty((len(pairs), *level.tensor.shape[1:]), dtype=wp.vec2, device=device)
-        wp.launch(kernels.begin_patches, patch_flow.shape, [flow, search.stride], [patch_flow], device=device)
+        _launch(kernels.begin_patches, patch_flow.shape, [flow, search.stride], [patch_flow], device=device)
         _search_level(level, pair, patch_flow, search)
         inputs = [level.packed, pair, patch_flow, search.stride]
-        wp.launch(kernels.spread_patches, flow.shape, inputs, [flow], device=device)
+        _launch(kernels.spread_patches, flow.shape, inputs, [flow], device=device)
         if search.refinements:
             flow = _refine(level, pair, flow, search.refinements)
         finer = index - 1 if index > search.finest else 0
         shape = pyramid.levels[finer].packed.shape[1:] if finer in pyramid.levels else pyramid.shape
         larger = wp.empty((len(pairs), *shape), dtype=wp.vec2, device=device)
-        wp.launch(kernels.enlarge_flow, larger.shape, [flow, float(2 ** (index - finer))], [larger], device=device)
+        _launch(kernels.enlarge_flow, larger.shape, [flow, float(2 ** (index - finer))], [larger], device=device)
         flow = larger
     return flow
 
@@ -132,7 +137,7 @@ def _search_level(level: Level, pair: Array, patch_flow: Array, search: Search) 
         for diagonal in range(columns + thickness - 1):
             settings = [search.stride, PATCH, diagonal, forward, search.steps // 2]
             inputs = [level.packed, pair, level.tensor, level.sums, *settings]
-            wp.launch(kernels.search_diagonal, (count, rows), inputs, [patch_flow], device=patch_flow.device)
+            _launch(kernels.search_diagonal, (count, rows), inputs, [patch_flow], device=patch_flow.device)
 
 
 def _refine(level: Level, pair: Array, flow: Array, refinements: int) -> Array:
