@@ -48,6 +48,8 @@ FORBIDDEN = {
     "analysis": {"jax", "flax", "warp", "newton", "mujoco"},
 }
 """Libraries that a room does not import, inside functions neither."""
+WITH_WARP = "xew.metrics.estimators.batched"
+"""Package of `metrics` that may import Warp. Others import it inside functions: the room loads without Warp."""
 WITH_TORCH = ("xew.model.weights.reading",)
 """Modules of `model` that may import PyTorch inside functions: files of weights that only it can read."""
 REGISTRIES = {"analysis": "xew.model.conditions"}
@@ -80,6 +82,10 @@ def room_failures(sources: Sources) -> list[str]:
             {"torch"} if source.module in WITH_TORCH and not touches(at_once, "torch") else set()
         )
         libraries -= {"jax"} if source.module == JAX_GROUND else set()
+        in_warp = touches([source.module], WITH_WARP)
+        libraries -= {"warp"} if in_warp else set()
+        if touches(at_once, WITH_WARP) and not in_warp:
+            failures.append(f"{source.name} imports {WITH_WARP} at once; only inside functions")
         libraries |= {JAX_GROUND} if "jax" in libraries else set()
         failures += [f"{source.name} imports {name}" for name in sorted(libraries) if touches(names, name)]
         names = {name for name in names if not touches([name], REGISTRIES.get(source.room, "none"))}
@@ -268,6 +274,10 @@ PLANTED: dict[str, tuple[Callable[[Sources], list[str]], Files, str]] = {
     "a room from the ground": (room_failures, {"files.py": "from xew.analysis import b\n"}, "files.py imports xew.analysis"),
     "a lazy import at once": (room_failures, {"model/conditions.py": "from xew.sim_warp import scene\n"}, "inside functions"),
     "a lazy import elsewhere": (room_failures, {"model/a.py": "def f():\n    from xew.sim_warp import scene\n"}, "which only"),
+    "Warp in the metrics": (room_failures, {"metrics/a.py": "def f():\n    import warp\n"}, "metrics/a.py imports warp"),
+    "the batched estimators": (
+        room_failures, {"metrics/a.py": "from xew.metrics.estimators.batched import masks\n"}, "only inside functions",
+    ),
     "no room": (room_failures, {"kitchen/__init__.py": ""}, "is no room"),
     "statistics on episodes": (ground_failures, {"statistics/a.py": "from xew.episode import b\n"}, "imports xew.episode"),
     "a metric that reads": (ground_failures, {"metrics/a.py": "def f():\n    import xew.episode\n"}, "imports xew.episode"),

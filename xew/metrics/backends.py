@@ -14,6 +14,7 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
+from xew.concurrency import PARSING
 from xew.config import ConfigError, pick
 from xew.files import digest_tree
 from xew.metrics.estimators.cotracker import open_cotracker
@@ -45,6 +46,28 @@ class Tracker(Protocol):
             prediction, target: [t h w 3] uint8, predicted and true video.
             points: [t k 2] float32, true projections [pixels, x right, y down, center of the first pixel at 0].
             visible: [t k] bool, where a true point is seen.
+        """
+
+
+@runtime_checkable
+class Confirmer(Protocol):
+    """A tracker that also says where what it found does not show a point's body, as `presence.confirm_tracks`."""
+
+    def confirm(
+        self,
+        found: np.ndarray,
+        prediction: np.ndarray,
+        target: np.ndarray,
+        points: np.ndarray,
+        visible: np.ndarray,
+        shown: np.ndarray,
+        body: np.ndarray,
+    ) -> np.ndarray:
+        """Tracks [t k 2] without the places that do not show the point's body.
+
+        Args:
+            found: [t k 2] float32 pixels, as the tracker gave them for the same videos and points.
+            prediction, target, points, visible, shown, body: as of `presence.confirm_tracks`.
         """
 
 
@@ -121,10 +144,39 @@ class ReferenceMasker:
         return estimate_masks(prediction, target, target_mask, self._learnt[2])
 
 
+def _find_gpu() -> str | None:
+    # Only here and in what follows: the metrics load without Warp, whose kernels are parsed as they are imported.
+    with PARSING:
+        from xew.metrics.estimators.batched.devices import find_gpu
+
+        return find_gpu()
+
+
+def open_batched_masker() -> Masker:
+    """The default masker in Warp kernels, on the calling thread's GPU, or on the CPU where there is none."""
+    with PARSING:
+        from xew.metrics.estimators.batched.masks import BatchedMasker
+
+        return BatchedMasker(_find_gpu() or "cpu")
+
+
+def open_batched_tracker() -> Tracker:
+    """The default tracker in Warp kernels, on the calling thread's GPU, or on the CPU where there is none."""
+    with PARSING:
+        from xew.metrics.estimators.batched.tracks import BatchedTracker
+
+        return BatchedTracker(_find_gpu() or "cpu")
+
+
 MASKERS: Mapping[str, Backend[Masker]] = {
     "default": Backend(
-        ReferenceMasker, None, "color, background and gated flow against the true video (xew.metrics.estimators.masks)"
+        lambda: open_batched_masker() if _find_gpu() else ReferenceMasker(),
+        None,
+        "color, background and gated flow against the true video (xew.metrics.estimators.masks); warp where there is a GPU, "
+        "else opencv",
     ),
+    "opencv": Backend(ReferenceMasker, None, "the default masker frame by frame, on the CPU"),
+    "warp": Backend(open_batched_masker, None, "the default masker for all frames at once, in Warp kernels"),
     "sam2": Backend(
         open_sam2,
         "sam2.1_hiera_{tiny,small,base_plus,large}.pt of github.com/facebookresearch/sam2, or a folder of Hugging Face's "
@@ -133,7 +185,13 @@ MASKERS: Mapping[str, Backend[Masker]] = {
     ),
 }
 TRACKERS: Mapping[str, Backend[Tracker]] = {
-    "default": Backend(ReferenceTracker, None, "template search against the true video (xew.metrics.estimators.tracks)"),
+    "default": Backend(
+        lambda: open_batched_tracker() if _find_gpu() else ReferenceTracker(),
+        None,
+        "template search against the true video (xew.metrics.estimators.tracks); warp where there is a GPU, else opencv",
+    ),
+    "opencv": Backend(ReferenceTracker, None, "the default tracker frame by frame, on the CPU"),
+    "warp": Backend(open_batched_tracker, None, "the default tracker for all points and frames at once, in Warp kernels"),
     "cotracker3": Backend(
         open_cotracker,
         "scaled_offline.pth of Hugging Face's facebook/cotracker3; CC-BY-NC 4.0: not for commercial use",

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from xew.metrics import METRICS, contact_f1
-from xew.metrics.backends import Masker, Tracker
+from xew.metrics.backends import Confirmer, Masker, Tracker
 from xew.metrics.estimators.contact import predicted_contact
 from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.metric import ACCELERATOR_CHUNK
@@ -111,7 +111,8 @@ class Comparison:
             found[:, seen] = self.tracker(self.seen, self.truth.rgb, *known)
             if self.surfaces.shown is not None:
                 body = np.concatenate([some.body for some in both if some.body is not None])[seen]
-                found[:, seen] = confirm_tracks(found[:, seen], self.seen, self.truth.rgb, *known, self.surfaces.shown, body)
+                confirm = self.tracker.confirm if isinstance(self.tracker, Confirmer) else confirm_tracks
+                found[:, seen] = confirm(found[:, seen], self.seen, self.truth.rgb, *known, self.surfaces.shown, body)
         count = both[0].pixels.shape[1]
         return found[:, :count], found[:, count:]
 

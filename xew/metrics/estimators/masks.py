@@ -29,6 +29,8 @@ SOFTNESS = (1.0, 2.0)
 """Standard deviations of the blur [pixels] of the softened copies that are learnt from too."""
 RESIDUAL_SOFTNESS = 1.5
 """Standard deviation [pixels] of the blur of both frames before they are compared: sharpness and grain are no motion."""
+LOOKS_SOFTNESS = 0.8
+"""Standard deviation [pixels] of the blur of the evidence of color and background."""
 EVIDENCE_LIMIT = 4.0
 """Largest log-likelihood ratio of a single kind of evidence, exp(4) : 1; histograms of one episode know no better."""
 SHAPE_WEIGHT = 9.0
@@ -100,7 +102,7 @@ def learn_appearance(video: np.ndarray, mask: np.ndarray) -> Appearance:
     background, uncovered = _background(video[picked], mask[picked])
     video = np.concatenate([video[picked], *([_soften(frame, s) for frame in video[picked]] for s in SOFTNESS)])
     mask = np.tile(mask[picked], (1 + len(SOFTNESS), 1, 1))
-    color = _color_bins(video)
+    color = color_bins(video)
     difference = np.stack([_difference(frame, background) for frame in video])
     seen = np.broadcast_to(uncovered, mask.shape)
     return Appearance(
@@ -139,11 +141,11 @@ def _estimate_frame(appearance: Appearance, frame: np.ndarray, shapes: list[Shap
 
 def _looks(appearance: Appearance, frame: np.ndarray) -> np.ndarray:
     """[h w] float32, evidence of color and background."""
-    color = appearance.color.reshape(-1)[_color_bins(frame)]
+    color = appearance.color.reshape(-1)[color_bins(frame)]
     difference = appearance.difference[_difference(frame, appearance.background)]
     looks = np.clip(color, -EVIDENCE_LIMIT, EVIDENCE_LIMIT)
     looks += np.where(appearance.uncovered, np.clip(difference, -EVIDENCE_LIMIT, EVIDENCE_LIMIT), 0)
-    return cv2.GaussianBlur(looks.astype(np.float32), (0, 0), 0.8)
+    return cv2.GaussianBlur(looks.astype(np.float32), (0, 0), LOOKS_SOFTNESS)
 
 
 def _choose_better(a: Shape, b: Shape) -> Shape:
@@ -236,8 +238,8 @@ def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return functools.reduce(np.maximum, cv2.split(cv2.absdiff(a, b)))
 
 
-def _color_bins(video: np.ndarray) -> np.ndarray:
-    """Index of each pixel's Lab color among the bins."""
+def color_bins(video: np.ndarray) -> np.ndarray:
+    """Index of each pixel's Lab color among the bins, [t h w] or [h w] int32 of colors [t h w 3] or [h w 3] uint8."""
     flat = video.reshape(-1, video.shape[-2], 3)
     lab = cv2.cvtColor(flat, cv2.COLOR_RGB2LAB).reshape(video.shape).astype(np.int32) * COLOR_BINS // 256
     return (lab[..., 0] * COLOR_BINS + lab[..., 1]) * COLOR_BINS + lab[..., 2]

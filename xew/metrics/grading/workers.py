@@ -15,7 +15,7 @@ import numpy as np
 
 from xew.config import ConfigError, pick
 from xew.metrics.backends import Masker, Tracker
-from xew.metrics.estimators.adapters import use_torch_device
+from xew.metrics.estimators.adapters import use_gpu
 
 MOST_WORKERS = 32
 """Largest number of workers. At full length each holds an episode, a prediction and their optical flow, half a gigabyte, and
@@ -39,7 +39,7 @@ class Bench(threading.local):
         devices: Iterator[jax.Device],
     ) -> None:
         self.device = next(devices)
-        use_torch_device(self.device.local_hardware_id or 0)
+        use_gpu(self.device.local_hardware_id or 0)
         self.masker, self.tracker = masker(self.device), tracker(self.device)
 
 
