@@ -42,6 +42,10 @@ CHANGES: dict[str, tuple[str, ...]] = {
     "pasted render": (
         *("--model.embodiment", "pasted_render", "--model.reference", "channels", "--model.prediction", "residual"),
     ),
+    "pasted render, no flow": (
+        *("--model.embodiment", "pasted_render", "--model.reference", "channels", "--model.prediction", "residual"),
+        *("--model.action", "none"),
+    ),
     "shift 3": ("--train.shift", "3"),
     "two chunks": ("--train.chunks", "2", "--train.batch", "1"),
 }
