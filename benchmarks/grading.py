@@ -1,7 +1,7 @@
 """How long `python -m xew.metrics.evaluate` takes for a model's rollouts and all baselines, by OpenCV and in Warp kernels.
 
     python benchmarks/grading.py --data data                                  # 40 test episodes, on this machine's GPU
-    python benchmarks/grading.py --data data --codec runs/fixed               # and the truth through a run's codec
+    python benchmarks/grading.py --data data --codec configs/fixed.yaml      # and the truth through a codec
     python benchmarks/grading.py --data data --episodes 10 --ways opencv:2 warp:2
 
 Needs a data set with test seeds, of several robots where another robot's episode is to be graded too. The model's rollouts
@@ -21,6 +21,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -42,7 +43,7 @@ class Args:
     """Folder for what is made here; what is there is replaced."""
     episodes: int = 40
     codec: Path | None = None
-    """Run of `xew.model.train` whose codec the truth goes through."""
+    """Run of `xew.model.train`, or its config, whose codec the truth goes through."""
     ways: tuple[str, ...] = ("warp:1", "warp:8", "opencv:16")
     """Estimators and numbers of processes; one process has a thread for each processor core."""
 
@@ -51,11 +52,10 @@ def main(args: Args) -> None:
     shutil.rmtree(args.out, ignore_errors=True)
     count = make_workload(args)
     print(f"{platform.processor()}, {os.cpu_count()} cores; {count} episodes")
-    first: pd.DataFrame | None = None
+    first: pd.Series[Any] | None = None
     fastest = 0.0
-    print(
-        "| estimators | processes | first time [s] | again [s] | processor time [s] | factor | videos/s |\n|---|---|---|---|---|---|---|"
-    )
+    print("| estimators | processes | first time [s] | again [s] | processor time [s] | factor | videos/s |")
+    print("|---" * 7 + "|")
     for way in args.ways:
         estimators, processes = way.split(":")
         cold, _ = grade(args, estimators, processes)
@@ -89,7 +89,7 @@ def make_workload(args: Args) -> int:
         for folder in folders if made < args.episodes else ():
             task, seed, robot = folder.parts[-3:]
             shutil.copytree(folder, args.out / "data" / task / seed / robot)
-            header = {"model": args.codec.name if args.codec else "late", "condition": "made up"}
+            header = {"model": args.codec.stem if args.codec else "late", "condition": "made up"}
             video = read_video(folder / "rgb.mkv")
             made += 1
             write_rollout(args.out / "rollouts", task, int(seed), robot, soften(delay(video, LATE)), header)
@@ -122,7 +122,7 @@ def busy_seconds() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def compare(way: str, first: pd.Series, scores: pd.Series) -> None:
+def compare(way: str, first: "pd.Series[Any]", scores: "pd.Series[Any]") -> None:
     """Fail unless the scores agree."""
     both = pd.concat([first, scores], axis=1, keys=["first", "other"])
     assert (both["first"].isna() == both["other"].isna()).all(), f"{way}: other videos have a score"

@@ -170,9 +170,13 @@ def open_batched_tracker() -> Tracker:
 
 MASKERS: Mapping[str, Backend[Masker]] = {
     "default": Backend(
-        ReferenceMasker, None, "color, background and gated flow against the true video (xew.metrics.estimators.masks)"
+        lambda: open_batched_masker() if _find_gpu() else ReferenceMasker(),
+        None,
+        "color, background and gated flow against the true video (xew.metrics.estimators.masks); warp where there is a GPU, "
+        "else opencv",
     ),
-    "warp": Backend(open_batched_masker, None, "the default masker for all frames at once, in Warp kernels for a GPU"),
+    "opencv": Backend(ReferenceMasker, None, "the default masker frame by frame, on the CPU"),
+    "warp": Backend(open_batched_masker, None, "the default masker for all frames at once, in Warp kernels"),
     "sam2": Backend(
         open_sam2,
         "sam2.1_hiera_{tiny,small,base_plus,large}.pt of github.com/facebookresearch/sam2, or a folder of Hugging Face's "
@@ -181,10 +185,13 @@ MASKERS: Mapping[str, Backend[Masker]] = {
     ),
 }
 TRACKERS: Mapping[str, Backend[Tracker]] = {
-    "default": Backend(ReferenceTracker, None, "template search against the true video (xew.metrics.estimators.tracks)"),
-    "warp": Backend(
-        open_batched_tracker, None, "the default tracker for all points and frames at once, in Warp kernels for a GPU"
+    "default": Backend(
+        lambda: open_batched_tracker() if _find_gpu() else ReferenceTracker(),
+        None,
+        "template search against the true video (xew.metrics.estimators.tracks); warp where there is a GPU, else opencv",
     ),
+    "opencv": Backend(ReferenceTracker, None, "the default tracker frame by frame, on the CPU"),
+    "warp": Backend(open_batched_tracker, None, "the default tracker for all points and frames at once, in Warp kernels"),
     "cotracker3": Backend(
         open_cotracker,
         "scaled_offline.pth of Hugging Face's facebook/cotracker3; CC-BY-NC 4.0: not for commercial use",

@@ -13,6 +13,7 @@ Writes scores.parquet, one row per model, condition, task, seed, robot and metri
 """
 
 import itertools
+import os
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -324,6 +325,7 @@ def _grade_groups(
     """
     opener = make_grader_opener(args, metrics, store)
     if args.processes > 1 and len(groups) > 1:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # processes share the cores; NumPy's threads would only wait
         yield from map_in_processes(opener.open_in_process, groups, args.processes, imported=("xew.metrics.grading.grader",))
         return
     stop = threading.Event()

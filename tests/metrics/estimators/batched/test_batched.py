@@ -141,7 +141,7 @@ def test_places_of_other_things_are_told_as_opencv_tells_them(truth: Truth) -> N
 def test_scores_of_the_predictors_are_the_same(truth: Truth) -> None:
     graded = {
         name: pd.DataFrame(grade_material(Material(truth.rgb), truth, open_masker(name), open_tracker(name), SCORES, CASES))
-        for name in ("default", "warp")
+        for name in ("opencv", "warp")
     }
     expected, found = (rows.set_index(["metric", "case"])["value"].unstack() for rows in graded.values())
     assert expected.loc["keypoint_error_strict"].max() > 10 > 1 > expected.loc["keypoint_error_strict"].min()
@@ -172,6 +172,14 @@ def test_images_that_the_kernels_are_not_made_for_are_left_to_opencv(size: tuple
     if min(size) >= 12:  # the least that OpenCV's flow takes
         tracks = BatchedTracker("cpu")(prediction, target, points, visible)
         np.testing.assert_array_equal(tracks, estimate_tracks(prediction, target, points, visible))
+
+
+def test_the_default_is_opencv_where_there_is_no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("xew.metrics.backends._find_gpu", lambda: None)
+    assert type(open_masker("default")).__name__ == "ReferenceMasker"
+    assert type(open_tracker("default")).__name__ == "ReferenceTracker"
+    monkeypatch.setattr("xew.metrics.backends._find_gpu", lambda: "cpu")
+    assert isinstance(open_masker("default"), BatchedMasker) and isinstance(open_tracker("default"), BatchedTracker)
 
 
 def test_threads_take_the_gpu_of_their_own_number(monkeypatch: pytest.MonkeyPatch) -> None:
