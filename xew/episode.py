@@ -356,6 +356,15 @@ def open_video(path: Path) -> Any:
     return av.open(str(demand_regular(path).absolute()), container_options=options)
 
 
+def take_pixels(frame: av.VideoFrame, pixels: str = "rgb24") -> np.ndarray:
+    """A decoded frame as uint8 [h w c], converted by this thread: PyAV would start one a core for every frame anew.
+
+    Args:
+        pixels: name of FFmpeg's format with c channels, such as rgb24 or rgba.
+    """
+    return frame.to_ndarray(format=pixels, threads=1)
+
+
 def read_video(path: Path, most: int | None = None) -> np.ndarray:
     """Read a video, or its first `most` frames, as uint8 RGB [t h w 3].
 
@@ -364,7 +373,7 @@ def read_video(path: Path, most: int | None = None) -> np.ndarray:
     try:
         with open_video(path) as container:
             container.streams.video[0].codec_context.thread_count = 1
-            frames = [frame.to_ndarray(format="rgb24") for frame in itertools.islice(container.decode(video=0), most)]
+            frames = [take_pixels(frame) for frame in itertools.islice(container.decode(video=0), most)]
     except (av.FFmpegError, OSError, IndexError):  # IndexError: a file without a video in it
         frames = []
     if not frames:

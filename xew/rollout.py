@@ -20,7 +20,7 @@ import av
 import cv2
 import numpy as np
 
-from xew.episode import SEED_END, EpisodeError, complete_folder, open_video, place_episode, read_npz, write_video
+from xew.episode import SEED_END, EpisodeError, complete_folder, open_video, place_episode, read_npz, take_pixels, write_video
 from xew.files import demand_regular, read_json
 from xew.names import check_label, check_name, name_of_folder
 
@@ -247,8 +247,8 @@ def _read_container(path: Path, frame_rate: float | None) -> np.ndarray:
 def _rgb(path: Path, frame: Any) -> np.ndarray:
     """A decoded frame as RGB [h w 3]. OpenCV writes FFV1 with an alpha channel that hides nothing; any other is an error."""
     if not any(component.is_alpha for component in frame.format.components):
-        return frame.to_ndarray(format="rgb24")
-    image = frame.to_ndarray(format="rgba")
+        return take_pixels(frame)
+    image = take_pixels(frame, "rgba")
     if image[..., 3].min() < 255:
         raise RolloutError(f"{path} has an alpha channel ({frame.format.name}) that hides something; convert before grading.")
     return image[..., :3]

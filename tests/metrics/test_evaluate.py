@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import cv2
+import jax
 import numpy as np
 import pandas as pd
 import pytest
@@ -255,6 +256,25 @@ def test_only_what_moves_counts_among_objects(data: Path, tmp_path: Path) -> Non
     assert np.isnan(grades.values["trajectory_error_strict"]) and grades.values["pck_strict"] == 1
     with pytest.raises(ValueError, match="no points on surfaces; ask read_truth"):
         grade_one(Comparison(read.rgb, replace(read, surfaces=None), estimate_masks, exact), ("pck_strict",))
+
+
+def test_on_a_gpu_a_video_is_put_once_for_all_metrics_and_the_truth_once_for_all_predictions(
+    data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = episode_folder(data, TASK, SEED, "piper")
+    names = ("psnr", "ssim", "lpips", "robot_lpips")
+    read = read_truth(folder, FRAMES, {"video", "robot"})
+    videos = late(read.rgb), late(late(read.rgb))
+    expected = [grade_one(Comparison(video, read, estimate_masks, exact), names).values for video in videos]
+    put: list[tuple[int, ...]] = []
+    on_device = jax.device_put
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "device_put", lambda array: put.append(array.shape) or on_device(array))
+    read = read_truth(folder, FRAMES, {"video", "robot"})
+    for video, values, puts in zip(videos, expected, (4, 2), strict=True):
+        put.clear()
+        assert grade_one(Comparison(video, read, estimate_masks, exact), names).values == pytest.approx(values, rel=1e-4)
+        assert len([shape for shape in put if len(shape) == 4]) == puts, "whole for PSNR, in blocks for the others"
 
 
 def test_contact_is_a_diagnostic_and_no_part_of_the_suite(rollouts: Path, data: Path) -> None:

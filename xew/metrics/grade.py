@@ -84,6 +84,12 @@ class Comparison:
         """Video [t h w 3] uint8 that the estimators see."""
         return self.prediction if self.shown is None else self.shown
 
+    @cached_property
+    def video(self) -> tuple[np.ndarray, np.ndarray]:
+        """The graded frames [t h w 3] uint8 of the prediction and of the truth, whose array all predictions share."""
+        target = self.truth.notes.setdefault(f"frames from {self.first}", self.truth.rgb[self.first :])
+        return self.prediction[self.first :], target
+
     @property
     def side(self) -> float:
         """Square root of the image's area [pixels]."""
@@ -124,6 +130,7 @@ def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
     curves: dict[str, np.ndarray] = {}
     shared = _curves_by_shared_features(comparison, metrics, inputs)
     of_tracks = _grade_tracks(comparison, metrics, inputs)
+    blocks = Blocks(comparison)
     for name in metrics:
         arrays = inputs[input_kind(name)]
         if arrays is None:
@@ -137,10 +144,10 @@ def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
             whole = OF_WHOLE_FRAMES.get(name)
             known = curves.get(whole) if whole and _touches_all_borders(arrays[-1][0]) else None
             if known is None:
-                known = shared[name] if name in shared else _curve(name, arrays)
+                known = shared[name] if name in shared else _curve(name, arrays, blocks)
             curves[name] = known
             values[name] = _mean_of_known(curves[name])
-    prediction, target = _video(comparison)
+    prediction, target = comparison.video
     return Grades(values, curves, int(np.all(prediction == target, axis=(1, 2, 3)).sum()))
 
 
@@ -148,7 +155,7 @@ Arrays = tuple[np.ndarray, ...]
 
 
 def _video(c: Comparison) -> Arrays:
-    return c.prediction[c.first :], c.truth.rgb[c.first :]
+    return c.video
 
 
 def _mask(c: Comparison) -> Arrays:
@@ -161,7 +168,7 @@ def _region(c: Comparison) -> Arrays | None:
     _, _, height, width = union_box(np.expand_dims(covered, 0))
     if min(int(height), int(width)) < SMALLEST_SIDE:
         return None
-    return *_video(c), np.broadcast_to(covered, c.truth.mask[c.first :].shape)
+    return *c.video, np.broadcast_to(covered, c.truth.mask[c.first :].shape)
 
 
 def _robot(c: Comparison) -> Arrays | None:
@@ -169,7 +176,7 @@ def _robot(c: Comparison) -> Arrays | None:
     mask = c.truth.mask[c.first :]
     if not mask.any() or min(mask.shape[1:]) < SMALLEST_SIDE:
         return None
-    return *_video(c), mask
+    return *c.video, mask
 
 
 def _keypoints(c: Comparison) -> Arrays | None:
@@ -252,7 +259,7 @@ def _curves_by_shared_features(
     features = comparison.truth.notes.setdefault(f"features from frame {comparison.first}", SharedFeatures())
     curves: dict[str, np.ndarray] = {}
     whole, robot, region = (by_function.get(curve) for curve in (lpips, robot_lpips_frames, region_lpips_frames))
-    video = _video(comparison)
+    video = comparison.video
     if whole or robot:
         mask = comparison.truth.mask[comparison.first :] if robot else None
         plain, weighted = features.distances(*video, mask)
@@ -301,17 +308,44 @@ def _compare_tracks(
     return values, {name: jax.vmap(functions[name])(*frames) for name, m in chosen.items() if not m.whole}
 
 
-def _curve(name: str, arrays: Arrays) -> np.ndarray:
+class Blocks:
+    """Arrays of a comparison as metrics of frames take them: in blocks of one size, the last filled up with its last frame.
+
+    On a GPU a video is put there once for all its metrics, and the truth's once for all its predictions.
+    """
+
+    def __init__(self, comparison: Comparison) -> None:
+        self._target = comparison.video[1]
+        self._of_truth: dict[tuple[int, bool], Block] = comparison.truth.notes.setdefault("blocks", {})
+        self._of_prediction: dict[tuple[int, bool], Block] = {}
+
+    def cut(self, array: np.ndarray, whole: bool) -> list[np.ndarray] | list[jax.Array]:
+        """Blocks [n ...] of an array [t ...]; a single one where it is asked for whole."""
+        if jax.default_backend() == "cpu":
+            return _cut(array, WHOLE_BLOCK if whole else FRAME_BLOCK, whole)
+        kept = self._of_truth if array is self._target else self._of_prediction
+        if (id(array), whole) not in kept:
+            kept[id(array), whole] = array, [jax.device_put(part) for part in _cut(array, ACCELERATOR_CHUNK, whole)]
+        return kept[id(array), whole][1]
+
+
+Block = tuple[np.ndarray, list[jax.Array]]
+"""An array, which is kept so that no other has its identity, and its blocks on a device."""
+
+
+def _cut(array: np.ndarray, block: int, whole: bool) -> list[np.ndarray]:
+    filled = _fill(array, 0, block, "last")
+    return [filled] if whole else [filled[first : first + block] for first in range(0, len(filled), block)]
+
+
+def _curve(name: str, arrays: Arrays, blocks: Blocks) -> np.ndarray:
     """[t] float32."""
     curve = METRICS[name].curve
     assert curve is not None, "metrics of frames have one"
     count = len(arrays[0])
-    few = WHOLE_BLOCK if METRICS[name].whole else FRAME_BLOCK
-    block = few if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK
-    padded = [_fill(array, 0, block, "last") for array in arrays]
-    size = len(padded[0]) if METRICS[name].whole else block
-    blocks = [curve(*(array[i : i + size] for array in padded)) for i in range(0, len(padded[0]), size)]
-    return np.concatenate(jax.device_get(blocks))[:count].astype(np.float32)
+    parts = zip(*(blocks.cut(array, METRICS[name].whole) for array in arrays), strict=True)
+    curves = [curve(*part) for part in parts]
+    return np.concatenate(jax.device_get(curves))[:count].astype(np.float32)
 
 
 def _mean_of_known(curve: np.ndarray) -> float:

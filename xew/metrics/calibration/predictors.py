@@ -13,7 +13,7 @@ import av
 import cv2
 import numpy as np
 
-from xew.episode import States, read_states
+from xew.episode import States, read_states, take_pixels
 from xew.metrics.calibration.perturbations import render_perturbation
 from xew.metrics.grading.jobs import SOFTNESS
 from xew.metrics.truth import MOVED
@@ -59,7 +59,7 @@ def through_h264(video: np.ndarray, quality: int = QUALITY) -> np.ndarray:
     decoder = av.CodecContext.create("h264", "r")
     decoder.thread_count = 1
     frames = [frame for packet in [*packets, None] for frame in decoder.decode(packet)]
-    return np.stack([frame.to_ndarray(format="rgb24") for frame in frames])
+    return np.stack([take_pixels(frame) for frame in frames])
 
 
 def delay(video: np.ndarray, frames: int) -> np.ndarray:

@@ -3,6 +3,9 @@
 Both estimators read a predicted frame beside two true frames: that of the same time, and the one found here.
 """
 
+import threading
+import weakref
+
 import cv2
 import numpy as np
 
@@ -33,7 +36,17 @@ def find_most_similar(prediction: np.ndarray, target: np.ndarray) -> tuple[np.nd
     return chosen, np.sqrt(square[rows, chosen])
 
 
+_last = threading.local()
+"""Thumbnails of the last two videos of each thread: masks and tracks ask for the same ones, of one truth again and again."""
+
+
 def _thumbnails(video: np.ndarray) -> np.ndarray:
     """[t n] float64."""
-    small = [cv2.resize(frame, THUMBNAIL, interpolation=cv2.INTER_AREA) for frame in video]
-    return np.stack(small).reshape(len(video), -1).astype(np.float64)
+    known = getattr(_last, "videos", ())
+    small = next((thumbnails for of, thumbnails in known if of() is video), None)
+    if small is None:
+        frames = [cv2.resize(frame, THUMBNAIL, interpolation=cv2.INTER_AREA) for frame in video]
+        small = np.stack(frames).reshape(len(video), -1).astype(np.float64)
+    others = [one for one in known if one[0]() is not video]
+    _last.videos = (*others[-1:], (weakref.ref(video), small))
+    return small

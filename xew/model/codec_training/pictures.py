@@ -21,7 +21,7 @@ from tqdm import tqdm
 from xew.concurrency import map_in_order
 from xew.config import ConfigError
 from xew.dataset import Episode
-from xew.episode import EpisodeError, Record, open_video, read_states
+from xew.episode import EpisodeError, Record, open_video, read_states, take_pixels
 from xew.model import conditions
 from xew.model.cache.clips import take_frames
 from xew.model.conditions import make_command
@@ -236,7 +236,7 @@ def read_frames(path: Path, wanted: set[int]) -> dict[int, np.ndarray]:
             container.streams.video[0].codec_context.thread_count = 1
             for number, frame in enumerate(container.decode(video=0)):
                 if number in wanted:
-                    frames[number] = frame.to_ndarray(format="rgb24")
+                    frames[number] = take_pixels(frame)
                 if len(frames) == len(wanted):
                     break
     except (av.FFmpegError, OSError, IndexError):
