@@ -71,22 +71,6 @@ def test_latents_from_states_are_those_from_video(simulated: Path, capsys: pytes
     assert not list((simulated / "bare").rglob("*.mkv"))
 
 
-def test_latents_from_processes_are_those_from_threads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    synthetic.write_synthetic_data(tmp_path / "data", seeds=(0,), robots=("arx_x5", "ur5_wsg"), frames=9)
-    config = [write_config(tmp_path), "--model.action", "joints"]
-    cached = tmp_path / "data-latents"
-    latents.main(config)
-    from_threads = files(cached)
-    streams = [path for path in cached.rglob("*.safetensors") if path.parent.name in ("arx_x5", "ur5_wsg")]
-    for path in streams:
-        path.unlink()
-    latents.main([*config, "--processes", "2"])
-    assert len(streams) == 6 and files(cached) == from_threads
-    with pytest.raises(SystemExit):
-        latents.main([*config, "--processes", "0"])
-    assert "--processes is 0; expected at least one" in capsys.readouterr().err
-
-
 @pytest.fixture(scope="module")
 def codec() -> PatchCodec:
     rng = np.random.default_rng(0)

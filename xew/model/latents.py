@@ -17,7 +17,7 @@ from xew.config import ConfigError, user_errors
 from xew.dataset import Dataset, Episode, read_dataset
 from xew.files import hold_lock, read_json, write_text
 from xew.model.cache.codecs import prepare_codec
-from xew.model.cache.encode import Encoder, EncoderOpener, encode_episodes, encode_in_processes
+from xew.model.cache.encode import encode_episodes
 from xew.model.cache.keys import CACHE_VERSION
 from xew.model.cache.scales import keep_scales
 from xew.model.cache.store import LatentCache
@@ -40,8 +40,6 @@ class Flags:
     """Render the episodes anew; no video needs to be there."""
     batch: int = 4
     """Number of clips that the codec encodes at once."""
-    processes: int = 1
-    """Processes that episodes are shared out to, in place of threads, which keep few cores busy beside a GPU."""
     trust: tuple[str, ...] = ()
     """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
@@ -52,14 +50,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     flags, experiment = parse_experiment(Flags, arguments, "python -m xew.model.latents", __doc__.splitlines()[0])
     if flags.batch < 1:
         raise ConfigError(f"--batch is {flags.batch}; expected at least one clip.")
-    if flags.processes < 1:
-        raise ConfigError(f"--processes is {flags.processes}; expected at least one.")
-    encode_experiment(experiment, flags)
+    encode_experiment(experiment, rendered_pixels() if flags.from_states else stored_pixels, flags.batch)
 
 
-def encode_experiment(experiment: Experiment, flags: Flags) -> None:
-    """Encode all that the training of an experiment reads, and print what was made."""
-    source = rendered_pixels() if flags.from_states else stored_pixels
+def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixels, batch: int = 4) -> None:
+    """Encode all that the training of an experiment reads, and print what was made.
+
+    Args:
+        source: where the episodes' pixels come from.
+        batch: clips that the codec encodes at once.
+    """
     encoding, choice, dataset = experiment.encoding, experiment.choice, read_dataset(experiment.data)
     episodes = training_episodes(dataset, choice)
     with hold_lock(encoding.folder, wait=True):  # whoever comes second finds a codec that is fitted already
@@ -69,12 +69,7 @@ def encode_experiment(experiment: Experiment, flags: Flags) -> None:
     cache = LatentCache(encoding, codec)
     # Experiments of a study share a cache and encode at once: those of other streams go on, those of the same ones wait.
     with hold_lock(encoding.folder.with_name("-".join((encoding.folder.name, *sorted(cache.streams)))), wait=True):
-        wanted = [*episodes, *replay_episodes(dataset, choice)]
-        if flags.processes > 1:
-            opener = EncoderOpener(encoding, episodes, flags.from_states, flags.batch)
-            written = encode_in_processes(opener, cache, wanted, flags.processes)
-        else:
-            written = encode_episodes(Encoder(cache, source, flags.batch), wanted)
+        written = encode_episodes(cache, [*episodes, *replay_episodes(dataset, choice)], source, batch)
         header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip)}
         header |= {"streams": list(cache.streams), "episodes": len(episodes)}
         header |= {"ceiling": report_ceiling(experiment, cache, dataset, episodes, source)}

@@ -1,90 +1,54 @@
-"""Encoding episodes into the latent cache: pixels are read or rendered ahead, in threads or processes, the codec works in
-batches."""
+"""Encoding episodes into the latent cache: pixels are read or rendered ahead in threads, the codec works in batches."""
 
-import os
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 
 import jax
 import numpy as np
 from tqdm import tqdm
 
-from xew.compilation import keep_compiled_programs
-from xew.concurrency import map_in_order, map_in_processes
+from xew.concurrency import map_in_order
 from xew.dataset import Episode
 from xew.episode import Record
 from xew.model.cache.clips import cut_clip, needed_pixels, read_streams
-from xew.model.cache.store import LatentCache, open_cache
+from xew.model.cache.store import LatentCache
 from xew.model.codecs.contract import Codec, check_clip_shape, encode_pictures
-from xew.model.settings.parts import Encoding
-from xew.model.video.pixels import PixelSource, rendered_pixels, stored_pixels
+from xew.model.video.pixels import PixelSource, stored_pixels
 
 ENCODERS = 3
 """Number of episodes that an accelerator encodes side by side: one computes while others are copied to it and back."""
 
 
-@dataclass(frozen=True)
-class Encoder:
-    """What encodes the streams that the cache has not of an episode, for one thread or several."""
+def encode_episodes(
+    cache: LatentCache, episodes: Sequence[Episode], source: PixelSource = stored_pixels, batch: int = 4
+) -> int:
+    """Encode what is missing of some episodes, and return the number of bytes written.
 
-    cache: LatentCache
-    source: PixelSource = stored_pixels
-    batch: int = 4
-    """Number of clips that the codec encodes at once."""
-    turns: threading.BoundedSemaphore = field(
-        default_factory=lambda: threading.BoundedSemaphore(1 if jax.default_backend() == "cpu" else ENCODERS)
-    )
-
-    def __call__(self, episode: Episode) -> int:
-        """Encode what is missing of an episode, and return the number of bytes written."""
-        inputs, missing = self.cache.encoding.inputs, self.cache.missing(episode[1])
-        pixels = self.source(*episode, needed_pixels(inputs.conditions, missing))
-        videos = read_streams(inputs.conditions, inputs.clip, *episode, missing, pixels)
-        with self.turns:
-            return _encode_streams(self.cache, episode[1], videos, self.batch)
-
-
-@dataclass(frozen=True)
-class EncoderOpener:
-    """What opens an encoder in a process of its own; it can be sent there."""
-
-    encoding: Encoding
-    training: Sequence[Episode]
-    """Episodes that the codec, where it is a fitted one, was fitted on."""
-    from_states: bool
-    batch: int
-
-    def __call__(self) -> Encoder:
-        keep_compiled_programs()
-        source = rendered_pixels() if self.from_states else stored_pixels
-        return Encoder(open_cache(self.encoding, self.training), source, self.batch)
-
-
-def encode_episodes(encoder: Encoder, episodes: Sequence[Episode]) -> int:
-    """Encode what is missing of some episodes in threads of this process, and return the number of bytes written."""
-    pending = [episode for episode in episodes if encoder.cache.missing(episode[1])]
-    return _follow(map_in_order(encoder, pending), len(pending), len(episodes))
-
-
-def encode_in_processes(opener: EncoderOpener, cache: LatentCache, episodes: Sequence[Episode], processes: int) -> int:
-    """The same in so many processes, each of which reads, encodes and writes one episode after another.
-
-    Threads wait for Python's lock in most of what reads an episode and draws its conditions. Processes that share a GPU take
-    its memory as they need it.
+    Args:
+        source: where their pixels come from; they are read or rendered, and conditions drawn, ahead in threads.
+        batch: clips that the codec encodes at once.
     """
+    inputs = cache.encoding.inputs
     pending = [episode for episode in episodes if cache.missing(episode[1])]
-    if not pending:
-        return 0
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    return _follow(map_in_processes(opener, pending, processes, (__name__,)), len(pending), len(episodes))
+    done = len(episodes) - len(pending)
+    progress = tqdm(total=len(episodes), initial=done, desc="encode", unit="episode", file=sys.stderr)
+    written = 0
 
+    turns = threading.BoundedSemaphore(1 if jax.default_backend() == "cpu" else ENCODERS)
 
-def _follow(sizes: Iterator[int], pending: int, total: int) -> int:
-    """Sum of the sizes [bytes], with a line of progress."""
-    bar = tqdm(sizes, initial=total - pending, total=total, desc="encode", unit="episode", file=sys.stderr)
-    return sum(bar)
+    def encode(episode: Episode) -> int:
+        missing = cache.missing(episode[1])
+        pixels = source(*episode, needed_pixels(inputs.conditions, missing))
+        videos = read_streams(inputs.conditions, inputs.clip, *episode, missing, pixels)
+        with turns:
+            return _encode_streams(cache, episode[1], videos, batch)
+
+    for size in map_in_order(encode, pending):
+        written += size
+        progress.update()
+    progress.close()
+    return written
 
 
 def _encode_streams(cache: LatentCache, record: Record, videos: dict[str, np.ndarray], batch: int) -> int:
