@@ -13,6 +13,7 @@ import warp as wp
 from xew.concurrency import PARSING
 from xew.metrics.estimators import masks as reference
 from xew.metrics.estimators.batched import mask_kernels as kernels
+from xew.metrics.estimators.batched.devices import upload
 from xew.metrics.estimators.batched.flow import Array, Search, build_pyramid, find_flow, is_large_enough
 from xew.metrics.estimators.similarity import find_most_similar
 
@@ -40,24 +41,27 @@ class BatchedMasker:
         known = self._known
         if known is None or known.target is not target or known.mask is not target_mask:
             appearance = reference.learn_appearance(target, target_mask)
+            frames = upload(target, self._device)
             with PARSING, wp.ScopedDevice(self._device):
-                self._known = known = _Episode(target, target_mask, appearance)
+                self._known = known = _Episode(target, target_mask, frames, appearance)
         plan = _plan(prediction, find_most_similar(prediction, target)[0])
-        with PARSING, wp.ScopedDevice(self._device):  # threads take turns at the device
-            return _estimate(prediction, known, plan)
+        frames = upload(prediction, self._device)
+        with PARSING, wp.ScopedDevice(self._device):  # threads take turns at launching, and wait side by side
+            masks = _estimate(frames, known, plan)
+        return masks.numpy().astype(bool)
 
 
 class _Episode:
     """A true video and its masks as a device has them, with room for a predicted video before them."""
 
-    def __init__(self, target: np.ndarray, mask: np.ndarray, appearance: reference.Appearance) -> None:
+    def __init__(self, target: np.ndarray, mask: np.ndarray, frames: Array, appearance: reference.Appearance) -> None:
         self.target, self.mask = target, mask
         count, *size = mask.shape
         self.frames = wp.empty((2 * count, *size, 3), dtype=wp.uint8)
         self.soft = wp.empty_like(self.frames)
         self.gray = wp.empty((2 * count, *size), dtype=wp.uint8)
         self._blur = wp.array(fixed_kernel(reference.RESIDUAL_SOFTNESS), dtype=int)
-        self.put(target, slice(count, None))
+        self.put(frames, slice(count, None))
         self.distance = wp.empty(mask.shape, dtype=float)
         wp.launch(kernels.measure_distance, mask.shape, [wp.array(mask.astype(np.uint8)), 0], [self.distance])
         self.looks = [
@@ -68,10 +72,10 @@ class _Episode:
             wp.array(appearance.uncovered.astype(np.uint8), dtype=wp.uint8),
         ]
 
-    def put(self, video: np.ndarray, images: slice) -> None:
-        """Make a video [t h w 3] uint8 these images, softened and gray as well."""
+    def put(self, video: Array, images: slice) -> None:
+        """Make a video [t h w 3] uint8 on the device these images, softened and gray as well."""
         frames, soft, gray = (array[images] for array in (self.frames, self.soft, self.gray))
-        wp.copy(frames, wp.array(np.ascontiguousarray(video), dtype=wp.uint8))
+        wp.copy(frames, video)
         rows = wp.empty(frames.shape, dtype=wp.uint16)
         wp.launch(kernels.blur_rows, gray.shape, [frames, self._blur], [rows])
         wp.launch(kernels.blur_columns, gray.shape, [rows, self._blur], [soft])
@@ -121,8 +125,8 @@ def _plan(prediction: np.ndarray, alike: np.ndarray) -> _Plan:
     return _Plan(shown, alike)
 
 
-def _estimate(prediction: np.ndarray, known: _Episode, plan: _Plan) -> np.ndarray:
-    """Masks bool [t h w] of a prediction [t h w 3] uint8."""
+def _estimate(prediction: Array, known: _Episode, plan: _Plan) -> Array:
+    """Masks [t h w] uint8 of a prediction [t h w 3] uint8, both on the device; nothing is waited for."""
     count = len(prediction)
     known.put(prediction, slice(0, count))
     pyramid = build_pyramid(known.gray, SEARCH)
@@ -139,7 +143,7 @@ def _estimate(prediction: np.ndarray, known: _Episode, plan: _Plan) -> np.ndarra
         true = _carry_true(known, plan, frames, used, gate, source)
         looks = _weigh_looks(known, frames)
         _decide(frames, [looks, *true], used[:, 2], [gate, source], masks)
-    return masks.numpy().astype(bool)
+    return masks
 
 
 def _carry_true(

@@ -15,6 +15,7 @@ from xew.metrics.estimators import presence
 from xew.metrics.estimators import tracks as reference
 from xew.metrics.estimators.batched import mask_kernels, path_kernels
 from xew.metrics.estimators.batched import track_kernels as kernels
+from xew.metrics.estimators.batched.devices import upload
 from xew.metrics.estimators.batched.flow import Array, Search, build_pyramid, find_flow, is_large_enough
 from xew.metrics.estimators.batched.masks import fixed_kernel
 from xew.metrics.estimators.similarity import find_most_similar
@@ -58,13 +59,21 @@ class BatchedTracker:
             return reference.estimate_tracks(prediction, target, points, visible)
         videos = self._videos
         shown = videos is not None and videos.target is target and videos.prediction is prediction
-        similar = None if shown else find_most_similar(prediction, target)
-        with PARSING, wp.ScopedDevice(self._device):  # threads take turns at the device
-            if videos is None or videos.target is not target:
-                videos = self._videos = _Videos(target)
-            if similar is not None:
-                videos.show(prediction, *similar)
-            return _track(videos, points, visible)
+        if videos is None or videos.target is not target:
+            frames = upload(target, self._device)
+            with PARSING, wp.ScopedDevice(self._device):  # threads take turns at launching, and wait side by side
+                videos = self._videos = _Videos(target, frames)
+        if not shown:
+            similar, frames = find_most_similar(prediction, target), upload(prediction, self._device)
+            with PARSING, wp.ScopedDevice(self._device):
+                videos.show(prediction, frames, *similar)
+        with PARSING, wp.ScopedDevice(self._device):
+            truth, proposal = _propose(videos, points, visible)
+        sure = proposal.numpy()[..., 2].min(axis=-1) <= 1 - reference.SURE
+        with PARSING, wp.ScopedDevice(self._device):
+            paths = _walk(videos, truth, proposal, points, visible & ~sure)
+        place, origin, total = (array.numpy() for array in paths)
+        return _follow_back(place, origin, total, visible)
 
     def confirm(
         self,
@@ -89,13 +98,13 @@ class BatchedTracker:
             known = [wp.array(visible.astype(np.uint8)), videos.put_bodies(shown), wp.array(body.astype(np.int32))]
             wrong = wp.empty(visible.shape, dtype=wp.uint8)
             _launch(kernels.confirm, wrong.shape, [videos.images.soft, *places, *known], [wrong])
-            return np.where(wrong.numpy().astype(bool)[..., None], np.float32(np.nan), found)
+        return np.where(wrong.numpy().astype(bool)[..., None], np.float32(np.nan), found)
 
 
 class _Videos:
     """A true video as a device has it, with room for a predicted video before it."""
 
-    def __init__(self, target: np.ndarray) -> None:
+    def __init__(self, target: np.ndarray, frames: Array) -> None:
         self.target = target
         self.prediction: np.ndarray | None = None
         self._bodies: tuple[np.ndarray, Array] | None = None
@@ -112,15 +121,19 @@ class _Videos:
         self.images.soft = wp.empty((2 * count, height, width, 3), dtype=wp.uint8)
         self.half = wp.empty((2 * count, height // 2, width // 2), dtype=int)
         self._blur = wp.array(fixed_kernel(reference.SOFTNESS), dtype=int)
-        self.true_flow = self._put(target, slice(count, None))
+        self.true_flow = self._put(frames, slice(count, None))
         for first, *side in self._levels:
             inputs = [self.images.pyramid, wp.vec3i(first, *side)]
             _launch(kernels.take_slopes, (2 * count, *side), inputs, [self.images.slope])
 
-    def show(self, prediction: np.ndarray, alike: np.ndarray, difference: np.ndarray) -> None:
-        """Make a video [t h w 3] uint8 the predicted one; the others are its `find_most_similar`."""
+    def show(self, prediction: np.ndarray, frames: Array, alike: np.ndarray, difference: np.ndarray) -> None:
+        """Make a video [t h w 3] uint8 the predicted one, which is on the device as `frames`.
+
+        Args:
+            alike, difference: its `find_most_similar`.
+        """
         self.alike, self.difference = alike, difference
-        self.seen_flow = self._put(prediction, slice(0, len(prediction)))
+        self.seen_flow = self._put(frames, slice(0, len(prediction)))
         self.prediction = prediction
 
     def put_bodies(self, shown: np.ndarray) -> Array:
@@ -129,10 +142,9 @@ class _Videos:
             self._bodies = shown, wp.array(np.ascontiguousarray(shown, np.int16), dtype=wp.int16)
         return self._bodies[1]
 
-    def _put(self, video: np.ndarray, images: slice) -> Array:
-        """Make a video these images; [t-1 h w 2] float32, its optical flow from frame to frame."""
-        count, height, width = video.shape[:3]
-        frames = wp.array(np.ascontiguousarray(video), dtype=wp.uint8)
+    def _put(self, frames: Array, images: slice) -> Array:
+        """Make a video [t h w 3] on the device these images; [t-1 h w 2] float32, its optical flow from frame to frame."""
+        count, height, width = frames.shape[:3]
         soft, half, pyramid = self.images.soft[images], self.half[images], self.images.pyramid[images]
         rows = wp.empty(frames.shape, dtype=wp.uint16)
         wp.launch(mask_kernels.blur_rows, frames.shape[:3], [frames, self._blur], [rows])
@@ -149,8 +161,8 @@ class _Videos:
         return find_flow(build_pyramid(gray, SEARCH), np.stack([first, np.minimum(first + 1, count - 1)], axis=-1))
 
 
-def _track(videos: _Videos, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """`estimate_tracks` of points without NaN."""
+def _propose(videos: _Videos, points: np.ndarray, visible: np.ndarray) -> tuple[kernels.Truth, Array]:
+    """Points [t k 2] without NaN on the device, and what flow proposes for them [t k 2 3]: x, y and cost."""
     frames, count = visible.shape
     truth = kernels.Truth()
     truth.point = wp.array(points, dtype=wp.vec2)
@@ -158,9 +170,16 @@ def _track(videos: _Videos, points: np.ndarray, visible: np.ndarray) -> np.ndarr
     truth.alike = wp.array(videos.alike.astype(np.int32))
     proposal = wp.empty((frames, count, 2), dtype=wp.vec3)
     _launch_blocks(kernels.propose, [frames, count, 2], [videos.images, truth], [proposal])
-    sure = proposal.numpy()[..., 2].min(axis=-1) <= 1 - reference.SURE
-    frame, index = np.nonzero(visible & ~sure)
-    search = np.full(visible.shape, -1, np.int32)
+    return truth, proposal
+
+
+def _walk(
+    videos: _Videos, truth: kernels.Truth, proposal: Array, points: np.ndarray, unsure: np.ndarray
+) -> tuple[Array, Array, Array]:
+    """Paths through all proposals, as `_follow_back` takes them; points [t k 2] are searched for where `unsure` [t k]."""
+    frames, count = unsure.shape
+    frame, index = np.nonzero(unsure)
+    search = np.full(unsure.shape, -1, np.int32)
     search[frame, index] = np.arange(len(frame))
     peak = _search(videos, truth, frame, index, points)
     repeats = wp.array((videos.difference < reference.SAME_MOMENT).astype(np.uint8))
@@ -170,7 +189,7 @@ def _track(videos: _Videos, points: np.ndarray, visible: np.ndarray) -> np.ndarr
     total = wp.empty((count, states + 1), dtype=wp.float64)
     known = [videos.images, truth, repeats, videos.seen_flow, videos.true_flow, proposal, wp.array(search), peak]
     _launch_blocks(path_kernels.walk, [count], known, [place, origin, total])
-    return _follow_back(place.numpy(), origin.numpy(), total.numpy(), visible)
+    return place, origin, total
 
 
 def _follow_back(place: np.ndarray, origin: np.ndarray, total: np.ndarray, visible: np.ndarray) -> np.ndarray:
