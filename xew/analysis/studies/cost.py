@@ -14,7 +14,10 @@ from xew.analysis.studies.config import KINDS, Settings, Study, build_experiment
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import usable_gpus
 from xew.analysis.studies.plan import Step, sort_steps
-from xew.protocol import BASELINES, Variant
+from xew.protocol import BASELINES, Variant, training_counts
+
+FITTED = "patch_pca"
+"""Codec that is fitted to the training episodes of a split; the others are the same for all."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +37,10 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     tested = study.task_count * study.test_seeds * len(study.graded_robots)
     episodes = study.task_count * study.train_seeds * len(study.trained_robots) + tested
     costs["generate"] = Cost(episodes, "episodes", rates.start_s + episodes * rates.episode_s, episodes * rates.episode_mb)
-    encoded: set[tuple[str, ...]] = set()
+    encoded: dict[tuple[str, ...], int] = {}
     for variant in study.planned_runs:
         experiment = build_experiment(study, variant)
-        streams = _count_new_streams(variant, experiment, encoded) * study.training_count(variant)
+        streams = _count_new_streams(study, variant, experiment, encoded)
         updates, graded = count_optimizer_steps(study, variant, experiment), sum(study.graded_counts(variant).values())
         costs |= {
             f"latents/{variant.name}": Cost(
@@ -57,13 +60,19 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     return {name: costs[name] for name in steps}
 
 
-def _count_new_streams(variant: Variant, experiment: Settings, encoded: set[tuple[str, ...]]) -> int:
-    """Number of streams of an episode that no earlier variant has encoded with the same codec and episodes."""
+def _count_new_streams(study: Study, variant: Variant, experiment: Settings, encoded: dict[tuple[str, ...], int]) -> int:
+    """Number of streams of single episodes that no earlier variant has encoded with the same codec.
+
+    A codec that is fitted is another one for every split, and that of the start for an adaptation.
+    """
     model, new = experiment["model"], 0
-    for stream in ("rgb", model["action"], model["embodiment"]):
-        key = (variant.split, variant.target or "", str(variant.shots), stream)
-        new += stream != "none" and key not in encoded
-        encoded.add(key)
+    fitted = experiment.get("codec", {}).get("name", FITTED) == FITTED
+    counts = training_counts(variant, study.task_count, study.train_seeds, study.robot_keys)
+    for stream in (name for name in ("rgb", model["action"], model["embodiment"]) if name != "none"):
+        for robot, count in counts.items():
+            key = (variant.split if fitted else "", robot, stream)
+            new += max(0, count - encoded.get(key, 0))
+            encoded[key] = max(count, encoded.get(key, 0))
     return new
 
 
