@@ -308,6 +308,10 @@ def _compare_tracks(
     return values, {name: jax.vmap(functions[name])(*frames) for name, m in chosen.items() if not m.whole}
 
 
+Block = tuple[np.ndarray, list[jax.Array]]
+"""An array, which is kept so that no other has its identity, and its blocks on a device."""
+
+
 class Blocks:
     """Arrays of a comparison as metrics of frames take them: in blocks of one size, the last filled up with its last frame.
 
@@ -327,10 +331,6 @@ class Blocks:
         if (id(array), whole) not in kept:
             kept[id(array), whole] = array, [jax.device_put(part) for part in _cut(array, ACCELERATOR_CHUNK, whole)]
         return kept[id(array), whole][1]
-
-
-Block = tuple[np.ndarray, list[jax.Array]]
-"""An array, which is kept so that no other has its identity, and its blocks on a device."""
 
 
 def _cut(array: np.ndarray, block: int, whole: bool) -> list[np.ndarray]:

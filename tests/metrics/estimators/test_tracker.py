@@ -7,6 +7,7 @@ import pytest
 from tests.synthetic import write_cell
 from xew.episode import States, read_states, read_video
 from xew.metrics import coverage, keypoint_error, pck
+from xew.metrics.estimators import similarity
 from xew.metrics.estimators.similarity import find_most_similar
 from xew.metrics.estimators.tracks import estimate_tracks, likeness
 
@@ -117,6 +118,19 @@ def test_the_moment_that_a_frame_shows(episode: Episode) -> None:
     assert len(moving) > 3 and difference.max() < 0.01
     still = np.repeat(video[:1], FRAMES, axis=0)
     np.testing.assert_array_equal(find_most_similar(still, still)[0], np.arange(FRAMES))
+
+
+def test_thumbnails_are_made_once_a_video(monkeypatch: pytest.MonkeyPatch) -> None:
+    resized: list[int] = []
+    resize = similarity.cv2.resize
+    monkeypatch.setattr(similarity.cv2, "resize", lambda *asked, **how: resized.append(1) or resize(*asked, **how))
+    truth, *predictions = (np.full((3, 60, 80, 3), level, np.uint8) for level in (10, 20, 30, 40))
+    for prediction in (*predictions, predictions[-1]):
+        for _ in ("masks", "tracks"):
+            find_most_similar(prediction, truth)
+    assert len(resized) == 4 * 3, "three predictions and the truth, three frames each"
+    find_most_similar(predictions[0], truth)
+    assert len(resized) == 5 * 3, "a video of before is not kept"
 
 
 def test_patches_are_compared_as_far_as_both_are_in_the_image(episode: Episode) -> None:

@@ -1,5 +1,7 @@
 """The default estimators in Warp kernels: the same flow, masks, points and scores as OpenCV's, on a CPU."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 import pandas as pd
@@ -180,6 +182,19 @@ def test_the_default_is_opencv_where_there_is_no_gpu(monkeypatch: pytest.MonkeyP
     assert type(open_tracker("default")).__name__ == "ReferenceTracker"
     monkeypatch.setattr("xew.metrics.backends._find_gpu", lambda: "cpu")
     assert isinstance(open_masker("default"), BatchedMasker) and isinstance(open_tracker("default"), BatchedTracker)
+
+
+def test_threads_side_by_side_find_what_one_finds(truth: Truth) -> None:
+    points, visible = truth.keypoints, truth.keypoint_visible
+    videos = [np.ascontiguousarray(predict(case, Material(truth.rgb))) for case in CASES[:3]]
+
+    def find(video: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return BatchedMasker("cpu")(video, truth.rgb, truth.mask), BatchedTracker("cpu")(video, truth.rgb, points, visible)
+
+    with ThreadPoolExecutor(3) as pool:
+        for found, expected in zip(pool.map(find, videos), map(find, videos), strict=True):
+            for ours, theirs in zip(found, expected, strict=True):
+                np.testing.assert_array_equal(ours, theirs)
 
 
 def test_threads_take_the_gpu_of_their_own_number(monkeypatch: pytest.MonkeyPatch) -> None:
