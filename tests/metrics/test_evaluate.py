@@ -269,6 +269,7 @@ def test_on_a_gpu_a_video_is_put_once_for_all_metrics_and_the_truth_once_for_all
     put: list[tuple[int, ...]] = []
     on_device = jax.device_put
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr("xew.metrics.grade.ACCELERATOR_CHUNK", FRAMES)  # a CPU takes long for 64
     monkeypatch.setattr(jax, "device_put", lambda array: put.append(array.shape) or on_device(array))
     read = read_truth(folder, FRAMES, {"video", "robot"})
     for video, values, puts in zip(videos, expected, (4, 2), strict=True):
