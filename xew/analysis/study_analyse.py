@@ -31,7 +31,8 @@ class Args:
     variants: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Trainings of variants that are graded; all that have scores where left out."""
     rollouts: Path | None = None
-    """Folder of rollouts by variant, for pictures; <study>/rollouts where left out. Some scenes are enough."""
+    """Folder of rollouts by variant, for pictures; <study>/rollouts, as far as they are there, where left out. Some scenes are
+    enough."""
     data: Path | None = None
     """Data set that holds these scenes; the study's where left out."""
     distances: Path | None = None
@@ -67,8 +68,12 @@ def merge_and_report(args: Args, study: Study) -> None:
     print(format_coverage(scores.attributes["study"]))
     # Strips show the first training of each variant.
     shown = [name for name in graded if name not in planned or planned[name].of == name]
-    rollouts = tuple((args.rollouts or args.study / "rollouts") / name for name in shown)
-    table, data, out = args.study / "scores.parquet", args.data or study.data_folder, args.study / "report"
+    root = args.rollouts or args.study / "rollouts"
+    rollouts = tuple(root / name for name in shown if args.rollouts or (root / name).is_dir())
+    if len(rollouts) < len(shown):
+        print(f"{len(shown) - len(rollouts)} of {len(shown)} variants are in no picture: their rollouts were not under {root}")
+    data = args.data or (study.data_folder if rollouts else None)
+    table, out = args.study / "scores.parquet", args.study / "report"
     remove_written(out, report.FILES)  # a larger study's figures would stay
     other = study.other_scores
     report.main(report.Args(table, data, rollouts, out, distances=args.distances, other_motion=other))

@@ -27,7 +27,7 @@ import yaml
 from tests.analysis.inline import InlineMachines
 from tests.metrics.quick import QUICK, QUICK_TRACKS
 from tests.sim_warp.small import TASK, work_inline
-from xew.analysis import study
+from xew.analysis import study, study_analyse
 from xew.protocol import BASELINES, PAPER_PARTS, PARTS, VARIANTS
 
 ROOT = Path(__file__).parents[3]
@@ -131,6 +131,26 @@ def test_done_is_done_and_redone_is_the_same(made: Place) -> None:
     changed = {path.relative_to(made.study) for path in before if before[path] != path.stat().st_mtime_ns}
     assert {path.parts[0] for path in changed} <= {"study.yaml", "status.txt", ".lock", "logs", "scores"}, changed
     assert {path.parts[1].split(".")[0] for path in changed if path.parts[0] == "scores"} == {ADAPTED}, changed
+
+
+def test_a_report_needs_no_rollouts_and_no_data(
+    made: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As where pieces of a study came without what is large; whatever is left of the rollouts is shown."""
+    shutil.copytree(
+        made.study, tmp_path / "study", ignore=shutil.ignore_patterns("runs", "latents", "data", "rollouts", "report")
+    )
+    monkeypatch.chdir(tmp_path)
+    study_analyse.main(study_analyse.Args(Path("study"), distances=Path("study/distances")))
+    shown, said = len(MADE), capsys.readouterr().out
+    assert f"{shown} of {shown} variants are in no picture: their rollouts were not under study/rollouts" in said
+    page, tables = Path("study/report/index.html"), Path("study/report/tables")
+    assert page.stat().st_size > 10_000 and not list(tables.parent.rglob("*strip*"))
+    for table in (made.study / "report" / "tables").rglob("*.csv"):
+        assert (tables / table.name).read_bytes() == table.read_bytes()
+    shutil.copytree(made.study / "rollouts" / ADAPTED, Path("study/rollouts") / ADAPTED)
+    study_analyse.main(study_analyse.Args(Path("study"), data=made.study / "data"))
+    assert f"{shown - 1} of {shown} variants are in no picture" in capsys.readouterr().out
 
 
 def test_an_adaptation_started_from_its_variant(made: Place) -> None:
