@@ -19,6 +19,7 @@ from xew.dataset import find_records, read_dataset
 from xew.episode import HEIGHT, WIDTH, read_video
 from xew.model import latents, rollout, train
 from xew.model.cache.clips import clip_starts
+from xew.model.codecs.contract import decode_to_pictures, encode_pictures
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.log import RunLog
@@ -219,6 +220,11 @@ def test_rollouts_cover_the_test_episodes(run: Path, world: Path) -> None:
     left = codec(true)
     error, inverse = (np.abs(left.astype(int) - video).mean() for video in (true, 255 - true))
     assert left.shape == true.shape and 0 < error < inverse / 2
+    programs = encode_pictures._cache_size(), decode_to_pictures._cache_size()
+    whole = (len(true) - 2 - 1) // 4 * 4 + 1  # frames of groups that are not filled up
+    shorter = codec(true[:-2])
+    assert shorter.shape == true[:-2].shape and np.abs(shorter[:whole].astype(int) - left[:whole]).max() <= 1
+    assert programs == (encode_pictures._cache_size(), decode_to_pictures._cache_size()), "lengths share programs"
     smaller = replace(codec, experiment=replace(codec.experiment, clip=replace(codec.experiment.clip, height=32, width=40)))
     assert smaller.digest != codec.digest
 

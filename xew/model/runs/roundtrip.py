@@ -13,6 +13,9 @@ from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.folder import load_run
 from xew.model.video.frames import to_camera_size, to_model_size
 
+LENGTH_BLOCK = 24
+"""Number of frames behind the first that videos are filled up to multiples of, groups of four as codecs take them."""
+
 
 @dataclass(frozen=True)
 class RunRoundtrip:
@@ -32,10 +35,15 @@ class RunRoundtrip:
         return f"{self.codec.hash} {self.experiment.clip.height}x{self.experiment.clip.width}"
 
     def __call__(self, video: np.ndarray) -> np.ndarray:
-        """Video [t h w 3] uint8 to what the codec leaves of it, [t h w 3] uint8."""
-        filled = np.concatenate([video, np.repeat(video[-1:], -(len(video) - 1) % 4, axis=0)])  # it takes 4 k + 1 frames
-        small = to_model_size(filled, self.experiment.clip.height, self.experiment.clip.width)
-        return to_camera_size(self.codec.decode(self.codec.encode(small)))[: len(video)]
+        """Video [t h w 3] uint8 to what the codec leaves of it, [t h w 3] uint8.
+
+        It is filled up to a multiple of LENGTH_BLOCK frames behind the first, which changes no frame before: videos of all
+        lengths share some compiled programs.
+        """
+        clip = self.experiment.clip
+        filled = np.concatenate([video, np.repeat(video[-1:], -(len(video) - 1) % LENGTH_BLOCK, axis=0)])
+        small = to_model_size(filled, clip.height, clip.width)
+        return to_camera_size(self.codec.decode(self.codec.encode(small))[: len(video)])
 
 
 def open_roundtrip(run: Path) -> RunRoundtrip:
