@@ -130,6 +130,34 @@ def test_pieces_come_together(study: Study, tmp_path: Path, capsys: pytest.Captu
     assert capsys.readouterr().out.splitlines()[-1].endswith("0 steps taken over"), "what is done here stays"
 
 
+def test_scores_that_were_lost_on_the_way_are_made_again(study: Study) -> None:
+    """A piece that was fetched while it was written says that a variant is graded, and its scores are not there."""
+
+    def graded(out: Path) -> dict[str, Step]:
+        steps = {name: replace(step, kind="evaluate") for name, step in chain(out).items() if name == "train/data"}
+        return {step.name: step for step in steps.values()}
+
+    piece = study.out / "piece"
+    run(replace(study, out=piece), graded(piece))
+    (piece / "data").unlink()
+    assert runner.merge_pieces(graded(study.out), ledger := Ledger(study.out), [piece]) == {}
+    assert not any(ledger.record(step) for step in graded(study.out).values())
+    assert run(study, graded(study.out)) == {} and begun(study.out) == {"data": 1}
+
+
+def test_all_tables_of_the_distances_come_along(study: Study) -> None:
+    def distances(out: Path) -> dict[str, Step]:
+        table = out / "tables" / "data"
+        return {"distances": Step("distances", "", (STEPS, str(table), "data"), (), None, table)}
+
+    piece = study.out / "piece"
+    (piece / "tables").mkdir(parents=True)
+    run(replace(study, out=piece), distances(piece))
+    (piece / "tables" / "robots.csv").write_text("a table beside")
+    runner.merge_pieces(distances(study.out), Ledger(study.out), [piece])
+    assert (study.out / "tables" / "robots.csv").read_text() == "a table beside"
+
+
 def test_a_piece_from_other_data_or_with_another_product_is_not_taken(study: Study) -> None:
     run(replace(study, out=study.out / "piece"), chain(study.out / "piece", data=("--wait", "0.01")))
     home, ledger = chain(study.out), Ledger(study.out)

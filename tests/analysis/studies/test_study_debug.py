@@ -86,7 +86,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     root = tmp_path_factory.mktemp("debug")
     settings = yaml.safe_load(CONFIG.read_text())
     del settings["step_environment"]  # XLA's options are those of the session
-    # The estimators that find masks and points are at work in tests/metrics/test_evaluate.py.
+    # The estimators that find masks and points are at work in tests/metrics/grading/test_evaluate.py.
     settings["evaluate"] = ["--masks", QUICK, "--tracks", QUICK_TRACKS]
     (root / "config.yaml").write_text(yaml.safe_dump(settings))
     yield Place(root, root / "config.yaml")

@@ -72,10 +72,20 @@ def test_an_adaptation_waits_for_what_it_starts_from(study: Study) -> None:
     steps = plan(study)
     order = [step.name for step in sort_steps(steps)]
     for step in steps.values():
-        assert all(order.index(need) < order.index(step.name) for need in step.needs)
+        assert all(order.index(name) < order.index(step.name) for name in step.predecessors)
     assert "train/fixed-optical_flow-nine_views" in steps["latents/few_shot-piper-1"].needs
     assert "train/fixed-optical_flow-nine_views" in steps["adapt/few_shot-piper-1"].needs
     assert order[0] == "generate" and order[-1] == "analyse"
+
+
+def test_what_a_step_depends_on_does_not_depend_on_the_variants_of_a_piece(study: Study) -> None:
+    """Whichever variant of a split comes first encodes what others share, and pieces with other firsts can be merged."""
+    whole, piece = plan(study), plan(replace(study, variants=("fixed-joints-none", "fixed-mask-none")))
+    assert whole["latents/fixed-mask-none"].after == ("latents/fixed-optical_flow-none",)
+    assert piece["latents/fixed-mask-none"].after == ("latents/fixed-joints-none",)
+    for kind in ("latents", "train", "rollout", "evaluate"):
+        for name in (f"{kind}/fixed-joints-none", f"{kind}/fixed-mask-none"):
+            assert (whole[name].needs, whole[name].inputs) == (piece[name].needs, piece[name].inputs)
 
 
 def test_baselines_are_graded_once_and_before_there_is_a_model(study: Study) -> None:

@@ -106,7 +106,7 @@ def correct_by_ledger(costs: Mapping[str, Cost], steps: Mapping[str, Step], ledg
 
 def estimate_wall_seconds(steps: Mapping[str, Step], seconds: Mapping[str, float], done: Collection[str], slots: int) -> float:
     """Time to the end on a number of slots, with each step started as soon as it can be, the longest critical path first."""
-    left = {name: {need for need in step.needs if need not in done} for name, step in steps.items() if name not in done}
+    left = {name: {need for need in step.predecessors if need not in done} for name, step in steps.items() if name not in done}
     paths, free, now = critical_paths(steps, seconds), slots, 0.0
     running: list[tuple[float, str, int]] = []
     while left or running:
@@ -130,7 +130,7 @@ def critical_paths(steps: Mapping[str, Step], seconds: Mapping[str, float], own:
     """
     paths: dict[str, float] = {}
     for step in reversed(sort_steps(steps)):
-        followers = [other for other in steps.values() if step.name in other.needs]
+        followers = [other for other in steps.values() if step.name in other.predecessors]
         after = [paths[other.name] for other in followers if not own or other.variant == step.variant]
         paths[step.name] = seconds[step.name] + max(after, default=0.0)
     return paths

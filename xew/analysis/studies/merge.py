@@ -15,6 +15,8 @@ from xew.config import ConfigError
 
 SERVES_ALL = ("generate", "latents")
 """Kinds of steps whose products are not taken over: every machine has its own, and records tell whether they are the same."""
+READ_LATER = ("baselines", "evaluate", "distances")
+"""Kinds of steps whose products the analysis reads: without them a record is of no use."""
 
 
 def merge_piece(steps: Mapping[str, Step], ledger: Ledger, piece: Path) -> list[str]:
@@ -40,6 +42,8 @@ def merge_piece(steps: Mapping[str, Step], ledger: Ledger, piece: Path) -> list[
         outcome = ledger.noted_outcome(step, outcomes)
         if outcome is None:
             outcome = there.noted_outcome(step, outcomes)
+            if step.kind in READ_LATER and not (piece / step.product.relative_to(ledger.out)).exists():
+                outcome = None  # it was lost on the way
             if outcome is not None and step.kind != "analyse":
                 _take_product(step, ledger.out, piece, outcome)
                 ledger.take_record(step, there)
@@ -59,7 +63,8 @@ def _take_product(step: Step, out: Path, piece: Path, outcome: str) -> None:
         raise ConfigError(f"{source} is not what the records of {piece} say was made; bring the whole piece again.")
     if source.is_dir():
         shutil.copytree(source, step.product, dirs_exist_ok=True, ignore=shutil.ignore_patterns(".*"))
-    beside = [path for path in source.parent.glob(f"{source.stem}.*") if path.is_file()]
+    name = "*" if step.kind == "distances" else f"{source.stem}.*"  # distances have a folder of their own
+    beside = [path for path in source.parent.glob(name) if path.is_file()]
     for path in {source, *beside} if source.is_file() else ():
         step.product.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(path, step.product.parent / path.name)

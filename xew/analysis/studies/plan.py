@@ -47,6 +47,13 @@ class Step:
     """Program and arguments that start the command, if any."""
     environment: Mapping[str, str] = field(default_factory=dict)
     """Environment variables of its kind."""
+    after: tuple[str, ...] = ()
+    """Names of steps that it lets end first, such as one that makes part of the same; its result does not depend on theirs."""
+
+    @property
+    def predecessors(self) -> tuple[str, ...]:
+        """Names of all steps that it comes after."""
+        return (*self.needs, *self.after)
 
     @property
     def name(self) -> str:
@@ -78,7 +85,7 @@ def plan(study: Study) -> dict[str, Step]:
 
 def sort_steps(steps: Mapping[str, Step]) -> list[Step]:
     """The steps in an order in which each comes after those that it needs."""
-    return [steps[name] for name in TopologicalSorter({name: step.needs for name, step in steps.items()}).static_order()]
+    return [steps[name] for name in TopologicalSorter({name: step.predecessors for name, step in steps.items()}).static_order()]
 
 
 def write_configs(study: Study) -> dict[str, Path]:
@@ -119,15 +126,17 @@ def _plan_generate(study: Study) -> Step:
 
 def _plan_latents(study: Study, variant: Variant, experiment: Settings, first: str) -> Step:
     name = f"latents/{variant.name}"
-    # Streams that variants of a split share are encoded by the first of them; an adaptation has its start's codec.
-    before = (_training_name(variant.start),) if variant.start is not None else () if first == name else (first,)
+    # An adaptation has its start's codec.
+    started = (_training_name(variant.start),) if variant.start is not None else ()
     return Step(
         "latents",
         variant.name,
         ("xew.model.latents", str(_config_path(study, variant))),
-        needs=("generate", *before),
+        needs=("generate", *started),
         inputs=_training_inputs(experiment),
         product=study.out / "latents",
+        # Streams that variants of a split share are encoded by the first of them that is run.
+        after=() if started or first == name else (first,),
     )
 
 

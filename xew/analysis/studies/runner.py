@@ -37,7 +37,7 @@ class StudyRunner:
 
     def run(self) -> dict[str, str]:
         """Run every step that can be run and for which there is time; returns those that failed, with the reason."""
-        order = TopologicalSorter({name: step.needs for name, step in self.steps.items()})
+        order = TopologicalSorter({name: step.predecessors for name, step in self.steps.items()})
         order.prepare()
         self.ledger.find_all_done(self.steps)
         waiting: set[str] = set()

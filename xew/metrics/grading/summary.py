@@ -15,7 +15,7 @@ import pandas as pd
 
 from xew.metrics import METRICS
 from xew.names import plain_markdown
-from xew.protocol import BASELINES, COPY_FIRST_FRAME, GROUND_TRUTH
+from xew.protocol import BASELINES, CODEC_TRUTH, COPY_FIRST_FRAME, GROUND_TRUTH
 from xew.statistics import (
     DRAWS,
     LEVEL,
@@ -119,9 +119,13 @@ def _best(metric: str) -> float:
 
 
 def _find_floor(column: Column, means: Mapping[Column, Mean], codecs: Codecs) -> float:
-    """The noise floor of a model in a metric: of the truth through its codec where that was graded, else of the true video."""
-    metric, model, _ = column
-    graded = [means.get((metric, *source)) for source in floor_sources(model, codecs)]
+    """The noise floor of a model in a metric: of the truth through its codec where that was graded, else of the true video.
+
+    The truth through a codec is its own floor.
+    """
+    metric, model, condition = column
+    sources = [(model, condition)] if model == CODEC_TRUTH else floor_sources(model, codecs)
+    graded = [means.get((metric, *source)) for source in sources]
     known: list[Mean | None] = [mean for mean in graded if mean] or [means.get((metric, GROUND_TRUTH, ""))]
     return largest_floor(noise_floor(m.value if m else None, _best(metric), METRICS[metric].estimated) for m in known)
 

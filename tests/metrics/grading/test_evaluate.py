@@ -1,19 +1,17 @@
-"""The command: rollouts in every admitted form to a table, and clear words for every mistake."""
+"""The command: rollouts to a table of scores, and clear words for every mistake."""
 
 import json
 import re
 import shutil
-from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 
-import cv2
 import jax
 import numpy as np
 import pandas as pd
 import pytest
 
-from tests.synthetic import write_synthetic_data
+from tests.metrics.grading.graded import ASKED, CHEAP, FRAMES, ROBOTS, SEED, TASK, grade, late, truth, value
 from xew.episode import episode_folder, read_record, read_states, read_video, write_episode
 from xew.metrics import METRICS, keypoint_error, mask_iou, psnr, ssim
 from xew.metrics.backends import Backend, estimate_masks
@@ -30,10 +28,6 @@ from xew.protocol import CODEC_TRUTH, OTHER_ROBOT
 from xew.rollout import write_rollout
 from xew.statistics import describe_floors
 
-TASK, SEED, ROBOTS = "place_empty_cup", 1_000_000, ("franka_panda", "piper")
-FRAMES, ASKED = 9, 7
-CHEAP = ("psnr", "ssim", "mask_iou")
-
 
 def shifted(prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
     """A tracker whose answer is known: three pixels right of the truth where the frames differ, and never the last point."""
@@ -49,43 +43,6 @@ def exact(prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visibl
 
 SHIFTED = Backend(lambda: shifted, None, "for tests")
 EXACT = Backend(lambda: exact, None, "for tests")
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("data")
-    write_synthetic_data(root, tasks=(TASK,), seeds=(SEED,), robots=ROBOTS, frames=FRAMES)
-    return root
-
-
-def truth(data: Path, robot: str) -> np.ndarray:
-    return read_video(episode_folder(data, TASK, SEED, robot) / "rgb.mkv")
-
-
-def late(video: np.ndarray) -> np.ndarray:
-    return video[np.maximum(np.arange(len(video)) - 1, 0)]
-
-
-@pytest.fixture
-def rollouts(data: Path, tmp_path: Path) -> Path:
-    """A model that is a frame late, asked for ASKED frames."""
-    root = tmp_path / "rollouts"
-    for robot in ROBOTS:
-        header = {"model": "late", "condition": "none"}
-        write_rollout(root, TASK, SEED, robot, late(truth(data, robot))[:ASKED], header)
-    return root
-
-
-def grade(rollouts: Path, data: Path, **settings: object) -> pd.DataFrame:
-    out = settings.pop("out", rollouts.parent / "scores.parquet")
-    main(Args((rollouts,), data, out, **{"metrics": CHEAP, "baselines": False, "workers": 2} | settings))
-    return pd.read_parquet(out)
-
-
-def value(scores: pd.DataFrame, model: str, robot: str, metric: str) -> float:
-    found = scores[(scores["model"] == model) & (scores["robot"] == robot) & (scores["metric"] == metric)]
-    assert len(found) == 1
-    return float(found["value"].iloc[0])
 
 
 def test_every_score_is_the_mean_of_the_functions_without_the_given_frame(rollouts: Path, data: Path) -> None:
@@ -145,6 +102,11 @@ def test_the_floor_of_a_model_is_the_truth_through_its_codec(
         assert means.loc[(robot, "late", "psnr"), "noise"] == 0
     assert key in summary.floors and summary.floors in (rollouts.parent / "scores.summary.md").read_text()
     assert "softened" in describe_floors(["late"], {})
+    alone = summarize(grade(rollouts, data, codec=(Path("runs/late"),), **codec | {"baselines": False}))
+    pairs = alone.pairs[alone.pairs["metric"] == "mask_iou"].set_index("robot")
+    assert set(pairs["other"]) == {CODEC_TRUTH}, "the true video was not graded"
+    for robot in ROBOTS:
+        assert pairs.loc[robot, "noise"] == means.loc[(robot, "late", "mask_iou"), "noise"]
     with pytest.raises(SystemExit):
         grade(rollouts, data, codec=(Path("runs/early"),), **codec)
     assert "of 'early', of which no rollout is graded; graded are late" in capsys.readouterr().err
@@ -373,67 +335,6 @@ def test_curves_of_tracks_are_the_metric_of_each_frame(rollouts: Path, data: Pat
         assert (robot, "ndtw") not in curves.index.droplevel("frame")
 
 
-def as_mp4(folder: Path, video: np.ndarray, rate: float = 1000 / 60) -> None:
-    height, width = video.shape[1:3]
-    writer = cv2.VideoWriter(str(folder / "video.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), rate, (width, height))
-    for frame in video:
-        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-    writer.release()
-
-
-def as_pngs(folder: Path, video: np.ndarray) -> None:
-    """Their names do not sort as text: 10.png would come before 2.png."""
-    (folder / "frames").mkdir()
-    for i, frame in enumerate(video):
-        cv2.imwrite(str(folder / "frames" / f"{i + 5}.png"), cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-
-
-def as_npz(folder: Path, video: np.ndarray) -> None:
-    np.savez_compressed(folder / "rgb.npz", rgb=video)
-
-
-def their_folder(tmp_path: Path) -> Path:
-    folder = episode_folder(tmp_path / "theirs", TASK, SEED, "piper")
-    folder.mkdir(parents=True)
-    return folder
-
-
-@pytest.mark.parametrize(("store", "lossless"), [(as_mp4, False), (as_pngs, True), (as_npz, True)])
-def test_any_models_video_in_the_tree_is_graded(store: Callable, lossless: bool, data: Path, tmp_path: Path) -> None:
-    store(their_folder(tmp_path), late(truth(data, "piper")))
-    scores = grade(tmp_path / "theirs", data, metrics=("psnr",))
-    target = truth(data, "piper")
-    expected = float(np.mean(psnr(late(target)[1:], target[1:])))
-    assert value(scores, "theirs", "piper", "psnr") == pytest.approx(expected, rel=1e-5 if lossless else 0.2)
-
-
-def test_what_becomes_of_frame_zero_is_said(data: Path, tmp_path: Path) -> None:
-    target = truth(data, "piper")
-    folder = their_folder(tmp_path)
-    as_npz(folder, late(target)[1:])
-    absent = grade(tmp_path / "theirs", data, metrics=("psnr",), frame_zero="absent")
-    assert absent.attrs["frame_zero"] == "absent"
-    expected = float(np.mean(psnr(late(target)[1:], target[1:])))
-    assert value(absent, "theirs", "piper", "psnr") == pytest.approx(expected, rel=1e-5)
-    noisy = target.copy()
-    noisy[0] //= 2
-    as_npz(folder, noisy)
-    predicted = grade(tmp_path / "theirs", data, metrics=("ssim",), frame_zero="predicted")
-    assert value(predicted, "theirs", "piper", "ssim") == pytest.approx(float(np.mean(ssim(noisy, target))), rel=1e-5)
-    curves = pd.read_parquet(tmp_path / "scores.curves.parquet")
-    assert curves["frame"].tolist() == list(range(FRAMES))
-
-
-def test_what_is_allowed_is_done_and_said(data: Path, tmp_path: Path) -> None:
-    target = truth(data, "piper")
-    large = np.repeat(np.repeat(np.concatenate([late(target), target[-1:]]), 2, axis=1), 2, axis=2)
-    as_mp4(their_folder(tmp_path), large, rate=24)
-    scores = grade(tmp_path / "theirs", data, metrics=("psnr",), allow=("trim", "resize", "rate"))
-    assert scores.attrs["allowed"] == ["rate", "resize", "trim"]
-    expected = float(np.mean(psnr(late(target)[1:], target[1:])))
-    assert value(scores, "theirs", "piper", "psnr") == pytest.approx(expected, rel=0.2)
-
-
 def test_a_rollout_made_anew_replaces_its_scores(rollouts: Path, data: Path) -> None:
     before = grade(rollouts, data)
     write_rollout(rollouts, TASK, SEED, "piper", truth(data, "piper")[:ASKED], {"model": "late", "condition": "none"})
@@ -441,91 +342,6 @@ def test_a_rollout_made_anew_replaces_its_scores(rollouts: Path, data: Path) -> 
     assert len(after) == len(before)
     assert value(after, "late", "piper", "ssim") == 1 > value(before, "late", "piper", "ssim")
     assert value(after, "late", "franka_panda", "ssim") == value(before, "late", "franka_panda", "ssim")
-
-
-def short(folder: Path, video: np.ndarray) -> None:
-    as_npz(folder, video[:-2])
-
-
-def long(folder: Path, video: np.ndarray) -> None:
-    as_npz(folder, np.concatenate([video, video[-1:]]))
-
-
-def small(folder: Path, video: np.ndarray) -> None:
-    as_npz(folder, video[:, ::2, ::2])
-
-
-def not_numbers(folder: Path, video: np.ndarray) -> None:
-    as_npz(folder, np.where(video > 200, np.float32("nan"), video / np.float32(255)))
-
-
-def other_rate(folder: Path, video: np.ndarray) -> None:
-    as_mp4(folder, video, rate=30)
-
-
-def two_videos(folder: Path, video: np.ndarray) -> None:
-    as_npz(folder, video)
-    as_mp4(folder, video)
-
-
-def broken(folder: Path, video: np.ndarray) -> None:
-    (folder / "rgb.mkv").write_bytes(b"no video at all")
-
-
-def nothing(folder: Path, video: np.ndarray) -> None:
-    (folder / "notes.txt").write_text("later")
-
-
-def other_source(folder: Path, video: np.ndarray) -> None:
-    as_npz(folder, video)
-    (folder / "rollout.json").write_text(json.dumps({"source_hash": "of another video"}))
-
-
-def too_long(folder: Path, video: np.ndarray) -> None:
-    as_npz(folder, video)
-    (folder / "rollout.json").write_text(json.dumps({"frame_count": FRAMES + 1}))
-
-
-def a_baselines_name(folder: Path, video: np.ndarray) -> None:
-    as_npz(folder, video)
-    (folder / "rollout.json").write_text(json.dumps({"model": "ground_truth"}))
-
-
-MISTAKES = [
-    (short, "7 frames of 320x240, expected 9 frames"),
-    (long, "10 frames of 320x240, expected 9 frames"),
-    (small, "9 frames of 160x120, expected 9 frames of 320x240"),
-    (not_numbers, "float32 (9, 240, 320, 3), with NaN"),
-    (other_rate, "30.00 frames a second, its episode 16.67"),
-    (two_videos, "rgb.npz, video.mp4"),
-    (broken, "no readable frame"),
-    (nothing, "0 PNG files"),
-    (other_source, "another video"),
-    (too_long, "asks for 10 frames"),
-    (a_baselines_name, "is a baseline's"),
-]
-
-
-@pytest.mark.parametrize(("spoil", "word"), MISTAKES, ids=[spoil.__name__ for spoil, _ in MISTAKES])
-def test_a_mistake_is_one_clear_error_and_the_rest_is_graded_if_asked(
-    spoil: Callable, word: str, rollouts: Path, data: Path, capsys: pytest.CaptureFixture
-) -> None:
-    folder = episode_folder(rollouts, TASK, SEED, "piper")
-    shutil.rmtree(folder)
-    folder.mkdir()
-    spoil(folder, truth(data, "piper"))
-    whole = episode_folder(rollouts, TASK, SEED, "franka_panda")
-    shutil.rmtree(whole)
-    whole.mkdir()
-    as_npz(whole, late(truth(data, "franka_panda")))
-    for keep_going in (False, True):
-        with pytest.raises(SystemExit) as exit_:
-            grade(rollouts, data, metrics=("psnr",), keep_going=keep_going)
-        message = capsys.readouterr().err
-        assert exit_.value.code == 2 and word in message and str(folder) in message and "Traceback" not in message
-        assert message.count(word) == 1
-    assert "1 of 2 could not be graded" in message
-    assert pd.read_parquet(rollouts.parent / "scores.parquet")["robot"].tolist() == ["franka_panda"]
 
 
 def test_missing_episodes_trees_and_metrics_are_named(
@@ -586,7 +402,7 @@ def test_models_over_different_horizons_do_not_share_a_table(
 
 
 def test_the_page_shows_what_works(data: Path) -> None:
-    text = (Path(__file__).parents[2] / "docs" / "evaluate.md").read_text()
+    text = (Path(__file__).parents[3] / "docs" / "evaluate.md").read_text()
     options = {field.name.replace("_", "-") for field in fields(Args)}
     assert {name.removeprefix("no-") for name in re.findall(r"--([a-z][a-z-]+)", text)} <= options
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
