@@ -10,7 +10,7 @@ To add one: its file, and one line in MASKERS, TRACKERS or FLOWS; from outside t
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar, runtime_checkable
+from typing import Generic, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from xew.config import ConfigError, pick
 from xew.files import digest_tree
 from xew.metrics.estimators.cotracker import open_cotracker
 from xew.metrics.estimators.flow import dis_flow, open_raft
-from xew.metrics.estimators.masks import Appearance, estimate_masks, learn_appearance
+from xew.metrics.estimators.masks import Episode, estimate_masks
 from xew.metrics.estimators.sam2 import open_sam2
 from xew.metrics.estimators.tapir import open_tapir
 from xew.metrics.estimators.tracks import ReferenceTracker
@@ -69,6 +69,13 @@ class Confirmer(Protocol):
             found: [t k 2] float32 pixels, as the tracker gave them for the same videos and points.
             prediction, target, points, visible, shown, body: as of `presence.confirm_tracks`.
         """
+
+
+@runtime_checkable
+class Pointwise(Protocol):
+    """A tracker that finds each point without regard to the others, so that points of all kinds are asked for in one pass."""
+
+    pointwise: Literal[True]
 
 
 @runtime_checkable
@@ -132,16 +139,16 @@ def _open(backend: Backend[T], name: str, checkpoint: Path | None, option: str) 
 
 
 class ReferenceMasker:
-    """`estimate_masks`; an episode's looks are learnt once while predictions of the same episode follow each other."""
+    """`estimate_masks`; what it makes of an episode is made once while predictions of the same episode follow each other."""
 
     def __init__(self) -> None:
-        self._learnt: tuple[np.ndarray, np.ndarray, Appearance] | None = None
+        self._episode: Episode | None = None
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:
         """Masks bool [t h w] of a prediction [t h w 3] uint8, from the true video [t h w 3] uint8 and masks [t h w] bool."""
-        if self._learnt is None or self._learnt[0] is not target or self._learnt[1] is not target_mask:
-            self._learnt = target, target_mask, learn_appearance(target, target_mask)
-        return estimate_masks(prediction, target, target_mask, self._learnt[2])
+        if self._episode is None or not self._episode.is_of(target, target_mask):
+            self._episode = Episode(target, target_mask)
+        return estimate_masks(prediction, target, target_mask, self._episode)
 
 
 def _find_gpu() -> str | None:

@@ -6,14 +6,14 @@ Frames and points go through the compiler in blocks of one size, so that a few p
 import functools
 import math
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import jax
 import numpy as np
 
 from xew.metrics import METRICS, contact_f1
-from xew.metrics.backends import Confirmer, Masker, Tracker
+from xew.metrics.backends import Confirmer, Masker, Pointwise, Tracker
 from xew.metrics.estimators.contact import predicted_contact
 from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.metric import ACCELERATOR_CHUNK
@@ -25,7 +25,7 @@ from xew.metrics.perceptual import (
     robot_lpips_frames,
     union_box,
 )
-from xew.metrics.truth import Points, Surfaces, Truth, is_inside
+from xew.metrics.truth import Points, Truth, is_inside
 
 FRAME_BLOCK = 4
 """Number of frames graded at once on a CPU; on a GPU it is `ACCELERATOR_CHUNK`. A video's last block is filled up: a short one
@@ -78,6 +78,7 @@ class Comparison:
     """The first graded frame; those before it were given to the model."""
     shown: np.ndarray | None = None
     """[t h w 3] uint8, what the estimators see of the prediction; the prediction itself where left out."""
+    _found: dict[str, np.ndarray] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def seen(self) -> np.ndarray:
@@ -96,31 +97,60 @@ class Comparison:
         return math.sqrt(self.prediction.shape[1] * self.prediction.shape[2])
 
     @cached_property
-    def surfaces(self) -> Surfaces:
-        """Points on the truth's surfaces. Raises ValueError where the truth was read without them."""
-        if self.truth.surfaces is None:
-            raise ValueError("the truth has no points on surfaces; ask read_truth for 'robot_points' and 'object_points'.")
-        return self.truth.surfaces
+    def points(self) -> dict[str, Points]:
+        """Points of the truth that a tracker can be asked for, by `input_kind`; on surfaces where it was read with them."""
+        truth = self.truth
+        known = {
+            "keypoints": Points(truth.keypoints, truth.keypoint_visible),
+            "objects": Points(truth.objects, truth.object_visible),
+        }
+        if truth.surfaces is not None:
+            known |= {"robot_points": truth.surfaces.robot, "object_points": truth.surfaces.objects}
+        return known
 
-    @cached_property
-    def found_on_surfaces(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where the tracker finds the points on the robot [t k 2] and on objects [t p 2], all in one pass; NaN where lost.
+    def find(self, kind: str) -> np.ndarray:
+        """Where the tracker finds the points of a kind [t k 2] pixels, NaN where lost or hidden in the truth.
 
-        A place that does not have the color of the point's body is none, so that an object is not found by what is round it.
+        Raises ValueError where the truth was read without them.
         """
-        both = (self.surfaces.robot, self.surfaces.objects)
-        points, visible = (np.concatenate([getattr(some, name) for some in both], axis=1) for name in ("pixels", "visible"))
-        seen = visible.any(axis=0)
-        found = np.full_like(points, np.nan)
-        if seen.any():
-            known = np.nan_to_num(points[:, seen]), visible[:, seen]
-            found[:, seen] = self.tracker(self.seen, self.truth.rgb, *known)
-            if self.surfaces.shown is not None:
-                body = np.concatenate([some.body for some in both if some.body is not None])[seen]
-                confirm = self.tracker.confirm if isinstance(self.tracker, Confirmer) else confirm_tracks
-                found[:, seen] = confirm(found[:, seen], self.seen, self.truth.rgb, *known, self.surfaces.shown, body)
-        count = both[0].pixels.shape[1]
-        return found[:, :count], found[:, count:]
+        if kind not in self.points:
+            raise ValueError("the truth has no points on surfaces; ask read_truth for 'robot_points' and 'object_points'.")
+        if kind not in self._found:
+            self._found.update(_find_points(self, kind))
+        return self._found[kind]
+
+
+ON_SURFACES = ("robot_points", "object_points")
+"""Kinds of points that are found in one pass, whoever the tracker is."""
+
+
+def _find_points(c: Comparison, kind: str) -> dict[str, np.ndarray]:
+    """Tracks [t k 2] by kind: of the kind that is asked for, and of those that the tracker finds in the same pass.
+
+    A place on a surface that does not have the color of the point's body is none, so that an object is not found by what is
+    round it.
+    """
+    alone = ON_SURFACES if kind in ON_SURFACES else (kind,)
+    kinds = tuple(c.points) if isinstance(c.tracker, Pointwise) else alone
+    pixels, visible = (np.concatenate([getattr(c.points[k], name) for k in kinds], axis=1) for name in ("pixels", "visible"))
+    seen = visible.any(axis=0)
+    found = np.full(pixels.shape, np.nan, np.float32)
+    if seen.any():
+        found[:, seen] = c.tracker(c.seen, c.truth.rgb, np.nan_to_num(pixels[:, seen]), visible[:, seen])
+    if c.truth.surfaces is not None and c.truth.surfaces.shown is not None:
+        body = np.concatenate([_bodies(c.points[k]) for k in kinds])
+        some = seen & (body >= 0)
+        if some.any():
+            confirm = c.tracker.confirm if isinstance(c.tracker, Confirmer) else confirm_tracks
+            known = c.seen, c.truth.rgb, np.nan_to_num(pixels[:, some]), visible[:, some], c.truth.surfaces.shown, body[some]
+            found[:, some] = confirm(found[:, some], *known)
+    ends = np.cumsum([c.points[k].visible.shape[1] for k in kinds])
+    return dict(zip(kinds, np.split(found, ends[:-1], axis=1), strict=True))
+
+
+def _bodies(points: Points) -> np.ndarray:
+    """[k] int32, the body that each point lies on, -1 where that is not known."""
+    return np.full(points.visible.shape[1], -1, np.int32) if points.body is None else points.body
 
 
 def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
@@ -179,30 +209,12 @@ def _robot(c: Comparison) -> Arrays | None:
     return *c.video, mask
 
 
-def _keypoints(c: Comparison) -> Arrays | None:
-    return _tracks(c, c.truth.keypoints, c.truth.keypoint_visible)
-
-
-def _objects(c: Comparison) -> Arrays | None:
-    return _tracks(c, c.truth.objects, c.truth.object_visible)
-
-
-def _robot_points(c: Comparison) -> Arrays | None:
-    return _found_points(c, c.surfaces.robot, 0)
-
-
-def _object_points(c: Comparison) -> Arrays | None:
-    return _found_points(c, c.surfaces.objects, 1)
-
-
-def _found_points(c: Comparison, points: Points, which: int) -> Arrays | None:
+def _tracks(kind: str, c: Comparison) -> Arrays | None:
     """Tracked points, true points and visibility of those that are ever seen; None where none is, whatever the prediction."""
-    if not points.visible[c.first :].any():
-        return None
-    seen = points.visible[c.first :].any(axis=0)
-    found = c.found_on_surfaces[which][c.first :, seen]
-    pixels, visible = (array[c.first :, seen] for array in (np.nan_to_num(points.pixels), points.visible))
-    return found.astype(np.float32), pixels, visible
+    found, points = c.find(kind), c.points[kind]
+    pixels, visible = np.nan_to_num(points.pixels[c.first :]), points.visible[c.first :]
+    seen = visible.any(axis=0)
+    return (found[c.first :, seen], pixels[:, seen], visible[:, seen]) if seen.any() else None
 
 
 def _contact(c: Comparison) -> Arrays | None:
@@ -227,23 +239,10 @@ INPUTS: dict[str, Callable[[Comparison], Arrays | None]] = {
     "mask": _mask,
     "region": _region,
     "robot": _robot,
-    "keypoints": _keypoints,
-    "objects": _objects,
-    "robot_points": _robot_points,
-    "object_points": _object_points,
+    **{kind: functools.partial(_tracks, kind) for kind in ("keypoints", "objects", *ON_SURFACES)},
     "contact": _contact,
 }
 """Arrays that the functions of metrics take, by `input_kind`; None where the truth has nothing to compare."""
-
-
-def _tracks(c: Comparison, points: np.ndarray, visible: np.ndarray) -> Arrays | None:
-    """Tracked points, true points, visibility; points that are never seen are left out."""
-    if not visible[c.first :].any():
-        return None
-    seen = visible.any(axis=0)
-    points, visible = np.nan_to_num(points[:, seen]), visible[:, seen]
-    found = c.tracker(c.seen, c.truth.rgb, points, visible)
-    return found[c.first :].astype(np.float32), points[c.first :], visible[c.first :]
 
 
 def _curves_by_shared_features(

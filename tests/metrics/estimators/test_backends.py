@@ -12,7 +12,7 @@ from xew.config import ConfigError
 from xew.files import digest_tree
 from xew.metrics import backends
 from xew.metrics.backends import FLOWS, MASKERS, TRACKERS, Backend, identity, open_flow, open_masker, open_tracker
-from xew.metrics.estimators.masks import estimate_masks
+from xew.metrics.estimators.masks import Episode, estimate_masks
 from xew.metrics.estimators.tracks import estimate_tracks
 
 REGISTRIES = {"masker": (MASKERS, open_masker), "tracker": (TRACKERS, open_tracker), "optical flow": (FLOWS, open_flow)}
@@ -81,8 +81,7 @@ def test_the_default_masker_learns_an_episode_once(monkeypatch: pytest.MonkeyPat
     mask = np.zeros((3, 40, 50), bool)
     mask[:, 10:30, 10:30] = True
     learnt = []
-    learn = backends.learn_appearance
-    monkeypatch.setattr(backends, "learn_appearance", lambda *episode: learnt.append(1) or learn(*episode))
+    monkeypatch.setattr(backends, "Episode", lambda *episode: learnt.append(1) or Episode(*episode))
     masker = open_masker("default")
     for prediction in (target, other, target):
         np.testing.assert_array_equal(masker(prediction, target, mask), estimate_masks(prediction, target, mask))

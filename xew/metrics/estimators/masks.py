@@ -14,6 +14,7 @@ Its error on true video is published beside every score: the row `ground_truth` 
 """
 
 import functools
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -23,6 +24,8 @@ from xew.metrics.estimators.similarity import find_most_similar
 
 COLOR_BINS = 24
 """Number of bins for each channel of Lab."""
+BIN_OF_LEVEL = (np.arange(256) * COLOR_BINS // 256).astype(np.uint8)
+"""[256] the bin of each level of a channel."""
 LEARNING_FRAMES = 32
 """Largest number of frames, spread evenly, that the appearance is learnt from."""
 SOFTNESS = (1.0, 2.0)
@@ -61,21 +64,46 @@ class Appearance:
     """[h w] bool, where the background was seen in some frame."""
 
 
+class Episode:
+    """A true episode as predictions of it are compared with it; what is made of a frame is made once for all of them.
+
+    Args:
+        video: [t h w 3] uint8 RGB, the true video.
+        mask: [t h w] bool, true robot masks.
+    """
+
+    def __init__(self, video: np.ndarray, mask: np.ndarray) -> None:
+        self.frames, self.mask = _Frames(video), mask
+        self.appearance = learn_appearance(video, mask)
+        self._distance: dict[int, np.ndarray] = {}
+
+    def is_of(self, video: np.ndarray, mask: np.ndarray) -> bool:
+        """Are these the very arrays of the episode?"""
+        return self.frames.video is video and self.mask is mask
+
+    def distance(self, t: int) -> np.ndarray:
+        """[h w] float32, `_signed_distance` of the mask of frame t."""
+        if t not in self._distance:
+            self._distance[t] = _signed_distance(self.mask[t])
+        return self._distance[t]
+
+
 def estimate_masks(
-    prediction: np.ndarray, target: np.ndarray, target_mask: np.ndarray, appearance: Appearance | None = None
+    prediction: np.ndarray, target: np.ndarray, target_mask: np.ndarray, episode: Episode | None = None
 ) -> np.ndarray:
     """Robot masks of a predicted video.
 
     Args:
         prediction, target: [t h w 3] uint8 RGB, predicted and true video of one episode, same frames.
         target_mask: [t h w] bool, true robot masks.
-        appearance: `learn_appearance(target, target_mask)`, where several predictions of one episode share it.
+        episode: `Episode(target, target_mask)`, where several predictions of one episode share it.
 
     Returns:
         [t h w] bool.
     """
-    appearance = appearance or learn_appearance(target, target_mask)
+    episode = episode or Episode(target, target_mask)
     alike, _ = find_most_similar(prediction, target)
+    seen, true = _Frames(prediction), episode.frames
     masks: list[np.ndarray] = []
     carriers: dict[int, Carrier] = {}
     resting: Carrier | None = None
@@ -83,12 +111,13 @@ def estimate_masks(
         stands = t > 0 and np.array_equal(frame, prediction[t - 1])
         known = carriers if stands else {}
         # The mask of the frame itself comes first: where both explain a pixel equally well, it is the one that counts.
-        carriers = {i: known.get(i) or _find_carrier(frame, target[i]) for i in dict.fromkeys((t, int(alike[t])))}
-        shapes = [carrier.carry(target_mask[i]) for i, carrier in carriers.items()]
-        resting = (resting or _find_carrier(frame, frame)) if stands else None
-        from_before = resting or (_find_carrier(frame, prediction[t - 1]) if t else None)
-        before = None if from_before is None else from_before.carry(masks[-1])
-        masks.append(_estimate_frame(appearance, frame, shapes, before))
+        carriers = {i: known.get(i) or _find_carrier(seen, t, true, i) for i in dict.fromkeys((t, int(alike[t])))}
+        shapes = [carrier.carry(episode.distance(i)) for i, carrier in carriers.items()]
+        resting = (resting or _find_carrier(seen, t, seen, t)) if stands else None
+        from_before = resting or (_find_carrier(seen, t, seen, t - 1) if t else None)
+        before = None if from_before is None else from_before.carry(_signed_distance(masks[-1]))
+        masks.append(_estimate_frame(episode.appearance, frame, shapes, before))
+        seen.forget(t - 1)
     return np.stack(masks)
 
 
@@ -102,13 +131,11 @@ def learn_appearance(video: np.ndarray, mask: np.ndarray) -> Appearance:
     background, uncovered = _background(video[picked], mask[picked])
     video = np.concatenate([video[picked], *([_soften(frame, s) for frame in video[picked]] for s in SOFTNESS)])
     mask = np.tile(mask[picked], (1 + len(SOFTNESS), 1, 1))
-    color = color_bins(video)
     difference = np.stack([_difference(frame, background) for frame in video])
-    seen = np.broadcast_to(uncovered, mask.shape)
     return Appearance(
-        color=_log_ratio(color, mask, COLOR_BINS**3, smooth=(COLOR_BINS,) * 3),
+        color=_log_ratio(color_bins(video), mask, smooth=(COLOR_BINS,) * 3),
         background=background,
-        difference=_log_ratio(difference[seen], mask[seen], 256, smooth=(256,)),
+        difference=_log_ratio(difference[:, uncovered], mask[:, uncovered], smooth=(256,)),
         uncovered=uncovered,
     )
 
@@ -126,9 +153,9 @@ class Carrier:
     source: np.ndarray
     """[h w 2] float32, where in the other frame each pixel comes from."""
 
-    def carry(self, mask: np.ndarray) -> Shape:
-        """The shape of the other frame's mask [h w] bool."""
-        return self.gate, np.tanh(_sample(_signed_distance(mask), self.source) / SHAPE_REACH)
+    def carry(self, distance: np.ndarray) -> Shape:
+        """The shape of the other frame's mask, of which this is the `_signed_distance` [h w]."""
+        return self.gate, np.tanh(_sample(distance, self.source) / SHAPE_REACH)
 
 
 def _estimate_frame(appearance: Appearance, frame: np.ndarray, shapes: list[Shape], before: Shape | None) -> np.ndarray:
@@ -172,14 +199,39 @@ def _drop_specks(mask: np.ndarray) -> np.ndarray:
     return large[pieces]
 
 
-def _find_carrier(frame: np.ndarray, target: np.ndarray) -> Carrier:
-    """How a true frame, or the one before, comes to a predicted frame; both [h w 3] uint8."""
-    gray, gray_target = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame, target))
-    there, back = _flow(gray, gray_target), _flow(gray_target, gray)
+class _Frames:
+    """A video [t h w 3] uint8 and what flow and its check are made of, frame by frame, each when it is first asked for."""
+
+    def __init__(self, video: np.ndarray) -> None:
+        self.video = video
+        self._gray: dict[int, np.ndarray] = {}
+        self._soft: dict[int, np.ndarray] = {}
+
+    def gray(self, t: int) -> np.ndarray:
+        """[h w] uint8."""
+        if t not in self._gray:
+            self._gray[t] = cv2.cvtColor(self.video[t], cv2.COLOR_RGB2GRAY)
+        return self._gray[t]
+
+    def soft(self, t: int) -> np.ndarray:
+        """[h w 3] uint8, softened."""
+        if t not in self._soft:
+            self._soft[t] = _soften(self.video[t], RESIDUAL_SOFTNESS)
+        return self._soft[t]
+
+    def forget(self, t: int) -> None:
+        """Free what was made of a frame."""
+        self._gray.pop(t, None)
+        self._soft.pop(t, None)
+
+
+def _find_carrier(seen: _Frames, t: int, others: _Frames, other: int) -> Carrier:
+    """How another frame, a true one or the one before, comes to the predicted frame t."""
+    gray, gray_other = seen.gray(t), others.gray(other)
+    there, back = _flow(gray, gray_other), _flow(gray_other, gray)
     source = _grid(gray.shape) + there
-    closure = np.hypot(*cv2.split(there + _sample(back, source)))
-    soft_frame, soft_target = (_soften(image, RESIDUAL_SOFTNESS).astype(np.float32) for image in (frame, target))
-    residual = _difference(soft_frame, _sample(soft_target, source))
+    closure = cv2.magnitude(*cv2.split(there + _sample(back, source)))
+    residual = _difference(seen.soft(t).astype(np.float32), _sample(others.soft(other).astype(np.float32), source))
     gate = np.exp(-((residual / RESIDUAL_SCALE) ** 2) - (closure / CLOSURE_SCALE) ** 2)
     return Carrier(gate, source)
 
@@ -223,11 +275,11 @@ def _signed_distance(mask: np.ndarray) -> np.ndarray:
 
 def _background(video: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Median over time of the frames that show each pixel without the robot; [h w 3] uint8, and where there are any."""
-    hidden = np.broadcast_to(mask[..., None], video.shape)
-    rank = np.sort(np.where(hidden, 256, video.astype(np.int16)), axis=0)
+    level = np.where(mask[..., None], np.int16(256), video)
+    rank = np.sort(np.ascontiguousarray(np.moveaxis(level, 0, -1)), axis=-1)  # sorting what lies side by side is quicker
     shown = np.count_nonzero(~mask, axis=0)
     middle = np.maximum(shown - 1, 0) // 2
-    median = np.take_along_axis(rank, np.broadcast_to(middle[None, :, :, None], (1, *video.shape[1:])), axis=0)[0]
+    median = np.take_along_axis(rank, middle[:, :, None, None], axis=-1)[..., 0]
     uncovered = shown > 0
     plate = np.where(uncovered[..., None], median, 0).astype(np.uint8)
     return cv2.inpaint(plate, (~uncovered).astype(np.uint8), 3, cv2.INPAINT_TELEA), uncovered
@@ -241,18 +293,27 @@ def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def color_bins(video: np.ndarray) -> np.ndarray:
     """Index of each pixel's Lab color among the bins, [t h w] or [h w] int32 of colors [t h w 3] or [h w 3] uint8."""
     flat = video.reshape(-1, video.shape[-2], 3)
-    lab = cv2.cvtColor(flat, cv2.COLOR_RGB2LAB).reshape(video.shape).astype(np.int32) * COLOR_BINS // 256
-    return (lab[..., 0] * COLOR_BINS + lab[..., 1]) * COLOR_BINS + lab[..., 2]
+    lightness, a, b = cv2.split(cv2.LUT(cv2.cvtColor(flat, cv2.COLOR_RGB2LAB), BIN_OF_LEVEL))
+    bins = lightness.astype(np.int32)
+    for channel in (a, b):
+        bins *= COLOR_BINS
+        bins += channel
+    return bins.reshape(video.shape[:-1])
 
 
-def _log_ratio(values: np.ndarray, robot: np.ndarray, count: int, smooth: tuple[int, ...]) -> np.ndarray:
-    """log p(value | robot) / p(value | rest) of integers below count, from smoothed histograms of the shape `smooth`."""
-    ratio = []
-    for members in (values[robot], values[~robot]):
-        histogram = np.bincount(members, minlength=count).reshape(smooth).astype(np.float64)
-        ratio.append((_blur(histogram) + 1e-9) / max(len(members), 1))
+def _log_ratio(values: np.ndarray, robot: np.ndarray, smooth: tuple[int, ...]) -> np.ndarray:
+    """log p(value | robot) / p(value | rest) of integers, from smoothed histograms of the shape `smooth`.
+
+    Args:
+        values: [...] int, from 0 to the product of `smooth` less 1.
+        robot: [...] bool, which of them are the robot's.
+        smooth: the shape in which values are neighbors.
+    """
+    count = math.prod(smooth)
+    rest, of_robot = np.bincount((values + count * robot).ravel(), minlength=2 * count).reshape(2, *smooth).astype(np.float64)
+    shares = [(_blur(histogram) + 1e-9) / max(histogram.sum(), 1) for histogram in (of_robot, rest)]
     floor = 1e-6
-    return np.log((ratio[0] + floor) / (ratio[1] + floor)).astype(np.float32)
+    return np.log((shares[0] + floor) / (shares[1] + floor)).astype(np.float32)
 
 
 def _blur(histogram: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ Its error on true video is published beside every score: the row `ground_truth` 
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -91,6 +92,8 @@ class ReferenceTracker:
 
     A prediction is asked for several kinds of points, and an episode's true video stands beside several predictions.
     """
+
+    pointwise: Literal[True] = True
 
     def __init__(self) -> None:
         self._seen: _Video | None = None

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from xew.metrics import mask_iou
-from xew.metrics.backends import Confirmer, open_masker, open_tracker
+from xew.metrics.backends import Confirmer, Pointwise, open_masker, open_tracker
 from xew.metrics.calibration.matrix import grade_material
 from xew.metrics.calibration.predictors import Material, delay, predict
 from xew.metrics.estimators.batched import masks as batched_masks
@@ -21,6 +21,7 @@ from xew.metrics.estimators.batched.tracks import BatchedTracker
 from xew.metrics.estimators.masks import _flow, estimate_masks
 from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.estimators.tracks import estimate_tracks
+from xew.metrics.grade import Comparison
 from xew.metrics.truth import Points, Surfaces, Truth
 
 wp = pytest.importorskip("warp")
@@ -150,6 +151,23 @@ def test_scores_of_the_predictors_are_the_same(truth: Truth) -> None:
     assert (found - expected).loc["mask_iou"].abs().mean() < MEAN_IOU
     for name in SCORES[1:]:
         np.testing.assert_allclose(found.loc[name], expected.loc[name], rtol=ERRORS, atol=0.02, err_msg=name)
+
+
+@pytest.mark.parametrize("name", ["opencv", "warp"])
+def test_points_of_all_kinds_are_found_in_one_pass_as_one_kind_alone(name: str, truth: Truth) -> None:
+    tracker, asked = open_tracker(name), []
+
+    def one_kind(*arguments: np.ndarray) -> np.ndarray:
+        """The same tracker as one that may not be asked for all at once."""
+        asked.append(arguments[2].shape[1])
+        return tracker(*arguments)
+
+    video = np.ascontiguousarray(predict("2 frames late", Material(truth.rgb)))
+    assert isinstance(tracker, Pointwise) and not isinstance(one_kind, Pointwise)
+    together, alone = (Comparison(video, truth, estimate_masks, some) for some in (tracker, one_kind))
+    for kind in together.points:
+        np.testing.assert_array_equal(together.find(kind), alone.find(kind))
+    assert asked == [9, 1, 18], "links, the object, and points on surfaces"
 
 
 def test_a_tracker_gives_the_same_whatever_it_was_asked_before(truth: Truth) -> None:

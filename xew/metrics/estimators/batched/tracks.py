@@ -5,7 +5,7 @@ more walks through the frames, a block of threads for each point.
 """
 
 import functools
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -44,6 +44,8 @@ class BatchedTracker:
     Args:
         device: Warp's name of a device, None for Warp's default.
     """
+
+    pointwise: Literal[True] = True
 
     def __init__(self, device: str | None = None) -> None:
         self._device = wp.get_device(device)
