@@ -13,13 +13,15 @@ from markupsafe import Markup, escape
 
 from xew.analysis.reports.charts import Chart, panel_svg, themed_color
 from xew.analysis.tables.findings import Finding
-from xew.analysis.tables.table import Table, TableRow
+from xew.analysis.tables.table import Column, Table, TableRow
 
 __all__ = [
     "Markup", "anchor", "chart", "claims", "contents", "definitions", "details", "escape", "labeled_picture", "link", "note",
     "page", "paragraph", "section", "table",
 ]  # fmt: skip
 
+MOST_COLUMNS = 13
+"""Largest number of columns of values that stand beside one another on a page of 1400 pixels, unless one group has more."""
 TEMPLATES = Environment(
     loader=PackageLoader("xew.analysis.reports"),
     autoescape=True,
@@ -74,11 +76,39 @@ def definitions(pairs: Mapping[str, str]) -> Markup:
 
 
 def table(table: Table) -> Markup:
-    """A table with its caption."""
-    grouped = groupby(table.columns, key=lambda column: column.group)
-    groups = [(title, len(list(members))) for title, members in grouped]
-    sections = [(one, [(row, _labels(one.rows, i)) for i, row in enumerate(one.rows)]) for one in table.sections]
-    return _render("table.html", "table", table, groups if any(title for title, _ in groups) else (), sections)
+    """A table with its caption; one too wide for the page goes on below, cut between groups of columns."""
+    sections = [(one, [(row, list(_labels(one.rows, i))) for i, row in enumerate(one.rows)]) for one in table.sections]
+    return _render("table.html", "table", table, _bands(table.columns), sections)
+
+
+@dataclass(frozen=True)
+class _Band:
+    """Columns of a table that stand beside one another."""
+
+    first: int
+    columns: tuple[Column, ...]
+
+    @property
+    def end(self) -> int:
+        return self.first + len(self.columns)
+
+    @property
+    def groups(self) -> list[tuple[str, int]]:
+        """Titles over the columns, each with how many it stands over; none where no column has one."""
+        grouped = [(title, len(list(members))) for title, members in groupby(self.columns, key=lambda column: column.group)]
+        return grouped if any(title for title, _ in grouped) else []
+
+
+def _bands(columns: Sequence[Column]) -> list[_Band]:
+    """Whole groups of columns, as many a band as MOST_COLUMNS allow."""
+    bands = [_Band(0, ())]
+    for _, members in groupby(columns, key=lambda column: column.group):
+        group, last = tuple(members), bands[-1]
+        if last.columns and len(last.columns) + len(group) > MOST_COLUMNS:
+            bands.append(_Band(last.end, group))
+        else:
+            bands[-1] = _Band(last.first, (*last.columns, *group))
+    return bands
 
 
 @dataclass(frozen=True)
