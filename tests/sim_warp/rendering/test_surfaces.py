@@ -1,4 +1,4 @@
-"""Points on surfaces: they go with their bodies, whatever lies before them hides them, and where few are left more are found."""
+"""Points on surfaces: they go with their bodies, whatever lies before them hides them, and more are found where few are left."""
 
 from dataclasses import fields, replace
 
