@@ -1,4 +1,4 @@
-"""Points on surfaces: they go with their bodies, whatever lies before them hides them, and more are found where few are left."""
+"""Points on surfaces: they go with their bodies, what lies before them hides them, and where few are left more are found."""
 
 from dataclasses import fields, replace
 
@@ -21,10 +21,10 @@ CUBE, SCREEN = Body(box((0.05, 0.05, 0.05), RED), False), Body(box((0.3, 0.3, 0.
 FRAMES = 3
 TURN = (0.0, 0.0, 0.0, 1.0)
 UPRIGHT = (0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5))
-"""A quarter turn about y, by which a plate stands in the plane of the camera, at its x."""
-PLATE = Body(box((0.2, 0.3, 0.004), RED), False)
+"""A quarter turn about y, by which a plate that lies stands upright and shows the camera its edge."""
+PLATE = Body(box((0.2, 0.3, 0.002), RED), False)
 PIPER = ROBOTS["piper"]
-BESIDE = 150
+BESIDE = 340
 """Number of pixels by which the image is moved so that it shows little of the robot."""
 
 
@@ -50,8 +50,9 @@ def tracks(recording: Recording, renderer: Renderer) -> SurfaceTracks:
 
 @pytest.fixture(scope="module")
 def edge_on() -> Recording:
-    """A plate that is seen edge-on, two pixels wide, and moves up by 10 mm a frame."""
-    poses = np.float32([[[HEAD_CAMERA.position[0], 0.1, TABLE_TOP + 0.15 + 0.01 * t, *UPRIGHT]] for t in range(FRAMES)])
+    """A plate that is seen edge-on, a pixel wide and 110 pixels high, and moves up by 10 mm a frame."""
+    x = HEAD_CAMERA.position[0] - 0.001  # between the camera's plane and the middle of a column of pixels
+    poses = np.float32([[[x, 0.1, TABLE_TOP + 0.2 + 0.01 * t, *UPRIGHT]] for t in range(FRAMES)])
     return Recording(PIPER, stand_at_home(PIPER, FRAMES), (PLATE,), poses)
 
 
