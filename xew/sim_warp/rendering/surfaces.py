@@ -35,14 +35,18 @@ LEAST_FACING = 0.15
 """Least cosine between a point's normal and the direction to the camera; what is seen at a flatter angle is a rim."""
 
 AIM_OF_ROBOT, AIM_OF_THING = 8, 4
-"""Numbers of visible points of the whole robot, and of a thing that moves, that a frame should have. Frames that have fewer,
-although what lacks points is seen in them, are filled with points of a denser set."""
+"""Numbers of visible points that a frame should have of the whole robot, and of a thing that is moving. Frames that have fewer
+are filled with points of a denser set."""
+LEAST_SHOWN = 16
+"""Least number of pixels that show what is filled; of fewer no tracker can tell anything."""
 DENSE_LINK_CANDIDATES, DENSE_THING_CANDIDATES = 256, 1024
 """Numbers of points of the denser sets on each moving link and on each thing."""
 LEAST_DENSE_FACING = 0.05
 """Least cosine of a point of the denser sets: of a lid that is seen edge-on a rim is all there is."""
 MOVED = 0.01
 """Distance from its first place [m] from which on a body has moved."""
+MOVING = 0.001
+"""Distance from one frame to the next [m] from which on a body is moving."""
 
 
 @dataclass(frozen=True)
@@ -185,13 +189,11 @@ def _tracks(view: _View, thing_names: Sequence[str], placed: _Placed) -> Surface
     wanted = {b: WANTED_OF_LINK if b < len(links) else WANTED_OF_THING for b in bodies}
     kept = [np.flatnonzero(seen.body == b)[choose_points(seen.visible[:, seen.body == b], wanted[b])] for b in bodies]
     far = [_motion(placed.xyz[:, placed.body == b]) for b in bodies]
-    moving = [b for b, (displacement, _) in zip(bodies, far, strict=True) if b >= len(links) and displacement.max() > MOVED]
     first = seen.select(np.concatenate(kept))
-    parts = [
-        first,
-        _fill(view, bodies[bodies < len(links)], AIM_OF_ROBOT, first),
-        *(_fill(view, [b], AIM_OF_THING, first) for b in moving),
-    ]
+    parts = [first, _fill(view, bodies[bodies < len(links)], AIM_OF_ROBOT, first)]
+    for b, (displacement, step) in zip(bodies, far, strict=True):
+        if b >= len(links) and displacement.max() > MOVED:
+            parts.append(_fill(view, [b], np.where(step > MOVING, AIM_OF_THING, 0), first))
     number = np.full(len(links) + len(thing_names) + 1, -1, np.int16)  # the last is that of body -1
     number[bodies] = np.arange(len(bodies))
     return SurfaceTracks(
@@ -215,11 +217,14 @@ def _see(camera: Camera, placed: _Placed, body: np.ndarray, depth: np.ndarray, l
     return _Seen(pixels, (body == placed.body) & facing & near, placed.body)
 
 
-def _fill(view: _View, bodies: Sequence[int], aim: int, first: _Seen) -> _Seen:
-    """Few points of denser sets on some bodies: with the first ones as many as is aimed at are seen in every frame, as far as
-    there are. None where the first suffice."""
+def _fill(view: _View, bodies: Sequence[int], aim: int | np.ndarray, first: _Seen) -> _Seen:
+    """Few points of denser sets on some bodies: with the first ones as many are seen in a frame as is aimed at, or aimed at [t]
+    in each, as far as there are. None where the first suffice."""
     missing = np.maximum(aim - first.count_on(bodies), 0)
-    found = [_look(view, body) for body in bodies if np.any(view.shown.body[missing > 0] == body)]
+    lacking = np.flatnonzero(missing)
+    pixels = np.stack([np.sum(view.shown.body[lacking] == body, axis=(1, 2)) for body in bodies])
+    missing[lacking[pixels.sum(axis=0) < LEAST_SHOWN]] = 0
+    found = [_look(view, body) for body, shows in zip(bodies, pixels, strict=True) if np.any(shows * missing[lacking])]
     if not found:
         return first.select(np.zeros(0, int))
     pixels, visible = (np.concatenate([getattr(some, name) for some in found], axis=1) for name in ("pixels", "visible"))
