@@ -33,12 +33,12 @@ DEPTH_MARGIN = 0.01
 """Largest distance in depth [m] between a point and what its pixel shows of its own body at the pixel's center."""
 LEAST_FACING = 0.15
 """Least cosine between a point's normal and the direction to the camera; what is seen at a flatter angle is a rim."""
-
 AIM_OF_ROBOT, AIM_OF_THING = 8, 4
 """Numbers of visible points that a frame should have of the whole robot, and of a thing that is moving. Frames that have fewer
 are filled with points of a denser set."""
 LEAST_SHOWN = 16
-"""Least number of pixels that show what is filled; of fewer no tracker can tell anything."""
+"""Least number of pixels that show what is filled, a square of four: of a smaller one most that lies round a point is something
+else."""
 DENSE_LINK_CANDIDATES, DENSE_THING_CANDIDATES = 256, 1024
 """Numbers of points of the denser sets on each moving link and on each thing."""
 LEAST_DENSE_FACING = 0.05
@@ -190,16 +190,17 @@ def _tracks(view: _View, thing_names: Sequence[str], placed: _Placed) -> Surface
     kept = [np.flatnonzero(seen.body == b)[choose_points(seen.visible[:, seen.body == b], wanted[b])] for b in bodies]
     far = [_motion(placed.xyz[:, placed.body == b]) for b in bodies]
     first = seen.select(np.concatenate(kept))
-    parts = [first, _fill(view, bodies[bodies < len(links)], AIM_OF_ROBOT, first)]
+    parts = [first, _fill(view, bodies[bodies < len(links)].tolist(), AIM_OF_ROBOT, first)]
     for b, (displacement, step) in zip(bodies, far, strict=True):
         if b >= len(links) and displacement.max() > MOVED:
             parts.append(_fill(view, [b], np.where(step > MOVING, AIM_OF_THING, 0), first))
+    points = _join(parts)
     number = np.full(len(links) + len(thing_names) + 1, -1, np.int16)  # the last is that of body -1
     number[bodies] = np.arange(len(bodies))
     return SurfaceTracks(
-        pixels=np.concatenate([part.pixels for part in parts], axis=1).astype(np.float32),
-        visible=np.concatenate([part.visible for part in parts], axis=1),
-        body=number[np.concatenate([part.body for part in parts])].astype(np.int32),
+        pixels=points.pixels.astype(np.float32),
+        visible=points.visible,
+        body=number[points.body].astype(np.int32),
         shown=number[view.shown.body],
         names=tuple([*links, *thing_names][b] for b in bodies),
         is_robot=bodies < len(links),
@@ -217,19 +218,33 @@ def _see(camera: Camera, placed: _Placed, body: np.ndarray, depth: np.ndarray, l
     return _Seen(pixels, (body == placed.body) & facing & near, placed.body)
 
 
+def _join(parts: Sequence[_Seen]) -> _Seen:
+    """The points of all parts."""
+    pixels, visible = (np.concatenate([getattr(part, name) for part in parts], axis=1) for name in ("pixels", "visible"))
+    return _Seen(pixels, visible, np.concatenate([part.body for part in parts]))
+
+
 def _fill(view: _View, bodies: Sequence[int], aim: int | np.ndarray, first: _Seen) -> _Seen:
-    """Few points of denser sets on some bodies: with the first ones as many are seen in a frame as is aimed at, or aimed at [t]
-    in each, as far as there are. None where the first suffice."""
+    """Few points of the denser sets on some bodies, for frames in which the first points are fewer than is aimed at.
+
+    Args:
+        view: the episode.
+        bodies: what the aim is of: the robot's links together, or one thing.
+        aim: how many points should be visible in a frame, or [t] in each; all that are, where they are fewer.
+        first: the points that there are.
+
+    Returns:
+        The points to add; none where the first suffice, or nothing is seen.
+    """
     missing = np.maximum(aim - first.count_on(bodies), 0)
     lacking = np.flatnonzero(missing)
     pixels = np.stack([np.sum(view.shown.body[lacking] == body, axis=(1, 2)) for body in bodies])
     missing[lacking[pixels.sum(axis=0) < LEAST_SHOWN]] = 0
-    found = [_look(view, body) for body, shows in zip(bodies, pixels, strict=True) if np.any(shows * missing[lacking])]
+    found = [_look(view, body) for body, of_body in zip(bodies, pixels, strict=True) if of_body[missing[lacking] > 0].any()]
     if not found:
         return first.select(np.zeros(0, int))
-    pixels, visible = (np.concatenate([getattr(some, name) for some in found], axis=1) for name in ("pixels", "visible"))
-    dense = _Seen(pixels, visible, np.concatenate([some.body for some in found]))
-    return dense.select(choose_points(visible, missing))
+    dense = _join(found)
+    return dense.select(choose_points(dense.visible, missing))
 
 
 def _look(view: _View, body: int) -> _Seen:
