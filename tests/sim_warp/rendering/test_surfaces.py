@@ -51,7 +51,7 @@ def tracks(recording: Recording, renderer: Renderer) -> SurfaceTracks:
 @pytest.fixture(scope="module")
 def edge_on() -> Recording:
     """A plate that is seen edge-on, a pixel wide and 110 pixels high, and moves up by 10 mm a frame."""
-    x = HEAD_CAMERA.position[0] - 0.001  # between the camera's plane and the middle of a column of pixels
+    x = HEAD_CAMERA.position[0] - 0.0008  # so that it covers the middle of a column of pixels, and neither side is seen
     poses = np.float32([[[x, 0.1, TABLE_TOP + 0.2 + 0.01 * t, *UPRIGHT]] for t in range(FRAMES)])
     return Recording(PIPER, stand_at_home(PIPER, FRAMES), (PLATE,), poses)
 

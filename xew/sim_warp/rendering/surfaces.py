@@ -41,8 +41,8 @@ LEAST_SHOWN = 16
 else."""
 DENSE_LINK_CANDIDATES, DENSE_THING_CANDIDATES = 256, 1024
 """Numbers of points of the denser sets on each moving link and on each thing."""
-LEAST_DENSE_FACING = 0.05
-"""Least cosine of a point of the denser sets: of a lid that is seen edge-on a rim is all there is."""
+LEAST_DENSE_FACING = 0.0
+"""Least cosine of a point of the denser sets: of a lid that is seen edge-on what is flat to the view is all there is."""
 MOVED = 0.01
 """Distance from its first place [m] from which on a body has moved."""
 MOVING = 0.001
