@@ -137,7 +137,7 @@ SHOTS = (1, 2, 3)
 """Numbers of training episodes of each task that a model is adapted with (M); they are of the first accepted seeds."""
 FORGETTING_ROBOT = "ur5_wsg"
 """Robot whose test episodes measure forgetting, the same for every adapted model."""
-GRADING_PROTOCOL = 5
+GRADING_PROTOCOL = 6
 """Version of the grading: it goes up when any score would change, and scores of another version are graded anew."""
 COPY_FIRST_FRAME, PASTED_RENDER, OTHER_ROBOT = "copy_first_frame", "pasted_render", "other_robot"
 CODEC_TRUTH, GROUND_TRUTH = "codec_truth", "ground_truth"

@@ -20,15 +20,10 @@ from xew.sim_warp.production.kept_tracks import load_tracks, save_tracks, tracks
 from xew.sim_warp.rendering.observe import scene_recording
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import default_renderer
-from xew.sim_warp.rendering.surfaces import SurfaceTracks, track_surfaces
+from xew.sim_warp.rendering.surfaces import MOVED, MOVING, SurfaceTracks, track_surfaces
 from xew.sim_warp.robots import recorded_robot
 from xew.sim_warp.scene import Scene, scene_hash, scene_rng
 from xew.sim_warp.tasks import recorded_task
-
-MOVED = 0.01
-"""Distance from its first place [m] from which on a body has moved."""
-MOVING = 0.001
-"""Distance from one frame to the next [m] from which on a body is moving."""
 
 
 @dataclass(frozen=True)

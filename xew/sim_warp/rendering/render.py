@@ -133,10 +133,11 @@ class Renderer:
             return _split_by_world(self._render_worlds(worlds, camera, ground, wanted), worlds)
 
     def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA) -> list[Frames]:
-        """Look up the points of worlds with the stage about them, and which body each pixel shows, without any colors.
+        """Look up the points of worlds with the stage about them, and which body each pixel shows and how far off, without any
+        colors.
 
         Returns:
-            For each world its frames as `render_batch` gives them, of which `rgb` and what is optional but `body` are empty.
+            For each world its frames as `render_batch` gives them, of which `rgb` and `optical_flow` are empty.
 
         Raises:
             ValueError: poses or points do not fit, or are not finite, or a world has no points.
@@ -148,7 +149,7 @@ class Renderer:
         if not worlds:
             return []
         with PARSING:
-            images = self._render_worlds(worlds, camera, True, frozenset({"body"}), colors=False)
+            images = self._render_worlds(worlds, camera, True, frozenset({"body", "depth"}), colors=False)
             return _split_by_world(images, worlds)
 
     def _render_worlds(
@@ -167,7 +168,7 @@ class Renderer:
             wanted=wanted,
             colors=colors,
         )
-        pixel = _nearest_pixel(camera, pack_points(worlds))
+        pixel = nearest_pixel(camera, pack_points(worlds))
         chunks = [slice(i, i + self._frames_per_chunk) for i in range(0, len(table.world), self._frames_per_chunk)]
         host: dict[str, np.ndarray] = {}
         for chunk in chunks:
@@ -228,7 +229,7 @@ def _split_by_world(images: dict[str, np.ndarray], worlds: Sequence[World]) -> l
     return frames
 
 
-def _nearest_pixel(camera: Camera, points: np.ndarray) -> np.ndarray:
+def nearest_pixel(camera: Camera, points: np.ndarray) -> np.ndarray:
     """[t k 2] int32 pixel x, y of points [t k 3]; (-1, -1) for those behind the camera."""
     pixel, _ = project(camera, points)
     return np.where(np.isfinite(pixel), np.clip(np.round(pixel), -1, 1 << 20), -1).astype(np.int32)

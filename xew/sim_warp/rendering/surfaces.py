@@ -5,10 +5,11 @@ Writes `SurfaceTracks`: pixels and visibility of points on the robot's moving li
 
 A point is fixed to its body, so that its path follows from the states. It is seen where the renderer's own buffer shows its
 body at its pixel, at its depth: what hides it may be the robot, an object, the table, or its own body. Of many points sampled
-on each body, few are kept: as many as it takes to see some of them in every frame in which the body is seen.
+on each body, few are kept: as many as it takes to see some of them in every frame in which the body is seen. Where that leaves
+too few in some frames, as on a lid seen edge-on or a tool in a hand, far more are sampled, and a few of these fill the frames.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -21,7 +22,7 @@ from xew.sim_warp.geometry.poses import matrix_from_pose
 from xew.sim_warp.geometry.surface_points import sample_surface
 from xew.sim_warp.rendering.bodies import SIDES, body_names, robot_bodies, robot_pose
 from xew.sim_warp.rendering.observe import Recording
-from xew.sim_warp.rendering.render import Frames, Renderer, World
+from xew.sim_warp.rendering.render import Frames, Renderer, World, nearest_pixel
 
 LINK_CANDIDATES, THING_CANDIDATES = 64, 256
 """Numbers of points that are sampled on each link that an arm or a gripper moves, and on each object and hinged lid: of what a
@@ -32,6 +33,20 @@ DEPTH_MARGIN = 0.01
 """Largest distance in depth [m] between a point and what its pixel shows of its own body at the pixel's center."""
 LEAST_FACING = 0.15
 """Least cosine between a point's normal and the direction to the camera; what is seen at a flatter angle is a rim."""
+AIM_OF_ROBOT, AIM_OF_THING = 8, 4
+"""Numbers of visible points that a frame should have of the whole robot, and of a thing that is moving. Frames that have fewer
+are filled with points of a denser set."""
+LEAST_SHOWN = 16
+"""Least number of pixels that show what is filled, a square of four: of a smaller one most that lies round a point is something
+else."""
+DENSE_LINK_CANDIDATES, DENSE_THING_CANDIDATES = 256, 1024
+"""Numbers of points of the denser sets on each moving link and on each thing."""
+LEAST_DENSE_FACING = 0.0
+"""Least cosine of a point of the denser sets: of a lid that is seen edge-on what is flat to the view is all there is."""
+MOVED = 0.01
+"""Distance from its first place [m] from which on a body has moved."""
+MOVING = 0.001
+"""Distance from one frame to the next [m] from which on a body is moving."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +81,49 @@ class _Points:
     """[n 3]."""
 
 
+@dataclass(frozen=True)
+class _Placed:
+    """Points of several bodies, where they are in the world."""
+
+    xyz: np.ndarray
+    """[t p 3] m."""
+    normal: np.ndarray
+    """[t p 3]."""
+    body: np.ndarray
+    """[p] int, index of each point's body in its world."""
+
+
+@dataclass(frozen=True)
+class _View:
+    """An episode of t frames and what the camera sees of it."""
+
+    recording: Recording
+    pose: np.ndarray
+    """[t b 7] poses of all bodies, xyz [m] and quaternion xyzw, world."""
+    shown: Frames
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Points of several bodies, as the camera sees them."""
+
+    pixels: np.ndarray
+    """[t p 2] float64 x right, y down; NaN behind the camera."""
+    visible: np.ndarray
+    """[t p] bool."""
+    body: np.ndarray
+    """[p] int, index of each point's body in its world."""
+
+    def select(self, points: np.ndarray) -> "_Seen":
+        """Those of an index [k]."""
+        return _Seen(self.pixels[:, points], self.visible[:, points], self.body[points])
+
+    def count_on(self, bodies: Sequence[int]) -> np.ndarray:
+        """[t] int, how many are visible on some bodies."""
+        return np.sum(self.visible[:, np.isin(self.body, bodies)], axis=1)
+
+
 def track_surfaces(
     recordings: Sequence[Recording], thing_names: Sequence[Sequence[str]], renderer: Renderer, camera: Camera = HEAD_CAMERA
 ) -> list[SurfaceTracks]:
@@ -77,72 +135,73 @@ def track_surfaces(
         renderer: whose buffer says what is seen.
         camera: the camera.
     """
-    placed = [_place(recording) for recording in recordings]
+    poses = [_body_pose(recording) for recording in recordings]
+    placed = [_place(_candidates(recording), pose) for recording, pose in zip(recordings, poses, strict=True)]
     worlds = [
-        World([*robot_bodies(recording.robot), *recording.things], pose, xyz)
-        for recording, (pose, xyz, _, _) in zip(recordings, placed, strict=True)
+        World([*robot_bodies(recording.robot), *recording.things], pose, points.xyz)
+        for recording, pose, points in zip(recordings, poses, placed, strict=True)
     ]
     seen = renderer.probe_batch(worlds, camera)
     return [
-        _tracks(recording, names, where[1:], shown, camera)
-        for recording, names, where, shown in zip(recordings, thing_names, placed, seen, strict=True)
+        _tracks(_View(recording, pose, shown, camera), names, points)
+        for recording, names, pose, points, shown in zip(recordings, thing_names, poses, placed, seen, strict=True)
     ]
 
 
-def _place(recording: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Poses of all bodies [t n 7], and of all points their places [t p 3] m and normals [t p 3], world, and bodies [p]."""
+def _body_pose(recording: Recording) -> np.ndarray:
+    """Poses [t b 7] of all bodies of a recording, the robot's first."""
     pose = robot_pose(recording.robot, recording.joint_pos)
-    if recording.thing_pose is not None:
-        pose = np.concatenate([pose, recording.thing_pose], 1)
-    points = [*robot_points(recording.robot)]
-    points += [_Points(*sample_surface(thing.mesh, THING_CANDIDATES)) for thing in recording.things]
-    body = np.repeat(np.arange(len(points)), [len(some.xyz) for some in points])
+    return pose if recording.thing_pose is None else np.concatenate([pose, recording.thing_pose], 1)
+
+
+def _candidates(recording: Recording) -> dict[int, _Points]:
+    """The points of each body that has some, of which the tracks' are chosen."""
+    things = [_Points(*sample_surface(thing.mesh, THING_CANDIDATES)) for thing in recording.things]
+    return dict(enumerate([*robot_points(recording.robot), *things]))
+
+
+def _place(points: Mapping[int, _Points], pose: np.ndarray) -> _Placed:
+    """Points of bodies with these poses [t b 7], in the world."""
+    body = np.repeat(np.array([*points], int), [len(some.xyz) for some in points.values()])
     matrix = matrix_from_pose(pose)[:, body]
-    xyz, normal = (np.concatenate([getattr(some, name) for some in points]) for name in ("xyz", "normal"))
+    xyz, normal = (np.concatenate([getattr(some, name) for some in points.values()]) for name in ("xyz", "normal"))
     world = np.einsum("tpij,pj->tpi", matrix[..., :3, :3], xyz) + matrix[..., :3, 3]
-    return pose, world, np.einsum("tpij,pj->tpi", matrix[..., :3, :3], normal), body
+    return _Placed(world, np.einsum("tpij,pj->tpi", matrix[..., :3, :3], normal), body)
 
 
 @lru_cache(maxsize=32)
-def robot_points(robot: RobotSpec) -> tuple[_Points, ...]:
+def robot_points(robot: RobotSpec, count: int = LINK_CANDIDATES) -> tuple[_Points, ...]:
     """Points of each of the robot's visible links, in the order of `robot_bodies`; none on links that nothing moves."""
     urdf = load_urdf(robot.urdf)
     moving = {name for arm in robot.arms for name in (*arm.joints, *arm.fingers)}
     found = []
     for body, (_, link) in zip(robot_bodies(robot), body_names(robot), strict=True):
         moves = any(joint.name in moving for joint in urdf.chain(link))
-        found.append(_Points(*sample_surface(body.mesh, LINK_CANDIDATES if moves else 0)))
+        found.append(_Points(*sample_surface(body.mesh, count if moves else 0)))
     return tuple(found)
 
 
-def _tracks(
-    recording: Recording,
-    thing_names: Sequence[str],
-    where: tuple[np.ndarray, np.ndarray, np.ndarray],
-    shown: Frames,
-    camera: Camera,
-) -> SurfaceTracks:
-    """Tracks from the candidates' places and normals [t p 3] and bodies [p], and from what the camera sees."""
-    world, normal, body = where
-    pixels, depth = project(camera, world)
-    to_camera = camera.position - world
-    facing = np.einsum("tpi,tpi->tp", normal, to_camera) > LEAST_FACING * np.linalg.norm(to_camera, axis=-1)
-    visible = (shown.point_body == body) & facing & (depth > 0) & (np.abs(shown.point_depth - depth) < DEPTH_MARGIN)
-    links = _link_names(recording.robot)
-    bodies = np.unique(body)
-    kept = [
-        np.flatnonzero(body == b)[choose_points(visible[:, body == b], WANTED_OF_LINK if b < len(links) else WANTED_OF_THING)]
-        for b in bodies
-    ]
-    far = [_motion(world[:, body == b]) for b in bodies]
-    points = np.concatenate(kept)
+def _tracks(view: _View, thing_names: Sequence[str], placed: _Placed) -> SurfaceTracks:
+    """Tracks from the candidates, which the view's frames were probed with."""
+    seen = _see(view.camera, placed, view.shown.point_body, view.shown.point_depth, LEAST_FACING)
+    links = _link_names(view.recording.robot)
+    bodies = np.unique(placed.body)
+    wanted = {b: WANTED_OF_LINK if b < len(links) else WANTED_OF_THING for b in bodies}
+    kept = [np.flatnonzero(seen.body == b)[choose_points(seen.visible[:, seen.body == b], wanted[b])] for b in bodies]
+    far = [_motion(placed.xyz[:, placed.body == b]) for b in bodies]
+    first = seen.select(np.concatenate(kept))
+    parts = [first, _fill(view, bodies[bodies < len(links)].tolist(), AIM_OF_ROBOT, first)]
+    for b, (displacement, step) in zip(bodies, far, strict=True):
+        if b >= len(links) and displacement.max() > MOVED:
+            parts.append(_fill(view, [b], np.where(step > MOVING, AIM_OF_THING, 0), first))
+    points = _join(parts)
     number = np.full(len(links) + len(thing_names) + 1, -1, np.int16)  # the last is that of body -1
     number[bodies] = np.arange(len(bodies))
     return SurfaceTracks(
-        pixels=pixels[:, points].astype(np.float32),
-        visible=visible[:, points],
-        body=np.repeat(np.arange(len(bodies), dtype=np.int32), [len(some) for some in kept]),
-        shown=number[shown.body],
+        pixels=points.pixels.astype(np.float32),
+        visible=points.visible,
+        body=number[points.body].astype(np.int32),
+        shown=number[view.shown.body],
         names=tuple([*links, *thing_names][b] for b in bodies),
         is_robot=bodies < len(links),
         displacement=np.stack([of_body[0] for of_body in far], axis=1),
@@ -150,12 +209,65 @@ def _tracks(
     )
 
 
-def choose_points(visible: np.ndarray, wanted: int) -> np.ndarray:
-    """Indices of few points of a body of which enough are seen in every frame, by greedy set cover; the earlier of equals.
+def _see(camera: Camera, placed: _Placed, body: np.ndarray, depth: np.ndarray, least_facing: float) -> _Seen:
+    """Points that face the camera, by a least cosine, are seen where the buffer has their body [t p] at their depth [t p] m."""
+    pixels, own_depth = project(camera, placed.xyz)
+    to_camera = camera.position - placed.xyz
+    facing = np.einsum("tpi,tpi->tp", placed.normal, to_camera) > least_facing * np.linalg.norm(to_camera, axis=-1)
+    near = (own_depth > 0) & (np.abs(depth - own_depth) < DEPTH_MARGIN)
+    return _Seen(pixels, (body == placed.body) & facing & near, placed.body)
+
+
+def _join(parts: Sequence[_Seen]) -> _Seen:
+    """The points of all parts."""
+    pixels, visible = (np.concatenate([getattr(part, name) for part in parts], axis=1) for name in ("pixels", "visible"))
+    return _Seen(pixels, visible, np.concatenate([part.body for part in parts]))
+
+
+def _fill(view: _View, bodies: Sequence[int], aim: int | np.ndarray, first: _Seen) -> _Seen:
+    """Few points of the denser sets on some bodies, for frames in which the first points are fewer than is aimed at.
 
     Args:
-        visible: [t n] bool, in which frames each of the body's points is seen.
-        wanted: how many should be seen in a frame; all that are, where they are fewer.
+        view: the episode.
+        bodies: what the aim is of: the robot's links together, or one thing.
+        aim: how many points should be visible in a frame, or [t] in each; all that are, where they are fewer.
+        first: the points that there are.
+
+    Returns:
+        The points to add; none where the first suffice, or nothing is seen.
+    """
+    missing = np.maximum(aim - first.count_on(bodies), 0)
+    lacking = np.flatnonzero(missing)
+    pixels = np.stack([np.sum(view.shown.body[lacking] == body, axis=(1, 2)) for body in bodies])
+    missing[lacking[pixels.sum(axis=0) < LEAST_SHOWN]] = 0
+    found = [_look(view, body) for body, of_body in zip(bodies, pixels, strict=True) if of_body[missing[lacking] > 0].any()]
+    if not found:
+        return first.select(np.zeros(0, int))
+    dense = _join(found)
+    return dense.select(choose_points(dense.visible, missing))
+
+
+def _look(view: _View, body: int) -> _Seen:
+    """The denser set on one body, looked up in the view's frames."""
+    links = robot_bodies(view.recording.robot)
+    if body < len(links):
+        points = robot_points(view.recording.robot, DENSE_LINK_CANDIDATES)[body]
+    else:
+        points = _Points(*sample_surface(view.recording.things[body - len(links)].mesh, DENSE_THING_CANDIDATES))
+    placed = _place({body: points}, view.pose)
+    column, row = np.moveaxis(nearest_pixel(view.camera, placed.xyz), -1, 0)
+    inside = (column >= 0) & (column < view.camera.width) & (row >= 0) & (row < view.camera.height)
+    at = np.arange(len(view.pose))[:, None], np.where(inside, row, 0), np.where(inside, column, 0)
+    there = np.where(inside, view.shown.body[at], -2), view.shown.depth[at]
+    return _see(view.camera, placed, *there, LEAST_DENSE_FACING)
+
+
+def choose_points(visible: np.ndarray, wanted: int | np.ndarray) -> np.ndarray:
+    """Indices of few points of which enough are seen in every frame, by greedy set cover; the earlier of equals.
+
+    Args:
+        visible: [t n] bool, in which frames each of the points is seen.
+        wanted: how many should be seen in a frame, or [t] in each; all that are, where they are fewer.
 
     Returns:
         [k] int, ascending.
