@@ -22,8 +22,8 @@ def make_table(groups: dict[str, int]) -> Table:
     [
         (
             {"visual": 3, "morphology": 4, "kinematics": 9, "objects": 4},
-            [7, 13],
-            [["visual", "morphology"], ["kinematics", "objects"]],
+            [7, 9, 4],
+            [["visual", "morphology"], ["kinematics"], ["objects"]],
         ),
         ({"visual": 3, "morphology": 4}, [7], [["visual", "morphology"]]),
         ({"all": page.MOST_COLUMNS + 2}, [page.MOST_COLUMNS + 2], [["all"]]),

@@ -20,7 +20,7 @@ __all__ = [
     "page", "paragraph", "section", "table",
 ]  # fmt: skip
 
-MOST_COLUMNS = 13
+MOST_COLUMNS = 10
 """Largest number of columns of values that stand beside one another on a page of 1400 pixels, unless one group has more."""
 TEMPLATES = Environment(
     loader=PackageLoader("xew.analysis.reports"),

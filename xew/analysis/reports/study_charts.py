@@ -211,7 +211,7 @@ def frame_chart(curves: pd.DataFrame, part: str, labels: Mapping[str, str]) -> C
 
 
 def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Sequence[str]) -> Chart:
-    """Error of one run by frame, a panel for each metric and robot; lines are means, bands hold the middle half."""
+    """Error of one run by frame, a panel for each metric that has curves and robot; lines are means, bands the middle half."""
     robots = [robot for robot in robots if (curves["robot"] == robot).any()]
     shown = curves[curves["robot"].isin(robots) & curves["metric"].isin([metric.name for metric in metrics])]
     # The truth's PSNR is a cap, not a measurement, and would squeeze everything else flat.
@@ -237,6 +237,7 @@ def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Seque
     panels = [
         Panel(ROBOT_TITLES.get(robot, robot), partial(draw, metric=metric, robot=robot))
         for metric in metrics
+        if metric.name in set(data["metric"])
         for robot in robots
     ]
     caption = "Mean over episodes frame by frame; bands hold the middle half of the episodes."
