@@ -14,7 +14,7 @@ Its error on true video is published beside every score: the row `ground_truth` 
 """
 
 import functools
-import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -131,11 +131,13 @@ def learn_appearance(video: np.ndarray, mask: np.ndarray) -> Appearance:
     background, uncovered = _background(video[picked], mask[picked])
     video = np.concatenate([video[picked], *([_soften(frame, s) for frame in video[picked]] for s in SOFTNESS)])
     mask = np.tile(mask[picked], (1 + len(SOFTNESS), 1, 1))
-    difference = np.stack([_difference(frame, background) for frame in video])
+    everywhere = np.ones_like(uncovered)
+    lab = (cv2.cvtColor(frame, cv2.COLOR_RGB2LAB) for frame in video)
+    difference = (_difference(frame, background) for frame in video)
     return Appearance(
-        color=_log_ratio(color_bins(video), mask, smooth=(COLOR_BINS,) * 3),
+        color=_log_ratio(lab, mask, everywhere, (COLOR_BINS,) * 3),
         background=background,
-        difference=_log_ratio(difference[:, uncovered], mask[:, uncovered], smooth=(256,)),
+        difference=_log_ratio(difference, mask, uncovered, (256,)),
         uncovered=uncovered,
     )
 
@@ -301,19 +303,26 @@ def color_bins(video: np.ndarray) -> np.ndarray:
     return bins.reshape(video.shape[:-1])
 
 
-def _log_ratio(values: np.ndarray, robot: np.ndarray, smooth: tuple[int, ...]) -> np.ndarray:
-    """log p(value | robot) / p(value | rest) of integers, from smoothed histograms of the shape `smooth`.
+def _log_ratio(images: Iterable[np.ndarray], robot: np.ndarray, counted: np.ndarray, bins: tuple[int, ...]) -> np.ndarray:
+    """log p(value | robot) / p(value | rest) of pixels, from smoothed histograms.
 
     Args:
-        values: [...] int, from 0 to the product of `smooth` less 1.
-        robot: [...] bool, which of them are the robot's.
-        smooth: the shape in which values are neighbors.
+        images: t arrays [h w] or [h w c] uint8.
+        robot: [t h w] bool, which pixels are the robot's.
+        counted: [h w] bool, which pixels count.
+        bins: how many bins each of the c channels has.
+
+    Returns:
+        [bins of each channel] float32.
     """
-    count = math.prod(smooth)
-    rest, of_robot = np.bincount((values + count * robot).ravel(), minlength=2 * count).reshape(2, *smooth).astype(np.float64)
-    shares = [(_blur(histogram) + 1e-9) / max(histogram.sum(), 1) for histogram in (of_robot, rest)]
+    histograms = np.zeros((2, *bins))
+    channels, ends = list(range(len(bins))), [0, 256] * len(bins)
+    for image, mask in zip(images, robot, strict=True):
+        for histogram, members in zip(histograms, (mask & counted, ~mask & counted), strict=True):
+            histogram += cv2.calcHist([image], channels, members.astype(np.uint8), bins, ends).reshape(bins)
+    share, rest = ((_blur(histogram) + 1e-9) / max(histogram.sum(), 1) for histogram in histograms)
     floor = 1e-6
-    return np.log((shares[0] + floor) / (shares[1] + floor)).astype(np.float32)
+    return np.log((share + floor) / (rest + floor)).astype(np.float32)
 
 
 def _blur(histogram: np.ndarray) -> np.ndarray:
