@@ -10,7 +10,7 @@ To add one: its file, and one line in MASKERS, TRACKERS or FLOWS; from outside t
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -37,7 +37,11 @@ class Masker(Protocol):
 
 @runtime_checkable
 class Tracker(Protocol):
-    """Where the true video's points are in a predicted video."""
+    """Where the true video's points are in a predicted video.
+
+    One that finds each point without regard to the others has the attribute `pointwise = True`, and is then asked for points
+    of all kinds in one pass.
+    """
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
         """Pixels float32 [t k 2] in the prediction, NaN where a point is lost.
@@ -69,13 +73,6 @@ class Confirmer(Protocol):
             found: [t k 2] float32 pixels, as the tracker gave them for the same videos and points.
             prediction, target, points, visible, shown, body: as of `presence.confirm_tracks`.
         """
-
-
-@runtime_checkable
-class Pointwise(Protocol):
-    """A tracker that finds each point without regard to the others, so that points of all kinds are asked for in one pass."""
-
-    pointwise: Literal[True]
 
 
 @runtime_checkable

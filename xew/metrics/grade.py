@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from xew.metrics import METRICS, contact_f1
-from xew.metrics.backends import Confirmer, Masker, Pointwise, Tracker
+from xew.metrics.backends import Confirmer, Masker, Tracker
 from xew.metrics.estimators.contact import predicted_contact
 from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.metric import ACCELERATOR_CHUNK
@@ -131,7 +131,7 @@ def _find_points(c: Comparison, kind: str) -> dict[str, np.ndarray]:
     round it.
     """
     alone = ON_SURFACES if kind in ON_SURFACES else (kind,)
-    kinds = tuple(c.points) if isinstance(c.tracker, Pointwise) else alone
+    kinds = tuple(c.points) if getattr(c.tracker, "pointwise", False) else alone
     pixels, visible = (np.concatenate([getattr(c.points[k], name) for k in kinds], axis=1) for name in ("pixels", "visible"))
     seen = visible.any(axis=0)
     found = np.full(pixels.shape, np.nan, np.float32)

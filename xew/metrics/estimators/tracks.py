@@ -13,7 +13,6 @@ Its error on true video is published beside every score: the row `ground_truth` 
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -93,7 +92,8 @@ class ReferenceTracker:
     A prediction is asked for several kinds of points, and an episode's true video stands beside several predictions.
     """
 
-    pointwise: Literal[True] = True
+    pointwise = True
+    """Whether each point is found without regard to the others (`backends.Tracker`)."""
 
     def __init__(self) -> None:
         self._seen: _Video | None = None

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from xew.metrics import mask_iou
-from xew.metrics.backends import Confirmer, Pointwise, open_masker, open_tracker
+from xew.metrics.backends import Confirmer, open_masker, open_tracker
 from xew.metrics.calibration.matrix import grade_material
 from xew.metrics.calibration.predictors import Material, delay, predict
 from xew.metrics.estimators.batched import masks as batched_masks
@@ -163,7 +163,7 @@ def test_points_of_all_kinds_are_found_in_one_pass_as_one_kind_alone(name: str, 
         return tracker(*arguments)
 
     video = np.ascontiguousarray(predict("2 frames late", Material(truth.rgb)))
-    assert isinstance(tracker, Pointwise) and not isinstance(one_kind, Pointwise)
+    assert tracker.pointwise
     together, alone = (Comparison(video, truth, estimate_masks, some) for some in (tracker, one_kind))
     for kind in together.points:
         np.testing.assert_array_equal(together.find(kind), alone.find(kind))

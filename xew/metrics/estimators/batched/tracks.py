@@ -5,7 +5,7 @@ more walks through the frames, a block of threads for each point.
 """
 
 import functools
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -45,7 +45,8 @@ class BatchedTracker:
         device: Warp's name of a device, None for Warp's default.
     """
 
-    pointwise: Literal[True] = True
+    pointwise = True
+    """Whether each point is found without regard to the others (`backends.Tracker`)."""
 
     def __init__(self, device: str | None = None) -> None:
         self._device = wp.get_device(device)
