@@ -78,7 +78,7 @@ class Episode:
         self._distance: dict[int, np.ndarray] = {}
 
     def is_of(self, video: np.ndarray, mask: np.ndarray) -> bool:
-        """Are these the very arrays of the episode?"""
+        """Are video [t h w 3] and mask [t h w] the very arrays of the episode?"""
         return self.frames.video is video and self.mask is mask
 
     def distance(self, t: int) -> np.ndarray:
