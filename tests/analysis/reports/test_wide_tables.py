@@ -1,4 +1,4 @@
-"""Parts of the report's page by themselves."""
+"""Tables of the report that are too wide for its page."""
 
 import re
 

@@ -237,7 +237,7 @@ def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Seque
     panels = [
         Panel(ROBOT_TITLES.get(robot, robot), partial(draw, metric=metric, robot=robot))
         for metric in metrics
-        if metric.name in set(data["metric"])
+        if (data["metric"] == metric.name).any()
         for robot in robots
     ]
     caption = "Mean over episodes frame by frame; bands hold the middle half of the episodes."
