@@ -10,9 +10,12 @@ from xew.analysis.studies.config import Study
 from xew.analysis.studies.cost import correct_by_ledger, critical_paths, estimate, format_duration
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import Machines
-from xew.analysis.studies.plan import Step, sort_steps
+from xew.analysis.studies.plan import Step
 from xew.dataset import find_accepted
 from xew.protocol import seed_split
+
+FINISHING = ("baselines", "rollout", "evaluate")
+"""Kinds of steps after which there are scores: where time is short they come before those that only begin something."""
 
 
 @dataclass
@@ -116,7 +119,9 @@ class StudyRunner:
 
 
 class Budget:
-    """Time that a study may take now: what is soonest graded first, and nothing is trained that would not be graded in time.
+    """Time that a study may take now: what is trained is graded first, and nothing is trained that would not be graded in time.
+
+    Trainings come in the order of the plan, so what a study names first is had first.
 
     Args:
         study, steps: what is run.
@@ -127,7 +132,7 @@ class Budget:
     def __init__(self, study: Study, steps: Mapping[str, Step], ledger: Ledger, seconds: float) -> None:
         self._steps, self._costs = steps, estimate(study, steps)
         self._end = time.monotonic() + seconds
-        self._order = {step.name: place for place, step in enumerate(sort_steps(steps))}
+        self._order = {name: place for place, name in enumerate(steps)}
         self.learn(ledger)
 
     def learn(self, ledger: Ledger) -> None:
@@ -136,17 +141,17 @@ class Budget:
         paths = critical_paths({name: step for name, step in self._steps.items() if step.kind != "analyse"}, seconds, own=True)
         self._seconds = seconds | paths
 
-    def rank(self, name: str) -> tuple[float, int]:
-        """Sort key: what every table has comes first, then what is soonest graded."""
-        return 0.0 if name == "baselines" else self._seconds[name], self._order[name]
+    def rank(self, name: str) -> tuple[bool, int]:
+        """Sort key: what every table has and what was trained comes first, then the plan's order."""
+        return name.partition("/")[0] not in FINISHING, self._order[name]
 
     def fits(self, name: str) -> bool:
         """Whether a step and what follows it up to the grades of the same variant would end in time.
 
         What is trained is rolled out and graded while there is any time: otherwise the training was for nothing.
         """
-        spent = name.partition("/")[0] in ("rollout", "evaluate")
-        return time.monotonic() + (0.0 if spent else self._seconds[name]) <= self._end
+        trained = name.partition("/")[0] in ("rollout", "evaluate")
+        return time.monotonic() + (0.0 if trained else self._seconds[name]) <= self._end
 
 
 def complete_command(step: Step, goes_on: bool, failed: Mapping[str, str]) -> tuple[str, ...]:
