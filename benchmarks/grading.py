@@ -19,6 +19,7 @@ import shutil
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import tyro
+
+from xew.dataset import read_dataset
+from xew.episode import read_video
+from xew.metrics.calibration.predictors import delay, soften
+from xew.rollout import write_rollout
 
 LATE = 4
 """Number of frames by which the made-up model is late."""
@@ -72,11 +78,6 @@ def main(args: Args) -> None:
 
 def make_workload(args: Args) -> int:
     """Copy whole scenes of test seeds, in turns of the tasks, and make rollouts of their episodes; the number of these."""
-    from xew.dataset import read_dataset
-    from xew.episode import read_video
-    from xew.metrics.calibration.predictors import delay, soften
-    from xew.rollout import write_rollout
-
     dataset = read_dataset(args.data)
     scenes: dict[tuple[int, str], list[Path]] = {}
     ranks: dict[str, list[int]] = {}
@@ -84,17 +85,22 @@ def make_workload(args: Args) -> int:
         seeds = ranks.setdefault(record.task, [])
         seeds += [] if record.seed in seeds else [record.seed]
         scenes.setdefault((seeds.index(record.seed), record.task), []).append(folder)
-    made = 0
+    chosen: list[Path] = []
     for _, folders in sorted(scenes.items()):
-        for folder in folders if made < args.episodes else ():
-            task, seed, robot = folder.parts[-3:]
-            shutil.copytree(folder, args.out / "data" / task / seed / robot)
-            header = {"model": args.codec.stem if args.codec else "late", "condition": "made up"}
-            video = read_video(folder / "rgb.mkv")
-            made += 1
-            write_rollout(args.out / "rollouts", task, int(seed), robot, soften(delay(video, LATE)), header)
-    assert made >= args.episodes, f"{args.data} has {made} episodes of test seeds; {args.episodes} are asked for"
-    return made
+        chosen += folders if len(chosen) < args.episodes else []
+    assert len(chosen) >= args.episodes, f"{args.data} has {len(chosen)} episodes of test seeds; {args.episodes} are asked for"
+    with ProcessPoolExecutor() as pool:
+        list(pool.map(make_rollout, [args] * len(chosen), chosen))
+    return len(chosen)
+
+
+def make_rollout(args: Args, folder: Path) -> None:
+    """Copy one episode and write its made-up rollout."""
+    task, seed, robot = folder.parts[-3:]
+    shutil.copytree(folder, args.out / "data" / task / seed / robot)
+    header = {"model": args.codec.stem if args.codec else "late", "condition": "made up"}
+    video = soften(delay(read_video(folder / "rgb.mkv"), LATE))
+    write_rollout(args.out / "rollouts", task, int(seed), robot, video, header)
 
 
 def grade(args: Args, estimators: str, processes: str) -> tuple[float, float]:
