@@ -71,6 +71,15 @@ def test_latents_from_states_are_those_from_video(simulated: Path, capsys: pytes
     assert not list((simulated / "bare").rglob("*.mkv"))
 
 
+def test_processes_encode_as_one_does(simulated: Path, tmp_path: Path) -> None:
+    for processes in ("1", "2"):
+        shutil.copytree(simulated / "data", tmp_path / processes / "data")
+        latents.main([str(simulated / "config.yaml"), "--data", str(tmp_path / processes / "data"), "--processes", processes])
+    encoded = {processes: files(tmp_path / processes / "data-latents") for processes in ("1", "2")}
+    assert len([name for name in encoded["1"] if name.endswith(".safetensors")]) == 3
+    assert encoded["2"] == encoded["1"]
+
+
 @pytest.fixture(scope="module")
 def codec() -> PatchCodec:
     rng = np.random.default_rng(0)

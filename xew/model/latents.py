@@ -9,6 +9,7 @@ Command: python -m xew.model.latents CONFIG [--data … and other overrides]
 """
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -17,7 +18,7 @@ from xew.config import ConfigError, user_errors
 from xew.dataset import Dataset, Episode, read_dataset
 from xew.files import hold_lock, read_json, write_text
 from xew.model.cache.codecs import prepare_codec
-from xew.model.cache.encode import encode_episodes
+from xew.model.cache.encode import default_processes, encode_episodes
 from xew.model.cache.keys import CACHE_VERSION
 from xew.model.cache.scales import keep_scales
 from xew.model.cache.store import LatentCache
@@ -40,6 +41,8 @@ class Flags:
     """Render the episodes anew; no video needs to be there."""
     batch: int = 4
     """Number of clips that the codec encodes at once."""
+    processes: int = 0
+    """Number of processes; 0 asks for one on a CPU and, on a GPU, one for six cores. With --from-states there is one."""
     trust: tuple[str, ...] = ()
     """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
@@ -48,17 +51,22 @@ class Flags:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Encode what the training of an experiment reads."""
     flags, experiment = parse_experiment(Flags, arguments, "python -m xew.model.latents", __doc__.splitlines()[0])
-    if flags.batch < 1:
-        raise ConfigError(f"--batch is {flags.batch}; expected at least one clip.")
-    encode_experiment(experiment, rendered_pixels() if flags.from_states else stored_pixels, flags.batch)
+    if flags.batch < 1 or flags.processes < 0:
+        raise ConfigError(f"--batch is {flags.batch}, --processes {flags.processes}; expected 1 or more, and 0 or more.")
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # several processes share the GPU, and none needs much
+    if flags.from_states:
+        encode_experiment(experiment, rendered_pixels(), flags.batch)
+    else:
+        encode_experiment(experiment, stored_pixels, flags.batch, flags.processes or default_processes())
 
 
-def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixels, batch: int = 4) -> None:
+def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixels, batch: int = 4, processes: int = 1) -> None:
     """Encode all that the training of an experiment reads, and print what was made.
 
     Args:
-        source: where the episodes' pixels come from.
+        source: where the episodes' pixels come from; several processes need one that can be pickled.
         batch: clips that the codec encodes at once.
+        processes: number of processes that share the work.
     """
     encoding, choice, dataset = experiment.encoding, experiment.choice, read_dataset(experiment.data)
     episodes = training_episodes(dataset, choice)
@@ -67,9 +75,10 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
         keep_scales(encoding, episodes)
         experiment.instructions.encode(record.instruction for _, record in dataset.accepted)
     cache = LatentCache(encoding, codec)
-    # Experiments of a study share a cache and encode at once: those of other streams go on, those of the same ones wait.
-    with hold_lock(encoding.folder.with_name("-".join((encoding.folder.name, *sorted(cache.streams)))), wait=True):
-        written = encode_episodes(cache, [*episodes, *replay_episodes(dataset, choice)], source, batch)
+    # Experiments of a study share a cache and encode at once: those of other conditions go on, those of the same ones wait.
+    conditions = sorted({condition.name for condition in encoding.inputs.conditions.values()})
+    with hold_lock(encoding.folder.with_name("-".join((encoding.folder.name, *conditions))), wait=True):
+        written = encode_episodes(cache, [*episodes, *replay_episodes(dataset, choice)], source, batch, processes)
         header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip)}
         header |= {"streams": list(cache.streams), "episodes": len(episodes)}
         header |= {"ceiling": report_ceiling(experiment, cache, dataset, episodes, source)}

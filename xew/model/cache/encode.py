@@ -1,14 +1,20 @@
-"""Encoding episodes into the latent cache: pixels are read or rendered ahead in threads, the codec works in batches."""
+"""Encoding episodes into the latent cache: pixels are read or rendered ahead in threads, the codec works in batches.
 
+Threads of one process keep about six cores busy, for NumPy and OpenCV hold Python's lock in between; so there are processes.
+"""
+
+import functools
+import os
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import jax
 import numpy as np
 from tqdm import tqdm
 
-from xew.concurrency import map_in_order
+from xew.concurrency import map_in_order, map_in_processes
 from xew.dataset import Episode
 from xew.episode import Record
 from xew.model.cache.clips import cut_clip, needed_pixels, read_streams
@@ -18,37 +24,76 @@ from xew.model.video.pixels import PixelSource, stored_pixels
 
 ENCODERS = 3
 """Number of episodes that an accelerator encodes side by side: one computes while others are copied to it and back."""
+CORES_PER_PROCESS = 6
+"""Number of cores that the threads of one process keep busy."""
+GROUP = 16
+"""Number of episodes that a process is given at once."""
+
+
+def default_processes() -> int:
+    """Number of processes that fill this machine: a CPU's one computes with all cores already."""
+    return 1 if jax.default_backend() == "cpu" else max(1, (os.cpu_count() or 1) // CORES_PER_PROCESS)
 
 
 def encode_episodes(
-    cache: LatentCache, episodes: Sequence[Episode], source: PixelSource = stored_pixels, batch: int = 4
+    cache: LatentCache,
+    episodes: Sequence[Episode],
+    source: PixelSource = stored_pixels,
+    batch: int = 4,
+    processes: int = 1,
 ) -> int:
     """Encode what is missing of some episodes, and return the number of bytes written.
 
     Args:
         source: where their pixels come from; they are read or rendered, and conditions drawn, ahead in threads.
         batch: clips that the codec encodes at once.
+        processes: number of processes that share the work, each with threads and, on a GPU, a codec of its own.
     """
-    inputs = cache.encoding.inputs
     pending = [episode for episode in episodes if cache.missing(episode[1])]
     done = len(episodes) - len(pending)
-    progress = tqdm(total=len(episodes), initial=done, desc="encode", unit="episode", file=sys.stderr)
+    encoder = _Encoder(cache, source, batch, threads=-(-(os.cpu_count() or 1) // processes))
+    groups = [pending[first : first + GROUP] for first in range(0, len(pending), GROUP)]
+    if processes > 1:
+        opener = functools.partial(_open_encoder, cache, source, batch, encoder.threads)
+        sizes = map_in_processes(opener, groups, processes, imported=(__name__,))
+        counts = [len(group) for group in groups]
+    else:
+        sizes, counts = map_in_order(encoder.encode, pending), [1] * len(pending)
     written = 0
-
-    turns = threading.BoundedSemaphore(1 if jax.default_backend() == "cpu" else ENCODERS)
-
-    def encode(episode: Episode) -> int:
-        missing = cache.missing(episode[1])
-        pixels = source(*episode, needed_pixels(inputs.conditions, missing))
-        videos = read_streams(inputs.conditions, inputs.clip, *episode, missing, pixels)
-        with turns:
-            return _encode_streams(cache, episode[1], videos, batch)
-
-    for size in map_in_order(encode, pending):
-        written += size
-        progress.update()
-    progress.close()
+    with tqdm(total=len(episodes), initial=done, desc="encode", unit="episode", file=sys.stderr) as progress:
+        for size, count in zip(sizes, counts, strict=True):
+            written += size
+            progress.update(count)
     return written
+
+
+@dataclass(frozen=True)
+class _Encoder:
+    """Encodes episodes in the threads of one process, which take turns at the codec."""
+
+    cache: LatentCache
+    source: PixelSource
+    batch: int
+    threads: int
+    turns: threading.BoundedSemaphore = field(
+        default_factory=lambda: threading.BoundedSemaphore(1 if jax.default_backend() == "cpu" else ENCODERS)
+    )
+
+    def encode(self, episode: Episode) -> int:
+        """Encode what is missing of one episode; returns the number of bytes written."""
+        missing, inputs = self.cache.missing(episode[1]), self.cache.encoding.inputs
+        pixels = self.source(*episode, needed_pixels(inputs.conditions, missing))
+        videos = read_streams(inputs.conditions, inputs.clip, *episode, missing, pixels)
+        with self.turns:
+            return _encode_streams(self.cache, episode[1], videos, self.batch)
+
+    def encode_group(self, episodes: Sequence[Episode]) -> int:
+        """Encode some episodes side by side; returns the number of bytes written."""
+        return sum(map_in_order(self.encode, episodes, self.threads))
+
+
+def _open_encoder(cache: LatentCache, source: PixelSource, batch: int, threads: int) -> Callable[[Sequence[Episode]], int]:
+    return _Encoder(cache, source, batch, threads).encode_group
 
 
 def _encode_streams(cache: LatentCache, record: Record, videos: dict[str, np.ndarray], batch: int) -> int:
