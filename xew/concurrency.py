@@ -18,6 +18,11 @@ PARSING = threading.RLock()
 parsers in one place (github.com/python/cpython/issues/106905), and two at a time end in a SystemError now and then."""
 
 
+def usable_cores() -> int:
+    """Number of processor cores that this process may use: a job of a cluster has fewer than its machine."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def map_in_order(
     function: Callable[[Item], Result],
     items: Iterable[Item],
@@ -32,7 +37,7 @@ def map_in_order(
     Args:
         workers: threads; as many as there are cores where left out.
     """
-    workers = workers or os.cpu_count() or 1
+    workers = workers or usable_cores()
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[Result]] = deque()
         try:

@@ -8,7 +8,6 @@ Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … 
 """
 
 import itertools
-import os
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,6 +24,7 @@ from tqdm import tqdm
 
 from xew.command_line import find_path, parse_command
 from xew.compilation import keep_compiled_programs
+from xew.concurrency import usable_cores
 from xew.config import CONVERTER, ConfigError, admit, find_config, is_packaged, parse, user_errors
 from xew.dataset import Episode
 from xew.episode import Record, episode_folder, remove_left_overs
@@ -49,7 +49,7 @@ from xew.rollout import write_rollout
 
 Item = tuple[Episode, dict[str, Any]]
 """An episode to predict and the header that its rollout will have."""
-WRITERS = min(8, os.cpu_count() or 1)
+WRITERS = min(8, usable_cores())
 """Threads that compress videos."""
 WAITING = 16
 """Videos that may wait for a writer before predicting waits too."""

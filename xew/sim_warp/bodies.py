@@ -19,7 +19,6 @@ Command: python -m xew.sim_warp.bodies [--count 104 --anew --recheck --workers 2
 """
 
 import hashlib
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import count as count_from
@@ -31,6 +30,7 @@ import tyro
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from xew.concurrency import usable_cores
 from xew.config import ConfigError, user_errors
 from xew.files import hold_lock, write_bytes
 from xew.protocol import body_key
@@ -200,7 +200,7 @@ class Args:
     """Forget the bodies that the file knows."""
     recheck: bool = False
     """Replace the bodies that the file knows and that fail in physics; all others keep their numbers."""
-    workers: int = os.cpu_count() or 1
+    workers: int = usable_cores()
     out: Path = CATALOG
     """File of the catalog."""
     digest: bool = False

@@ -10,7 +10,6 @@ Command: python -m xew.sim_warp.inspect data [--verify] [--visibility] [--rerend
 """
 
 import math
-import os
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import cache
@@ -23,6 +22,7 @@ import tyro
 from PIL import Image
 from tqdm import tqdm
 
+from xew.concurrency import usable_cores
 from xew.config import admit, user_errors
 from xew.dataset import explain_missing, read_dataset
 from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, encode_png, read_record, read_states, read_video, verify_episode
@@ -170,7 +170,7 @@ def read_headers(data: Path) -> tuple[list[tuple[Path, Record]], list[str]]:
 
 def verify(folders: list[Path]) -> list[str]:
     """Compare all files with their hashes, and motions with what is plausible; returns what is wrong with which episode."""
-    with Workers(min(os.cpu_count() or 1, len(folders) // EPISODES_PER_WORKER)) as workers:
+    with Workers(min(usable_cores(), len(folders) // EPISODES_PER_WORKER)) as workers:
         found = workers.run(find_problem, folders) if len(folders) >= 2 * EPISODES_PER_WORKER else map(find_problem, folders)
         bar = tqdm(found, desc="verifying", unit="episode", total=len(folders))
         damaged = sorted(problem for problem in bar if problem)

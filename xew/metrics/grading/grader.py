@@ -137,5 +137,6 @@ class Grader:
 def prepare_process(trust: Sequence[str]) -> None:
     """Make a process ready to grade; `trust` names modules of one's own that data may name."""
     admit(trust)
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # JAX has the GPU together with Warp
     keep_compiled_programs()
     cv2.setNumThreads(1)  # episodes are shared out; OpenCV's own threads would only get in the way

@@ -4,7 +4,6 @@ Threads share compiled programs, and decoding, OpenCV and XLA let go of Python's
 (`evaluate --processes`).
 """
 
-import os
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,20 +12,22 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
+from xew.concurrency import usable_cores
 from xew.config import ConfigError, pick
 from xew.metrics.backends import Masker, Tracker
 from xew.metrics.estimators.adapters import use_gpu
 
-MOST_WORKERS = 32
-"""Largest number of workers. At full length each holds an episode, a prediction and their optical flow, half a gigabyte, and
-on a CPU as much again of features (`perceptual.KEPT_FEATURES`)."""
+MOST_WORKERS = {"cpu": 32, "gpu": 12}
+"""Largest number of workers. At full length each holds an episode, a prediction and their optical flow, half a gigabyte of the
+host's memory and as much of a GPU's, and on a CPU as much again of features (`perceptual.KEPT_FEATURES`)."""
 
 
 def worker_count(asked: int) -> int:
     """How many threads to use; 0 asks for one for each processor core. Raises ConfigError for a negative number."""
     if asked < 0:
         raise ConfigError(f"--workers is {asked}, expected a positive number, or 0 for one for each core.")
-    return asked or max(len(jax.local_devices()), min(os.cpu_count() or 1, MOST_WORKERS))
+    most = MOST_WORKERS["cpu" if jax.default_backend() == "cpu" else "gpu"]
+    return asked or max(len(jax.local_devices()), min(usable_cores(), most))
 
 
 class Bench(threading.local):

@@ -4,7 +4,6 @@ Threads of one process keep about six cores busy, for NumPy and OpenCV hold Pyth
 """
 
 import functools
-import os
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -14,7 +13,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from xew.concurrency import map_in_order, map_in_processes
+from xew.concurrency import map_in_order, map_in_processes, usable_cores
 from xew.dataset import Episode
 from xew.episode import Record
 from xew.model.cache.clips import cut_clip, needed_pixels, read_streams
@@ -32,7 +31,7 @@ GROUP = 16
 
 def default_processes() -> int:
     """Number of processes that fill this machine: a CPU's one computes with all cores already."""
-    return 1 if jax.default_backend() == "cpu" else max(1, (os.cpu_count() or 1) // CORES_PER_PROCESS)
+    return 1 if jax.default_backend() == "cpu" else max(1, usable_cores() // CORES_PER_PROCESS)
 
 
 def encode_episodes(
@@ -51,7 +50,7 @@ def encode_episodes(
     """
     pending = [episode for episode in episodes if cache.missing(episode[1])]
     done = len(episodes) - len(pending)
-    encoder = _Encoder(cache, source, batch, threads=-(-(os.cpu_count() or 1) // processes))
+    encoder = _Encoder(cache, source, batch, threads=-(-usable_cores() // processes))
     groups = [pending[first : first + GROUP] for first in range(0, len(pending), GROUP)]
     if processes > 1:
         opener = functools.partial(_open_encoder, cache, source, batch, encoder.threads)

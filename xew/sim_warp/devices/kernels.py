@@ -4,7 +4,6 @@ Warp compiles a module of kernels when one of them is first launched, one module
 known before: `noted_launches` lets them pass by without launching anything, and `compile_together` compiles on all cores.
 """
 
-import os
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +13,8 @@ from typing import Any
 from unittest import mock
 
 import warp as wp
+
+from xew.concurrency import usable_cores
 
 Variant = tuple[wp.Module, int]
 """A module, and the number of threads in a block that it is compiled for."""
@@ -110,6 +111,6 @@ def _compile_module(module: wp.Module, blocks: Sequence[int], arch: int) -> None
 
 def _run_in_threads(function: Callable[[Any], object], items: Iterable[Any]) -> None:
     """Call a function with each item, on as many threads as there are cores, and raise what one of the calls raises."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         for _ in pool.map(function, items):
             pass

@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import warp
 
-from xew.concurrency import open_processes
+from xew.concurrency import open_processes, usable_cores
 from xew.config import ConfigError
 from xew.episode import EpisodeError
 
@@ -40,7 +40,7 @@ def find_device(name: str | None) -> warp.Device:
 
 def worker_count(device: warp.Device) -> int:
     """How many processes a device feeds by default: one a core, on a GPU one for two cores if its memory has room."""
-    cores = os.cpu_count() or 1
+    cores = usable_cores()
     return max(1, min(cores // 2, int(device.total_memory // MEMORY_PER_WORKER))) if device.is_cuda else cores
 
 

@@ -6,11 +6,11 @@ Writes episodes and, for what did not succeed, their headers with the reason
 The robots of a seed are made together, because a seed counts only when all of them succeed; only then it is rendered.
 """
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
+from xew.concurrency import usable_cores
 from xew.episode import Record
 from xew.sim_warp.production.cells import Cell, Job, plan_cells, simulate_cells
 from xew.sim_warp.production.episodes import render_cells, write_cell
@@ -48,7 +48,7 @@ def produce(
     rejected = {(job.task, job.seed) for job in jobs if job.rejected}
     records: list[list[Record]] = []
     writing: list[list[Future[Record]]] = []
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # codecs, zlib and hashes let go of the interpreter's lock
+    with ThreadPoolExecutor(usable_cores()) as pool:  # codecs, zlib and hashes let go of the interpreter's lock
         for group in _group_seeds(seeds):
             accepted = [cell for cells in group if _is_accepted(cells, rejected) for cell in cells]
             pixels = dict(zip(map(id, accepted), render_cells(accepted, renderer), strict=True))

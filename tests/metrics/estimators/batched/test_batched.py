@@ -1,5 +1,7 @@
 """The default estimators in Warp kernels: the same flow, masks, points and scores as OpenCV's, on a CPU."""
 
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -215,10 +217,42 @@ def test_threads_side_by_side_find_what_one_finds(truth: Truth) -> None:
                 np.testing.assert_array_equal(ours, theirs)
 
 
+def test_few_videos_are_on_the_device_at_once(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+    there, most, lock = 0, 0, threading.Lock()
+
+    def upload_slowly(video: np.ndarray, device: str) -> wp.array:
+        nonlocal there, most
+        with lock:
+            there += 1
+            most = max(most, there)
+        time.sleep(0.02)
+        with lock:
+            there -= 1
+        return wp.array(video, dtype=wp.uint8, device=device)
+
+    monkeypatch.setattr(batched_masks, "upload", upload_slowly)
+    with ThreadPoolExecutor(6) as pool:
+        list(pool.map(lambda _: BatchedMasker("cpu")(truth.rgb, truth.rgb, truth.mask), range(6)))
+    assert most == 2
+
+
+class FakeGpu:
+    """A GPU as Warp tells of it, whose context is made when its stream is first asked for."""
+
+    def __init__(self, alias: str) -> None:
+        self.alias, self.begun = alias, False
+
+    @property
+    def stream(self) -> object:
+        self.begun = True
+        return self
+
+
 def test_threads_take_the_gpu_of_their_own_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    gpus = [type("Device", (), {"alias": f"cuda:{i}"}) for i in range(2)]
+    gpus = [FakeGpu(f"cuda:{i}") for i in range(2)]
     monkeypatch.setattr(wp, "get_cuda_devices", lambda: gpus)
     monkeypatch.setattr("xew.metrics.estimators.batched.devices.gpu_number", lambda: 3)
     assert find_gpu() == "cuda:1"
+    assert [gpu.begun for gpu in gpus] == [False, True], "its context is made while no other thread can find it half made"
     monkeypatch.setattr(wp, "get_cuda_devices", list)
     assert find_gpu() is None

@@ -1,18 +1,29 @@
 """The GPU that the batched estimators use, if there is one: Warp's, whatever JAX computes on."""
 
+import threading
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from xew.concurrency import PARSING
 from xew.metrics.estimators.adapters import gpu_number
+
+ON_DEVICE = threading.BoundedSemaphore(2)
+"""Turns of threads at computing on a device: one launches while another waits for its result. What a video needs there, a
+gigabyte and more, is then taken twice and not once a thread."""
 
 
 def find_gpu() -> str | None:
     """Warp's name of the calling thread's GPU; None where Warp sees none."""
     wp.config.log_level = wp.LOG_ERROR  # no banner and no line for each module among the progress bars
-    gpus = wp.get_cuda_devices()
-    return gpus[gpu_number() % len(gpus)].alias if gpus else None
+    with PARSING:  # Warp makes a GPU's context at its first use, and a thread that came second would find it without a stream
+        gpus = wp.get_cuda_devices()
+        if not gpus:
+            return None
+        gpu = gpus[gpu_number() % len(gpus)]
+        assert gpu.stream is not None
+    return gpu.alias
 
 
 def upload(video: np.ndarray, device: Any) -> Any:

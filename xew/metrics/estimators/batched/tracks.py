@@ -15,7 +15,7 @@ from xew.metrics.estimators import presence
 from xew.metrics.estimators import tracks as reference
 from xew.metrics.estimators.batched import mask_kernels, path_kernels
 from xew.metrics.estimators.batched import track_kernels as kernels
-from xew.metrics.estimators.batched.devices import upload
+from xew.metrics.estimators.batched.devices import ON_DEVICE, upload
 from xew.metrics.estimators.batched.flow import Array, Search, build_pyramid, find_flow, is_large_enough
 from xew.metrics.estimators.batched.masks import fixed_kernel
 from xew.metrics.estimators.similarity import find_most_similar
@@ -60,23 +60,29 @@ class BatchedTracker:
         height, width = target.shape[1:3]
         if not is_large_enough((height, width), SEARCH) or height % 2 or width % 2:
             return reference.estimate_tracks(prediction, target, points, visible)
-        videos = self._videos
-        shown = videos is not None and videos.target is target and videos.prediction is prediction
-        if videos is None or videos.target is not target:
-            frames = upload(target, self._device)
-            with PARSING, wp.ScopedDevice(self._device):  # threads take turns at launching, and wait side by side
-                videos = self._videos = _Videos(target, frames)
-        if not shown:
-            similar, frames = find_most_similar(prediction, target), upload(prediction, self._device)
+        shown = self._videos is not None and self._videos.target is target and self._videos.prediction is prediction
+        similar = None if shown else find_most_similar(prediction, target)
+        with ON_DEVICE:
+            videos = self._open(target)
+            if similar is not None:
+                frames = upload(prediction, self._device)
+                with PARSING, wp.ScopedDevice(self._device):  # threads take turns at launching, and wait side by side
+                    videos.show(prediction, frames, *similar)
             with PARSING, wp.ScopedDevice(self._device):
-                videos.show(prediction, frames, *similar)
-        with PARSING, wp.ScopedDevice(self._device):
-            truth, proposal = _propose(videos, points, visible)
-        sure = proposal.numpy()[..., 2].min(axis=-1) <= 1 - reference.SURE
-        with PARSING, wp.ScopedDevice(self._device):
-            paths = _walk(videos, truth, proposal, points, visible & ~sure)
-        place, origin, total = (array.numpy() for array in paths)
+                truth, proposal = _propose(videos, points, visible)
+            sure = proposal.numpy()[..., 2].min(axis=-1) <= 1 - reference.SURE
+            with PARSING, wp.ScopedDevice(self._device):
+                paths = _walk(videos, truth, proposal, points, visible & ~sure)
+            place, origin, total = (array.numpy() for array in paths)
         return _follow_back(place, origin, total, visible)
+
+    def _open(self, target: np.ndarray) -> "_Videos":
+        """The true video on the device, put there once while it stays the same."""
+        if self._videos is None or self._videos.target is not target:
+            frames = upload(target, self._device)
+            with PARSING, wp.ScopedDevice(self._device):
+                self._videos = _Videos(target, frames)
+        return self._videos
 
     def confirm(
         self,
@@ -96,7 +102,7 @@ class BatchedTracker:
         videos = self._videos
         if videos is None or videos.target is not target or videos.prediction is not prediction or not found.size:
             return presence.confirm_tracks(found, prediction, target, points, visible, shown, body)
-        with PARSING, wp.ScopedDevice(self._device):
+        with ON_DEVICE, PARSING, wp.ScopedDevice(self._device):
             places = [wp.array(np.ascontiguousarray(array, np.float32), dtype=wp.vec2) for array in (found, points)]
             known = [wp.array(visible.astype(np.uint8)), videos.put_bodies(shown), wp.array(body.astype(np.int32))]
             wrong = wp.empty(visible.shape, dtype=wp.uint8)
