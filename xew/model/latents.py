@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from xew.compilation import keep_compiled_programs
 from xew.config import ConfigError, user_errors
 from xew.dataset import Dataset, Episode, read_dataset
 from xew.files import hold_lock, read_json, write_text
@@ -53,6 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     flags, experiment = parse_experiment(Flags, arguments, "python -m xew.model.latents", __doc__.splitlines()[0])
     if flags.batch < 1 or flags.processes < 0:
         raise ConfigError(f"--batch is {flags.batch}, --processes {flags.processes}; expected 1 or more, and 0 or more.")
+    keep_compiled_programs()
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # several processes share the GPU, and none needs much
     if flags.from_states:
         encode_experiment(experiment, rendered_pixels(), flags.batch)

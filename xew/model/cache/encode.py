@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from xew.compilation import keep_compiled_programs
 from xew.concurrency import map_in_order, map_in_processes, usable_cores
 from xew.dataset import Episode
 from xew.episode import Record
@@ -92,6 +93,7 @@ class _Encoder:
 
 
 def _open_encoder(cache: LatentCache, source: PixelSource, batch: int, threads: int) -> Callable[[Sequence[Episode]], int]:
+    keep_compiled_programs()
     return _Encoder(cache, source, batch, threads).encode_group
 
 
