@@ -10,7 +10,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Literal
+from typing import Any, Literal, cast
 
 import pytest
 import warp as wp
@@ -371,6 +371,19 @@ def test_a_hopeless_task_gives_up_and_says_so() -> None:
 
 
 # --- Worker processes.
+
+
+@pytest.mark.parametrize(
+    ("cores", "gigabytes", "physics", "count"),
+    [(16, 141, "cuda", 8), (32, 80, "cuda", 8), (32, 80, "cpu", 26), (16, 80, "cpu", 16), (1, 4, "cuda", 1)],
+)
+def test_a_gpu_has_as_many_workers_as_cores_and_its_memory_allow(
+    cores: int, gigabytes: int, physics: str, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers, "usable_cores", lambda: cores)
+    gpu = SimpleNamespace(is_cpu=False, total_memory=gigabytes * 1e9)
+    stepping = gpu if physics == "cuda" else SimpleNamespace(is_cpu=True)
+    assert workers.worker_count(cast(Any, gpu), cast(Any, stepping)) == count
 
 
 def test_workers_hand_over_results_and_errors() -> None:

@@ -36,7 +36,7 @@ from xew.protocol import (
     expand_robots,
     seed_split,
 )
-from xew.sim_warp.devices.workers import Workers, find_device, quiet_warp, worker_count
+from xew.sim_warp.devices.workers import FRAMES_OF_A_PAINTER, Workers, find_device, quiet_warp, worker_count
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import produce
@@ -76,7 +76,7 @@ class Args:
     batch: int = 256
     """Number of worlds that a GPU steps together. A CPU steps each by itself, as many at a time as there are workers."""
     workers: int | None = None
-    """Number of processes; by default one a core, on a GPU one for two cores."""
+    """Number of processes; by default one a core, on a GPU one for two cores, as far as its memory has room."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
     """Default: a GPU if Warp finds one."""
     physics: Literal["cpu"] | None = None
@@ -192,7 +192,7 @@ def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Calla
         batch=args.batch,
         videos=not args.states_only,
     )
-    with Workers(args.workers or worker_count(device)) as workers:
+    with Workers(args.workers or worker_count(device, physics)) as workers:
         parts = {"physics": physics.alias, "kinematics": physics.alias, "rendering": device.alias}
         compile_on_devices(workers, parts, args.batch)
 
@@ -205,9 +205,9 @@ def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Calla
 
 
 @cache
-def _renderer(device: str) -> Renderer:
+def _renderer(device: str, physics: str) -> Renderer:
     """The renderer of a worker process, made once."""
-    return Renderer(device)
+    return Renderer(device, FRAMES_OF_A_PAINTER if device != physics else None)
 
 
 def _make(
@@ -216,7 +216,7 @@ def _make(
     """Make some jobs in a worker process, with pictures and physics on these devices."""
     begin = time.perf_counter()
     pictures, physics = devices
-    seeds = produce(jobs, out, _renderer(pictures), batch, videos, robots, physics)
+    seeds = produce(jobs, out, _renderer(pictures, physics), batch, videos, robots, physics)
     seconds = (time.perf_counter() - begin) / len(jobs)
     return [(records, seconds) for records in seeds]
 

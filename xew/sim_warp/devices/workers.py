@@ -27,6 +27,10 @@ IMPORTED = ("xew.sim_warp.production.produce",)
 """Modules that workers are forked with: physics and the renderer."""
 MEMORY_PER_WORKER = 9e9
 """Memory of a GPU that a worker takes [bytes]: a batch of 256 worlds, 512 frames in flight and what CUDA itself takes."""
+FRAMES_OF_A_PAINTER = 192
+"""Number of frames in flight of a worker that steps physics on the CPU and has the GPU draw them."""
+MEMORY_PER_PAINTER = 3e9
+"""Memory of a GPU that such a worker takes [bytes]; 14 of them were seen with 1.8e9 each on an H100."""
 
 
 def find_device(name: str | None) -> warp.Device:
@@ -38,10 +42,19 @@ def find_device(name: str | None) -> warp.Device:
         raise ConfigError(f"--device {name}: not on this machine, which has {known}.") from error
 
 
-def worker_count(device: warp.Device) -> int:
-    """How many processes a device feeds by default: one a core, on a GPU one for two cores if its memory has room."""
+def worker_count(device: warp.Device, physics: warp.Device | None = None) -> int:
+    """How many processes a device feeds by default: one a core, on a GPU one for two cores if its memory has room.
+
+    Args:
+        device: draws the pictures.
+        physics: plans and steps, if it is another device; a CPU's physics takes a core a process, and less of the GPU's memory.
+    """
     cores = usable_cores()
-    return max(1, min(cores // 2, int(device.total_memory // MEMORY_PER_WORKER))) if device.is_cuda else cores
+    if device.is_cpu:
+        return cores
+    paints = physics is not None and physics.is_cpu
+    wanted, memory = (cores, MEMORY_PER_PAINTER) if paints else (cores // 2, MEMORY_PER_WORKER)
+    return max(1, min(wanted, int(device.total_memory // memory)))
 
 
 class Workers:
