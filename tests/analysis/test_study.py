@@ -213,6 +213,16 @@ def test_a_gpu_has_one_training_and_a_few_steps_beside(tmp_path: Path) -> None:
     used = [next(line for line in (tmp_path / f"{step.variant}.log").read_text().splitlines() if line.startswith("on "))
             for step in steps]  # fmt: skip
     assert used == ["on 4", "on 7", "on 7", "on 4"], "the least busy GPU first, and never two trainings on one"
+
+
+def test_a_gpu_may_have_two_trainings(tmp_path: Path) -> None:
+    machine = ThisMachine(("4", "7"), 1, {}, beside=1, trainings=2)
+    steps = [Step("train", name, (), (), None, tmp_path / name, launcher=("sleep", "1")) for name in "abcde"]
+    started = [
+        step for step in steps if machine.has_room_for(step) and not machine.start(step, (), tmp_path / f"{step.variant}.log")
+    ]
+    assert started == steps[:4] and machine.has_room_for(replace(steps[4], kind="rollout"))
+    machine.stop()
     assert all(machine.has_room_for(step) for step in steps)
 
 

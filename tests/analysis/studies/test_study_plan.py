@@ -206,6 +206,7 @@ def test_a_subset_keeps_what_it_starts_from(study: Study) -> None:
         (["--variants", "few_shot-piper-3"], "no variant"),
         (["--train-seeds", "0"], "expected at least 1 and 1"),
         (["--machine.workers", "0"], "at least 1"),
+        (["--machine.trainings", "2"], "more where machine.beside is not 0"),
     ],
 )
 def test_what_cannot_be_planned_is_said(overrides: list[str], says: str) -> None:

@@ -65,7 +65,7 @@ def open_machines(study: Study) -> Machines:
         raise ConfigError(f"machine.gpus_per_training is {needed}, there are {len(gpus)} GPUs ({', '.join(gpus)}); lower it.")
     if gpus and study.machine.beside:
         environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | environment
-    return ThisMachine(gpus, study.machine.workers, environment, study.machine.beside)
+    return ThisMachine(gpus, study.machine.workers, environment, study.machine.beside, study.machine.trainings)
 
 
 def usable_gpus(study: Study) -> tuple[str, ...]:
@@ -92,10 +92,12 @@ class _Running:
 
 
 class ThisMachine:
-    """This machine: one step per GPU, or a training and a few others; without a GPU as many steps as there are workers."""
+    """This machine: one step per GPU, or some trainings and others; without a GPU as many steps as there are workers."""
 
-    def __init__(self, gpus: tuple[str, ...], workers: int, environment: Mapping[str, str], beside: int = 0) -> None:
-        self.gpus, self.environment, self.beside = gpus, dict(environment), beside if gpus else 0
+    def __init__(
+        self, gpus: tuple[str, ...], workers: int, environment: Mapping[str, str], beside: int = 0, trainings: int = 1
+    ) -> None:
+        self.gpus, self.environment, self.beside, self.trainings = gpus, dict(environment), beside if gpus else 0, trainings
         self._slots = gpus or tuple(map(str, range(workers)))
         self.slots = len(self._slots)
         self._running: dict[str, _Running] = {}
@@ -113,7 +115,7 @@ class ThisMachine:
         steps = {slot: [running.step for running in self._running.values() if slot in running.slots] for slot in self._slots}
         if not self.beside:
             return [slot for slot, here in steps.items() if not here]
-        room = 1 if step.kind in TRAININGS else self.beside
+        room = self.trainings if step.kind in TRAININGS else self.beside
         same = {slot: sum((other.kind in TRAININGS) == (step.kind in TRAININGS) for other in steps[slot]) for slot in steps}
         return sorted((slot for slot in steps if same[slot] < room), key=lambda slot: len(steps[slot]))
 
