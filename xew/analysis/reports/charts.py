@@ -148,19 +148,19 @@ def bars(axes: Axes, labels: Sequence[str], groups: Sequence[tuple[str, np.ndarr
         axes: to draw on.
         labels: n labels from top to bottom.
         groups: of each its color, values with the ends of their intervals [n 3] and the paper's values [n], in `unit`; NaN
-            where there is none.
+            where there is none, infinite where a gain is over zero.
         unit: text at the axis of values.
     """
     height = 0.8 / len(groups)
     for g, (color, values, paper) in enumerate(groups):
         y = np.arange(len(labels)) + (g - (len(groups) - 1) / 2) * height
-        axes.barh(y, np.nan_to_num(values[:, 0]), height * 0.9, color=color)
+        axes.barh(y, np.where(np.isfinite(values[:, 0]), values[:, 0], 0.0), height * 0.9, color=color)
         known = ~np.isnan(values[:, 1])
         axes.hlines(y[known], values[known, 1], values[known, 2], color=INK, linewidth=1)
         axes.plot(paper, y, "o", color=INK, fillstyle="none", markersize=4, markeredgewidth=1)
         for at, value in zip(y, values[:, 0], strict=True):
-            if np.isnan(value):
-                axes.text(0, at, " not run", va="center", color=SOFT, fontsize=7)
+            if not np.isfinite(value):
+                axes.text(0, at, " not run" if np.isnan(value) else " over zero", va="center", color=SOFT, fontsize=7)
     axes.axvline(0, color=SOFT, linewidth=0.8)
     axes.set_yticks(range(len(labels)), labels)
     axes.invert_yaxis()
