@@ -43,7 +43,7 @@ class Flags:
     batch: int = 4
     """Number of clips that the codec encodes at once."""
     processes: int = 0
-    """Number of processes; 0 asks for one on a CPU and, on a GPU, one for six cores. With --from-states there is one."""
+    """Number of processes; 0 asks for one on a CPU and, on a GPU, one for eight cores. With --from-states there is one."""
     trust: tuple[str, ...] = ()
     """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 

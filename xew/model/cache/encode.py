@@ -7,7 +7,6 @@ import functools
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 
 import jax
 import numpy as np
@@ -23,9 +22,10 @@ from xew.model.codecs.contract import Codec, check_clip_shape, encode_pictures
 from xew.model.video.pixels import PixelSource, stored_pixels
 
 ENCODERS = 3
-"""Number of episodes that an accelerator encodes side by side: one computes while others are copied to it and back."""
-CORES_PER_PROCESS = 6
-"""Number of cores that the threads of one process keep busy."""
+"""Number of episodes that an accelerator encodes side by side: one computes while others are copied to it and back. Where
+several processes share it, each has one."""
+CORES_PER_PROCESS = 8
+"""Number of cores for each process: its threads keep about six busy, and each takes gigabytes of a GPU's memory."""
 GROUP = 16
 """Number of episodes that a process is given at once."""
 
@@ -50,16 +50,13 @@ def encode_episodes(
         processes: number of processes that share the work, each with threads and, on a GPU, a codec of its own.
     """
     pending = [episode for episode in episodes if cache.missing(episode[1])]
-    done = len(episodes) - len(pending)
-    encoder = _Encoder(cache, source, batch, threads=-(-usable_cores() // processes))
-    groups = [pending[first : first + GROUP] for first in range(0, len(pending), GROUP)]
     if processes > 1:
-        opener = functools.partial(_open_encoder, cache, source, batch, encoder.threads)
-        sizes = map_in_processes(opener, groups, processes, imported=(__name__,))
-        counts = [len(group) for group in groups]
+        groups = [pending[first : first + GROUP] for first in range(0, len(pending), GROUP)]
+        opener = functools.partial(_open_encoder, cache, source, batch, processes)
+        sizes, counts = map_in_processes(opener, groups, processes, imported=(__name__,)), list(map(len, groups))
     else:
-        sizes, counts = map_in_order(encoder.encode, pending), [1] * len(pending)
-    written = 0
+        sizes, counts = map_in_order(_Encoder(cache, source, batch).encode, pending), [1] * len(pending)
+    written, done = 0, len(episodes) - len(pending)
     with tqdm(total=len(episodes), initial=done, desc="encode", unit="episode", file=sys.stderr) as progress:
         for size, count in zip(sizes, counts, strict=True):
             written += size
@@ -67,34 +64,30 @@ def encode_episodes(
     return written
 
 
-@dataclass(frozen=True)
 class _Encoder:
     """Encodes episodes in the threads of one process, which take turns at the codec."""
 
-    cache: LatentCache
-    source: PixelSource
-    batch: int
-    threads: int
-    turns: threading.BoundedSemaphore = field(
-        default_factory=lambda: threading.BoundedSemaphore(1 if jax.default_backend() == "cpu" else ENCODERS)
-    )
+    def __init__(self, cache: LatentCache, source: PixelSource, batch: int, processes: int = 1) -> None:
+        self.cache, self.source, self.batch = cache, source, batch
+        self._threads = -(-usable_cores() // processes)
+        self._turns = threading.BoundedSemaphore(ENCODERS if processes == 1 and jax.default_backend() != "cpu" else 1)
 
     def encode(self, episode: Episode) -> int:
         """Encode what is missing of one episode; returns the number of bytes written."""
         missing, inputs = self.cache.missing(episode[1]), self.cache.encoding.inputs
         pixels = self.source(*episode, needed_pixels(inputs.conditions, missing))
         videos = read_streams(inputs.conditions, inputs.clip, *episode, missing, pixels)
-        with self.turns:
+        with self._turns:
             return _encode_streams(self.cache, episode[1], videos, self.batch)
 
     def encode_group(self, episodes: Sequence[Episode]) -> int:
         """Encode some episodes side by side; returns the number of bytes written."""
-        return sum(map_in_order(self.encode, episodes, self.threads))
+        return sum(map_in_order(self.encode, episodes, self._threads))
 
 
-def _open_encoder(cache: LatentCache, source: PixelSource, batch: int, threads: int) -> Callable[[Sequence[Episode]], int]:
+def _open_encoder(cache: LatentCache, source: PixelSource, batch: int, processes: int) -> Callable[[Sequence[Episode]], int]:
     keep_compiled_programs()
-    return _Encoder(cache, source, batch, threads).encode_group
+    return _Encoder(cache, source, batch, processes).encode_group
 
 
 def _encode_streams(cache: LatentCache, record: Record, videos: dict[str, np.ndarray], batch: int) -> int:
