@@ -175,6 +175,9 @@ def test_encoding_waits_for_who_fits_the_codec_of_the_same_cache(tmp_path: Path,
     content = {"data": str(tmp_path / "data"), "out": str(tmp_path / "run"), "clip": {"frames": 5, "height": 32, "width": 48}}
     content |= {"codec": {"spatial_factor": 8, "channels": 4}, "model": {"size": "tiny"}, "train": {"steps": 1, "batch": 1}}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(content))
-    latents.main([str(tmp_path / "config.yaml")])
-    assert [wait for _, wait in asked] == [True, True]
-    assert asked[0][0] == "data-latents" and asked[1][0].startswith("data-latents-") and "rgb" in asked[1][0]
+    for embodiment in ("none", "reference_image", "nine_views"):
+        latents.main([str(tmp_path / "config.yaml"), "--model.action", "optical_flow", "--model.embodiment", embodiment])
+    assert all(wait for _, wait in asked)
+    assert [name for name, _ in asked[::2]] == ["data-latents"] * 3
+    held = ["optical_flow", "optical_flow-reference_image", "nine_views-optical_flow"]
+    assert [name for name, _ in asked[1::2]] == [f"data-latents-rgb-{name}" for name in held], "others go on meanwhile"

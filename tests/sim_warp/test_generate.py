@@ -381,8 +381,8 @@ def test_a_gpu_has_as_many_workers_as_cores_and_its_memory_allow(
     cores: int, gigabytes: int, physics: str, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(workers, "usable_cores", lambda: cores)
-    gpu = SimpleNamespace(is_cpu=False, total_memory=gigabytes * 1e9)
-    stepping = gpu if physics == "cuda" else SimpleNamespace(is_cpu=True)
+    gpu = SimpleNamespace(is_cuda=True, total_memory=gigabytes * 1e9)
+    stepping = gpu if physics == "cuda" else SimpleNamespace(is_cuda=False)
     assert workers.worker_count(cast(Any, gpu), cast(Any, stepping)) == count
 
 

@@ -78,8 +78,8 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
         experiment.instructions.encode(record.instruction for _, record in dataset.accepted)
     cache = LatentCache(encoding, codec)
     # Experiments of a study share a cache and encode at once: those of other conditions go on, those of the same ones wait.
-    conditions = sorted({condition.name for condition in encoding.inputs.conditions.values()})
-    with hold_lock(encoding.folder.with_name("-".join((encoding.folder.name, *conditions))), wait=True):
+    streams = ("rgb", *sorted(condition.name for condition in encoding.inputs.conditions.values()))
+    with hold_lock(encoding.folder.with_name("-".join((encoding.folder.name, *streams))), wait=True):
         written = encode_episodes(cache, [*episodes, *replay_episodes(dataset, choice)], source, batch, processes)
         header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip)}
         header |= {"streams": list(cache.streams), "episodes": len(episodes)}

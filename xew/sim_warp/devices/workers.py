@@ -50,9 +50,9 @@ def worker_count(device: warp.Device, physics: warp.Device | None = None) -> int
         physics: plans and steps, if it is another device; a CPU's physics takes a core a process, and less of the GPU's memory.
     """
     cores = usable_cores()
-    if device.is_cpu:
+    if not device.is_cuda:
         return cores
-    paints = physics is not None and physics.is_cpu
+    paints = physics is not None and not physics.is_cuda
     wanted, memory = (cores, MEMORY_PER_PAINTER) if paints else (cores // 2, MEMORY_PER_WORKER)
     return max(1, min(wanted, int(device.total_memory // memory)))
 
