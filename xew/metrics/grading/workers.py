@@ -18,16 +18,18 @@ from xew.metrics.backends import Masker, Tracker
 from xew.metrics.estimators.adapters import use_gpu
 
 MOST_WORKERS = {"cpu": 32, "gpu": 12}
-"""Largest number of workers. At full length each holds an episode, a prediction and their optical flow, half a gigabyte of the
-host's memory and as much of a GPU's, and on a CPU as much again of features (`perceptual.KEPT_FEATURES`)."""
+"""Largest number of workers of a CPU and of each GPU. At full length each holds an episode, a prediction and their optical
+flow, half a gigabyte of the host's memory and as much of a GPU's, and on a CPU as much again of features
+(`perceptual.KEPT_FEATURES`)."""
 
 
 def worker_count(asked: int) -> int:
     """How many threads to use; 0 asks for one for each processor core. Raises ConfigError for a negative number."""
     if asked < 0:
         raise ConfigError(f"--workers is {asked}, expected a positive number, or 0 for one for each core.")
-    most = MOST_WORKERS["cpu" if jax.default_backend() == "cpu" else "gpu"]
-    return asked or max(len(jax.local_devices()), min(usable_cores(), most))
+    devices = jax.local_devices()
+    most = MOST_WORKERS["cpu"] if jax.default_backend() == "cpu" else MOST_WORKERS["gpu"] * len(devices)
+    return asked or max(len(devices), min(usable_cores(), most))
 
 
 class Bench(threading.local):

@@ -236,23 +236,13 @@ def test_few_videos_are_on_the_device_at_once(truth: Truth, monkeypatch: pytest.
     assert most == 2
 
 
-class FakeGpu:
-    """A GPU as Warp tells of it, whose context is made when its stream is first asked for."""
-
-    def __init__(self, alias: str) -> None:
-        self.alias, self.begun = alias, False
-
-    @property
-    def stream(self) -> object:
-        self.begun = True
-        return self
-
-
 def test_threads_take_the_gpu_of_their_own_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    gpus = [FakeGpu(f"cuda:{i}") for i in range(2)]
+    gpus = [type("Device", (), {"alias": f"cuda:{i}"}) for i in range(2)]
+    begun: list[object] = []
     monkeypatch.setattr(wp, "get_cuda_devices", lambda: gpus)
+    monkeypatch.setattr(wp, "get_stream", begun.append)
     monkeypatch.setattr("xew.metrics.estimators.batched.devices.gpu_number", lambda: 3)
     assert find_gpu() == "cuda:1"
-    assert [gpu.begun for gpu in gpus] == [False, True], "its context is made while no other thread can find it half made"
+    assert begun == [gpus[1]], "its context is made while no other thread can find it half made"
     monkeypatch.setattr(wp, "get_cuda_devices", list)
     assert find_gpu() is None

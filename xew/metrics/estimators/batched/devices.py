@@ -9,9 +9,15 @@ import warp as wp
 from xew.concurrency import PARSING
 from xew.metrics.estimators.adapters import gpu_number
 
-ON_DEVICE = threading.BoundedSemaphore(2)
-"""Turns of threads at computing on a device: one launches while another waits for its result. What a video needs there, a
-gigabyte and more, is then taken twice and not once a thread."""
+AT_ONCE = 2
+"""Number of threads that compute on a device at once: one launches while another waits for its result. What a video needs
+there, a gigabyte and more, is then taken twice and not once a thread."""
+_turns: dict[str, threading.BoundedSemaphore] = {}
+
+
+def turn_on(device: Any) -> threading.BoundedSemaphore:
+    """What a thread holds while it computes on a device of Warp."""
+    return _turns.setdefault(device.alias, threading.BoundedSemaphore(AT_ONCE))
 
 
 def find_gpu() -> str | None:
@@ -22,7 +28,7 @@ def find_gpu() -> str | None:
         if not gpus:
             return None
         gpu = gpus[gpu_number() % len(gpus)]
-        assert gpu.stream is not None
+        wp.get_stream(gpu)
     return gpu.alias
 
 

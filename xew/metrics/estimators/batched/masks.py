@@ -13,7 +13,7 @@ import warp as wp
 from xew.concurrency import PARSING
 from xew.metrics.estimators import masks as reference
 from xew.metrics.estimators.batched import mask_kernels as kernels
-from xew.metrics.estimators.batched.devices import ON_DEVICE, upload
+from xew.metrics.estimators.batched.devices import turn_on, upload
 from xew.metrics.estimators.batched.flow import Array, Search, build_pyramid, find_flow, is_large_enough
 from xew.metrics.estimators.similarity import find_most_similar
 
@@ -41,12 +41,12 @@ class BatchedMasker:
         known = self._known
         if known is None or known.target is not target or known.mask is not target_mask:
             appearance = reference.learn_appearance(target, target_mask)
-            with ON_DEVICE:
+            with turn_on(self._device):
                 frames = upload(target, self._device)
                 with PARSING, wp.ScopedDevice(self._device):
                     self._known = known = _Episode(target, target_mask, frames, appearance)
         plan = _plan(prediction, find_most_similar(prediction, target)[0])
-        with ON_DEVICE:
+        with turn_on(self._device):
             frames = upload(prediction, self._device)
             with PARSING, wp.ScopedDevice(self._device):  # threads take turns at launching, and wait side by side
                 masks = _estimate(frames, known, plan)

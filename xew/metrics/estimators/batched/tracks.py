@@ -15,7 +15,7 @@ from xew.metrics.estimators import presence
 from xew.metrics.estimators import tracks as reference
 from xew.metrics.estimators.batched import mask_kernels, path_kernels
 from xew.metrics.estimators.batched import track_kernels as kernels
-from xew.metrics.estimators.batched.devices import ON_DEVICE, upload
+from xew.metrics.estimators.batched.devices import turn_on, upload
 from xew.metrics.estimators.batched.flow import Array, Search, build_pyramid, find_flow, is_large_enough
 from xew.metrics.estimators.batched.masks import fixed_kernel
 from xew.metrics.estimators.similarity import find_most_similar
@@ -62,7 +62,7 @@ class BatchedTracker:
             return reference.estimate_tracks(prediction, target, points, visible)
         shown = self._videos is not None and self._videos.target is target and self._videos.prediction is prediction
         similar = None if shown else find_most_similar(prediction, target)
-        with ON_DEVICE:
+        with turn_on(self._device):
             videos = self._open(target)
             if similar is not None:
                 frames = upload(prediction, self._device)
@@ -102,7 +102,7 @@ class BatchedTracker:
         videos = self._videos
         if videos is None or videos.target is not target or videos.prediction is not prediction or not found.size:
             return presence.confirm_tracks(found, prediction, target, points, visible, shown, body)
-        with ON_DEVICE, PARSING, wp.ScopedDevice(self._device):
+        with turn_on(self._device), PARSING, wp.ScopedDevice(self._device):
             places = [wp.array(np.ascontiguousarray(array, np.float32), dtype=wp.vec2) for array in (found, points)]
             known = [wp.array(visible.astype(np.uint8)), videos.put_bodies(shown), wp.array(body.astype(np.int32))]
             wrong = wp.empty(visible.shape, dtype=wp.uint8)
