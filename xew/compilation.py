@@ -1,4 +1,6 @@
-"""Compiled JAX programs, kept between processes; JAX is imported only where this is asked for."""
+"""What processes share of JAX: compiled programs and a GPU's memory. JAX is imported only where this is asked for."""
+
+import os
 
 from xew.files import cache_folder
 
@@ -9,3 +11,11 @@ def keep_compiled_programs() -> None:
 
     if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
         jax.config.update("jax_compilation_cache_dir", str(cache_folder("jax")))
+
+
+def take_memory_as_needed() -> None:
+    """Have JAX take a GPU's memory as it needs it and not three quarters at once, unless it was told otherwise.
+
+    It is for commands that share a GPU with Warp or with processes of their own, before JAX's first computation.
+    """
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from tests.analysis.conftest import FRAMES, SEEDS, TASKS, Study
 from tests.analysis.reports.browser import find_faults, needs_chromium
 from xew.analysis.report import Args, Picture, _strip_section, _write_explorer, main, run_table
-from xew.analysis.reports import pictures
+from xew.analysis.reports import charts, pictures
 from xew.analysis.reports.study_charts import run_chart
 from xew.analysis.scores import MetricInfo, read_scores
 from xew.analysis.statistics.summary import Interval, RobotTable, Row
@@ -307,3 +307,11 @@ def test_reading_gives_the_metrics_with_unit_and_direction(study: Study) -> None
         ("mask_iou", "", True),
     ]
     assert scores.models == [("late", "by one <frame>")]
+
+
+def test_a_gain_over_zero_is_named_and_leaves_the_axis_as_it_is() -> None:
+    axes = Figure().subplots()
+    values = np.array([[40.0, 30.0, 50.0], [np.inf, np.nan, np.nan], [np.nan] * 3])
+    charts.bars(axes, ["render", "over nothing", "missing"], [("C0", values, np.full(3, np.nan))], "better by [%]")
+    assert [text.get_text().strip() for text in axes.texts] == ["over zero", "not run"]
+    assert 50 < axes.get_xlim()[1] < 60

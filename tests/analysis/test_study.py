@@ -213,6 +213,7 @@ def test_a_gpu_has_one_training_and_a_few_steps_beside(tmp_path: Path) -> None:
     used = [next(line for line in (tmp_path / f"{step.variant}.log").read_text().splitlines() if line.startswith("on "))
             for step in steps]  # fmt: skip
     assert used == ["on 4", "on 7", "on 7", "on 4"], "the least busy GPU first, and never two trainings on one"
+    assert all(machine.has_room_for(step) for step in steps)
 
 
 def test_a_gpu_may_have_two_trainings(tmp_path: Path) -> None:

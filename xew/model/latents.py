@@ -9,12 +9,11 @@ Command: python -m xew.model.latents CONFIG [--data … and other overrides]
 """
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from xew.compilation import keep_compiled_programs
+from xew.compilation import keep_compiled_programs, take_memory_as_needed
 from xew.config import ConfigError, user_errors
 from xew.dataset import Dataset, Episode, read_dataset
 from xew.files import hold_lock, read_json, write_text
@@ -55,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if flags.batch < 1 or flags.processes < 0:
         raise ConfigError(f"--batch is {flags.batch}, --processes {flags.processes}; expected 1 or more, and 0 or more.")
     keep_compiled_programs()
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # several processes share the GPU, and none needs much
+    take_memory_as_needed()
     if flags.from_states:
         encode_experiment(experiment, rendered_pixels(), flags.batch)
     else:
@@ -78,8 +77,8 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
         experiment.instructions.encode(record.instruction for _, record in dataset.accepted)
     cache = LatentCache(encoding, codec)
     # Experiments of a study share a cache and encode at once: those of other conditions go on, those of the same ones wait.
-    streams = ("rgb", *sorted(condition.name for condition in encoding.inputs.conditions.values()))
-    with hold_lock(encoding.folder.with_name("-".join((encoding.folder.name, *streams))), wait=True):
+    encoded = ("rgb", *sorted(condition.name for condition in encoding.inputs.conditions.values()))
+    with hold_lock(encoding.folder.with_name("-".join((encoding.folder.name, *encoded))), wait=True):
         written = encode_episodes(cache, [*episodes, *replay_episodes(dataset, choice)], source, batch, processes)
         header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip)}
         header |= {"streams": list(cache.streams), "episodes": len(episodes)}

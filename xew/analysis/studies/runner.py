@@ -14,8 +14,8 @@ from xew.analysis.studies.plan import Step
 from xew.dataset import find_accepted
 from xew.protocol import seed_split
 
-FINISHING = ("baselines", "rollout", "evaluate")
-"""Kinds of steps after which there are scores: where time is short they come before those that only begin something."""
+FINISHING = ("rollout", "evaluate")
+"""Kinds of steps that make scores of what is trained: where time is short they come before those that only begin something."""
 
 
 @dataclass
@@ -143,15 +143,15 @@ class Budget:
 
     def rank(self, name: str) -> tuple[bool, int]:
         """Sort key: what every table has and what was trained comes first, then the plan's order."""
-        return name.partition("/")[0] not in FINISHING, self._order[name]
+        return name.partition("/")[0] not in ("baselines", *FINISHING), self._order[name]
 
     def fits(self, name: str) -> bool:
         """Whether a step and what follows it up to the grades of the same variant would end in time.
 
         What is trained is rolled out and graded while there is any time: otherwise the training was for nothing.
         """
-        trained = name.partition("/")[0] in ("rollout", "evaluate")
-        return time.monotonic() + (0.0 if trained else self._seconds[name]) <= self._end
+        seconds = 0.0 if name.partition("/")[0] in FINISHING else self._seconds[name]
+        return time.monotonic() + seconds <= self._end
 
 
 def complete_command(step: Step, goes_on: bool, failed: Mapping[str, str]) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import jax
 
-from xew.compilation import keep_compiled_programs
+from xew.compilation import keep_compiled_programs, take_memory_as_needed
 from xew.config import admit
 from xew.episode import EpisodeError
 from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, open_masker, open_tracker
@@ -137,6 +137,6 @@ class Grader:
 def prepare_process(trust: Sequence[str]) -> None:
     """Make a process ready to grade; `trust` names modules of one's own that data may name."""
     admit(trust)
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # JAX has the GPU together with Warp
+    take_memory_as_needed()
     keep_compiled_programs()
     cv2.setNumThreads(1)  # episodes are shared out; OpenCV's own threads would only get in the way

@@ -1,7 +1,6 @@
 """The default estimators in Warp kernels: the same flow, masks, points and scores as OpenCV's, on a CPU."""
 
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -218,14 +217,15 @@ def test_threads_side_by_side_find_what_one_finds(truth: Truth) -> None:
 
 
 def test_few_videos_are_on_the_device_at_once(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
-    there, most, lock = 0, 0, threading.Lock()
+    there, lock, third = 0, threading.Lock(), threading.Event()
 
     def upload_slowly(video: np.ndarray, device: str) -> wp.array:
-        nonlocal there, most
+        nonlocal there
         with lock:
             there += 1
-            most = max(most, there)
-        time.sleep(0.02)
+            if there > 2:
+                third.set()
+        third.wait(0.1)
         with lock:
             there -= 1
         return wp.array(video, dtype=wp.uint8, device=device)
@@ -233,7 +233,7 @@ def test_few_videos_are_on_the_device_at_once(truth: Truth, monkeypatch: pytest.
     monkeypatch.setattr(batched_masks, "upload", upload_slowly)
     with ThreadPoolExecutor(6) as pool:
         list(pool.map(lambda _: BatchedMasker("cpu")(truth.rgb, truth.rgb, truth.mask), range(6)))
-    assert most == 2
+    assert not third.is_set()
 
 
 def test_threads_take_the_gpu_of_their_own_number(monkeypatch: pytest.MonkeyPatch) -> None:
