@@ -178,10 +178,12 @@ def test_a_budget_begins_only_what_ends_in_time_and_ends_what_is_begun_first(
     steps, ledger = chain(study.out), Ledger(study.out)
     monkeypatch.setattr(Budget, "learn", lambda self, ledger: None)
     budget = Budget(study, {}, ledger, 60.0)
-    budget._order = {name: place for place, name in enumerate((*steps, "evaluate/data", "baselines"))}
+    adapted = ("latents/few", "adapt/few")
+    budget._order = {name: place for place, name in enumerate((*steps, *adapted, "evaluate/data", "baselines"))}
     budget._seconds = {"train/data": 30.0, "train/left": 61.0, "train/right": 20.0, "train/end": 10.0}
     assert [budget.fits(name) for name in steps] == [True, False, True, True]
-    assert sorted(budget._order, key=budget.rank) == ["evaluate/data", "baselines", *steps], "grades first, then as planned"
+    planned = ["evaluate/data", "baselines", *adapted, *steps]
+    assert sorted(budget._order, key=budget.rank) == planned, "grades first, then what a checkpoint here is needed for"
     assert StudyRunner(study, steps, ledger, ThisMachine((), 2, {}), dict.fromkeys(steps, 1.0), budget).run() == {}
     assert begun(study.out) == {"data": 1, "right": 1}, "the end needs what there was no time for"
     assert run(study, steps) == {} and begun(study.out)["data"] == 1

@@ -121,7 +121,8 @@ class StudyRunner:
 class Budget:
     """Time that a study may take now: what is trained is graded first, and nothing is trained that would not be graded in time.
 
-    Trainings come in the order of the plan, so what a study names first is had first.
+    Trainings come in the order of the plan, so what a study names first is had first. Adaptations follow at once on the
+    training that they start from, which another machine would have to repeat.
 
     Args:
         study, steps: what is run.
@@ -141,9 +142,11 @@ class Budget:
         paths = critical_paths({name: step for name, step in self._steps.items() if step.kind != "analyse"}, seconds, own=True)
         self._seconds = seconds | paths
 
-    def rank(self, name: str) -> tuple[bool, int]:
-        """Sort key: what every table has and what was trained comes first, then the plan's order."""
-        return name.partition("/")[0] not in ("baselines", *FINISHING), self._order[name]
+    def rank(self, name: str) -> tuple[int, int]:
+        """Sort key: what every table has and what was trained comes first, then adaptations, then the plan's order."""
+        kind, _, variant = name.partition("/")
+        finishing, adapting = kind in ("baselines", *FINISHING), f"adapt/{variant}" in self._order
+        return 0 if finishing else 1 if adapting else 2, self._order[name]
 
     def fits(self, name: str) -> bool:
         """Whether a step and what follows it up to the grades of the same variant would end in time.
