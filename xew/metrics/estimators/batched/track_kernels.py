@@ -77,6 +77,17 @@ class Truth:
 
 
 @wp.kernel
+def fill_first_level(
+    # In:
+    gray: wp.array3d(dtype=wp.uint8),  # [n h w] uint8
+    # Out:
+    pyramid_out: wp.array2d(dtype=wp.uint8),  # [n P] uint8
+):
+    n, y, x = wp.tid()
+    pyramid_out[n, y * gray.shape[2] + x] = gray[n, y, x]
+
+
+@wp.kernel
 def shrink(
     # In:
     above: wp.vec3i,  # first pixel, height and width of the larger level

@@ -153,7 +153,7 @@ class _Videos:
 
     def _put(self, frames: Array, images: slice) -> Array:
         """Make a video [t h w 3] on the device these images; [t-1 h w 2] float32, its optical flow from frame to frame."""
-        count, height, width = frames.shape[:3]
+        count = len(frames)
         soft, half, pyramid = self.images.soft[images], self.half[images], self.images.pyramid[images]
         rows = wp.empty(frames.shape, dtype=wp.uint16)
         wp.launch(mask_kernels.blur_rows, frames.shape[:3], [frames, self._blur], [rows])
@@ -161,8 +161,8 @@ class _Videos:
         _launch(kernels.halve_colors, half.shape, [soft], [half])
         gray = wp.empty(frames.shape[:3], dtype=wp.uint8)
         wp.launch(mask_kernels.take_gray, gray.shape, [frames], [gray])
-        pixels = height * width
-        wp.copy(pyramid[:, :pixels], gray.reshape((count, pixels)))
+        # A kernel, since Warp's copy between strides has failed with several threads on a GPU (CUDA error 201).
+        _launch(kernels.fill_first_level, gray.shape, [gray], [pyramid])
         for above, below in zip(self._levels, self._levels[1:], strict=False):
             inputs = [wp.vec3i(above), wp.vec3i(below)]
             _launch(kernels.shrink, (count, below[1], below[2]), inputs, [pyramid])
