@@ -20,7 +20,7 @@ from xew.analysis.studies.config import Study, load_study
 from xew.analysis.studies.cost import critical_paths
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import Machines, RayCluster, ThisMachine, open_machines, visible_gpus
-from xew.analysis.studies.plan import Step
+from xew.analysis.studies.plan import Step, plan
 from xew.analysis.studies.processes import last_lines, start_step
 from xew.analysis.studies.runner import Budget, StudyRunner, complete_command
 from xew.analysis.studies.status import exit_with_failures
@@ -187,6 +187,16 @@ def test_a_budget_begins_only_what_ends_in_time_and_ends_what_is_begun_first(
     assert StudyRunner(study, steps, ledger, ThisMachine((), 2, {}), dict.fromkeys(steps, 1.0), budget).run() == {}
     assert begun(study.out) == {"data": 1, "right": 1}, "the end needs what there was no time for"
     assert run(study, steps) == {} and begun(study.out)["data"] == 1
+
+
+@pytest.mark.parametrize(("name", "firsts"), [("six", {"fixed"}), ("debug", {"fixed", "loeo_piper"})])
+def test_latents_wait_for_the_first_of_their_codec(name: str, firsts: set[str]) -> None:
+    """A codec that is fitted is another one for each split; of another, folds need the streams that the fixed split encodes."""
+    given = ["--parts", "ladder", "loeo", "--variants", "fixed-*", "loeo_piper*", "--repeated", "*"]
+    steps = plan(load_study(ROOT / "configs" / f"study_{name}.yaml", given))
+    waits = {step.variant: step.after for step in steps.values() if step.kind == "latents"}
+    assert {variant.partition("-")[0] for variant, after in waits.items() if not after} == firsts
+    assert len([after for after in waits.values() if not after]) == len(firsts) < len(waits)
 
 
 def test_what_follows_is_counted_within_a_variant() -> None:

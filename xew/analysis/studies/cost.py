@@ -10,14 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from xew.analysis.studies.config import KINDS, Settings, Study, build_experiment
+from xew.analysis.studies.config import KINDS, Settings, Study, build_experiment, has_fitted_codec
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import usable_gpus
 from xew.analysis.studies.plan import Step, sort_steps
 from xew.protocol import BASELINES, Variant, training_counts
-
-FITTED = "patch_pca"
-"""Codec that is fitted to the training episodes of a split; the others are the same for all."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +63,7 @@ def _count_new_streams(study: Study, variant: Variant, experiment: Settings, enc
     A codec that is fitted is another one for every split, and that of the start for an adaptation.
     """
     model, new = experiment["model"], 0
-    fitted = experiment.get("codec", {}).get("name", FITTED) == FITTED
+    fitted = has_fitted_codec(experiment)
     counts = training_counts(variant, study.task_count, study.train_seeds, study.robot_keys)
     for stream in (name for name in ("rgb", model["action"], model["embodiment"]) if name != "none"):
         for robot, count in counts.items():

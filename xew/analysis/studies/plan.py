@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 
 import xew
-from xew.analysis.studies.config import Settings, Study, build_experiment, run_folder
+from xew.analysis.studies.config import Settings, Study, build_experiment, has_fitted_codec, run_folder
 from xew.episode import SCHEMA_VERSION
 from xew.files import file_digest, write_text
 from xew.protocol import DISTANCE_BODIES, GRADING_PROTOCOL, SHARED_MOTION, Variant
@@ -67,7 +67,7 @@ def plan(study: Study) -> dict[str, Step]:
     firsts: dict[str, str] = {}
     for variant in study.planned_runs:
         experiment = experiments[variant.name]
-        first = firsts.setdefault(variant.split, f"latents/{variant.name}")
+        first = firsts.setdefault(variant.split if has_fitted_codec(experiment) else "", f"latents/{variant.name}")
         steps += [
             _plan_latents(study, variant, experiment, first),
             _plan_train(study, variant, experiment),
@@ -135,7 +135,7 @@ def _plan_latents(study: Study, variant: Variant, experiment: Settings, first: s
         needs=("generate", *started),
         inputs=_training_inputs(experiment),
         product=study.out / "latents",
-        # Streams that variants of a split share are encoded by the first of them that is run.
+        # Streams that variants share are encoded by the first of them that is run: of a split, or of all where the codec is.
         after=() if started or first == name else (first,),
     )
 
