@@ -38,3 +38,12 @@ def upload(video: np.ndarray, device: Any) -> Any:
     It waits for what was launched there before, and so is no part of a thread's turn at launching.
     """
     return wp.array(np.ascontiguousarray(video), dtype=wp.uint8, device=device)
+
+
+def download(array: Any) -> np.ndarray:
+    """An array of Warp as NumPy's, once the device has computed it.
+
+    Not `array.numpy()`, which makes the null stream that of the whole device while it copies: other threads then launch on it,
+    and two that copy at once leave it there for good (CUDA error 201 in threads without a context).
+    """
+    return array.to("cpu").numpy()

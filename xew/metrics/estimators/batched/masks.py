@@ -13,7 +13,7 @@ import warp as wp
 from xew.concurrency import PARSING
 from xew.metrics.estimators import masks as reference
 from xew.metrics.estimators.batched import mask_kernels as kernels
-from xew.metrics.estimators.batched.devices import turn_on, upload
+from xew.metrics.estimators.batched.devices import download, turn_on, upload
 from xew.metrics.estimators.batched.flow import Array, Search, build_pyramid, find_flow, is_large_enough
 from xew.metrics.estimators.similarity import find_most_similar
 
@@ -50,7 +50,7 @@ class BatchedMasker:
             frames = upload(prediction, self._device)
             with PARSING, wp.ScopedDevice(self._device):  # threads take turns at launching, and wait side by side
                 masks = _estimate(frames, known, plan)
-            return masks.numpy().astype(bool)
+            return download(masks).astype(bool)
 
 
 class _Episode:

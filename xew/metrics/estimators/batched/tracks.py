@@ -15,7 +15,7 @@ from xew.metrics.estimators import presence
 from xew.metrics.estimators import tracks as reference
 from xew.metrics.estimators.batched import mask_kernels, path_kernels
 from xew.metrics.estimators.batched import track_kernels as kernels
-from xew.metrics.estimators.batched.devices import turn_on, upload
+from xew.metrics.estimators.batched.devices import download, turn_on, upload
 from xew.metrics.estimators.batched.flow import Array, Search, build_pyramid, find_flow, is_large_enough
 from xew.metrics.estimators.batched.masks import fixed_kernel
 from xew.metrics.estimators.similarity import find_most_similar
@@ -70,10 +70,10 @@ class BatchedTracker:
                     videos.show(prediction, frames, *similar)
             with PARSING, wp.ScopedDevice(self._device):
                 truth, proposal = _propose(videos, points, visible)
-            sure = proposal.numpy()[..., 2].min(axis=-1) <= 1 - reference.SURE
+            sure = download(proposal)[..., 2].min(axis=-1) <= 1 - reference.SURE
             with PARSING, wp.ScopedDevice(self._device):
                 paths = _walk(videos, truth, proposal, points, visible & ~sure)
-            place, origin, total = (array.numpy() for array in paths)
+            place, origin, total = map(download, paths)
         return _follow_back(place, origin, total, visible)
 
     def _open(self, target: np.ndarray) -> "_Videos":
@@ -107,7 +107,7 @@ class BatchedTracker:
             known = [wp.array(visible.astype(np.uint8)), videos.put_bodies(shown), wp.array(body.astype(np.int32))]
             wrong = wp.empty(visible.shape, dtype=wp.uint8)
             _launch(kernels.confirm, wrong.shape, [videos.images.soft, *places, *known], [wrong])
-        return np.where(wrong.numpy().astype(bool)[..., None], np.float32(np.nan), found)
+        return np.where(download(wrong).astype(bool)[..., None], np.float32(np.nan), found)
 
 
 class _Videos:
@@ -161,7 +161,7 @@ class _Videos:
         _launch(kernels.halve_colors, half.shape, [soft], [half])
         gray = wp.empty(frames.shape[:3], dtype=wp.uint8)
         wp.launch(mask_kernels.take_gray, gray.shape, [frames], [gray])
-        # A kernel, since Warp's copy between strides has failed with several threads on a GPU (CUDA error 201).
+        # A kernel, since Warp's copy between strides fails where an earlier call of the thread has left an error behind.
         _launch(kernels.fill_first_level, gray.shape, [gray], [pyramid])
         for above, below in zip(self._levels, self._levels[1:], strict=False):
             inputs = [wp.vec3i(above), wp.vec3i(below)]
