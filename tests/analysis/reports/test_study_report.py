@@ -330,6 +330,8 @@ def test_gains_are_relative_to_the_row_that_is_named(folder: Path, rows: pd.Data
 def test_a_strip_has_robots_down_and_conditions_across(folder: Path) -> None:
     found = [str(image["alt"]) for image in Page((folder / "report" / "index.html").read_text()).images]
     assert "Franka, Piper by observed, Joint pose, Optical flow" in found
+    written = (folder / "report" / "report.md").read_text()
+    assert "From the left: observed, Joint pose, Optical flow; from the top: Franka, Piper." in written
     strip = cv2.imread(str(folder / "report" / "figures" / "strip_actions.png"))
     frames = strip[:240, 648:968], strip[244:, :320]
     truth = [read_video(episode_folder(folder / "data", TASKS[0], seed, "piper") / "rgb.mkv")[8] for seed in (10**6, 10**6 + 1)]

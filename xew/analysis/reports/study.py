@@ -262,7 +262,7 @@ def _write_markdown(content: Content) -> str:
             if name in content.charts:
                 lines += ["", f"![{content.charts[name].caption}](figures/{name}.png)"]
         if part in content.strips:
-            lines += ["", f"![{content.strips[part].caption}](figures/strip_{part}.png)"]
+            lines += ["", f"![{content.strips[part].labeled_caption}](figures/strip_{part}.png)"]
         for name in (*shown, *folded):
             if name in content.tables:
                 table = content.tables[name]

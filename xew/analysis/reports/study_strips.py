@@ -32,6 +32,11 @@ class Strip:
     columns: Sequence[str]
     rows: Sequence[str]
 
+    @property
+    def labeled_caption(self) -> str:
+        """The caption with what is shown where, for pages that cannot set labels beside a picture."""
+        return f"{self.caption} From the left: {', '.join(self.columns)}; from the top: {', '.join(self.rows)}."
+
 
 def study_strips(scores: Scores, data: Path, rollouts: Sequence[Path]) -> dict[str, Strip]:
     """A strip for each comparison of which at least two variants can be shown.
