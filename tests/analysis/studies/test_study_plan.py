@@ -342,6 +342,16 @@ def test_wall_time_by_hand() -> None:
     assert estimate_wall_seconds(steps, seconds, ("train/a", "train/b"), slots=1) == 6.0
 
 
+def test_wall_time_of_steps_beside_trainings_by_hand() -> None:
+    """One GPU trains a, then b, in 3 + 2; a's rollout goes beside b, and only b's comes after. Alone it would be 5 + 2 + 2."""
+    steps = graph(("a", ""), ("b", ""))
+    for name in "ab":
+        steps[f"rollout/{name}"] = Step("rollout", name, (), (f"train/{name}",), None, Path(name))
+    seconds = {"train/a": 3.0, "train/b": 2.0, "rollout/a": 2.0, "rollout/b": 2.0}
+    assert estimate_wall_seconds(steps, seconds, (), slots=1, beside=1) == 7.0
+    assert estimate_wall_seconds(steps, seconds, (), slots=1) == 9.0
+
+
 def test_a_training_that_takes_all_gpus_runs_alone() -> None:
     steps = graph(("a", ""), ("b", ""))
     steps = {name: replace(step, gpus=8) for name, step in steps.items()}

@@ -12,7 +12,7 @@ from typing import Any
 
 from xew.analysis.studies.config import KINDS, Settings, Study, build_experiment, has_fitted_codec
 from xew.analysis.studies.ledger import Ledger
-from xew.analysis.studies.machines import usable_gpus
+from xew.analysis.studies.machines import TRAININGS, usable_gpus
 from xew.analysis.studies.plan import Step, sort_steps
 from xew.protocol import BASELINES, Variant, training_counts
 
@@ -101,20 +101,33 @@ def correct_by_ledger(costs: Mapping[str, Cost], steps: Mapping[str, Step], ledg
     return {name: noted.get(name, cost.seconds * factors.get(steps[name].kind, 1.0)) for name, cost in costs.items()}
 
 
-def estimate_wall_seconds(steps: Mapping[str, Step], seconds: Mapping[str, float], done: Collection[str], slots: int) -> float:
-    """Time to the end on a number of slots, with each step started as soon as it can be, the longest critical path first."""
+def estimate_wall_seconds(
+    steps: Mapping[str, Step], seconds: Mapping[str, float], done: Collection[str], slots: int, beside: int = 0
+) -> float:
+    """Time to the end, with each step started as soon as it can be, the longest critical path first.
+
+    Args:
+        steps: of the study.
+        seconds: that each takes.
+        done: names of steps that need no time.
+        slots: number of GPUs, or of steps at once where there is none.
+        beside: number of other steps that share a GPU with its training; 0 where every step has a slot for itself. Trainings
+            that share a GPU count as one after another, since each then takes as much longer.
+    """
     left = {name: {need for need in step.predecessors if need not in done} for name, step in steps.items() if name not in done}
-    paths, free, now = critical_paths(steps, seconds), slots, 0.0
+    pools = {name: "training" if step.kind in TRAININGS or not beside else "beside" for name, step in steps.items()}
+    free = {"training": slots, "beside": slots * beside}
+    paths, now = critical_paths(steps, seconds), 0.0
     running: list[tuple[float, str, int]] = []
     while left or running:
         for name in sorted((name for name, needs in left.items() if not needs), key=lambda name: -paths[name]):
             needed = min(max(1, steps[name].gpus), slots)
-            if needed <= free:
-                free -= needed
+            if needed <= free[pools[name]]:
+                free[pools[name]] -= needed
                 del left[name]
                 heapq.heappush(running, (now + seconds[name], name, needed))
         now, ended, needed = heapq.heappop(running)
-        free += needed
+        free[pools[ended]] += needed
         for needs in left.values():
             needs.discard(ended)
     return now
@@ -152,10 +165,12 @@ def format_costs(
             amount = f"{sum(costs[name].amount for name in left):,} {costs[names[0]].unit}"
             counts = f"{kind:<10}{len(names):>7}{len(names) - len(left):>7}{amount:>22}"
             lines.append(f"{counts}{hours:>9.2f}{f'{gpu_hours:.2f}' if on_gpus else '':>11}{disk:>8.1f}")
-    wall = estimate_wall_seconds(steps, seconds, done, slots)
+    beside = study.machine.beside if on_gpus else 0
+    wall = estimate_wall_seconds(steps, seconds, done, slots, beside)
     total = f"{'all':<10}{len(steps):>7}{len(done):>7}{'':>22}{totals[0]:>9.2f}"
     lines.append(f"{total}{f'{totals[1]:.2f}' if on_gpus else '':>11}{totals[2]:>8.1f}")
-    lines.append(f"about {format_duration(wall)} with {slots} at once, by the rates of: {study.rates.measured_on}")
+    shared = f"{slots} GPUs and {beside} steps beside a training" if beside else f"{slots} at once"
+    lines.append(f"about {format_duration(wall)} with {shared}, by the rates of: {study.rates.measured_on}")
     free = free_gb(study.out)
     if free < totals[2]:
         lines.append(f"WARNING: {totals[2]:.1f} GB are needed and {free:.1f} GB are free under {study.out}")
