@@ -190,6 +190,7 @@ class ConvAutoencoderCodec(AutoencoderCodec):
     """
 
     file: ClassVar[str] = "autoencoder"
+    alone: ClassVar[bool] = True
 
     params: Any
     """State of a `ConvAutoencoder` with the statistics of its latents."""

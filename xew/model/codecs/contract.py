@@ -58,6 +58,9 @@ class Codec(Protocol):
     relative: ClassVar[bool]
     """Whether later latents are coded relative to the first frame, so that another first frame changes them."""
 
+    alone: ClassVar[bool]
+    """Whether the first frame and each group of four behind it are coded alone, so that a video may be coded in pieces."""
+
     @property
     def spatial_factor(self) -> int:
         """Number of pixels a side of a latent."""
@@ -119,6 +122,7 @@ class BatchCodec:
     """A codec's functions on pictures and on single clips, from its `encode_batch` and `decode_batch`."""
 
     relative: ClassVar[bool] = False
+    alone: ClassVar[bool] = False
     spatial_factor: int
     encode_batch: Callable[[Array], Array]
     decode_batch: Callable[[Array], Array]

@@ -14,7 +14,8 @@ from xew.model.runs.folder import load_run
 from xew.model.video.frames import to_camera_size, to_model_size
 
 LENGTH_BLOCK = 24
-"""Number of frames behind the first that videos are filled up to multiples of, groups of four as codecs take them."""
+"""Number of frames behind the first that a piece has, or that a video is filled up to multiples of: groups of four, as codecs
+take them."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +38,17 @@ class RunRoundtrip:
     def __call__(self, video: np.ndarray) -> np.ndarray:
         """Video [t h w 3] uint8 to what the codec leaves of it, [t h w 3] uint8.
 
-        It is filled up to a multiple of LENGTH_BLOCK frames behind the first, which changes no frame before: videos of all
-        lengths share some compiled programs.
+        Videos of all lengths share compiled programs. They are filled up to a multiple of LENGTH_BLOCK frames behind the first,
+        which changes no frame before; a codec of groups that stand alone takes so many at a time.
         """
         clip = self.experiment.clip
         filled = np.concatenate([video, np.repeat(video[-1:], -(len(video) - 1) % LENGTH_BLOCK, axis=0)])
         small = to_model_size(filled, clip.height, clip.width)
-        return to_camera_size(self.codec.decode(self.codec.encode(small))[: len(video)])
+        first, later = small[:1], small[1:]
+        ends = range(LENGTH_BLOCK, len(later), LENGTH_BLOCK) if self.codec.alone else ()
+        pieces = [np.concatenate([first, piece]) for piece in np.split(later, ends)]
+        coded = [self.codec.decode(self.codec.encode(piece)) for piece in pieces]
+        return to_camera_size(np.concatenate([coded[0][:1], *(piece[1:] for piece in coded)])[: len(video)])
 
 
 def open_roundtrip(run: Path) -> RunRoundtrip:
