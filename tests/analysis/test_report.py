@@ -315,3 +315,11 @@ def test_a_gain_over_zero_is_named_and_leaves_the_axis_as_it_is() -> None:
     charts.bars(axes, ["render", "over nothing", "missing"], [("C0", values, np.full(3, np.nan))], "better by [%]")
     assert [text.get_text().strip() for text in axes.texts] == ["over zero", "not run"]
     assert 50 < axes.get_xlim()[1] < 60
+
+
+def test_a_gain_over_almost_nothing_is_written_on_a_bar_that_ends() -> None:
+    axes = Figure().subplots()
+    values = np.array([[40.0, 30.0, 5000.0], [80600.0, 20000.0, 73000.0]])
+    charts.bars(axes, ["render", "over almost nothing"], [("C0", values, np.full(2, np.nan))], "better by [%]")
+    assert [text.get_text() for text in axes.texts] == ["80,600"]
+    assert charts.LONGEST_BAR < axes.get_xlim()[1] < 1.1 * charts.LONGEST_BAR

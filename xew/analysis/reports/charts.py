@@ -20,6 +20,8 @@ from matplotlib.lines import Line2D
 
 from xew.names import csv_text
 
+LONGEST_BAR = 300.0
+"""Length at which bars end: a gain [%] over a score of almost nothing would leave no length to the others."""
 INK, SOFT, LINE, GROUND = "#1f2328", "#57606a", "#d0d7de", "#ffffff"
 SERIES = ("#1f6feb", "#c2410c", "#15803d", "#7e22ce", "#a16207", "#0e7490")
 """Colors of series in order; baselines are SOFT. In dark mode the page has a lighter one for each."""
@@ -148,19 +150,24 @@ def bars(axes: Axes, labels: Sequence[str], groups: Sequence[tuple[str, np.ndarr
         axes: to draw on.
         labels: n labels from top to bottom.
         groups: of each its color, values with the ends of their intervals [n 3] and the paper's values [n], in `unit`; NaN
-            where there is none, infinite where a gain is over zero.
+            where there is none, infinite where a gain is over zero. What is longer than LONGEST_BAR is written on its bar.
         unit: text at the axis of values.
     """
     height = 0.8 / len(groups)
     for g, (color, values, paper) in enumerate(groups):
         y = np.arange(len(labels)) + (g - (len(groups) - 1) / 2) * height
-        axes.barh(y, np.where(np.isfinite(values[:, 0]), values[:, 0], 0.0), height * 0.9, color=color)
-        known = ~np.isnan(values[:, 1])
-        axes.hlines(y[known], values[known, 1], values[known, 2], color=INK, linewidth=1)
+        finite = np.where(np.isfinite(values[:, 0]), values[:, 0], 0.0)
+        length = np.clip(finite, -LONGEST_BAR, LONGEST_BAR)
+        axes.barh(y, length, height * 0.9, color=color)
+        known = ~np.isnan(values[:, 1]) & (length == finite)
+        ends = np.clip(values[known, 1:], -LONGEST_BAR, LONGEST_BAR)
+        axes.hlines(y[known], ends[:, 0], ends[:, 1], color=INK, linewidth=1)
         axes.plot(paper, y, "o", color=INK, fillstyle="none", markersize=4, markeredgewidth=1)
-        for at, value in zip(y, values[:, 0], strict=True):
+        for at, value, end in zip(y, values[:, 0], length, strict=True):
             if not np.isfinite(value):
                 axes.text(0, at, " not run" if np.isnan(value) else " over zero", va="center", color=SOFT, fontsize=7)
+            elif value != end:
+                axes.text(end / 2, at, f"{value:,.0f}", va="center", ha="center", color=GROUND, fontsize=7)
     axes.axvline(0, color=SOFT, linewidth=0.8)
     axes.set_yticks(range(len(labels)), labels)
     axes.invert_yaxis()
