@@ -128,6 +128,21 @@ def test_a_variant_of_several_trainings_is_their_mean_and_has_their_spread(grade
     assert np.ptp(gap[1].interval()) > np.ptp(gap[0].interval())
 
 
+def test_an_adapted_model_is_compared_with_the_training_that_it_started_from(grades: StudyGrades, scores: Scores) -> None:
+    views = "fixed-optical_flow-nine_views"
+    rows = train_thrice(scores.rows, views, 0.2)
+    rows.loc[(rows["variant"] == views) & (rows["training"] == 2), "value"] *= 0.5
+    more = StudyGrades(rows, scores.metrics, paper_axes(read_paper()))
+    assert more.trainings(views) == 3 and more.variants == grades.variants
+    for part, row, robot in (("few_shot", "piper-0", "piper"), ("forgetting", "none", "ur5_wsg")):
+        one, own = (each.mean(part, row, robot, "lpips") for each in (grades, more))
+        assert one and own and own.value == one.value and own.trainings == 1
+    gains = [each.difference("few_shot", "piper-1", "piper-0", "piper", "lpips") for each in (grades, more)]
+    assert gains[0] and gains[1] and gains[1].value == gains[0].value and gains[1].interval() == gains[0].interval()
+    means = [each.mean("ladder", "nine_views", "piper", "lpips") for each in (grades, more)]
+    assert means[0] and means[1] and means[1].value < means[0].value, "elsewhere all trainings count"
+
+
 def test_episodes_that_one_training_lacks_count_for_none(scores: Scores) -> None:
     flow = "fixed-optical_flow-none"
     rows = train_thrice(scores.rows, flow, 0.2)

@@ -43,6 +43,10 @@ TOGETHER = {
     "baselines": ("baselines", "more_systems"),
 }
 """Parts of the protocol that are ours and stand in a part of the paper's."""
+ADAPTED_PARTS = ("few_shot", "forgetting")
+"""Parts that set adapted models beside the one that they start from."""
+ADAPTED = " adapted"
+"""Ending of the name under which a variant's trainings stand that adaptations started from, where it has others as well."""
 SEEN = "seen"
 REFERENCE = "reference"
 """The row of the few-shot part that stands for the model before adaptation, on the robots that it was trained on."""
@@ -124,6 +128,16 @@ def find_variant(part: str, row: str) -> Variant:
     raise KeyError(f"no variant of the protocol fills the row {row!r} of {part!r}")
 
 
+def _adapted_trainings(trainings: Mapping[str, set[int]]) -> dict[str, set[int]]:
+    """By variant that adaptations start from: those of its trainings that one started from, where it has others as well."""
+    adapted: dict[str, set[int]] = {}
+    for variant in (variant for part in ADAPTED_PARTS for variant in variants_of(part)):
+        if variant.start is not None:
+            start = variant.start.name
+            adapted[start] = adapted.get(start, set()) | (trainings.get(variant.name, set()) & trainings.get(start, set()))
+    return {start: found for start, found in adapted.items() if found and found != trainings[start]}
+
+
 def pooled(variant: Variant, robots: str) -> tuple[str, ...]:
     """The robots behind a name: 'seen' are those that the variant's split trains on, 'bodies' those that no split does."""
     if robots == BODIES:
@@ -176,6 +190,10 @@ class StudyGrades:
         for i, (variant, robot, metric, training) in enumerate(names):
             self._columns[str(variant), str(robot), str(metric), int(training)] = i
             trainings.setdefault(str(variant), set()).add(int(training))
+        for start, adapted in _adapted_trainings(trainings).items():
+            trainings[start + ADAPTED] = adapted
+            own = [(key, i) for key, i in self._columns.items() if key[0] == start and key[-1] in adapted]
+            self._columns |= {(start + ADAPTED, *key[1:]): i for key, i in own}
         self._trainings = {variant: tuple(sorted(found)) for variant, found in trainings.items()}
         self._several = [(name, len(found)) for name, found in sorted(self._trainings.items()) if len(found) > 1]
         self._cache: dict[tuple[str, tuple[str, ...], str, str], Mean | None] = {}
@@ -188,7 +206,7 @@ class StudyGrades:
     @property
     def variants(self) -> list[str]:
         """Names of the variants that were graded, without the baselines."""
-        return [name for name in self._trainings if name.partition(" ")[0] not in BASELINES]
+        return [name for name in self._trainings if name.partition(" ")[0] not in BASELINES and not name.endswith(ADAPTED)]
 
     @property
     def notes(self) -> str:
@@ -207,7 +225,12 @@ class StudyGrades:
 
     def mean(self, part: str, row: str, robots: str, metric: str, shared: bool = False) -> Mean | None:
         variant = find_variant(part, row)
-        return self.variant_mean(variant.name, pooled(variant, robots), metric, part if shared else "")
+        return self.variant_mean(self._name_in(part, variant), pooled(variant, robots), metric, part if shared else "")
+
+    def _name_in(self, part: str, variant: Variant) -> str:
+        """Name of a variant's scores in a part: an adapted model is compared with its own start, not with other trainings."""
+        adapted = variant.name + ADAPTED
+        return adapted if part in ADAPTED_PARTS and adapted in self._trainings else variant.name
 
     def has(self, variant: str) -> bool:
         """Was anything of a variant graded?"""
@@ -238,21 +261,23 @@ class StudyGrades:
 
     def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
         after, before = (find_variant(part, key) for key in (row, base))
-        if max(self.trainings(after.name), self.trainings(before.name)) > 1:
+        names = [self._name_in(part, variant) for variant in (after, before)]
+        if max(map(self.trainings, names)) > 1:
             means = [self.mean(part, key, robots, metric, shared=True) for key in (row, base)]
             return combine(np.subtract, *(mean for mean in means if mean)) if all(means) else None
         shared = self._shared(part, pooled(after, robots), metric)
-        new, old = (self._scores(variant.name, pooled(variant, robots), metric) for variant in (after, before))
-        return self._bootstrap(after.name, [np.where(shared, new - old, np.nan)])[0]
+        pools = [pooled(variant, robots) for variant in (after, before)]
+        new, old = (self._scores(name, pool, metric) for name, pool in zip(names, pools, strict=True))
+        return self._bootstrap(names[0], [np.where(shared, new - old, np.nan)])[0]
 
     def against(self, part: str, row: str, baseline: str, robots: str, metric: str) -> tuple[Mean, Mean] | None:
         variant = find_variant(part, row)
         if not (self.has(variant.name) and self.has(baseline)):
             return None
-        names = pooled(variant, robots)
-        scores = [self._scores(name, names, metric) for name in (variant.name, baseline)]
-        cells = self._shared(part, names, metric) & ~np.isnan(scores[1]).all(axis=0)
-        graded = zip((variant.name, baseline), scores, strict=True)
+        names, pool = (self._name_in(part, variant), baseline), pooled(variant, robots)
+        scores = [self._scores(name, pool, metric) for name in names]
+        cells = self._shared(part, pool, metric) & ~np.isnan(scores[1]).all(axis=0)
+        graded = zip(names, scores, strict=True)
         mean, other = (self._bootstrap(name, [np.where(cells, own, np.nan)])[0] for name, own in graded)
         return None if mean is None or other is None else (mean, other)
 
