@@ -41,7 +41,7 @@ def upload(video: np.ndarray, device: Any) -> Any:
 
 
 def download(array: Any) -> np.ndarray:
-    """An array of Warp as NumPy's, once the device has computed it.
+    """An array [...] of Warp as NumPy's, once the device has computed it.
 
     Not `array.numpy()`, which makes the null stream that of the whole device while it copies: other threads then launch on it,
     and two that copy at once leave it there for good (CUDA error 201 in threads without a context).
