@@ -117,8 +117,8 @@ class Args:
     workers: int = 0
     """Threads that read, estimate and grade, shared out to the devices; 0: one for each processor core."""
     processes: int = 1
-    """Processes that episodes are shared out to, in place of threads. Threads wait for Python's lock in part of what the
-    default tracker does, so that only processes keep more than about six cores busy; each takes seconds to start."""
+    """Processes that episodes are shared out to, in place of threads. Threads wait for Python's lock, so that only processes
+    keep more than about six cores, or a GPU, busy; each takes some ten seconds to start. 8 suit a GPU."""
     check: Path | None = None
     """Grade nothing: check that a bundle is consistent, and, where rollouts are named, that it was made from them."""
     regrade: int = 0
