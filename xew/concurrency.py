@@ -8,6 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import forkserver
 from typing import Any, TypeVar
 
 Item = TypeVar("Item")
@@ -51,6 +52,15 @@ def map_in_order(
             pool.shutdown(wait=False, cancel_futures=True)
             if stop is not None:
                 stop.set()
+
+
+def begin_importing(modules: Sequence[str]) -> None:
+    """Start the process that others are forked from, which imports these modules while this one gets their work ready.
+
+    `open_processes` starts it otherwise, and again where it names others.
+    """
+    multiprocessing.set_forkserver_preload(list(modules))
+    forkserver.ensure_running()
 
 
 def open_processes(

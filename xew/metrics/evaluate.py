@@ -25,7 +25,7 @@ import pandas as pd
 import tyro
 from tqdm import tqdm
 
-from xew.concurrency import map_in_order, map_in_processes
+from xew.concurrency import begin_importing, map_in_order, map_in_processes
 from xew.config import ConfigError, pick, suggestion, user_errors
 from xew.dataset import demand_one_motion, find_accepted
 from xew.episode import EpisodeError, read_record, verify_episode
@@ -58,6 +58,8 @@ from xew.names import csv_text
 from xew.protocol import GRADING_PROTOCOL, HELD_OUT_ROBOTS, seed_split
 from xew.rollout import find_rollouts
 
+IMPORTED = ("xew.metrics.grading.grader",)
+"""Modules that processes that grade need."""
 DIMENSIONS = tuple(dict.fromkeys(metric.dimension for metric in METRICS.values()))
 
 
@@ -153,6 +155,8 @@ def main(args: Args) -> None:
     if args.processes < 1:
         raise ConfigError(f"--processes is {args.processes}; expected at least 1.")
     check_out(args.out)
+    if args.processes > 1:
+        begin_importing(IMPORTED)
     with hold_lock(args.out):
         grade_tables(args)
 
@@ -326,7 +330,7 @@ def _grade_groups(
     opener = make_grader_opener(args, metrics, store)
     if args.processes > 1 and len(groups) > 1:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # processes share the cores; NumPy's threads would only wait
-        yield from map_in_processes(opener.open_in_process, groups, args.processes, imported=("xew.metrics.grading.grader",))
+        yield from map_in_processes(opener.open_in_process, groups, args.processes, imported=IMPORTED)
         return
     stop = threading.Event()
     yield from map_in_order(opener.open(stop, codecs), groups, worker_count(args.workers), stop)
