@@ -157,7 +157,9 @@ def _compare_pairs(
     columns = [pair for metric in metrics for pair in combinations([c for c in _columns(table) if c[0] == metric], 2)]
     if not columns:
         return []
-    differences = np.stack([(table[a] - table[b]).to_numpy() for a, b in columns], axis=1)
+    place = {column: i for i, column in enumerate(_columns(table))}
+    values, ones, others = table.to_numpy(), [place[a] for a, _ in columns], [place[b] for _, b in columns]
+    differences = values[:, ones] - values[:, others]
     rows = []
     for (a, b), mean in zip(columns, _bootstrap(differences, table, units), strict=True):
         floor, ends = largest_floor((floors[a], floors[b])), mean.interval()
