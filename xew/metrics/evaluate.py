@@ -156,7 +156,7 @@ def main(args: Args) -> None:
         raise ConfigError(f"--processes is {args.processes}; expected at least 1.")
     check_out(args.out)
     if args.processes > 1:
-        begin_importing(IMPORTED)
+        begin_processes()
     with hold_lock(args.out):
         grade_tables(args)
 
@@ -329,11 +329,17 @@ def _grade_groups(
     """
     opener = make_grader_opener(args, metrics, store)
     if args.processes > 1 and len(groups) > 1:
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # processes share the cores; NumPy's threads would only wait
+        begin_processes()
         yield from map_in_processes(opener.open_in_process, groups, args.processes, imported=IMPORTED)
         return
     stop = threading.Event()
     yield from map_in_order(opener.open(stop, codecs), groups, worker_count(args.workers), stop)
+
+
+def begin_processes() -> None:
+    """Begin to import what processes that grade need, with one thread for NumPy: they share the cores."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    begin_importing(IMPORTED)
 
 
 def make_grader_opener(args: Args, metrics: Sequence[str], store: CellStore) -> GraderOpener:
