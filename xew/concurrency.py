@@ -57,7 +57,7 @@ def map_in_order(
 def begin_importing(modules: Sequence[str]) -> None:
     """Start the process that others are forked from, which imports these modules while this one gets their work ready.
 
-    `open_processes` starts it otherwise, and again where it names others.
+    `open_processes` starts it otherwise. Where it runs already it keeps what it has imported.
     """
     multiprocessing.set_forkserver_preload(list(modules))
     forkserver.ensure_running()

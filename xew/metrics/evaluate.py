@@ -149,14 +149,14 @@ WRITTEN = {
 def main(args: Args) -> None:
     """Grade, write, and print what came out; or check a bundle."""
     prepare_process(args.trust)
+    if args.processes < 1:
+        raise ConfigError(f"--processes is {args.processes}; expected at least 1.")
+    if args.processes > 1:
+        begin_processes()
     if args.check is not None:
         check(args, args.check)
         return
-    if args.processes < 1:
-        raise ConfigError(f"--processes is {args.processes}; expected at least 1.")
     check_out(args.out)
-    if args.processes > 1:
-        begin_processes()
     with hold_lock(args.out):
         grade_tables(args)
 
@@ -329,7 +329,6 @@ def _grade_groups(
     """
     opener = make_grader_opener(args, metrics, store)
     if args.processes > 1 and len(groups) > 1:
-        begin_processes()
         yield from map_in_processes(opener.open_in_process, groups, args.processes, imported=IMPORTED)
         return
     stop = threading.Event()
