@@ -31,8 +31,7 @@ class Args:
     variants: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Trainings of variants that are graded; all that have scores where left out."""
     rollouts: Path | None = None
-    """Folder of rollouts by variant, for pictures; <study>/rollouts, as far as they are there, where left out. Some scenes are
-    enough."""
+    """Folder of rollouts by variant, for pictures; <study>/rollouts where left out. Some scenes of some variants are enough."""
     data: Path | None = None
     """Data set that holds these scenes; the study's where left out."""
     distances: Path | None = None
@@ -69,7 +68,9 @@ def merge_and_report(args: Args, study: Study) -> None:
     # Strips show the first training of each variant.
     shown = [name for name in graded if name not in planned or planned[name].of == name]
     root = args.rollouts or args.study / "rollouts"
-    rollouts = tuple(root / name for name in shown if args.rollouts or (root / name).is_dir())
+    rollouts = tuple(root / name for name in shown if (root / name).is_dir())
+    if args.rollouts and not rollouts:
+        raise ConfigError(f"{root} has no folder of a graded variant, such as {shown[0]}; name the folder that holds them.")
     if len(rollouts) < len(shown):
         print(f"{len(shown) - len(rollouts)} of {len(shown)} variants are in no picture: their rollouts were not under {root}")
     data = args.data or (study.data_folder if rollouts else None)

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,8 @@ from tests.analysis.test_report import Page, refers_outside
 from tests.synthetic import write_synthetic_data
 from xew.analysis.paper import read_paper
 from xew.analysis.report import Args, main
-from xew.analysis.reports import page
+from xew.analysis.reports import charts, page
+from xew.analysis.reports.study_strips import study_strips
 from xew.analysis.reports.study_text import trainings_note
 from xew.analysis.scores import MetricInfo, read_scores
 from xew.analysis.statistics.grades import PaperGrades, StudyGrades
@@ -24,6 +26,7 @@ from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import (
     correlation_table,
     distance_tables,
+    gap_correlation_table,
     own_correlation_tables,
     printed_distances,
     read_distances,
@@ -359,6 +362,51 @@ def test_measured_distances_take_the_place_of_the_printed(folder: Path, tmp_path
     lpips = next(row for row in own.sections[0].rows if row.labels == ("LPIPS",))
     assert lpips.cells[0].value == pytest.approx(np.corrcoef(distances.of("perceptual"), scores)[0, 1])
     assert own_correlation_tables(grades, printed_distances(read_paper())) == []
+
+
+def test_the_gap_leaves_out_how_hard_a_robot_is(folder: Path, rows: pd.DataFrame) -> None:
+    paper = read_paper()
+    distances = printed_distances(paper)
+    kinematic = distances.of("kinematic")
+    # Whoever saw a robot has its own difficulty as a score, and whoever did not has more of it in proportion to its distance.
+    made = rows.copy()
+    for robot, difficulty, distance in zip(ROBOT_NAMES, (0.1, 0.4, 0.2, 0.5, 0.3), kinematic, strict=True):
+        here = (made["robot"] == robot) & (made["metric"] == "lpips")
+        made.loc[here, "value"] = difficulty
+        made.loc[here & made["variant"].str.startswith(f"loeo_{robot}"), "value"] = difficulty * (1 + 2 * distance)
+    [table] = gap_correlation_table(StudyGrades(made, paper.infos, paper_axes(paper)), distances)
+    lpips = next(row for row in table.sections[0].rows if row.labels[0].startswith("LPIPS"))
+    assert [cell.value for cell in lpips.cells[:5]] == pytest.approx(2 * kinematic)
+    assert lpips.cells[0].text == f"{200 * kinematic[0]:+.0f} %"
+    r, p = lpips.cells[-3].value, lpips.cells[-1].value
+    assert r == pytest.approx(1) and p == pytest.approx(np.mean(_all_r(kinematic) > 1 - 1e-9))
+    assert gap_correlation_table(PaperGrades(paper, paper.infos), distances) == []  # it prints no fold on robots that it saw
+
+
+def test_words_beside_points_keep_apart_and_in_order() -> None:
+    heights = np.array([45.0, 32.0, 25.7, 27.2, 24.8])
+    spread = charts._spread(heights, 2.0)
+    assert (np.argsort(spread) == np.argsort(heights)).all()
+    assert np.diff(np.sort(spread)).min() > 1.99 and spread[:2].tolist() == [45.0, 32.0]
+
+
+def _all_r(values: np.ndarray) -> np.ndarray:
+    """|r| of five numbers with all their orders [120]."""
+    return np.abs([np.corrcoef(values, order)[0, 1] for order in permutations(values)])
+
+
+def test_a_strip_of_the_folds_has_each_robot_unseen_and_seen(folder: Path, tmp_path: Path) -> None:
+    data, folds = tmp_path / "data", [f"loeo_{robot}-optical_flow-nine_views" for robot in ROBOT_NAMES]
+    write_synthetic_data(data, tasks=TASKS[:1], seeds=(TEST_SEED_START,), robots=ROBOT_NAMES, frames=9)
+    for level, fold in enumerate(folds):
+        for robot in ROBOT_NAMES:
+            video = np.full((9, 240, 320, 3), 40 * level, np.uint8)
+            write_rollout(tmp_path / "rollouts" / fold, TASKS[0], TEST_SEED_START, robot, video, {"model": "reference"})
+    strip = study_strips(read_scores(folder / "scores.parquet"), data, (tmp_path / "rollouts",))["loeo"]
+    assert strip.columns == ["observed", "of a model that never saw it", "of one that did"] and len(strip.rows) == 5
+    frames = cv2.imdecode(np.frombuffer(strip.image, np.uint8), cv2.IMREAD_COLOR)[::244, 324::324]
+    assert frames[:, 0].mean(axis=-1).tolist() == [0, 40, 80, 120, 160]
+    assert frames[:, 1].mean(axis=-1).tolist() == [40, 80, 120, 160, 0]
 
 
 @needs_chromium

@@ -5,6 +5,7 @@ from the page, light or dark. For Markdown and LaTeX all panels are one PNG and 
 """
 
 import io
+import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,6 +30,10 @@ THEME = {INK: "ink", SOFT: "soft", LINE: "line", GROUND: "page"} | {color: f"c{i
 """Variable of the page's style for each color."""
 PANEL = (3.5, 2.5)
 """Width and height of a panel [inches]."""
+ONE_HEIGHT = 0.1
+"""Least difference in height between the words beside two points, as a part of all heights in a panel."""
+ROUNDS = 20
+"""Number of times that words which overlap move apart; each time they may come to overlap others."""
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "text.parse_math": False,  # names may have dollar signs
@@ -183,7 +188,8 @@ def scatter(axes: Axes, distance: np.ndarray, score: np.ndarray, robots: Sequenc
         axes.plot(ends, np.polyval(np.polyfit(distance[rest], score[rest], 1), ends), color=SOFT, linewidth=0.8)
     axes.plot(ends, np.polyval(np.polyfit(distance, score, 1), ends), color=SERIES[0], linewidth=2)
     axes.scatter(distance, score, color=INK, s=24, zorder=3)
-    for x, y, robot in zip(distance, score, robots, strict=True):
+    heights = _spread(score, ONE_HEIGHT * np.ptp(score))
+    for x, y, robot in zip(distance, heights, robots, strict=True):
         # Words stand towards the middle, so that none leaves the panel.
         side, shift = ("right", -7) if x > ends.mean() else ("left", 7)
         text = axes.annotate(robot, (x, y), xytext=(shift, 0), textcoords="offset points", ha=side, va="center")
@@ -191,6 +197,17 @@ def scatter(axes: Axes, distance: np.ndarray, score: np.ndarray, robots: Sequenc
     axes.locator_params(axis="x", nbins=5)  # more run into one another where they have three decimals
     axes.set_xlabel(xlabel)
     axes.set_ylabel(ylabel)
+
+
+def _spread(heights: np.ndarray, least: float) -> np.ndarray:
+    """Heights [n] of words, moved by as little as keeps them `least` apart, in the same order."""
+    order, spread = np.argsort(heights, kind="stable"), heights.astype(float)
+    for _ in range(ROUNDS):
+        for below, above in itertools.pairwise(order):
+            apart = max(0.0, least - (spread[above] - spread[below])) / 2
+            spread[below] -= apart
+            spread[above] += apart
+    return spread
 
 
 def points(axes: Axes, x: np.ndarray, y: np.ndarray, xlabel: str, ylabel: str) -> None:

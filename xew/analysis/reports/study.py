@@ -29,6 +29,7 @@ from xew.analysis.tables.distances import (
     certainty_table,
     correlation_table,
     distance_tables,
+    gap_correlation_table,
     own_correlation_tables,
     printed_distances,
     read_distances,
@@ -59,8 +60,8 @@ SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]]
     "ladder": (("gains_ladder",), ("ladder",), ("ladder_full",)),
     "few_shot": (("forgetting", "gains_few_shot"), ("few_shot",), ("few_shot_full", "forgetting_full")),
     "loeo": (
-        ("distance",),
-        ("correlations", "correlations_own", "loeo_full"),
+        ("distance", "distance_gap"),
+        ("correlations", "gap_correlations", "correlations_own", "loeo_full"),
         ("certainty", "distances", "features", "matrices"),
     ),
     "baselines": ((), ("baselines",), ()),
@@ -172,7 +173,7 @@ def _make_tables(
     tables += [count_table(builder), *distance_tables(known)]
     if builder.has_results("loeo"):
         tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
-        tables.append(certainty_table(grades, known, paper))
+        tables += [*gap_correlation_table(grades, known), certainty_table(grades, known, paper)]
     if correlated := difficulty_table(difficulty, grades.metrics):
         tables.append(correlated)
     return tables

@@ -9,13 +9,14 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
+from xew.analysis.paper import AXES
 from xew.analysis.reports import charts
 from xew.analysis.reports.charts import SERIES, SOFT, Chart, Panel, Series
 from xew.analysis.scores import COPY, TRUTH, VARIANT, MetricInfo
 from xew.analysis.statistics.grades import Grades, PaperGrades, find_variant, relative_gain
 from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables.builder import Builder, interval_ends
-from xew.analysis.tables.distances import AXIS_TITLES, Distances
+from xew.analysis.tables.distances import AXIS_TITLES, Distances, unseen_gaps
 from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, SHORT_ROBOTS
 from xew.analysis.tables.table import metric_title
 from xew.protocol import BASELINES, FORGETTING_ROBOT, HELD_OUT_ROBOTS, PASTED_RENDER, ROBOT_NAMES, SHOTS
@@ -56,9 +57,8 @@ def study_charts(builder: Builder, distances: Distances, curves: pd.DataFrame) -
     made = {f"gains_{gain.part}": gain_chart(builder, gain) for gain in GAIN_ROWS if builder.has_results(gain.part)}
     if builder.has_results("forgetting"):
         made["forgetting"] = forgetting_chart(builder)
-    scatter = distance_chart(builder.ours, distances)
-    if scatter:
-        made["distance"] = scatter
+    by_distance = (distance_chart(builder.ours, distances), gap_chart(builder.ours, distances))
+    made |= {chart.name: chart for chart in by_distance if chart}
     for part, labels in (("actions", ACTIONS), ("ladder", LADDER)):
         if builder.has_results(part) and len(curves):
             made[f"frames_{part}"] = frame_chart(curves, part, labels)
@@ -159,24 +159,43 @@ def _adaptation_rows(builder: Builder) -> Iterator[dict[str, object]]:
 def distance_chart(grades: Grades, distances: Distances, metric: str = "lpips") -> Chart | None:
     """A metric by distance, a panel for each axis; None where a fold is missing."""
     means = [grades.mean("loeo", f"loeo_{robot}", robot, metric) if metric in grades.metrics else None for robot in ROBOT_NAMES]
-    scores = np.array([mean.value for mean in means if mean is not None])
+    scores = [mean.value for mean in means if mean is not None]
     if len(scores) < len(ROBOT_NAMES):
         return None
-    robots = [ROBOT_TITLES[robot] for robot in ROBOT_NAMES]
-    title = metric_title(grades.metrics[metric])
+    caption = (
+        "Each robot held out in turn. Thick: the line through all five. Thin: the lines without one robot, which show how far "
+        "one point carries."
+    )
+    return _by_distance("distance", caption, distances, distances.axes, metric, scores, metric_title(grades.metrics[metric]))
+
+
+def gap_chart(grades: Grades, distances: Distances, metric: str = "lpips") -> Chart | None:
+    """The gap of each robot in a metric by the paper's two distances; None where a fold is missing."""
+    gaps = unseen_gaps(grades, metric) if metric in grades.metrics else None
+    if gaps is None:
+        return None
+    caption = (
+        "The gap of each robot: by how much the fold that never saw it is worse on it than those that did. Lines as before. "
+        "Ours, and exploratory."
+    )
+    percent = [100 * gap.value for gap in gaps]
+    return _by_distance("distance_gap", caption, distances, AXES, metric, percent, f"gap in {grades.metrics[metric].title} [%]")
+
+
+def _by_distance(
+    name: str, caption: str, distances: Distances, axes: Sequence[str], metric: str, values: Sequence[float], title: str
+) -> Chart:
+    """Values of the five robots by their distances, a panel for each axis."""
+    robots, scores = [ROBOT_TITLES[robot] for robot in ROBOT_NAMES], np.array(values)
     panels = [
         Panel(
             AXIS_TITLES[axis],
             partial(_scatter, distance=distances.of(axis), score=scores, robots=robots, axis=axis, title=title),
         )
-        for axis in distances.axes
+        for axis in axes
     ]
-    data = pd.DataFrame({"robot": ROBOT_NAMES, metric: scores} | {axis: distances.of(axis) for axis in distances.axes})
-    caption = (
-        "Each robot held out in turn. Thick: the line through all five. Thin: the lines without one robot, which show how far "
-        "one point carries."
-    )
-    return Chart("distance", caption, panels, data)
+    data = pd.DataFrame({"robot": ROBOT_NAMES, metric: scores} | {axis: distances.of(axis) for axis in axes})
+    return Chart(name, caption, panels, data)
 
 
 def _scatter(axes: Axes, distance: np.ndarray, score: np.ndarray, robots: Sequence[str], axis: str, title: str) -> None:

@@ -10,10 +10,10 @@ import pandas as pd
 from xew.analysis.reports import pictures
 from xew.analysis.scores import VARIANT, Scores
 from xew.analysis.statistics.grades import find_variant
-from xew.analysis.tables.labels import ACTIONS, LADDER, SHORT_ROBOTS
+from xew.analysis.tables.labels import ACTIONS, LADDER, SHORT_ROBOTS, SYSTEMS
 from xew.config import ConfigError
 from xew.episode import episode_folder, read_video
-from xew.protocol import HELD_OUT_ROBOTS, SHOTS, VARIANTS
+from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS, VARIANTS
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
 
 RANKED_BY = "lpips"
@@ -51,10 +51,16 @@ def study_strips(scores: Scores, data: Path, rollouts: Sequence[Path]) -> dict[s
     """
     videos = find_videos(rollouts)
     adapted = {f"M = {shots}": {robot: f"{robot}-{shots}" for robot in HELD_OUT_ROBOTS} for shots in (0, *SHOTS)}
+    others = dict(zip(ROBOT_NAMES, (*ROBOT_NAMES[1:], ROBOT_NAMES[0]), strict=True))
     wanted = {
         "actions": {label: dict.fromkeys(HELD_OUT_ROBOTS, row) for row, label in ACTIONS.items()},
         "ladder": {label: dict.fromkeys(HELD_OUT_ROBOTS, row) for row, label in LADDER.items()},
         "few_shot": adapted,
+        "loeo": {
+            "of a model that never saw it": {robot: f"loeo_{robot}" for robot in ROBOT_NAMES},
+            "of one that did": {robot: f"loeo_{other}" for robot, other in others.items()},
+        },
+        "baselines": {label: dict.fromkeys(HELD_OUT_ROBOTS, row) for row, label in SYSTEMS.items()},
     }
     made = {part: _make_strip(part, columns, scores, data, videos) for part, columns in wanted.items()}
     return {part: strip for part, strip in made.items() if strip is not None}
@@ -82,7 +88,7 @@ def _children(folder: Path) -> list[Path]:
 def _make_strip(
     part: str, columns: Mapping[str, Mapping[str, str]], scores: Scores, data: Path, videos: Videos
 ) -> Strip | None:
-    """Observed frame and all variants of a part, for each held-out robot; None where fewer than two can be shown."""
+    """Observed frame and all variants of a part, for each of its robots; None where fewer than two can be shown."""
     names = {
         label: {robot: find_variant(part, row).name for robot, row in by_robot.items()} for label, by_robot in columns.items()
     }
@@ -107,7 +113,8 @@ def _median_scene(
 ) -> tuple[str, int, list[str]] | None:
     """Task, seed and robots: of the scenes that most variants show on most robots, the one in the middle by LPIPS."""
     shown = {name for by_robot in names.values() for name in by_robot.values()}
-    chosen = rows[(rows["metric"] == RANKED_BY) & rows[VARIANT].isin(shown) & rows["robot"].isin(HELD_OUT_ROBOTS)]
+    robots = list(dict.fromkeys(robot for by_robot in names.values() for robot in by_robot))
+    chosen = rows[(rows["metric"] == RANKED_BY) & rows[VARIANT].isin(shown) & rows["robot"].isin(robots)]
     keys = zip(chosen[VARIANT], chosen["task"], chosen["seed"], chosen["robot"], strict=True)
     chosen = chosen[np.array([key in videos for key in keys], bool)]
     if chosen[VARIANT].nunique() < 2:
@@ -116,4 +123,4 @@ def _median_scene(
     full = scenes[scenes["size"] == scenes["size"].max()].sort_values(["mean", "task", "seed"])
     middle = full.iloc[len(full) // 2]
     there = chosen[(chosen["task"] == middle["task"]) & (chosen["seed"] == middle["seed"])]
-    return str(middle["task"]), int(middle["seed"]), [robot for robot in HELD_OUT_ROBOTS if robot in set(there["robot"])]
+    return str(middle["task"]), int(middle["seed"]), [robot for robot in robots if robot in set(there["robot"])]

@@ -99,6 +99,33 @@ def relative_gain(after: Mean, before: Mean, metric: MetricInfo) -> Mean:
     return combine(lambda new, old: sign * (new - old) / np.abs(old), after, before)
 
 
+def relative_loss(after: Mean, before: Mean, metric: MetricInfo) -> Mean:
+    """By how much a mean is worse than another, of the latter; positive is worse whatever the metric."""
+    return combine(np.negative, relative_gain(after, before, metric))
+
+
+def mean_of_folds_that_saw(grades: Grades, robot: str, metric: str) -> Mean | None:
+    """Mean on a robot over the leave-one-embodiment-out folds that trained on it; None where none was graded."""
+    rows = [f"loeo_{other}" for other in ROBOT_NAMES if other != robot] if metric in grades.metrics else []
+    means = [mean for row in rows if (mean := grades.mean("loeo", row, robot, metric, shared=True)) is not None]
+    return combine(average, *means) if means else None
+
+
+def unseen_gap(grades: Grades, robot: str, metric: str) -> Mean | None:
+    """By how much the fold that never saw a robot is worse on it than the folds that did, of their mean; positive is worse.
+
+    It is paired by episode, and the robot's own difficulty cancels. None where one of both was not graded.
+    """
+    saw = mean_of_folds_that_saw(grades, robot, metric)
+    unseen = grades.mean("loeo", f"loeo_{robot}", robot, metric, shared=True) if saw is not None else None
+    return None if saw is None or unseen is None else relative_loss(unseen, saw, grades.metrics[metric])
+
+
+def average(*values: np.ndarray) -> np.ndarray:
+    """Mean of arrays [...] of one shape."""
+    return np.stack(values).sum(axis=0) / len(values)
+
+
 def row_keys(part: str, variant: Variant) -> list[str]:
     """The rows of a part that a variant of it fills."""
     if variant.target is not None:

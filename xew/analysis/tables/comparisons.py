@@ -7,7 +7,7 @@ import numpy as np
 
 from xew.analysis.correlation import exact_p
 from xew.analysis.paper import PAPER_TITLES
-from xew.analysis.statistics.grades import SEEN, Grades, relative_gain
+from xew.analysis.statistics.grades import SEEN, Grades, average, mean_of_folds_that_saw, relative_gain, relative_loss
 from xew.analysis.tables.labels import SHORT_ROBOTS
 from xew.protocol import BASELINES, HELD_OUT_ROBOTS, PASTED_RENDER, ROBOT_NAMES, SEEN_ROBOTS
 from xew.statistics import MIN_SCENES, SIGNIFICANCE, Mean, combine, largest_floor
@@ -124,10 +124,7 @@ class Reader:
     def mean_of_seen(self, robot: str, metric: str) -> Mean | None:
         """Mean on a robot over the leave-one-embodiment-out folds that saw it; None where none was graded."""
         if (robot, metric) not in self._seen:
-            rows = [f"loeo_{other}" for other in ROBOT_NAMES if other != robot] if metric in self.grades.metrics else []
-            means = [self.grades.mean("loeo", row, robot, metric, shared=True) for row in rows]
-            known = [mean for mean in means if mean is not None]
-            self._seen[robot, metric] = combine(_average, *known) if known else None
+            self._seen[robot, metric] = mean_of_folds_that_saw(self.grades, robot, metric)
         return self._seen[robot, metric]
 
     def unseen_gap(self, robot: str, metric: str) -> Comparison:
@@ -142,7 +139,7 @@ class Reader:
         label = f"{SHORT_ROBOTS[robot]} {self.title(metric)}"
         unseen = self.mean("loeo", fold, robot, metric)
         doubt = self._doubt((unseen, saw), robot, metric, ("loeo", fold))
-        return Comparison(label, _loss(unseen, saw, self.grades, metric), above=0, doubt=doubt)
+        return Comparison(label, relative_loss(unseen, saw, self.grades.metrics[metric]), above=0, doubt=doubt)
 
     def worse_than_seen(self, part: str, row: str, robot: str, metric: str, above: float = 0) -> Comparison:
         """The loss of a row on a robot that it did not see from what it would score had it seen it; positive is worse.
@@ -156,10 +153,10 @@ class Reader:
         known = [mean for mean in saw if mean is not None]
         if len(known) < len(saw):
             doubt = self._doubt((new, old), robot, metric, (part, row)) or OTHER_ROBOTS
-            return Comparison(label, _loss(new, old, self.grades, metric), above, doubt=doubt)
-        expected = combine(lambda score, own, *others: score * own / _average(*others), old, *known)
+            return Comparison(label, relative_loss(new, old, self.grades.metrics[metric]), above, doubt=doubt)
+        expected = combine(lambda score, own, *others: score * own / average(*others), old, *known)
         doubt = self._doubt((new, expected), robot, metric, (part, row))
-        return Comparison(label, _loss(new, expected, self.grades, metric), above, doubt=doubt)
+        return Comparison(label, relative_loss(new, expected, self.grades.metrics[metric]), above, doubt=doubt)
 
     def share(self, start: Mean, after: Mean, end: Mean, metric: str) -> tuple[Mean, str]:
         """The share of the gap from a start to a better end that is closed, and a doubt about it, or ''.
@@ -218,11 +215,3 @@ class Reader:
         inside = floor > 0 and abs(means[0].value - means[1].value) <= floor
         unknown = "no noise floor: the true video was not graded" if np.isnan(floor) else ""
         return self._doubt_of_few(means) or unknown or (f"inside the noise floor of {floor:.3g}" if inside else "")
-
-
-def _average(*values: np.ndarray) -> np.ndarray:
-    return np.stack(values).sum(axis=0) / len(values)
-
-
-def _loss(new: Mean, old: Mean, grades: Grades, metric: str) -> Mean:
-    return combine(np.negative, relative_gain(new, old, grades.metrics[metric]))

@@ -12,12 +12,13 @@ import pandas as pd
 
 from xew.analysis.correlation import Correlation, dof_correlation, loeo_correlation
 from xew.analysis.paper import AXES, PAPER_TITLES, Paper
-from xew.analysis.statistics.grades import Grades
+from xew.analysis.statistics.grades import Grades, unseen_gap
 from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables.labels import PAPER_METRICS, SHORT_ROBOTS
-from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection
+from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, metric_title
 from xew.config import ConfigError
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES
+from xew.statistics import Mean, strict_metrics
 
 AXIS_TITLES = {
     "kinematic": "Kinematic distance [m]",
@@ -191,6 +192,50 @@ def own_correlation_tables(grades: Grades, distances: Distances) -> list[Table]:
     return [table] if own else []
 
 
+def unseen_gaps(grades: Grades, metric: str) -> list[Mean] | None:
+    """`unseen_gap` of each robot in the order of ROBOT_NAMES; None where a fold was not graded, or r is not defined."""
+    gaps = [unseen_gap(grades, robot, metric) for robot in ROBOT_NAMES]
+    known = [gap for gap in gaps if gap is not None]
+    return known if _vary([gap.value for gap in known]) else None
+
+
+def gap_correlation_table(grades: Grades, distances: Distances) -> list[Table]:
+    """The gap of each robot in the metrics that decide, and whether it goes with distance; none without all five folds.
+
+    A robot's score when it was held out also tells how hard it is to render for a model that knows it. The gap does not.
+    """
+    deciding = dict.fromkeys(strict_metrics(grades.metrics).get(name, name) for name in PAPER_METRICS if name in grades.metrics)
+    found = {metric: gaps for metric in deciding if (gaps := unseen_gaps(grades, metric)) is not None}
+
+    def row(metric: str, gaps: Sequence[Mean]) -> TableRow:
+        cells = [_percent_cell(gap, grades.level) for gap in gaps]
+        for axis in AXES:
+            result = loeo_correlation(distances.of(axis).tolist(), [gap.value for gap in gaps])
+            cells += [
+                _signed_cell([result.r], []),
+                _signed_cell([result.low, result.high], []),
+                TableCell(f"{result.p_value:.3f}", value=result.p_value),
+            ]
+        return TableRow((metric_title(grades.metrics[metric]),), tuple(cells))
+
+    heads = ("Pearson r", "leave one out", "p")
+    table = Table(
+        "gap_correlations",
+        "The gap of each robot, and whether it goes with distance",
+        "Gap: by how much the fold that never saw a robot is worse on it than the four folds that did, of their mean, on the "
+        "same episodes; what makes a robot hard for every model cancels. r of distance with the gap, its range when one robot "
+        "is left out, and the exact two-sided p over all 120 pairings. Ours, and exploratory: the claims are about scores."
+        f"{_note_printed_distances(distances)}",
+        ("metric",),
+        (
+            *(Column(SHORT_ROBOTS[robot], "Gap") for robot in ROBOT_NAMES),
+            *(Column(title, AXIS_TITLES[axis]) for axis in AXES for title in heads),
+        ),
+        (TableSection("", tuple(row(metric, gaps) for metric, gaps in found.items())),),
+    )
+    return [table] if found else []
+
+
 def certainty_table(grades: Grades, distances: Distances, paper: Paper) -> Table:
     """Table of what five points can say: exact p, Spearman, bootstrap over robots, stability of the sign."""
     found = correlate(grades, distances)
@@ -233,8 +278,12 @@ def format_signed(value: float) -> str:
 def _loeo_scores(grades: Grades, metric: str) -> list[float] | None:
     means = [grades.mean("loeo", f"loeo_{robot}", robot, metric) if metric in grades.metrics else None for robot in ROBOT_NAMES]
     values = [mean.value for mean in means if mean is not None]
-    varies = all(np.ptp(np.delete(values, i)) > 0 for i in range(len(values))) if len(values) > 2 else False
-    return values if len(values) == len(ROBOT_NAMES) and varies else None
+    return values if _vary(values) else None
+
+
+def _vary(values: Sequence[float]) -> bool:
+    """Whether there is a number for each robot, and they vary whichever robot is left out."""
+    return len(values) == len(ROBOT_NAMES) and all(np.ptp(np.delete(values, i)) > 0 for i in range(len(values)))
 
 
 def _note_missing_folds(grades: Grades, metrics: Sequence[str]) -> str:
@@ -260,6 +309,13 @@ def _signed_cell(ours: Sequence[float], printed: Sequence[float]) -> TableCell:
         high=ours[-1] if len(ours) == 2 else np.nan,
         printed=printed[0] if len(printed) == 1 else np.nan,
     )
+
+
+def _percent_cell(mean: Mean, level: float) -> TableCell:
+    """A cell of a share in percent with its interval."""
+    low, high = mean.interval(level)
+    text, *ends = (f"{100 * number:+.0f}".replace("-", "−") for number in (mean.value, low, high))
+    return TableCell(f"{text} %", "" if np.isnan(low) else " to ".join(ends), value=mean.value, low=low, high=high)
 
 
 def _robot_table(distances: Distances, name: str, title: str, caption: str, features: Mapping[str, str]) -> Table:
