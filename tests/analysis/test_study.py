@@ -427,6 +427,17 @@ def test_gpus_are_shared_out(study: Study) -> None:
     assert machine.has_room_for(Step("train", "c", (), (), None, study.out, gpus=3))
 
 
+def test_data_are_made_on_every_gpu(study: Study) -> None:
+    machine, generate = ThisMachine(("2", "5", "7"), 1, {}, beside=2), plan(study)["generate"]
+    machine.start(generate, (STEPS, str(study.out / "x"), "x"), study.out / "generate.log")
+    assert machine._running["generate"].slots == ("2", "5", "7")
+    assert machine.has_room_for(Step("distances", "", (), (), None, study.out)), "others go beside"
+    assert generate.gpus_of(3) == 3 and plan(study)["distances"].gpus_of(3) == 1
+    while machine._running:
+        machine.wait()
+    assert ThisMachine((), 2, {}).has_room_for(generate)
+
+
 def test_gpus_that_are_not_there(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     assert visible_gpus() == ()

@@ -55,7 +55,7 @@ WITH_WORKERS = ("devices.workers", "generate", "yields")
 class InlineWorkers:
     """Workers that do their jobs in the test's own process: a process of their own imports for several seconds."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, devices: Sequence[Any] = ()) -> None:
         pass
 
     def __enter__(self) -> "InlineWorkers":
@@ -74,7 +74,7 @@ def work_inline(patch: "pytest.MonkeyPatch") -> None:
         patch.setattr(f"xew.sim_warp.{module}.Workers", InlineWorkers)
 
 
-def fill_disk() -> None:
+def fill_disk(_: object = None) -> None:
     """Let this process write no file as large as the video of twelve frames."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (20 * 1024, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
 

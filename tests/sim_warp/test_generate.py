@@ -15,8 +15,8 @@ from typing import Any, Literal, cast
 import pytest
 import warp as wp
 
-from tests.sim_warp.halves import half
 from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, fill_disk, work_inline
+from tests.sim_warp.worker_jobs import half, name_of_own_device
 from xew.config import ConfigError
 from xew.dataset import find_accepted, find_records
 from xew.episode import EpisodeError, Record, episode_folder, read_record, verify_episode, write_episode
@@ -196,7 +196,7 @@ def test_a_full_disk_in_a_worker_is_one_line(
 ) -> None:
     """A limit on the size of files, which the worker sets as it begins, stands for the disk."""
     monkeypatch.setattr(sys, "argv", ["generate", *FLAGS, "--workers", "1", "--out", str(tmp_path)])
-    monkeypatch.setattr(workers, "quiet_warp", fill_disk)
+    monkeypatch.setattr(workers, "_begin_worker", fill_disk)
     with pytest.raises(SystemExit) as left:
         main()
     said = capfd.readouterr().err
@@ -299,16 +299,16 @@ def test_physics_on_the_cpu_leaves_the_gpu_to_the_pictures(
     """Five scenes of two robots on a GPU that steps eight worlds together: batches, devices of the jobs, compiled kernels."""
     compiled: dict[str, str] = {}
     made: list[tuple[int, object]] = []
-    gpu = SimpleNamespace(is_cuda=True, alias="cuda:0", total_memory=1e12)
-    monkeypatch.setattr(command, "find_device", lambda name: wp.get_device("cpu") if name == "cpu" else gpu)
+    gpus = [SimpleNamespace(is_cuda=True, alias=f"cuda:{number}", total_memory=1e12) for number in range(2)]
+    monkeypatch.setattr(command, "find_devices", lambda name: gpus)
     monkeypatch.setattr(command, "compile_on_devices", lambda pool, devices, batch: compiled.update(devices))
-    monkeypatch.setattr(command, "_make", lambda jobs, devices, **_: made.append((len(jobs), devices)) or [])
+    monkeypatch.setattr(command, "_make", lambda jobs, physics, **_: made.append((len(jobs), physics)) or [])
     work_inline(monkeypatch)
     args = Args((TASK,), ("a", "b"), out=tmp_path, batch=8, physics=physics)
     with command.start_workers(args, dict.fromkeys("ab", WITH_SLOW[SLOW])) as make:
         assert list(make([Job(TASK, seed, ("a", "b")) for seed in range(5)])) == []
     stepped = physics or "cuda:0"
-    assert made == [(size, ("cuda:0", stepped)) for size in sizes]
+    assert made == [(size, physics) for size in sizes]
     assert compiled == {"physics": stepped, "kinematics": stepped, "rendering": "cuda:0"}
 
 
@@ -375,15 +375,44 @@ def test_a_hopeless_task_gives_up_and_says_so() -> None:
 
 @pytest.mark.parametrize(
     ("cores", "gigabytes", "physics", "count"),
-    [(16, 141, "cuda", 8), (32, 80, "cuda", 8), (32, 80, "cpu", 26), (16, 80, "cpu", 16), (1, 4, "cuda", 1)],
+    [
+        (16, [141], "cuda", 8),
+        (32, [80], "cuda", 8),
+        (32, [80, 80], "cuda", 16),
+        (32, [80], "cpu", 26),
+        (32, [80, 80], "cpu", 32),
+        (16, [80], "cpu", 16),
+        (1, [4], "cuda", 1),
+    ],
 )
-def test_a_gpu_has_as_many_workers_as_cores_and_its_memory_allow(
-    cores: int, gigabytes: int, physics: str, count: int, monkeypatch: pytest.MonkeyPatch
+def test_gpus_have_as_many_workers_as_cores_and_their_memory_allow(
+    cores: int, gigabytes: list[int], physics: str, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(workers, "usable_cores", lambda: cores)
-    gpu = SimpleNamespace(is_cuda=True, total_memory=gigabytes * 1e9)
-    stepping = gpu if physics == "cuda" else SimpleNamespace(is_cuda=False)
-    assert workers.worker_count(cast(Any, gpu), cast(Any, stepping)) == count
+    gpus = [SimpleNamespace(is_cuda=True, total_memory=size * 1e9) for size in gigabytes]
+    stepping = gpus[0] if physics == "cuda" else SimpleNamespace(is_cuda=False)
+    assert workers.worker_count(cast(Any, gpus), cast(Any, stepping)) == count
+
+
+def test_workers_have_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[tuple[Any, ...]] = []
+    taken: list[str] = []
+    monkeypatch.setattr(workers, "open_processes", lambda count, imported, begin, arguments: begun.append((begin, arguments)))
+    monkeypatch.setattr(wp, "set_device", taken.append)
+    gpus = [SimpleNamespace(alias=f"cuda:{number}") for number in range(2)]
+    Workers(3, cast(Any, gpus))
+    [(begin, arguments)] = begun
+    for _ in range(3):
+        begin(*arguments)
+    assert taken == ["cuda:0", "cuda:1", "cuda:0"]
+    monkeypatch.setattr(wp, "get_cuda_devices", lambda: gpus)
+    assert workers.find_devices(None) == gpus
+    assert [device.alias for device in workers.find_devices("cpu")] == ["cpu"]
+
+
+def test_a_worker_has_its_device_as_warps_default() -> None:
+    with Workers(1, [wp.get_device("cpu")]) as pool:
+        assert list(pool.run(name_of_own_device, [0])) == ["cpu"]
 
 
 def test_workers_hand_over_results_and_errors() -> None:

@@ -10,8 +10,12 @@ Command: python -m xew.model.latents CONFIG [--data … and other overrides]
 
 import json
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
+
+from tqdm import tqdm
 
 from xew.compilation import keep_compiled_programs, take_memory_as_needed
 from xew.config import ConfigError, user_errors
@@ -79,10 +83,15 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
     # Experiments of a study share a cache and encode at once: those of other conditions go on, those of the same ones wait.
     encoded = ("rgb", *sorted(condition.name for condition in encoding.inputs.conditions.values()))
     with hold_lock(encoding.folder.with_name("-".join((encoding.folder.name, *encoded))), wait=True):
-        written = encode_episodes(cache, [*episodes, *replay_episodes(dataset, choice)], source, batch, processes)
+        measure = partial(report_ceiling, experiment, cache, dataset, episodes, source)
+        with ThreadPoolExecutor(1) as beside:
+            # While others encode this process only waits; compiling what the ceiling takes is half a minute on a GPU.
+            measured = beside.submit(measure) if processes > 1 else None
+            written = encode_episodes(cache, [*episodes, *replay_episodes(dataset, choice)], source, batch, processes)
+            ceiling = measured.result() if measured else measure()
         header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip)}
         header |= {"streams": list(cache.streams), "episodes": len(episodes)}
-        header |= {"ceiling": report_ceiling(experiment, cache, dataset, episodes, source)}
+        header |= {"ceiling": ceiling}
         write_text(encoding.folder / "header.json", json.dumps(header, indent=1) + "\n")
     robots, streams = sorted({record.robot for _, record in episodes}), ", ".join(cache.streams)
     print(f"{encoding.folder}: {len(episodes)} episodes of {', '.join(robots)}")
@@ -106,7 +115,7 @@ def report_ceiling(
         return kept
     videos = (source(folder, record, ("rgb",))["rgb"] for folder, record in chosen)
     measured = measure_ceiling(cache.codec, videos, **asdict(experiment.clip))
-    print(f"codec ceiling: {measured}, of {on}")
+    tqdm.write(f"codec ceiling: {measured}, of {on}")
     return {**asdict(measured), "of": on, "robots": sorted({record.robot for _, record in chosen}), "videos": hashes}
 
 

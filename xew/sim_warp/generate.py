@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+import warp as wp
 from tqdm import tqdm
 
 from xew.config import user_errors
@@ -36,7 +37,14 @@ from xew.protocol import (
     expand_robots,
     seed_split,
 )
-from xew.sim_warp.devices.workers import FRAMES_OF_A_PAINTER, Workers, find_device, quiet_warp, worker_count
+from xew.sim_warp.devices.workers import (
+    FRAMES_OF_A_PAINTER,
+    Workers,
+    find_device,
+    find_devices,
+    quiet_warp,
+    worker_count,
+)
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import produce
@@ -76,9 +84,9 @@ class Args:
     batch: int = 256
     """Number of worlds that a GPU steps together. A CPU steps each by itself, as many at a time as there are workers."""
     workers: int | None = None
-    """Number of processes; by default one a core, on a GPU one for two cores, as far as its memory has room."""
+    """Number of processes; by default one a core, on GPUs one for two cores, as far as their memory has room."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
-    """Default: a GPU if Warp finds one."""
+    """Default: all GPUs that Warp finds, which workers share, else the CPU."""
     physics: Literal["cpu"] | None = None
     """Plan and step physics on the CPU, which repeats to the bit where a GPU does not, and use the GPU for pictures alone, so
     that machines of a kind make the same data set (docs/performance.md). Takes about a second of a core an episode."""
@@ -180,20 +188,20 @@ Made = tuple[list[Record], float]
 @contextmanager
 def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Callable[[Sequence[Job]], Iterator[Made]]]:
     """Start worker processes; what is given runs jobs in them, one at a time on a CPU, in large batches on a GPU."""
-    device = find_device(args.device)
-    physics = find_device(args.physics or args.device)
+    devices = find_devices(args.device)
+    physics = find_device(args.physics) if args.physics else devices[0]
     together = 1 if args.unpaired else len(robots)
     size = max(1, args.batch // together) if physics.is_cuda else 1
     make = partial(
         _make,
         robots=robots,
         out=args.out,
-        devices=(device.alias, physics.alias),
+        physics=args.physics,
         batch=args.batch,
         videos=not args.states_only,
     )
-    with Workers(args.workers or worker_count(device, physics)) as workers:
-        parts = {"physics": physics.alias, "kinematics": physics.alias, "rendering": device.alias}
+    with Workers(args.workers or worker_count(devices, physics), devices) as workers:
+        parts = {"physics": physics.alias, "kinematics": physics.alias, "rendering": devices[0].alias}
         compile_on_devices(workers, parts, args.batch)
 
         def run(jobs: Sequence[Job]) -> Iterator[Made]:
@@ -205,18 +213,18 @@ def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Calla
 
 
 @cache
-def _renderer(device: str, physics: str) -> Renderer:
-    """The renderer of a worker process, made once."""
-    return Renderer(device, FRAMES_OF_A_PAINTER if device != physics else None)
+def _renderer(painter: bool) -> Renderer:
+    """The renderer of a worker process on its own device, made once."""
+    return Renderer(frames_per_chunk=FRAMES_OF_A_PAINTER if painter else None)
 
 
 def _make(
-    jobs: Sequence[Job], robots: Mapping[str, RobotSpec], out: Path, devices: tuple[str, str], batch: int, videos: bool
+    jobs: Sequence[Job], robots: Mapping[str, RobotSpec], out: Path, physics: str | None, batch: int, videos: bool
 ) -> list[Made]:
-    """Make some jobs in a worker process, with pictures and physics on these devices."""
+    """Make some jobs in a worker process, on its own device, with physics there or on another."""
     begin = time.perf_counter()
-    pictures, physics = devices
-    seeds = produce(jobs, out, _renderer(pictures, physics), batch, videos, robots, physics)
+    painter = physics is not None and physics != wp.get_device().alias
+    seeds = produce(jobs, out, _renderer(painter), batch, videos, robots, physics)
     seconds = (time.perf_counter() - begin) / len(jobs)
     return [(records, seconds) for records in seeds]
 
@@ -371,7 +379,7 @@ def _demand_enough(families: Sequence[Family]) -> None:
 def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
-    print(f"device: {find_device(args.device).name}")
+    print(f"device: {', '.join(device.name for device in find_devices(args.device))}")
     with hold_lock(args.out):
         families = generate(args)
     print(yield_table([record for family in families for seed in family.done.values() for record in seed.values()]))

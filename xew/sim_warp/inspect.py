@@ -28,7 +28,7 @@ from xew.dataset import explain_missing, read_dataset
 from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, encode_png, read_record, read_states, read_video, verify_episode
 from xew.files import hold_lock, replacing, write_bytes, write_section
 from xew.names import folder_name, path_below
-from xew.sim_warp.devices.workers import Workers, find_device, quiet_warp, worker_count
+from xew.sim_warp.devices.workers import Workers, find_devices, quiet_warp, worker_count
 from xew.sim_warp.generate import yield_table
 from xew.sim_warp.inspection.explorer import Page, choose_scenes, find_predictions, write_page
 from xew.sim_warp.inspection.visibility import HEADING as VISIBILITY
@@ -199,11 +199,11 @@ def rerender(folders: list[Path], count: int) -> None:
 
 def render_videos(folders: list[Path]) -> None:
     """Make and store the videos of episodes that have none."""
-    device = find_device(None)
+    devices = find_devices(None)
     several = len(folders) >= 2 * EPISODES_PER_WORKER
-    with Workers(worker_count(device)) as workers:
+    with Workers(worker_count(devices), devices) as workers:
         if several:
-            compile_kernels(workers, device, 1, ("rendering",))
+            compile_kernels(workers, devices[0], 1, ("rendering",))
         made = workers.run(_render_video, folders) if several else map(_render_video, folders)
         for _ in tqdm(made, desc="rendering", unit="episode", total=len(folders)):
             pass
@@ -212,7 +212,7 @@ def render_videos(folders: list[Path]) -> None:
 
 @cache
 def _renderer() -> Renderer:
-    """The renderer of this process, made once."""
+    """The renderer of this process on its own device, made once."""
     return Renderer()
 
 

@@ -27,7 +27,7 @@ from xew.config import user_errors
 from xew.episode import EpisodeError, Record
 from xew.files import hold_lock, write_text
 from xew.protocol import SHARED_MOTION, expand_robots
-from xew.sim_warp.devices.workers import Workers, find_device, quiet_warp, worker_count
+from xew.sim_warp.devices.workers import Workers, find_devices, quiet_warp, worker_count
 from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
 from xew.sim_warp.production.episodes import header
 from xew.sim_warp.production.warm_up import compile_kernels
@@ -58,9 +58,9 @@ class Args:
     batch: int = 256
     """Number of worlds that a GPU steps together."""
     workers: int | None = None
-    """Number of processes; by default one a core, on a GPU one for two cores."""
+    """Number of processes; by default one a core, on GPUs one for two cores."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
-    """Default: a GPU if Warp finds one."""
+    """Default: all GPUs that Warp finds, which workers share, else the CPU."""
     page: Path | None = None
     """Markdown file to write; none is written without it."""
 
@@ -85,20 +85,21 @@ def attempt_seeds(args: Args) -> Iterator[list[Record]]:
             f"nothing to try of {len(tasks)} tasks, {len(robots)} robots and {args.seeds} seeds from {args.first_seed}; name "
             "tasks and robots, --seeds from 1 and --first-seed from 0."
         )
-    device = find_device(args.device)
-    size = max(1, args.batch // len(robots)) if device.is_cuda else 1
+    devices = find_devices(args.device)
+    size = max(1, args.batch // len(robots)) if devices[0].is_cuda else 1
     batches = [jobs[start : start + size] for start in range(0, len(jobs), size)]
-    attempt = partial(attempt_batch, device=device.alias, batch=args.batch, robots=robots)
-    with Workers(args.workers or worker_count(device)) as workers:
-        compile_kernels(workers, device, args.batch, ("physics", "kinematics"))
+    attempt = partial(attempt_batch, batch=args.batch, robots=robots)
+    with Workers(args.workers or worker_count(devices), devices) as workers:
+        compile_kernels(workers, devices[0], args.batch, ("physics", "kinematics"))
         for seeds in workers.run(attempt, batches):
             yield from seeds
 
 
-def attempt_batch(jobs: Sequence[Job], device: str, batch: int, robots: Mapping[str, RobotSpec] = ROBOTS) -> list[list[Record]]:
-    """Plan and simulate some seeds; the headers that their episodes would have, without hashes."""
-    seeds = simulate_cells(plan_cells(jobs, robots), device, batch)
-    return [[header(cell, wp.get_device(device)) for cell in cells] for cells in seeds]
+def attempt_batch(jobs: Sequence[Job], batch: int, robots: Mapping[str, RobotSpec] = ROBOTS) -> list[list[Record]]:
+    """Plan and simulate some seeds on the worker's device; the headers that their episodes would have, without hashes."""
+    device = wp.get_device()
+    seeds = simulate_cells(plan_cells(jobs, robots), device.alias, batch)
+    return [[header(cell, device) for cell in cells] for cells in seeds]
 
 
 def markdown(records: Sequence[Record]) -> str:

@@ -203,7 +203,7 @@ def test_the_table_of_yields_counts_right() -> None:
 def test_yields_try_every_robot_and_write_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     jobs = [Job(TASK, seed, ("ur5_wsg", SLOW)) for seed in (0, 1)]
-    records = [record for seed in attempt_batch(jobs, "cpu", 1, WITH_SLOW) for record in seed]
+    records = [record for seed in attempt_batch(jobs, 1, WITH_SLOW) for record in seed]
     assert [(record.robot, record.success) for record in records] == [
         ("ur5_wsg", True), (SLOW, True), ("ur5_wsg", True), (SLOW, False),
     ]  # fmt: skip

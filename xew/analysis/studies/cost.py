@@ -121,7 +121,7 @@ def estimate_wall_seconds(
     running: list[tuple[float, str, int]] = []
     while left or running:
         for name in sorted((name for name, needs in left.items() if not needs), key=lambda name: -paths[name]):
-            needed = min(max(1, steps[name].gpus), slots)
+            needed = min(max(1, steps[name].gpus_of(slots)), slots)
             if needed <= free[pools[name]]:
                 free[pools[name]] -= needed
                 del left[name]
@@ -158,7 +158,7 @@ def format_costs(
         names = [name for name, step in steps.items() if step.kind == kind]
         left = [name for name in names if name not in done]
         hours = sum(seconds[name] for name in left) / 3600
-        gpu_hours = sum(seconds[name] * steps[name].gpus for name in left) / 3600
+        gpu_hours = sum(seconds[name] * steps[name].gpus_of(slots) for name in left) / 3600
         disk = sum(costs[name].disk_mb for name in left) / 1000
         totals = [total + value for total, value in zip(totals, (hours, gpu_hours, disk), strict=True)]
         if names:

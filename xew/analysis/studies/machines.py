@@ -108,7 +108,7 @@ class ThisMachine:
 
     def _count_slots(self, step: Step) -> int:
         """Number of slots that a step takes; without GPUs every step takes one."""
-        return max(1, step.gpus) if self.gpus else 1
+        return max(1, step.gpus_of(self.slots)) if self.gpus else 1
 
     def _open_slots(self, step: Step) -> list[str]:
         """Slots that may take a step, the least busy first."""

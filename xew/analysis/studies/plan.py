@@ -43,6 +43,8 @@ class Step:
     """File or folder that it makes."""
     gpus: int = 1
     """Number of GPUs that it takes at once."""
+    every_gpu: bool = False
+    """Whether it takes all GPUs of its machine in place of a number."""
     launcher: tuple[str, ...] = ()
     """Program and arguments that start the command, if any."""
     environment: Mapping[str, str] = field(default_factory=dict)
@@ -58,6 +60,10 @@ class Step:
     @property
     def name(self) -> str:
         return f"{self.kind}/{self.variant}" if self.variant else self.kind
+
+    def gpus_of(self, count: int) -> int:
+        """Number of GPUs that it takes of a machine that has `count`."""
+        return count if self.every_gpu else self.gpus
 
 
 def plan(study: Study) -> dict[str, Step]:
@@ -121,6 +127,7 @@ def _plan_generate(study: Study) -> Step:
         needs=(),
         inputs=[SCHEMA_VERSION, study.tasks, *robots, study.train_seeds, study.test_seeds, *motion],
         product=study.data_folder,
+        every_gpu=True,
     )
 
 

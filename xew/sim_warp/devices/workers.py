@@ -4,15 +4,18 @@ Reads  jobs and a function of a job; both travel to the workers by pickle
 Writes results, as they come
 
 On a GPU, too: what Python does there for a batch takes longer than the device, and several batches in flight keep it busy.
+Where there are several GPUs, workers have one each in turn: Warp's default device in a worker is its own.
 A worker ignores Ctrl-C (its parent decides) and leaves when its parent is killed, so that nobody writes on unwatched
 (`xew.concurrency.open_processes`).
 """
 
+import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
-from typing import TypeVar
+from itertools import cycle, islice
+from typing import Any, TypeVar
 
 import warp
 
@@ -42,27 +45,40 @@ def find_device(name: str | None) -> warp.Device:
         raise ConfigError(f"--device {name}: not on this machine, which has {known}.") from error
 
 
-def worker_count(device: warp.Device, physics: warp.Device | None = None) -> int:
-    """How many processes a device feeds by default: one a core, on a GPU one for two cores if its memory has room.
+def find_devices(name: str | None) -> list[warp.Device]:
+    """The devices that work is shared out to: what --device names, else every GPU, else the CPU. Raises as `find_device`."""
+    return (list(warp.get_cuda_devices()) if name is None else []) or [find_device(name)]
+
+
+def worker_count(devices: Sequence[warp.Device], physics: warp.Device | None = None) -> int:
+    """How many processes feed some devices by default: one a core, on GPUs one for two cores if their memory has room.
 
     Args:
-        device: draws the pictures.
+        devices: draw the pictures; all of a kind.
         physics: plans and steps, if it is another device; a CPU's physics takes a core a process, and less of the GPU's memory.
     """
     cores = usable_cores()
-    if not device.is_cuda:
+    if not devices[0].is_cuda:
         return cores
     paints = physics is not None and not physics.is_cuda
     wanted, memory = (cores, MEMORY_PER_PAINTER) if paints else (cores // 2, MEMORY_PER_WORKER)
-    return max(1, min(wanted, int(device.total_memory // memory)))
+    return max(1, min(wanted, sum(int(device.total_memory // memory) for device in devices)))
 
 
 class Workers:
-    """Processes that are started as they are needed and stay until the end of a `with` block."""
+    """Processes that are started as they are needed and stay until the end of a `with` block.
 
-    def __init__(self, count: int) -> None:
+    Args:
+        count: their number.
+        devices: that they have as Warp's default, in turn; Warp's own choice where left out.
+    """
+
+    def __init__(self, count: int, devices: Sequence[warp.Device] = ()) -> None:
         os.environ.setdefault("OMP_NUM_THREADS", "1")  # a worker is a core; more threads would wait for one another
-        self._pool = open_processes(count, IMPORTED, quiet_warp)
+        own = multiprocessing.get_context("forkserver").SimpleQueue()
+        for alias in islice(cycle([device.alias for device in devices]), count):
+            own.put(alias)
+        self._pool = open_processes(count, IMPORTED, _begin_worker, (own,) if devices else ())
 
     def __enter__(self) -> "Workers":
         return self
@@ -84,6 +100,13 @@ class Workers:
                 "a worker process was killed, perhaps for want of memory. What is done is kept: give the command again, "
                 "with fewer --workers if it happens again."
             ) from error
+
+
+def _begin_worker(own: Any = None) -> None:
+    """Prepare a worker; `own` is the queue from which it takes the name of its device."""
+    quiet_warp()
+    if own is not None:
+        warp.set_device(own.get())
 
 
 def quiet_warp() -> None:

@@ -1,7 +1,9 @@
-"""A job for worker processes, which import its module: one without the simulator, for a quick start."""
+"""Jobs for worker processes, which import their module: one without the simulator, for a quick start."""
 
 import os
 import signal
+
+import warp as wp
 
 from xew.config import ConfigError
 
@@ -13,3 +15,8 @@ def half(number: int) -> int:
     if number == 17:
         os.kill(os.getpid(), signal.SIGKILL)
     return number // 2
+
+
+def name_of_own_device(_: int) -> str:
+    """Warp's name of its default device here."""
+    return wp.get_device().alias
