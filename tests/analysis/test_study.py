@@ -145,6 +145,21 @@ def test_scores_that_were_lost_on_the_way_are_made_again(study: Study) -> None:
     assert run(study, graded(study.out)) == {} and begun(study.out) == {"data": 1}
 
 
+def test_scores_of_baselines_by_video_come_along(study: Study) -> None:
+    """The next grading finds the truth through the codec there, and does not grade it once more."""
+
+    def baselines(out: Path) -> dict[str, Step]:
+        return {"baselines": Step("baselines", "", (STEPS, str(out / "table"), "table"), (), None, out / "table")}
+
+    piece = study.out / "piece"
+    run(replace(study, out=piece), baselines(piece))
+    (piece / "data-baselines" / "task").mkdir(parents=True)
+    (piece / "data-baselines" / "task" / "cell.json").write_text("{}")
+    data = {"generate": Step("generate", "", (), (), None, study.out / "data")}
+    runner.merge_pieces(baselines(study.out) | data, Ledger(study.out), [piece])
+    assert (study.out / "data-baselines" / "task" / "cell.json").is_file()
+
+
 def test_all_tables_of_the_distances_come_along(study: Study) -> None:
     def distances(out: Path) -> dict[str, Step]:
         table = out / "tables" / "data"

@@ -46,11 +46,21 @@ def merge_piece(steps: Mapping[str, Step], ledger: Ledger, piece: Path) -> list[
                 outcome = None  # it was lost on the way
             if outcome is not None and step.kind != "analyse":
                 _take_product(step, ledger.out, piece, outcome)
+                if step.kind == "baselines":
+                    _take_scores_by_video(steps["generate"].product, ledger.out, piece)
                 ledger.take_record(step, there)
                 taken.append(step.name)
         if outcome is not None:
             outcomes[step.name] = outcome
     return taken
+
+
+def _take_scores_by_video(data: Path, out: Path, piece: Path) -> None:
+    """Copy what a piece has beside its data of the baselines' scores, which a grading that is left to do goes on from."""
+    if data.is_relative_to(out):
+        beside = data.with_name(f"{data.name}-baselines").relative_to(out)
+        if (piece / beside).is_dir():
+            shutil.copytree(piece / beside, out / beside, dirs_exist_ok=True)
 
 
 def _take_product(step: Step, out: Path, piece: Path, outcome: str) -> None:
