@@ -66,6 +66,18 @@ def test_shapes_are_not_checked_where_that_is_turned_off() -> None:
         assert done.stdout.strip() == checked, done.stderr
 
 
+@pytest.mark.parametrize(("asked", "least"), [({}, "0.0"), ({"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "7"}, "7.0")])
+def test_commands_keep_all_programs_unless_they_are_told_otherwise(asked: dict[str, str], least: str, tmp_path: Path) -> None:
+    code = (
+        "import jax, xew.compilation as c; c.keep_compiled_programs(); "
+        "print(jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs)"
+    )
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")} | asked
+    environment |= {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.stdout.split() == [str(tmp_path / "xew" / "jax"), least], done.stderr
+
+
 def test_compiled_programs_are_kept_for_other_workers() -> None:
     assert jax.config.jax_compilation_cache_dir == os.environ["JAX_COMPILATION_CACHE_DIR"]
     assert jax.config.jax_persistent_cache_min_compile_time_secs == 0
