@@ -207,6 +207,7 @@ def dry_run(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> str:
         raise Parsed
 
     said = io.StringIO()
+    importlib.import_module(arguments[0])  # before anything is replaced, which what is imported meanwhile would keep
     with monkeypatch.context() as patch, redirect_stdout(said), redirect_stderr(said), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # the module may have been imported before
         # The runs that pages name do not exist, and the command reads a run's config before it parses its options.
