@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from xew.config import ConfigError
 from xew.metrics import (
     lpips,
     lpips_features,
@@ -18,6 +19,7 @@ from xew.metrics import (
     robot_lpips,
     robot_lpips_frames,
 )
+from xew.metrics.grading.weights import check_weights
 from xew.metrics.networks import alexnet
 from xew.metrics.networks.alexnet import ADMITTED, _package_file, read_alexnet
 from xew.metrics.networks.pickles import read_arrays
@@ -50,6 +52,18 @@ def test_a_weight_file_that_asks_for_more_than_arrays_is_refused() -> None:
         read_arrays(io.BytesIO(pickle.dumps(print)), ADMITTED)
     with pytest.raises(pickle.UnpicklingError, match="numpy"):
         read_arrays(io.BytesIO(pickle.dumps(np.random.default_rng)), ADMITTED)
+
+
+def test_missing_weights_are_told_of_metrics_that_need_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing() -> None:
+        raise FileNotFoundError("LPIPS needs its weights")
+
+    check_weights()
+    monkeypatch.setattr(alexnet, "read_alexnet", missing)
+    check_weights(("psnr", "mask_iou", "pck_strict"))
+    for name in ("lpips", "region_lpips", "robot_lpips"):
+        with pytest.raises(ConfigError, match="needs its weights"):
+            check_weights(("psnr", name))
 
 
 def test_torchs_files_hold_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -71,6 +71,19 @@ def test_latents_from_states_are_those_from_video(simulated: Path, capsys: pytes
     assert not list((simulated / "bare").rglob("*.mkv"))
 
 
+def test_missing_lpips_is_told_before_anything_is_encoded(
+    simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing() -> None:
+        raise FileNotFoundError("LPIPS needs its weights")
+
+    monkeypatch.setattr("xew.metrics.networks.alexnet.read_alexnet", missing)
+    with pytest.raises(SystemExit):
+        latents.main([str(simulated / "config.yaml"), "--cache", str(tmp_path / "cache")])
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "LPIPS needs its weights" in said and not (tmp_path / "cache").exists()
+
+
 def test_processes_encode_as_one_does(simulated: Path, tmp_path: Path) -> None:
     for processes in ("1", "2"):
         shutil.copytree(simulated / "data", tmp_path / processes / "data")

@@ -35,10 +35,12 @@ from xew.files import hold_lock, write_text
 CHECK_CONFIGS = """
 import sys
 from xew.config import user_errors
+from xew.metrics.grading.weights import check_weights
 from xew.model.experiment import load_experiment
-user_errors(lambda: [load_experiment(path) for path in sys.argv[1:]])()
+user_errors(lambda: [check_weights(), *map(load_experiment, sys.argv[1:])])()
 """
-"""Program that checks experiments in a process of its own, since the analysis does not import the model."""
+"""Program that checks experiments, and that what metrics need is installed, in a process of its own, since the analysis does
+not import the model."""
 
 
 @dataclass(frozen=True)
@@ -137,11 +139,11 @@ def prepare(study: Study) -> None:
 
 
 def check_configs(paths: Sequence[Path]) -> None:
-    """Raises ConfigError with the model's message if it does not accept one of these experiments."""
+    """Raises ConfigError if the model does not accept one of these experiments, or metrics lack their weights."""
     checked = subprocess.run([sys.executable, "-c", CHECK_CONFIGS, *map(str, paths)], capture_output=True, text=True)
     if checked.returncode:
         message = checked.stderr.strip().removeprefix("error: ")
-        raise ConfigError(f"the model does not accept the study's experiments.\n{message}")
+        raise ConfigError(f"the study's experiments cannot be run here.\n{message}")
 
 
 def select_steps(steps: Mapping[str, Step], patterns: Sequence[str]) -> list[Step]:

@@ -51,6 +51,7 @@ from xew.metrics.grading.scores import (
     write_whole,
 )
 from xew.metrics.grading.summary import summarize, to_markdown
+from xew.metrics.grading.weights import check_weights
 from xew.metrics.grading.workers import worker_count
 from xew.metrics.metric import SUITES
 from xew.metrics.truth import read_truth
@@ -164,6 +165,7 @@ def main(args: Args) -> None:
 def grade_tables(args: Args) -> None:
     """Grade, write the tables and print the summary. Raises EpisodeError where a rollout could not be graded."""
     metrics = choose_metrics(args)
+    check_weights(metrics)
     attributes = describe(settings(args), metrics)
     store = CellStore(path_beside(args.out, "cells"), baselines_folder(args.data, args.out))
     errors: list[str] = []

@@ -26,7 +26,7 @@ from xew.model.cache.encode import default_processes, encode_episodes
 from xew.model.cache.keys import CACHE_VERSION
 from xew.model.cache.scales import keep_scales
 from xew.model.cache.store import LatentCache
-from xew.model.codecs.ceiling import choose_evenly, measure_ceiling
+from xew.model.codecs.ceiling import check_lpips, choose_evenly, measure_ceiling
 from xew.model.episodes.choice import replay_episodes, training_episodes
 from xew.model.experiment import Experiment, parse_experiment
 from xew.model.settings.settings import Clip
@@ -73,6 +73,7 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
         batch: clips that the codec encodes at once.
         processes: number of processes that share the work.
     """
+    check_lpips()
     encoding, choice, dataset = experiment.encoding, experiment.choice, read_dataset(experiment.data)
     episodes = training_episodes(dataset, choice)
     with hold_lock(encoding.folder, wait=True):  # whoever comes second finds a codec that is fitted already

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import UInt8
 
-from xew.config import ConfigError
 from xew.model.codecs.contract import Codec
 from xew.model.video.frames import to_camera_size, to_model_size
 
@@ -39,12 +38,9 @@ class Ceiling:
 
 def check_lpips() -> None:
     """Raise ConfigError unless the weights of LPIPS are installed, before long work that needs them at its end."""
-    from xew.metrics.networks.alexnet import read_alexnet
+    from xew.metrics.grading.weights import check_weights
 
-    try:
-        read_alexnet()
-    except FileNotFoundError as error:
-        raise ConfigError(str(error)) from error
+    check_weights(("lpips",))
 
 
 def measure_ceiling(
