@@ -37,14 +37,7 @@ from xew.protocol import (
     expand_robots,
     seed_split,
 )
-from xew.sim_warp.devices.workers import (
-    FRAMES_OF_A_PAINTER,
-    Workers,
-    find_device,
-    find_devices,
-    quiet_warp,
-    worker_count,
-)
+from xew.sim_warp.devices.workers import FRAMES_OF_A_PAINTER, Workers, find_device, find_devices, quiet_warp, worker_count
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import produce
@@ -86,7 +79,7 @@ class Args:
     workers: int | None = None
     """Number of processes; by default one a core, on GPUs one for two cores, as far as their memory has room."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
-    """Default: all GPUs that Warp finds, which workers share, else the CPU."""
+    """Default: all GPUs of the kind of the first, which workers share, else the CPU."""
     physics: Literal["cpu"] | None = None
     """Plan and step physics on the CPU, which repeats to the bit where a GPU does not, and use the GPU for pictures alone, so
     that machines of a kind make the same data set (docs/performance.md). Takes about a second of a core an episode."""

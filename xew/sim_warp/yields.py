@@ -60,7 +60,7 @@ class Args:
     workers: int | None = None
     """Number of processes; by default one a core, on GPUs one for two cores."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
-    """Default: all GPUs that Warp finds, which workers share, else the CPU."""
+    """Default: all GPUs of the kind of the first, which workers share, else the CPU."""
     page: Path | None = None
     """Markdown file to write; none is written without it."""
 

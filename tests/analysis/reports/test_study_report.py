@@ -26,7 +26,7 @@ from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import (
     correlation_table,
     distance_tables,
-    gap_correlation_table,
+    gap_correlation_tables,
     own_correlation_tables,
     printed_distances,
     read_distances,
@@ -374,13 +374,13 @@ def test_the_gap_leaves_out_how_hard_a_robot_is(folder: Path, rows: pd.DataFrame
         here = (made["robot"] == robot) & (made["metric"] == "lpips")
         made.loc[here, "value"] = difficulty
         made.loc[here & made["variant"].str.startswith(f"loeo_{robot}"), "value"] = difficulty * (1 + 2 * distance)
-    [table] = gap_correlation_table(StudyGrades(made, paper.infos, paper_axes(paper)), distances)
+    [table] = gap_correlation_tables(StudyGrades(made, paper.infos, paper_axes(paper)), distances)
     lpips = next(row for row in table.sections[0].rows if row.labels[0].startswith("LPIPS"))
     assert [cell.value for cell in lpips.cells[:5]] == pytest.approx(2 * kinematic)
     assert lpips.cells[0].text == f"{200 * kinematic[0]:+.0f} %"
     r, p = lpips.cells[-3].value, lpips.cells[-1].value
     assert r == pytest.approx(1) and p == pytest.approx(np.mean(_all_r(kinematic) > 1 - 1e-9))
-    assert gap_correlation_table(PaperGrades(paper, paper.infos), distances) == []  # it prints no fold on robots that it saw
+    assert gap_correlation_tables(PaperGrades(paper, paper.infos), distances) == []  # it prints no fold on robots that it saw
 
 
 def test_words_beside_points_keep_apart_and_in_order() -> None:

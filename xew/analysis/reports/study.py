@@ -29,7 +29,7 @@ from xew.analysis.tables.distances import (
     certainty_table,
     correlation_table,
     distance_tables,
-    gap_correlation_table,
+    gap_correlation_tables,
     own_correlation_tables,
     printed_distances,
     read_distances,
@@ -173,7 +173,7 @@ def _make_tables(
     tables += [count_table(builder), *distance_tables(known)]
     if builder.has_results("loeo"):
         tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
-        tables += [*gap_correlation_table(grades, known), certainty_table(grades, known, paper)]
+        tables += [*gap_correlation_tables(grades, known), certainty_table(grades, known, paper)]
     if correlated := difficulty_table(difficulty, grades.metrics):
         tables.append(correlated)
     return tables

@@ -171,7 +171,7 @@ def distance_chart(grades: Grades, distances: Distances, metric: str = "lpips") 
 
 def gap_chart(grades: Grades, distances: Distances, metric: str = "lpips") -> Chart | None:
     """The gap of each robot in a metric by the paper's two distances; None where a fold is missing."""
-    gaps = unseen_gaps(grades, metric) if metric in grades.metrics else None
+    gaps = unseen_gaps(grades, metric)
     if gaps is None:
         return None
     caption = (

@@ -199,7 +199,7 @@ def unseen_gaps(grades: Grades, metric: str) -> list[Mean] | None:
     return known if _vary([gap.value for gap in known]) else None
 
 
-def gap_correlation_table(grades: Grades, distances: Distances) -> list[Table]:
+def gap_correlation_tables(grades: Grades, distances: Distances) -> list[Table]:
     """The gap of each robot in the metrics that decide, and whether it goes with distance; none without all five folds.
 
     A robot's score when it was held out also tells how hard it is to render for a model that knows it. The gap does not.

@@ -46,8 +46,12 @@ def find_device(name: str | None) -> warp.Device:
 
 
 def find_devices(name: str | None) -> list[warp.Device]:
-    """The devices that work is shared out to: what --device names, else every GPU, else the CPU. Raises as `find_device`."""
-    return (list(warp.get_cuda_devices()) if name is None else []) or [find_device(name)]
+    """The devices that work is shared out to: what --device names, else all GPUs of the first one's kind, else the CPU.
+
+    A GPU of another kind, such as a small one for a display, would get as many workers as the others. Raises as `find_device`.
+    """
+    gpus = warp.get_cuda_devices() if name is None else []
+    return [gpu for gpu in gpus if gpu.name == gpus[0].name] or [find_device(name)]
 
 
 def worker_count(devices: Sequence[warp.Device], physics: warp.Device | None = None) -> int:
