@@ -158,9 +158,9 @@ def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
     inputs = {kind: INPUTS[kind](comparison) for kind in sorted({input_kind(name) for name in metrics})}
     values: dict[str, float] = {}
     curves: dict[str, np.ndarray] = {}
-    shared = _curves_by_shared_features(comparison, metrics, inputs)
-    of_tracks = _grade_tracks(comparison, metrics, inputs)
     blocks = Blocks(comparison)
+    shared = _curves_by_shared_features(comparison, metrics, inputs, blocks)
+    of_tracks = _grade_tracks(comparison, metrics, inputs)
     for name in metrics:
         arrays = inputs[input_kind(name)]
         if arrays is None:
@@ -246,27 +246,22 @@ INPUTS: dict[str, Callable[[Comparison], Arrays | None]] = {
 
 
 def _curves_by_shared_features(
-    comparison: Comparison, metrics: Collection[str], inputs: dict[str, Arrays | None]
+    comparison: Comparison, metrics: Collection[str], inputs: dict[str, Arrays | None], blocks: "Blocks"
 ) -> dict[str, np.ndarray]:
-    """Curves [t] float32 by metric, of those that LPIPS's network makes, which is most of the work of grading on a CPU.
-
-    On other devices, where frames are computed many at once, `_curve` makes them.
-    """
-    if jax.default_backend() != "cpu":
-        return {}
+    """Curves [t] float32 by metric, of those that LPIPS's network makes: it sees each video once for all of them."""
     by_function = {METRICS[name].curve: name for name in metrics if name in METRICS and inputs[input_kind(name)] is not None}
     features = comparison.truth.notes.setdefault(f"features from frame {comparison.first}", SharedFeatures())
     curves: dict[str, np.ndarray] = {}
     whole, robot, region = (by_function.get(curve) for curve in (lpips, robot_lpips_frames, region_lpips_frames))
-    video = comparison.video
+    video, cut = comparison.video, None if jax.default_backend() == "cpu" else functools.partial(blocks.cut, whole=False)
     if whole or robot:
         mask = comparison.truth.mask[comparison.first :] if robot else None
-        plain, weighted = features.distances(*video, mask)
+        plain, weighted = features.distances(*video, mask, cut=cut)
         curves |= {whole: plain} if whole else {}
         curves |= {robot: weighted} if robot and weighted is not None else {}
     arrays = inputs["region"] if region else None
     if region and arrays is not None and not (OF_WHOLE_FRAMES.get(region) in curves and _touches_all_borders(arrays[-1][0])):
-        curves[region] = features.distances(*video, box=union_box(arrays[-1]))[0]
+        curves[region] = features.distances(*video, box=union_box(arrays[-1]), cut=cut)[0]
     return curves
 
 
