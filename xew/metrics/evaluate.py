@@ -297,7 +297,7 @@ def grade_all(
     """Grade what is not in the store yet, and return what went wrong.
 
     Episodes are read and graded by threads or processes, a few ahead of each other, so that memory does not grow with their
-    number.
+    number; those with most to grade first, so that none is begun when all others are nearly done.
 
     Raises:
         RolloutError: a video cannot be graded, unless args.keep_going; what was graded before stays in the store.
@@ -307,6 +307,7 @@ def grade_all(
     if len(todo) < len(jobs):
         print(f"{len(jobs) - len(todo)} of {len(jobs)} are graded already in {store.folder}")
     groups = [list(group) for _, group in itertools.groupby(todo, key=lambda pair: (pair[0].episode, pair[0].cell.frames))]
+    groups.sort(key=lambda group: len(group) * group[0][0].cell.frames, reverse=True)
     errors: list[str] = []
     without_shapes: list[Path] = []
     with tqdm(total=len(jobs), initial=len(jobs) - len(todo), desc="evaluate", unit="video", disable=None) as bar:
