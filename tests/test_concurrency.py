@@ -129,3 +129,18 @@ def test_processes_have_the_environment_of_now(monkeypatch: pytest.MonkeyPatch) 
         found += map_in_processes(open_reader, ["XEW_TEST"], 1)
     assert [text for text, _ in found] == ["first", "second"]
     assert len({process for _, process in found} | {os.getpid()}) == 3
+
+
+def open_slow_reader() -> Callable[[str], tuple[str | None, int]]:
+    def read(name: str) -> tuple[str | None, int]:
+        time.sleep(0.5)  # so that every process gets some
+        return os.environ.get(name), os.getpid()
+
+    return read
+
+
+def test_processes_have_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
+    found = dict(map(reversed, map_in_processes(open_slow_reader, ["CUDA_VISIBLE_DEVICES"] * 6, 3, gpus=("4", "7"))))
+    assert sorted(found.values()) == ["4", "4", "7"], "each has one, and keeps it"
+    assert {gpu for gpu, _ in map_in_processes(open_reader, ["CUDA_VISIBLE_DEVICES"], 1)} == {"4,7"}

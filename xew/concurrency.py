@@ -4,11 +4,14 @@ import functools
 import multiprocessing
 import os
 import signal
+import subprocess
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from itertools import cycle, islice
 from multiprocessing import forkserver
+from multiprocessing.queues import SimpleQueue
 from typing import Any, TypeVar
 
 Item = TypeVar("Item")
@@ -22,6 +25,17 @@ parsers in one place (github.com/python/cpython/issues/106905), and two at a tim
 def usable_cores() -> int:
     """Number of processor cores that this process may use: a job of a cluster has fewer than its machine."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def visible_gpus() -> tuple[str, ...]:
+    """NVIDIA's GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    try:
+        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return ()
+    count = len([line for line in listed.splitlines() if line.startswith("GPU ")])
+    limited = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return tuple(map(str, range(count))) if limited is None else tuple(part for part in limited.split(",") if part)
 
 
 def map_in_order(
@@ -64,7 +78,11 @@ def begin_importing(modules: Sequence[str]) -> None:
 
 
 def open_processes(
-    count: int, imported: Sequence[str], begin: Callable[..., object], arguments: tuple[Any, ...] = ()
+    count: int,
+    imported: Sequence[str],
+    begin: Callable[..., object],
+    arguments: tuple[Any, ...] = (),
+    own: Sequence[Any] = (),
 ) -> ProcessPoolExecutor:
     """Processes that ignore Ctrl-C, for the one that started them decides, and that leave with it.
 
@@ -76,21 +94,33 @@ def open_processes(
         imported: modules to import before forking, where this process has started none yet. None of them may start a thread,
             JAX's backend, Warp or CUDA at import, which no fork survives.
         begin: called with `arguments` in each process before its first task.
+        own: what processes have for themselves, in turn, such as a GPU; `begin` has it as its last argument.
     """
     multiprocessing.set_forkserver_preload(list(imported))
     context = multiprocessing.get_context("forkserver")
-    return ProcessPoolExecutor(max(1, count), context, _begin_process, (dict(os.environ), begin, arguments))
+    turns = context.SimpleQueue()
+    for item in islice(cycle(own), max(1, count)):
+        turns.put(item)
+    return ProcessPoolExecutor(
+        max(1, count), context, _begin_process, (dict(os.environ), begin, arguments, turns if own else None)
+    )
 
 
-def _begin_process(environment: dict[str, str], begin: Callable[..., object], arguments: tuple[Any, ...]) -> None:
+def _begin_process(
+    environment: dict[str, str], begin: Callable[..., object], arguments: tuple[Any, ...], turns: "SimpleQueue[Any] | None"
+) -> None:
     os.environ.update(environment)  # as it is now: the process that forks was started with that of an earlier time
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     leave_with_parent(lambda: os._exit(1))
-    begin(*arguments)
+    begin(*arguments, *(() if turns is None else (turns.get(),)))
 
 
 def map_in_processes(
-    opener: Callable[[], Callable[[Item], Result]], items: Sequence[Item], processes: int, imported: Sequence[str] = ()
+    opener: Callable[[], Callable[[Item], Result]],
+    items: Sequence[Item],
+    processes: int,
+    imported: Sequence[str] = (),
+    gpus: Sequence[str] = (),
 ) -> Iterator[Result]:
     """Results of a function over items, in their order, computed by processes of their own.
 
@@ -99,8 +129,9 @@ def map_in_processes(
         items: sent to the processes, as results and exceptions are sent back: all of them can be pickled.
         processes: their number; no more are started than there are items.
         imported: modules that the processes need; see `open_processes`.
+        gpus: of which each process sees one, in turn, as CUDA_VISIBLE_DEVICES names them; where left out all see all.
     """
-    with open_processes(min(processes, len(items)), imported, _open_function, (opener,)) as pool:
+    with open_processes(min(processes, len(items)), imported, _open_function, (opener,), gpus) as pool:
         yield from pool.map(_call_function, items)
 
 
@@ -108,7 +139,9 @@ _opened: list[Callable[[], Any]] = []
 """Function of this process, once `_open_function` has been called; it is made when it is first asked for."""
 
 
-def _open_function(opener: Callable[[], Callable[[Any], Any]]) -> None:
+def _open_function(opener: Callable[[], Callable[[Any], Any]], gpu: str | None = None) -> None:
+    if gpu is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpu  # CUDA reads it once, when this process first uses it
     _opened[:] = [functools.cache(opener)]
 
 

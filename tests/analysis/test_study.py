@@ -19,11 +19,12 @@ from xew.analysis.studies import merge, processes
 from xew.analysis.studies.config import Study, load_study
 from xew.analysis.studies.cost import critical_paths
 from xew.analysis.studies.ledger import Ledger
-from xew.analysis.studies.machines import Machines, RayCluster, ThisMachine, open_machines, visible_gpus
+from xew.analysis.studies.machines import Machines, RayCluster, ThisMachine, open_machines
 from xew.analysis.studies.plan import Step, plan
 from xew.analysis.studies.processes import last_lines, start_step
 from xew.analysis.studies.runner import Budget, StudyRunner, complete_command
 from xew.analysis.studies.status import exit_with_failures
+from xew.concurrency import visible_gpus
 from xew.config import ConfigError
 from xew.episode import EpisodeError
 
@@ -447,7 +448,9 @@ def test_data_are_made_on_every_gpu(study: Study) -> None:
     machine.start(generate, (STEPS, str(study.out / "x"), "x"), study.out / "generate.log")
     assert machine._running["generate"].slots == ("2", "5", "7")
     assert machine.has_room_for(Step("distances", "", (), (), None, study.out)), "others go beside"
-    assert generate.gpus_of(3) == 3 and plan(study)["distances"].gpus_of(3) == 1
+    steps = plan(study)
+    assert generate.gpus_of(3) == steps["baselines"].gpus_of(3) == 3 and steps["distances"].gpus_of(3) == 1
+    assert [step.gpus_of(3) for step in steps.values() if step.kind == "latents"][:2] == [3, 1], "others wait for the first"
     while machine._running:
         machine.wait()
     assert ThisMachine((), 2, {}).has_room_for(generate)

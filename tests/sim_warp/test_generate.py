@@ -395,16 +395,11 @@ def test_gpus_have_as_many_workers_as_cores_and_their_memory_allow(
 
 
 def test_workers_have_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    begun: list[tuple[Any, ...]] = []
-    taken: list[str] = []
-    monkeypatch.setattr(workers, "open_processes", lambda count, imported, begin, arguments: begun.append((begin, arguments)))
-    monkeypatch.setattr(wp, "set_device", taken.append)
+    shared: list[list[str]] = []
+    monkeypatch.setattr(workers, "open_processes", lambda count, imported, begin, own: shared.append(own))
     gpus = [SimpleNamespace(alias=f"cuda:{number}", name="H100") for number in range(2)]
     Workers(3, cast(Any, gpus))
-    [(begin, arguments)] = begun
-    for _ in range(3):
-        begin(*arguments)
-    assert taken == ["cuda:0", "cuda:1", "cuda:0"]
+    assert shared == [["cuda:0", "cuda:1"]]
     monkeypatch.setattr(wp, "get_cuda_devices", lambda: [*gpus, SimpleNamespace(alias="cuda:2", name="T400")])
     assert workers.find_devices(None) == gpus
     assert [device.alias for device in workers.find_devices("cpu")] == ["cpu"]

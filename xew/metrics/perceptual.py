@@ -47,7 +47,7 @@ Box = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 Layers = tuple[tuple[jax.Array, jax.Array, jax.Array], ...]
 """Five layers of frames [n h w d] float32, each with the height and width that are valid."""
 Cut = Callable[[np.ndarray], Sequence[AnyArray]]
-"""What cuts an array [t ...] into blocks [n ...] of one size, on the device where they are needed."""
+"""Function that cuts an array [t ...] into blocks [n ...] of one size, on the device where they are needed."""
 KEPT_FEATURES = 512_000_000
 """Size [bytes] up to which `SharedFeatures` keeps features of a true video: 85 frames of 320x240 and of their box."""
 

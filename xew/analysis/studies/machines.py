@@ -8,7 +8,6 @@ import logging
 import multiprocessing.connection
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Mapping
@@ -20,6 +19,7 @@ from typing import Any, Protocol
 from xew.analysis.studies.config import Study
 from xew.analysis.studies.plan import Step
 from xew.analysis.studies.processes import start_step
+from xew.concurrency import visible_gpus
 from xew.config import TRUST, ConfigError
 
 TRAININGS = ("train", "adapt")
@@ -71,17 +71,6 @@ def open_machines(study: Study) -> Machines:
 def usable_gpus(study: Study) -> tuple[str, ...]:
     """The GPUs of this machine that a study may use, as CUDA_VISIBLE_DEVICES names them."""
     return visible_gpus() if study.machine.gpus is None else tuple(map(str, study.machine.gpus))
-
-
-def visible_gpus() -> tuple[str, ...]:
-    """NVIDIA's GPUs that this process may use."""
-    try:
-        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=True).stdout
-    except (OSError, subprocess.CalledProcessError):
-        return ()
-    count = len([line for line in listed.splitlines() if line.startswith("GPU ")])
-    limited = os.environ.get("CUDA_VISIBLE_DEVICES")
-    return tuple(map(str, range(count))) if limited is None else tuple(part for part in limited.split(",") if part)
 
 
 @dataclass(frozen=True)

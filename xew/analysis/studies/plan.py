@@ -144,6 +144,7 @@ def _plan_latents(study: Study, variant: Variant, experiment: Settings, first: s
         product=study.out / "latents",
         # Streams that variants share are encoded by the first of them that is run: of a split, or of all where the codec is.
         after=() if started or first == name else (first,),
+        every_gpu=first == name and not started,  # all others wait for it
     )
 
 
@@ -194,6 +195,7 @@ def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Ste
         needs=("generate", f"latents/{variant.name}"),
         inputs=[frames, study.evaluate, GRADING_PROTOCOL],
         product=out,
+        every_gpu=True,
     )
 
 

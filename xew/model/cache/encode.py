@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from xew.compilation import keep_compiled_programs
-from xew.concurrency import map_in_order, map_in_processes, usable_cores
+from xew.concurrency import map_in_order, map_in_processes, usable_cores, visible_gpus
 from xew.dataset import Episode
 from xew.episode import Record
 from xew.model.cache.clips import cut_clip, needed_pixels, read_streams
@@ -31,8 +31,8 @@ GROUP = 16
 
 
 def default_processes() -> int:
-    """Number of processes that fill this machine: a CPU's one computes with all cores already."""
-    return 1 if jax.default_backend() == "cpu" else max(1, usable_cores() // CORES_PER_PROCESS)
+    """Number of processes that fill this machine, each with a GPU of its own; a CPU's one computes with all cores already."""
+    return 1 if jax.default_backend() == "cpu" else max(len(jax.local_devices()), usable_cores() // CORES_PER_PROCESS)
 
 
 def encode_episodes(
@@ -47,13 +47,14 @@ def encode_episodes(
     Args:
         source: where their pixels come from; they are read or rendered, and conditions drawn, ahead in threads.
         batch: clips that the codec encodes at once.
-        processes: number of processes that share the work, each with threads and, on a GPU, a codec of its own.
+        processes: number of processes that share the work, each with threads and, on a GPU, a codec of its own; they have the
+            GPUs in turn.
     """
     pending = [episode for episode in episodes if cache.missing(episode[1])]
     if processes > 1:
         groups = [pending[first : first + GROUP] for first in range(0, len(pending), GROUP)]
         opener = functools.partial(_open_encoder, cache, source, batch, processes)
-        sizes, counts = map_in_processes(opener, groups, processes, imported=(__name__,)), list(map(len, groups))
+        sizes, counts = map_in_processes(opener, groups, processes, (__name__,), visible_gpus()), list(map(len, groups))
     else:
         sizes, counts = map_in_order(_Encoder(cache, source, batch).encode, pending), [1] * len(pending)
     written, done = 0, len(episodes) - len(pending)

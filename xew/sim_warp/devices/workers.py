@@ -9,13 +9,11 @@ A worker ignores Ctrl-C (its parent decides) and leaves when its parent is kille
 (`xew.concurrency.open_processes`).
 """
 
-import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
-from itertools import cycle, islice
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import warp
 
@@ -79,10 +77,7 @@ class Workers:
 
     def __init__(self, count: int, devices: Sequence[warp.Device] = ()) -> None:
         os.environ.setdefault("OMP_NUM_THREADS", "1")  # a worker is a core; more threads would wait for one another
-        own = multiprocessing.get_context("forkserver").SimpleQueue()
-        for alias in islice(cycle([device.alias for device in devices]), count):
-            own.put(alias)
-        self._pool = open_processes(count, IMPORTED, _begin_worker, (own,) if devices else ())
+        self._pool = open_processes(count, IMPORTED, _begin_worker, own=[device.alias for device in devices])
 
     def __enter__(self) -> "Workers":
         return self
@@ -106,11 +101,11 @@ class Workers:
             ) from error
 
 
-def _begin_worker(own: Any = None) -> None:
-    """Prepare a worker; `own` is the queue from which it takes the name of its device."""
+def _begin_worker(device: str | None = None) -> None:
+    """Prepare a worker, whose device has this name for Warp."""
     quiet_warp()
-    if own is not None:
-        warp.set_device(own.get())
+    if device is not None:
+        warp.set_device(device)
 
 
 def quiet_warp() -> None:
