@@ -109,6 +109,14 @@ SCALING = {
 }
 """The scaling protocol: the three robots, K bodies, or both; all are tested on Panda, PiPER and 32 unseen bodies. The model of
 the three robots alone is tested on 64 bodies of the wide family, too: one training serves error against distance as well."""
+CROSSED_BODIES = DISTANCE_BODIES[:32]
+"""Bodies of the wide family that two models share out, each training on one half and graded on both."""
+HALVES = {
+    "halves_even": Split(CROSSED_BODIES[0::2], CROSSED_BODIES[1::2]),
+    "halves_odd": Split(CROSSED_BODIES[1::2], CROSSED_BODIES[0::2]),
+}
+"""The protocol of halves: every body is rendered by a model that trained on it and by one that did not, as in the folds of
+LOEO, but with 32 bodies in place of five robots. Keys say which half trains, by the bodies' numbers."""
 VALIDATION = Split(SEEN_ROBOTS, VALIDATION_BODIES)
 """The fixed split's training robots, with the bodies by which choices are made in place of the held-out robots."""
 
@@ -124,7 +132,7 @@ def split_key(split: str, motion: str) -> str:
 
 
 _SHARED_SPLITS = (
-    {"fixed": FIXED} | {f"loeo_{robot}": split for robot, split in LOEO.items()} | SCALING | {"validation": VALIDATION}
+    {"fixed": FIXED} | {f"loeo_{robot}": split for robot, split in LOEO.items()} | SCALING | HALVES | {"validation": VALIDATION}
 )
 SPLITS = {
     split_key(key, motion): replace(split, motion=motion)
@@ -178,12 +186,14 @@ class Variant:
     @property
     def graded_robots(self) -> tuple[str, ...]:
         """Robots whose test episodes it predicts: those of the five that its split has, then the bodies that it holds out;
-        after an adaptation FORGETTING_ROBOT and the target. Bodies that it trains on have no test episodes."""
+        after an adaptation FORGETTING_ROBOT and the target. Of the bodies that a model trains on only those of the wide family
+        have test episodes."""
         if self.target is not None:
             return FORGETTING_ROBOT, self.target
         split = SPLITS[self.split]
         of_paper = tuple(robot for robot in ROBOT_NAMES if robot in (*split.train_robots, *split.held_out_robots))
-        return (*of_paper, *(robot for robot in split.held_out_robots if robot not in ROBOT_NAMES))
+        known = tuple(robot for robot in split.train_robots if robot in DISTANCE_BODIES)
+        return (*of_paper, *known, *(robot for robot in split.held_out_robots if robot not in ROBOT_NAMES))
 
     @property
     def seen_robots(self) -> tuple[str, ...]:
@@ -238,9 +248,11 @@ PARTS: dict[str, tuple[Variant, ...]] = {
         adaptation(target, shots, remedy) for remedy in ("replay", "lora") for target in HELD_OUT_ROBOTS for shots in SHOTS
     ),
     "more_systems": (system("bwm"),),
-    # Ours, with procedural bodies, which the paper does not have. All models get the robot's render at every frame.
+    # Ours, with procedural bodies, which the paper does not have. These models get the robot's render at every frame.
     "scaling": tuple(reference(split, embodiment="robot_render") for split in SCALING),
     "bodies": (reference("scaling_seen", embodiment="robot_render"),),
+    # Told what the folds of LOEO are told.
+    "halves": tuple(reference(split, *MULTI_VIEW) for split in HALVES),
 }
 """Variants that each table compares, in the order of its rows. A variant may be in several parts."""
 PAPER_PARTS = ("fixed", "actions", "ladder", "loeo", "few_shot", "forgetting", "baselines")

@@ -1,4 +1,4 @@
-"""What goes beyond the paper: the gap by number of training bodies, error against distance over bodies, kinds of motion."""
+"""What goes beyond the paper: the gap by number of bodies, error and gap against distance over bodies, kinds of motion."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,9 +11,12 @@ from tests.analysis.synthetic_study import TASKS, attributes, paper_axes, write_
 from xew.analysis.beyond import (
     Motions,
     body_errors,
+    body_gaps,
     correlate_bodies,
     difficulty_table,
     find_difficulty,
+    find_gaps,
+    gaps_table,
     motion_table,
     scaling_frame,
     scaling_table,
@@ -27,7 +30,17 @@ from xew.analysis.statistics.grades import BODIES, PaperGrades, StudyGrades
 from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import Distances, printed_distances, read_distances
 from xew.config import ConfigError
-from xew.protocol import DISTANCE_BODIES, HELD_OUT_ROBOTS, PARTS, SEEN_ROBOTS, TEST_SEED_START, UNSEEN_BODIES
+from xew.protocol import (
+    CROSSED_BODIES,
+    DISTANCE_BODIES,
+    HALVES,
+    HELD_OUT_ROBOTS,
+    PARTS,
+    SEEN_ROBOTS,
+    SPLITS,
+    TEST_SEED_START,
+    UNSEEN_BODIES,
+)
 
 SCENES = [(task, TEST_SEED_START + i) for task in ("place_empty_cup", "beat_block_hammer") for i in range(3)]
 RUN = ("scaling_seen", "scaling_seen_bodies_4", "scaling_seen_bodies_16", "scaling_bodies_16")
@@ -156,6 +169,89 @@ def test_the_report_shows_both(scores: Path, tmp_path: Path) -> None:
     for name in ("scaling", "bodies"):
         assert (tmp_path / "report" / "figures" / f"{name}.png").stat().st_size > 1000
     assert BODIES in set(pd.read_csv(tmp_path / "report" / "figures" / "scaling.csv")["robots"])
+
+
+# --- Bodies that one model saw and another did not.
+
+PRICES = dict(zip(CROSSED_BODIES, np.random.default_rng(8).permutation(np.linspace(0.1, 0.6, 32)), strict=True))
+"""Share by which each body is rendered worse by a model that never saw it."""
+
+
+@pytest.fixture(scope="module")
+def halves(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A score table in which bodies are hard by their looks, and the gap goes with kinematic distance."""
+    path, rows, rng = tmp_path_factory.mktemp("halves") / "scores.parquet", [], np.random.default_rng(9)
+    for task, seed in SCENES:
+        scene = rng.normal(1, 0.05)
+        for body in CROSSED_BODIES:
+            hard = scene * (0.2 + 0.3 * LOOKS[body])
+            scores = {"": ("copy_first_frame", 2 * hard)}
+            for variant in PARTS["halves"]:
+                unseen = body in SPLITS[variant.split].held_out_robots
+                scores[variant.name] = ("reference", hard * (1 + PRICES[body] * unseen) + rng.normal(0, 0.001))
+            for variant, (model, error) in scores.items():
+                names = {"variant": variant, "model": model, "condition": variant, "task": task, "seed": seed, "robot": body}
+                rows += [names | {"metric": "lpips", "value": error}, names | {"metric": "psnr", "value": 30 - 20 * error}]
+    table = pd.DataFrame(rows).assign(frames=9, exact_frames=0)
+    table.attrs = attributes()
+    table.attrs["metrics"] = {name: table.attrs["metrics"][name] for name in ("lpips", "psnr")}
+    table.to_parquet(path, index=False)
+    curves = table.assign(frame=1).drop(columns=["frames", "exact_frames"])
+    curves.to_parquet(path.with_suffix(".curves.parquet"), index=False)
+    return path
+
+
+def distances_between_halves() -> Distances:
+    """Kinematic distances that go with the price, and distances in looks that go with how hard bodies are."""
+    printed = printed_distances(read_paper())
+    even, odd = HALVES["halves_even"].train_robots, HALVES["halves_odd"].train_robots
+    rows = [
+        {"axis": axis, "robot": a, "other": b, "value": values[a] + values[b], "spread": 0.0, "published": np.nan}
+        for axis, values in (("kinematic", PRICES), ("appearance", LOOKS))
+        for a in even
+        for b in odd
+    ]
+    return Distances(pd.concat([printed.pairs, pd.DataFrame(rows)], ignore_index=True), printed.robots, measured=True)
+
+
+def test_halves_share_out_the_bodies_and_are_graded_on_all() -> None:
+    even, odd = PARTS["halves"]
+    assert set(even.seen_robots) == set(odd.held_out_robots) and set(even.held_out_robots) == set(odd.seen_robots)
+    assert set(even.graded_robots) == set(odd.graded_robots) == set(CROSSED_BODIES)
+    assert len(even.seen_robots) == len(odd.seen_robots) == 16
+
+
+def test_the_gap_of_a_body_is_what_never_having_seen_it_costs(halves: Path) -> None:
+    grades = grades_of(halves)
+    gaps = body_gaps(grades, distances_between_halves(), "lpips")
+    assert set(gaps.index) == set(CROSSED_BODIES)
+    assert gaps["value"].to_dict() == pytest.approx({body: 100 * price for body, price in PRICES.items()}, abs=1.5)
+    found = correlate_bodies(gaps, higher_is_better=False)
+    assert found["kinematic"].r > 0.9 and found["kinematic"].p_value < 0.001 and found["kinematic"].bodies == 32
+    assert abs(found["appearance"].r) < 0.5 and found["appearance"].frozen > 0.9, "how hard a body is has canceled"
+    assert (body_gaps(grades, distances_between_halves(), "psnr")["value"] > 0).all(), "positive is worse whatever the metric"
+
+
+def test_one_half_alone_gives_no_gap(halves: Path) -> None:
+    rows = pd.read_parquet(halves)
+    alone = rows[rows["variant"] != PARTS["halves"][1].name]
+    infos = [info for info in read_paper().infos if info.name in ("lpips", "psnr")]
+    grades = StudyGrades(alone, infos, paper_axes(read_paper()))
+    found = find_gaps(grades, distances_between_halves())
+    assert not len(found["lpips"].values) and gaps_table(found, grades.metrics) is None
+
+
+def test_the_report_shows_the_gap_of_bodies(halves: Path, tmp_path: Path) -> None:
+    measured = distances_between_halves()
+    measured.pairs.to_csv(tmp_path / "distances.csv", index=False)
+    measured.robots.to_csv(tmp_path / "robots.csv", index=False)
+    main(Args(halves, distances=tmp_path, out=tmp_path / "report"))
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "## Distance and the price of never having seen a body" in text
+    assert "The gap of 32 bodies against their distance" in text
+    assert "Over 32 bodies, a model that never saw the body has another LPIPS on it than one that did: +35" in text
+    assert "This gap correlates with kinematic distance at r = +0.9" in text
+    assert (tmp_path / "report" / "figures" / "halves.png").stat().st_size > 1000
 
 
 # --- Shared and own motion.

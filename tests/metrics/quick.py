@@ -36,7 +36,12 @@ TRACKER = Backend(lambda: points_moved_by_change, None, "the true points, moved 
 
 
 def mean_change(
-    shared: SharedFeatures, prediction: np.ndarray, target: np.ndarray, robot: np.ndarray | None = None, box: object = None
+    shared: SharedFeatures,
+    prediction: np.ndarray,
+    target: np.ndarray,
+    robot: np.ndarray | None = None,
+    box: object = None,
+    cut: object = None,
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """For `SharedFeatures.distances`: mean change of a frame's levels, and of the robot's, both [t] float32 in [0, 1]."""
     change = np.abs(prediction.astype(np.float32) - target).mean(axis=-1) / 255

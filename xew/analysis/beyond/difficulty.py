@@ -47,22 +47,22 @@ class BodyCorrelation:
 
 
 @dataclass(frozen=True)
-class Difficulty:
-    """One metric on the bodies of the wide family."""
+class OverBodies:
+    """One metric over the bodies of the wide family."""
 
-    errors: pd.DataFrame
-    """Table of `body_errors`."""
+    values: pd.DataFrame
+    """Table of `body_errors`, or of `halves.body_gaps`."""
     correlations: Mapping[str, BodyCorrelation]
     """Correlations by kind of distance; none where bodies are too few."""
 
 
-def find_difficulty(grades: StudyGrades, distances: Distances) -> dict[str, Difficulty]:
+def find_difficulty(grades: StudyGrades, distances: Distances) -> dict[str, OverBodies]:
     """How each reported metric goes with distance over bodies, by the metric's key."""
     found = {}
     for name, metric in grades.metrics.items():
         if name in PAPER_METRICS or metric.reported:
             errors = body_errors(grades, distances, name)
-            found[name] = Difficulty(errors, correlate_bodies(errors, metric.higher_is_better))
+            found[name] = OverBodies(errors, correlate_bodies(errors, metric.higher_is_better))
     return found
 
 
@@ -78,18 +78,22 @@ def body_errors(grades: StudyGrades, distances: Distances, metric: str) -> pd.Da
         Table by body with the columns value (mean over its episodes, in the metric's unit), frozen (that of the frozen first
         frame) and one for each kind of distance: the mean over the robots that the model was trained on.
     """
-    trained = SPLITS[VARIANT.split].train_robots
-    pairs = distances.pairs
-    both = pd.concat([pairs, pairs.rename(columns={"robot": "other", "other": "robot"})])  # each is listed once
-    chosen = both[both["robot"].isin(DISTANCE_BODIES) & both["other"].isin(trained)]
-    by_axis = chosen.pivot_table(index="robot", columns="axis", values="value", aggfunc="mean")
+    by_axis = mean_distances(distances, DISTANCE_BODIES, SPLITS[VARIANT.split].train_robots)
     rows = {}
     for body in by_axis.index:
         own, frozen = (grades.variant_mean(name, (body,), metric) for name in (VARIANT.name, COPY))
         if own is not None:
             rows[body] = {"value": own.value, "frozen": frozen.value if frozen else np.nan}
-    found = pd.DataFrame.from_dict(rows, orient="index", columns=["value", "frozen"])
-    return found.join(by_axis[[axis for axis in AXIS_TITLES if axis in by_axis]], how="inner").rename_axis("body")
+    return pd.DataFrame.from_dict(rows, orient="index", columns=["value", "frozen"]).join(by_axis, how="inner")
+
+
+def mean_distances(distances: Distances, bodies: Sequence[str], trained: Sequence[str]) -> pd.DataFrame:
+    """Mean distance of each body to the robots that a model was trained on: by body, a column for each kind of distance."""
+    pairs = distances.pairs
+    both = pd.concat([pairs, pairs.rename(columns={"robot": "other", "other": "robot"})])  # each is listed once
+    chosen = both[both["robot"].isin(bodies) & both["other"].isin(trained)]
+    by_axis = chosen.pivot_table(index="robot", columns="axis", values="value", aggfunc="mean").rename_axis("body")
+    return by_axis[[axis for axis in AXIS_TITLES if axis in by_axis]]
 
 
 def correlate_bodies(errors: pd.DataFrame, higher_is_better: bool) -> dict[str, BodyCorrelation]:
@@ -122,12 +126,32 @@ def _correlate(distance: np.ndarray, score: np.ndarray, frozen: np.ndarray) -> B
     return BodyCorrelation(r, low, high, float(result.pvalue), with_frozen, float(partial), len(score))
 
 
-def difficulty_table(found: Mapping[str, Difficulty], metrics: Mapping[str, MetricInfo]) -> Table | None:
+def difficulty_table(found: Mapping[str, OverBodies], metrics: Mapping[str, MetricInfo]) -> Table | None:
     """Correlation of each metric with each kind of distance over bodies; None where bodies are too few.
 
     Args:
         found: of `find_difficulty`.
         metrics: of the study, by key.
+    """
+    return bodies_table(
+        found,
+        metrics,
+        "bodies",
+        "Error on {} bodies against their distance",
+        "Pearson's r of a body's mean distance to the robots of the training with the model's score on it, with its 95 % "
+        "interval over bodies. Positive: farther is worse.",
+    )
+
+
+def bodies_table(
+    found: Mapping[str, OverBodies], metrics: Mapping[str, MetricInfo], name: str, title: str, caption: str
+) -> Table | None:
+    """Table of the correlations of each metric, by key, with each kind of distance; None where bodies are too few.
+
+    Args:
+        found: numbers that each metric gives of bodies, and their correlations.
+        metrics: of the study, by key.
+        name, title, caption: of the table. The title has the number of bodies in place of {}, the caption says what r is of.
     """
     axes = [axis for axis in AXIS_TITLES if any(axis in one.correlations for one in found.values())]
     if not axes:
@@ -139,12 +163,11 @@ def difficulty_table(found: Mapping[str, Difficulty], metrics: Mapping[str, Metr
     count = max(result.bodies for one in found.values() for result in one.correlations.values())
     heads = ("r", "p", "frozen", "partial")
     return Table(
-        "bodies",
-        f"Error on {count} bodies against their distance",
-        "Pearson's r of a body's mean distance to the robots of the training with the model's score on it, with its 95 % "
-        "interval over bodies. Positive: farther is worse. p is by permutation, corrected by Holm for the kinds of distance; "
-        "LPIPS is the primary outcome, all else exploratory. Frozen: the same r of the frozen first frame, which learned "
-        "nothing. Partial: what is left of r given the frozen frame's score.",
+        name,
+        title.format(count),
+        f"{caption} p is by permutation, corrected by Holm for the kinds of distance; LPIPS is the primary outcome, all else "
+        "exploratory. Frozen: r of the same distance with the score of the frozen first frame, which learned nothing. Partial: "
+        "what is left of r given the frozen frame's score.",
         ("metric",),
         tuple(Column(head, AXIS_TITLES[axis]) for axis in axes for head in heads),
         (TableSection("", tuple(rows)),),

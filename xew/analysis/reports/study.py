@@ -11,7 +11,15 @@ from pathlib import Path
 import pandas as pd
 from markupsafe import Markup
 
-from xew.analysis.beyond import Difficulty, Motions, difficulty_table, find_difficulty, motion_table, scaling_table
+from xew.analysis.beyond import (
+    Motions,
+    difficulty_table,
+    find_difficulty,
+    find_gaps,
+    gaps_table,
+    motion_table,
+    scaling_table,
+)
 from xew.analysis.paper import AXES, read_paper
 from xew.analysis.reports import page, pictures
 from xew.analysis.reports.charts import Chart, chart_files
@@ -51,6 +59,7 @@ PART_TITLES = {
     "baselines": "Other world models",
     "scaling": "More bodies in training",
     "bodies": "Distance and difficulty over many bodies",
+    "halves": "Distance and the price of never having seen a body",
     "motion": "Shared and own motion",
     "outside": "Outside the protocol",
 }
@@ -67,6 +76,7 @@ SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]]
     "baselines": ((), ("baselines",), ()),
     "scaling": (("scaling",), ("scaling",), ()),
     "bodies": (("bodies",), ("bodies",), ()),
+    "halves": (("halves",), ("halves",), ()),
     "motion": ((), ("motion",), ()),
     "outside": ((), ("outside",), ()),
 }
@@ -136,8 +146,9 @@ def build(
     printed = PaperGrades(paper, scores.metrics)
     planned = scores.attributes.get("study", {}).get("variants", {})
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
-    note, difficulty = trainings_note(grades), find_difficulty(grades, known)
-    tables = _make_tables(builder, scores, known, difficulty, (note, grades.notes))
+    note, difficulty, gaps = trainings_note(grades), find_difficulty(grades, known), find_gaps(grades, known)
+    tables = _make_tables(builder, scores, known, (note, grades.notes))
+    tables += filter(None, (difficulty_table(difficulty, grades.metrics), gaps_table(gaps, grades.metrics)))
     if other_motion:
         tables.append(motion_table(Motions(scores, other_motion)))
     # A study that has none of the paper's parts is asked none of its claims.
@@ -145,12 +156,12 @@ def build(
     findings, by_paper, by_print = (ask(g) if of_paper else [] for g in (StrictGrades(grades), grades, printed))
     missing = find_missing_scores(scores.rows)
     content = Content(
-        study_sentences(grades, known, difficulty.get("lpips"), findings, by_paper),
+        study_sentences(grades, known, (difficulty.get("lpips"), gaps.get("lpips")), findings, by_paper),
         findings,
         by_paper,
         by_print,
         {table.name: table for table in tables},
-        study_charts(builder, known, scores.curves) | body_charts(builder, difficulty),
+        study_charts(builder, known, scores.curves) | body_charts(builder, difficulty, gaps),
         strips,
         [*part_notes(builder, scores), *missing_note(missing)],
         missing,
@@ -160,10 +171,8 @@ def build(
     return Report(html, _write_markdown(content), formats.tables_frame(tables), dict(_files(content)))
 
 
-def _make_tables(
-    builder: Builder, scores: Scores, known: Distances, difficulty: Mapping[str, Difficulty], notes: Sequence[str]
-) -> list[Table]:
-    """All tables of a study in one kind of motion; `notes` are put behind the captions of those of scores."""
+def _make_tables(builder: Builder, scores: Scores, known: Distances, notes: Sequence[str]) -> list[Table]:
+    """Tables of a study in one kind of motion, without those of single bodies; `notes` are put behind captions of scores."""
     grades, paper = builder.ours, read_paper()
     scored = [*build_tables(builder), *outside_tables(builder, scores.rows)]
     if builder.has_results("scaling"):
@@ -174,8 +183,6 @@ def _make_tables(
     if builder.has_results("loeo"):
         tables += [correlation_table(grades, known, paper), *own_correlation_tables(grades, known)]
         tables += [*gap_correlation_tables(grades, known), certainty_table(grades, known, paper)]
-    if correlated := difficulty_table(difficulty, grades.metrics):
-        tables.append(correlated)
     return tables
 
 

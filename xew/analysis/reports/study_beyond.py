@@ -1,4 +1,4 @@
-"""Charts of what procedural bodies answer: the gap by number of training bodies, error by distance."""
+"""Charts of what procedural bodies answer: the gap by number of training bodies, error by distance, the gap by distance."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from xew.analysis.beyond import Difficulty, scaling_frame
+from xew.analysis.beyond import OverBodies, scaling_frame
 from xew.analysis.beyond.scaling import ALONE, GROUPS, WITH_ROBOTS
 from xew.analysis.reports import charts
 from xew.analysis.reports.charts import SERIES, Chart, Panel, Series
@@ -16,20 +16,28 @@ from xew.analysis.tables.distances import AXIS_TITLES, format_signed
 from xew.analysis.tables.table import metric_title
 
 METRIC = "lpips"
-"""Metric that both charts draw, the paper's primary outcome."""
+"""Metric that the charts draw, the paper's primary outcome."""
 KINDS = {kind: Series(kind, color) for kind, color in zip((WITH_ROBOTS, ALONE), SERIES, strict=False)}
 """Lines of the chart of scaling, by what a model was trained on."""
 
 
-def body_charts(builder: Builder, difficulty: Mapping[str, Difficulty]) -> dict[str, Chart]:
-    """Both charts by name, as far as there is something to draw; `difficulty` by metric."""
+def body_charts(builder: Builder, difficulty: Mapping[str, OverBodies], gaps: Mapping[str, OverBodies]) -> dict[str, Chart]:
+    """The charts by name, as far as there is something to draw; `difficulty` and `gaps` by metric."""
     if METRIC not in builder.ours.metrics:
         return {}
     made = {}
     if builder.has_results("scaling"):
         made["scaling"] = scaling_chart(builder)
+    metric = builder.ours.metrics[METRIC]
     if difficulty[METRIC].correlations:
-        made["bodies"] = difficulty_chart(difficulty[METRIC], metric_title(builder.ours.metrics[METRIC]))
+        caption = "One model on bodies that it has never seen, a point each; r with its 95 % interval over bodies."
+        made["bodies"] = chart_of_bodies("bodies", caption, difficulty[METRIC], "robots", metric_title(metric))
+    if gaps[METRIC].correlations:
+        caption = (
+            "By how much each body is rendered worse by a model that never saw it than by one that did, a point each; r with "
+            "its 95 % interval over bodies."
+        )
+        made["halves"] = chart_of_bodies("halves", caption, gaps[METRIC], "bodies", f"gap in {metric.title} [%]")
     return made
 
 
@@ -59,9 +67,12 @@ def _positions(counts: Sequence[int] | pd.Series) -> np.ndarray:
     return np.array([np.log(count) / np.log(4) if count else -1.0 for count in counts])
 
 
-def difficulty_chart(difficulty: Difficulty, title: str) -> Chart:
-    """Error of one model on each body by the body's distance, a panel for each kind of distance; `title` is the metric's."""
-    errors, heading = difficulty.errors, "mean distance to the robots of the training"
+def chart_of_bodies(name: str, caption: str, difficulty: OverBodies, trained: str, title: str) -> Chart:
+    """A number of each body by its distance, a panel for each kind of distance.
+
+    `trained` says of what the training was, `title` what the number is.
+    """
+    errors, heading = difficulty.values, f"mean distance to the {trained} of the training"
 
     def draw(axes: Axes, axis: str) -> None:
         result = difficulty.correlations[axis]
@@ -70,5 +81,4 @@ def difficulty_chart(difficulty: Difficulty, title: str) -> Chart:
         axes.text(0.02, 0.98, text, transform=axes.transAxes, va="top", fontsize=8)
 
     panels = [Panel(AXIS_TITLES[axis], partial(draw, axis=axis)) for axis in difficulty.correlations]
-    caption = "One model on bodies that it has never seen, a point each; r with its 95 % interval over bodies."
-    return Chart("bodies", caption, panels, errors.reset_index())
+    return Chart(name, caption, panels, errors.reset_index())

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pandas as pd
 
-from xew.analysis.beyond import Difficulty
+from xew.analysis.beyond import OverBodies
 from xew.analysis.paper import AXES
 from xew.analysis.scores import Scores, describe_scores
 from xew.analysis.statistics.grades import BODIES, Grades, StudyGrades, relative_gain
@@ -36,18 +36,20 @@ def trainings_note(grades: StudyGrades) -> str:
 def study_sentences(
     grades: StudyGrades,
     distances: Distances,
-    difficulty: Difficulty | None,
+    over_bodies: tuple[OverBodies | None, OverBodies | None],
     findings: Sequence[Finding],
     by_paper: Sequence[Finding],
 ) -> list[str]:
-    """The results in sentences, one for each question that was asked."""
+    """The results in sentences, one for each question that was asked; `over_bodies` are errors and gaps in LPIPS."""
+    errors, gaps = over_bodies
     asked = [
         *_gap_sentence(grades),
         *_best_sentences(grades),
         *_adaptation_sentences(grades),
         *_distance_sentence(grades, distances),
         *_scaling_sentence(grades),
-        *_bodies_sentence(difficulty),
+        *_bodies_sentence(errors),
+        *_halves_sentence(gaps),
     ]
     return [
         *([_answer_sentence(findings)] if findings else []),
@@ -175,21 +177,38 @@ def _scaling_sentence(grades: Grades) -> Iterator[str]:
         yield f"Training on {count} bodies beside the three robots changes LPIPS by {', '.join(parts)}."
 
 
-def _bodies_sentence(difficulty: Difficulty | None) -> Iterator[str]:
+def _bodies_sentence(difficulty: OverBodies | None) -> Iterator[str]:
     """How LPIPS on bodies of the wide family goes with each of the paper's distances, and with the frozen frame's."""
     if difficulty is None:
         return
-    errors = difficulty.errors
-    parts = [
+    errors, parts = difficulty.values, _correlations(difficulty)
+    if parts:
+        frozen = float(errors["value"].corr(errors["frozen"]))
+        last = "" if np.isnan(frozen) else f", and with that of the frozen first frame at r = {format_signed(frozen)}"
+        yield f"Over {len(errors)} bodies that one model has never seen, its LPIPS correlates {', '.join(parts)}{last}."
+
+
+def _halves_sentence(gaps: OverBodies | None) -> Iterator[str]:
+    """How the gap in LPIPS of bodies that one model saw and another did not goes with each of the paper's distances."""
+    if gaps is None:
+        return
+    shares, parts = gaps.values["value"] / 100, _correlations(gaps)
+    if parts:
+        yield (
+            f"Over {len(shares)} bodies, a model that never saw the body has another LPIPS on it than one that did: "
+            f"{_format_change(shares.mean())} on average, {_format_change(shares.min())} to {_format_change(shares.max())}. "
+            f"This gap correlates {', '.join(parts)}."
+        )
+
+
+def _correlations(difficulty: OverBodies) -> list[str]:
+    """Correlations over bodies with each of the paper's distances, in words."""
+    return [
         f"with {axis} distance at r = {format_signed(result.r)} ({format_signed(result.low)} to {format_signed(result.high)}, "
         f"p = {result.p_value:.4f})"
         for axis, result in difficulty.correlations.items()
         if axis in AXES
     ]
-    if parts:
-        frozen = float(errors["value"].corr(errors["frozen"]))
-        last = "" if np.isnan(frozen) else f", and with that of the frozen first frame at r = {format_signed(frozen)}"
-        yield f"Over {len(errors)} bodies that one model has never seen, its LPIPS correlates {', '.join(parts)}{last}."
 
 
 def _format_change(share: float) -> str:

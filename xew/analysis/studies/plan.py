@@ -81,7 +81,7 @@ def plan(study: Study) -> dict[str, Step]:
             _plan_evaluate(study, variant),
         ]
     steps.insert(2, _plan_baselines(study, study.planned_runs[0], experiments[study.planned_runs[0].name]))
-    if {"loeo", "bodies"}.intersection(study.parts):
+    if {"loeo", "bodies", "halves"}.intersection(study.parts):
         steps.append(_plan_distances(study))
     steps.append(
         _plan_analyse(study, tuple(step.name for step in steps if step.kind in ("baselines", "evaluate", "distances")))
@@ -217,7 +217,8 @@ def _plan_evaluate(study: Study, variant: Variant) -> Step:
 def _plan_distances(study: Study) -> Step:
     """Distances of the robots as they are rendered here, with which the errors of folds and bodies are correlated."""
     folder = study.out / "distances"
-    bodies = [robot for robot in study.graded_robots if robot in DISTANCE_BODIES] if "bodies" in study.parts else []
+    asks = {"bodies", "halves"}.intersection(study.parts)
+    bodies = [robot for robot in study.graded_robots if robot in DISTANCE_BODIES] if asks else []
     asked = (*(("--robot", *bodies) if bodies else ()), *study.distances)
     return Step(
         "distances",
