@@ -310,3 +310,9 @@ def test_the_report_sets_both_motions_side_by_side(both_motions: tuple[Path, Pat
     text = (tmp_path / "report.md").read_text()
     assert "## Shared and own motion" in text and "one tool path" in text
     assert "Shared and own motion" in (tmp_path / "index.html").read_text()
+    drawn = pd.read_csv(tmp_path / "figures" / "motion.csv").set_index(["robots", "action", "motion"])
+    joints, others = drawn["value"].xs("joints", level="action"), drawn["value"].drop("joints", level="action")
+    assert joints.xs("own", level="motion").to_numpy() == pytest.approx(2 * joints.xs("shared", level="motion").to_numpy())
+    assert others.xs("own", level="motion").equals(others.xs("shared", level="motion")) and len(others) == 2 * 3 * 3
+    assert ((drawn["low"] < drawn["value"]) & (drawn["value"] < drawn["high"])).all()
+    assert (tmp_path / "figures" / "motion.png").stat().st_size > 1000

@@ -8,7 +8,7 @@ each robot's own. `reports/study_beyond.py` draws them.
 
 from xew.analysis.beyond.difficulty import OverBodies, body_errors, correlate_bodies, difficulty_table, find_difficulty
 from xew.analysis.beyond.halves import body_gaps, find_gaps, gaps_table
-from xew.analysis.beyond.motion import Motions, motion_table
+from xew.analysis.beyond.motion import Motions, motion_frame, motion_table
 from xew.analysis.beyond.scaling import scaling_frame, scaling_table
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "find_difficulty",
     "find_gaps",
     "gaps_table",
+    "motion_frame",
     "motion_table",
     "scaling_frame",
     "scaling_table",

@@ -12,7 +12,7 @@ import pandas as pd
 
 from xew.analysis.scores import TRAINING, TRUTH, VARIANT, MetricInfo, Scores, name_graded
 from xew.analysis.statistics.grades import StudyGrades, pooled
-from xew.analysis.tables.builder import mean_cell
+from xew.analysis.tables.builder import interval_ends, mean_cell
 from xew.analysis.tables.labels import ACTIONS, GROUP_TITLES
 from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, metric_title
 from xew.config import ConfigError
@@ -83,6 +83,21 @@ def motion_table(motions: Motions) -> Table:
         tuple(Column(motion, metric_title(motions.metrics[metric])) for metric in shown for motion in MOTIONS),
         tuple(sections),
     )
+
+
+def motion_frame(motions: Motions, metric: str) -> pd.DataFrame:
+    """Means of a metric with the ends of their intervals, NaN where one was not graded.
+
+    Returns:
+        Table with the columns robots (a key of GROUP_TITLES), action, motion (one of MOTIONS), value, low, high.
+    """
+    rows = []
+    for robots in GROUP_TITLES:
+        for action in ACTIONS:
+            for motion in MOTIONS:
+                mean = motions.mean(motion, action, robots, metric)
+                rows.append((robots, action, motion, *((mean.value, *interval_ends(mean, LEVEL)) if mean else (np.nan,) * 3)))
+    return pd.DataFrame(rows, columns=["robots", "action", "motion", "value", "low", "high"])
 
 
 def _cells(motions: Motions, action: str, robots: str, metric: str) -> Sequence[TableCell]:

@@ -23,7 +23,7 @@ from xew.analysis.beyond import (
 from xew.analysis.paper import AXES, read_paper
 from xew.analysis.reports import page, pictures
 from xew.analysis.reports.charts import Chart, chart_files
-from xew.analysis.reports.study_beyond import body_charts
+from xew.analysis.reports.study_beyond import charts_beyond
 from xew.analysis.reports.study_charts import study_charts
 from xew.analysis.reports.study_strips import Strip, study_strips
 from xew.analysis.reports.study_text import missing_note, part_notes, study_sentences, trainings_note
@@ -77,7 +77,7 @@ SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]]
     "scaling": (("scaling",), ("scaling",), ()),
     "bodies": (("bodies",), ("bodies",), ()),
     "halves": (("halves",), ("halves",), ()),
-    "motion": ((), ("motion",), ()),
+    "motion": (("motion",), ("motion",), ()),
     "outside": ((), ("outside",), ()),
 }
 """Content of each part's section: charts, tables that stand open, and tables that are folded away."""
@@ -149,8 +149,8 @@ def build(
     note, difficulty, gaps = trainings_note(grades), find_difficulty(grades, known), find_gaps(grades, known)
     tables = _make_tables(builder, scores, known, (note, grades.notes))
     tables += filter(None, (difficulty_table(difficulty, grades.metrics), gaps_table(gaps, grades.metrics)))
-    if other_motion:
-        tables.append(motion_table(Motions(scores, other_motion)))
+    motions = Motions(scores, other_motion) if other_motion else None
+    tables += [motion_table(motions)] if motions else []
     # A study that has none of the paper's parts is asked none of its claims.
     of_paper = any(builder.has_results(part) for part in PAPER_PARTS)
     findings, by_paper, by_print = (ask(g) if of_paper else [] for g in (StrictGrades(grades), grades, printed))
@@ -161,7 +161,7 @@ def build(
         by_paper,
         by_print,
         {table.name: table for table in tables},
-        study_charts(builder, known, scores.curves) | body_charts(builder, difficulty, gaps),
+        study_charts(builder, known, scores.curves) | charts_beyond(builder, difficulty, gaps, motions),
         strips,
         [*part_notes(builder, scores), *missing_note(missing)],
         missing,

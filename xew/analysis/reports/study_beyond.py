@@ -1,4 +1,4 @@
-"""Charts of what procedural bodies answer: the gap by number of training bodies, error by distance, the gap by distance."""
+"""Charts beyond the paper: of bodies the gap by their number in training, error and gap by distance; both kinds of motion."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -7,25 +7,31 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from xew.analysis.beyond import OverBodies, scaling_frame
+from xew.analysis.beyond import Motions, OverBodies, motion_frame, scaling_frame
 from xew.analysis.beyond.scaling import ALONE, GROUPS, WITH_ROBOTS
 from xew.analysis.reports import charts
 from xew.analysis.reports.charts import SERIES, Chart, Panel, Series
 from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import AXIS_TITLES, format_signed
+from xew.analysis.tables.labels import ACTIONS, GROUP_TITLES
 from xew.analysis.tables.table import metric_title
+from xew.protocol import MOTIONS
 
 METRIC = "lpips"
 """Metric that the charts draw, the paper's primary outcome."""
 KINDS = {kind: Series(kind, color) for kind, color in zip((WITH_ROBOTS, ALONE), SERIES, strict=False)}
 """Lines of the chart of scaling, by what a model was trained on."""
+MOTION_COLORS = dict(zip(MOTIONS, SERIES, strict=False))
+"""Colors of the kinds of motion."""
 
 
-def body_charts(builder: Builder, difficulty: Mapping[str, OverBodies], gaps: Mapping[str, OverBodies]) -> dict[str, Chart]:
+def charts_beyond(
+    builder: Builder, difficulty: Mapping[str, OverBodies], gaps: Mapping[str, OverBodies], motions: Motions | None
+) -> dict[str, Chart]:
     """The charts by name, as far as there is something to draw; `difficulty` and `gaps` by metric."""
     if METRIC not in builder.ours.metrics:
         return {}
-    made = {}
+    made = {"motion": motion_chart(motions)} if motions and METRIC in motions.metrics else {}
     if builder.has_results("scaling"):
         made["scaling"] = scaling_chart(builder)
     metric = builder.ours.metrics[METRIC]
@@ -65,6 +71,23 @@ def scaling_chart(builder: Builder) -> Chart:
 def _positions(counts: Sequence[int] | pd.Series) -> np.ndarray:
     """Places [n] of numbers of bodies on the axis: powers of four lie at equal distances, and 0 one step before 1."""
     return np.array([np.log(count) / np.log(4) if count else -1.0 for count in counts])
+
+
+def motion_chart(motions: Motions) -> Chart:
+    """LPIPS of each action representation in shared and in own motion, a panel for robots seen and for each held out."""
+    data, metric = motion_frame(motions, METRIC), motions.metrics[METRIC]
+
+    def draw(axes: Axes, robots: str) -> None:
+        groups = []
+        for motion, color in MOTION_COLORS.items():
+            chosen = data[(data["robots"] == robots) & (data["motion"] == motion)]
+            groups.append((color, chosen[["value", "low", "high"]].to_numpy(), np.full(len(chosen), np.nan)))
+        charts.bars(axes, list(ACTIONS.values()), groups, metric_title(metric))
+
+    panels = [Panel(title, partial(draw, robots=robots)) for robots, title in GROUP_TITLES.items()]
+    caption = "Shared motion, in which all robots follow one tool path, and own motion. Lines: 95 % intervals over scenes."
+    legend = [Series(f"{motion} motion", color) for motion, color in MOTION_COLORS.items()]
+    return Chart("motion", caption, panels, data, legend)
 
 
 def chart_of_bodies(name: str, caption: str, difficulty: OverBodies, trained: str, title: str) -> Chart:
