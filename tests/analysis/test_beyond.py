@@ -124,6 +124,9 @@ def test_error_that_goes_with_one_distance_is_found_there_alone(scores: Path) ->
     found = correlate_bodies(errors, higher_is_better=False)
     kinematic, looks = found["kinematic"], found["appearance"]
     assert kinematic.r > 0.95 and kinematic.low > 0.9 and kinematic.p_value < 0.001 and kinematic.bodies == 64
+    more = correlate_bodies(errors.assign(arm_base=errors["appearance"]), higher_is_better=False)
+    assert {axis: more[axis].p_value for axis in found} == {axis: found[axis].p_value for axis in found}, "ours cost nothing"
+    assert more["arm_base"].p_value <= looks.p_value, "and are not corrected"
     assert abs(looks.r) < 0.35 and looks.low < 0 < looks.high and looks.p_value > 0.05
     assert looks.frozen < -0.95, "the frozen frame is made to be better on odd looks"
     up = correlate_bodies(body_errors(grades_of(scores), distances_of(DISTANCES, LOOKS), "psnr"), higher_is_better=True)

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import BootstrapMethod, PermutationMethod, pearsonr
 
-from xew.analysis.paper import PAPER_TITLES
+from xew.analysis.paper import AXES, PAPER_TITLES
 from xew.analysis.scores import COPY, MetricInfo
 from xew.analysis.statistics.grades import StudyGrades
 from xew.analysis.tables.distances import AXIS_TITLES, Distances, format_signed
@@ -37,7 +37,7 @@ class BodyCorrelation:
     high: float
     """Upper end."""
     p_value: float
-    """Two-sided, by permutation of the bodies, corrected by Holm for the kinds of distance."""
+    """Two-sided, by permutation of the bodies; of the paper's two kinds of distance corrected by Holm for both."""
     frozen: float
     """Pearson's r of distance with the error of the frozen first frame; NaN where that was not graded or does not vary."""
     partial: float
@@ -109,8 +109,9 @@ def correlate_bodies(errors: pd.DataFrame, higher_is_better: bool) -> dict[str, 
         return {}
     distances = {axis: errors[axis].to_numpy(np.float64) for axis in AXIS_TITLES if axis in errors}
     found = {axis: _correlate(distance, score, frozen) for axis, distance in distances.items() if np.ptp(distance) > 0}
-    adjusted = holm([result.p_value for result in found.values()])
-    return {axis: replace(result, p_value=float(p)) for (axis, result), p in zip(found.items(), adjusted, strict=True)}
+    asked = [axis for axis in found if axis in AXES]
+    adjusted = dict(zip(asked, holm([found[axis].p_value for axis in asked]), strict=True))
+    return {axis: replace(result, p_value=float(adjusted.get(axis, result.p_value))) for axis, result in found.items()}
 
 
 def _correlate(distance: np.ndarray, score: np.ndarray, frozen: np.ndarray) -> BodyCorrelation:
@@ -165,9 +166,9 @@ def bodies_table(
     return Table(
         name,
         title.format(count),
-        f"{caption} p is by permutation, corrected by Holm for the kinds of distance; LPIPS is the primary outcome, all else "
-        "exploratory. Frozen: r of the same distance with the score of the frozen first frame, which learned nothing. Partial: "
-        "what is left of r given the frozen frame's score.",
+        f"{caption} p is by permutation, corrected by Holm for the paper's two kinds of distance; LPIPS by these is the "
+        "primary outcome, all else exploratory. Frozen: r of the same distance with the score of the frozen first frame, which "
+        "learned nothing. Partial: what is left of r given the frozen frame's score.",
         ("metric",),
         tuple(Column(head, AXIS_TITLES[axis]) for axis in axes for head in heads),
         (TableSection("", tuple(rows)),),
