@@ -18,6 +18,7 @@ from xew.metrics.estimators.contact import predicted_contact
 from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.metric import ACCELERATOR_CHUNK
 from xew.metrics.perceptual import (
+    KEPT_FEATURES,
     SMALLEST_SIDE,
     SharedFeatures,
     lpips,
@@ -250,10 +251,13 @@ def _curves_by_shared_features(
 ) -> dict[str, np.ndarray]:
     """Curves [t] float32 by metric, of those that LPIPS's network makes: it sees each video once for all of them."""
     by_function = {METRICS[name].curve: name for name in metrics if name in METRICS and inputs[input_kind(name)] is not None}
-    features = comparison.truth.notes.setdefault(f"features from frame {comparison.first}", SharedFeatures())
+    device = "cpu" if jax.default_backend() == "cpu" else "gpu"
+    features = comparison.truth.notes.setdefault(
+        f"features from frame {comparison.first}", SharedFeatures(KEPT_FEATURES[device])
+    )
     curves: dict[str, np.ndarray] = {}
     whole, robot, region = (by_function.get(curve) for curve in (lpips, robot_lpips_frames, region_lpips_frames))
-    video, cut = comparison.video, None if jax.default_backend() == "cpu" else functools.partial(blocks.cut, whole=False)
+    video, cut = comparison.video, None if device == "cpu" else functools.partial(blocks.cut, whole=False)
     if whole or robot:
         mask = comparison.truth.mask[comparison.first :] if robot else None
         plain, weighted = features.distances(*video, mask, cut=cut)

@@ -48,8 +48,9 @@ Layers = tuple[tuple[jax.Array, jax.Array, jax.Array], ...]
 """Five layers of frames [n h w d] float32, each with the height and width that are valid."""
 Cut = Callable[[np.ndarray], Sequence[AnyArray]]
 """Function that cuts an array [t ...] into blocks [n ...] of one size, on the device where they are needed."""
-KEPT_FEATURES = 512_000_000
-"""Size [bytes] up to which `SharedFeatures` keeps features of a true video: 85 frames of 320x240 and of their box."""
+KEPT_FEATURES = {"cpu": 512_000_000, "gpu": 1_024_000_000}
+"""Size [bytes] up to which `SharedFeatures` keeps features of a true video on a device: 170 or 340 frames of 320x240, whose box
+is the whole image in three of four episodes."""
 
 
 @jax.tree_util.register_dataclass
@@ -226,7 +227,7 @@ class SharedFeatures:
     compiler adds what is weighted in another order. In blocks of frames all are within 1e-6.
     """
 
-    def __init__(self, most_bytes: int = KEPT_FEATURES) -> None:
+    def __init__(self, most_bytes: int) -> None:
         """Keep features of the true video up to this size [bytes]; those of further frames are made anew each time."""
         self._left = most_bytes
         self._true: dict[tuple[int, tuple[int, ...]], Layers] = {}

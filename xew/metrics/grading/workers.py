@@ -19,7 +19,7 @@ from xew.metrics.estimators.adapters import use_gpu
 
 MOST_WORKERS = {"cpu": 32, "gpu": 12}
 """Largest number of workers of a CPU and of each GPU. At full length each holds an episode, a prediction and their optical
-flow, half a gigabyte of the host's memory and as much of a GPU's, and on a CPU as much again of features
+flow, half a gigabyte of the host's memory and as much of a GPU's, and features of the true video
 (`perceptual.KEPT_FEATURES`)."""
 
 
