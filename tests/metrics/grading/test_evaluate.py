@@ -13,7 +13,7 @@ import pytest
 
 from tests.metrics.grading.graded import ASKED, CHEAP, FRAMES, ROBOTS, SEED, TASK, grade, late, truth, value
 from xew.episode import episode_folder, read_record, read_states, read_video, write_episode
-from xew.metrics import METRICS, keypoint_error, mask_iou, psnr, ssim
+from xew.metrics import METRICS, keypoint_error, mask_iou, perceptual, psnr, ssim
 from xew.metrics.backends import Backend, estimate_masks
 from xew.metrics.estimators.contact import predicted_contact, touching_distance
 from xew.metrics.evaluate import Args, main
@@ -229,15 +229,19 @@ def test_on_a_gpu_a_video_is_put_once_for_all_metrics_and_the_truth_once_for_all
     videos = late(read.rgb), late(late(read.rgb))
     expected = [grade_one(Comparison(video, read, estimate_masks, exact), names).values for video in videos]
     put: list[tuple[int, ...]] = []
-    on_device = jax.device_put
+    passes: list[bool] = []
+    on_device, layers = jax.device_put, perceptual._layers
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr("xew.metrics.grade.ACCELERATOR_CHUNK", FRAMES)  # a CPU takes long for 64
     monkeypatch.setattr(jax, "device_put", lambda array: put.append(array.shape) or on_device(array))
+    monkeypatch.setattr(perceptual, "_layers", lambda *given: passes.append(True) or layers(*given))
     read = read_truth(folder, FRAMES, {"video", "robot"})
-    for video, values, puts in zip(videos, expected, (4, 2), strict=True):
+    for video, values, puts, through in zip(videos, expected, (4, 2), (2, 1), strict=True):
         put.clear()
+        passes.clear()
         assert grade_one(Comparison(video, read, estimate_masks, exact), names).values == pytest.approx(values, rel=1e-4)
         assert len([shape for shape in put if len(shape) == 4]) == puts, "whole for PSNR, in blocks for the others"
+        assert len(passes) == through, "through LPIPS's network, for two metrics"
 
 
 def test_contact_is_a_diagnostic_and_no_part_of_the_suite(rollouts: Path, data: Path) -> None:
