@@ -448,9 +448,10 @@ def test_data_are_made_on_every_gpu(study: Study) -> None:
     machine.start(generate, (STEPS, str(study.out / "x"), "x"), study.out / "generate.log")
     assert machine._running["generate"].slots == ("2", "5", "7")
     assert machine.has_room_for(Step("distances", "", (), (), None, study.out)), "others go beside"
-    steps = plan(study)
-    assert generate.gpus_of(3) == steps["baselines"].gpus_of(3) == 3 and steps["distances"].gpus_of(3) == 1
+    steps, beside = plan(study), plan(replace(study, machine=replace(study.machine, beside=2)))
+    assert generate.gpus_of(3) == 3 and steps["distances"].gpus_of(3) == 1
     assert [step.gpus_of(3) for step in steps.values() if step.kind == "latents"][:2] == [3, 1], "others wait for the first"
+    assert [found["baselines"].gpus_of(3) for found in (steps, beside)] == [1, 3], "what trains need not wait for them"
     while machine._running:
         machine.wait()
     assert ThisMachine((), 2, {}).has_room_for(generate)

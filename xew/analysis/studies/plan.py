@@ -195,7 +195,7 @@ def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Ste
         needs=("generate", f"latents/{variant.name}"),
         inputs=[frames, study.evaluate, GRADING_PROTOCOL],
         product=out,
-        every_gpu=True,
+        every_gpu=study.machine.beside > 0,  # alone it would wait for all GPUs to be free, or trainings for it
     )
 
 
