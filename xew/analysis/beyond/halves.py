@@ -78,8 +78,8 @@ def gaps_table(found: Mapping[str, OverBodies], metrics: Mapping[str, MetricInfo
         PART,
         "The gap of {} bodies against their distance",
         "By how much a body is rendered worse by a model that never saw it than by one that did, on the same episodes, in "
-        "percent of the latter's score; what makes a body hard for both cancels. That one of the two models may be better on all "
-        "bodies is taken out: both halves have the same mean gap. Pearson's r of this gap with the body's mean distance to the "
-        "bodies that the first model was trained on, with its 95 % interval over bodies. Positive: what is farther has a "
+        "percent of the latter's score; what makes a body hard for both cancels. That one of the two models may be better on "
+        "all bodies is taken out: both halves have the same mean gap. Pearson's r of this gap with the body's mean distance to "
+        "the bodies that the first model was trained on, with its 95 % interval over bodies. Positive: what is farther has a "
         "larger gap.",
     )
