@@ -52,6 +52,17 @@ LOOKS = dict(zip(DISTANCE_BODIES, np.random.default_rng(5).permutation(np.linspa
 """Appearance distance of each body, which has nothing to do with the other."""
 
 
+def write_scores(path: Path, rows: list[dict[str, object]]) -> Path:
+    """Write a score table of LPIPS and PSNR, and curves of one frame."""
+    table = pd.DataFrame(rows).assign(frames=9, exact_frames=0)
+    table.attrs = attributes()
+    table.attrs["metrics"] = {name: table.attrs["metrics"][name] for name in ("lpips", "psnr")}
+    table.to_parquet(path, index=False)
+    curves = table.assign(frame=1).drop(columns=["frames", "exact_frames"])
+    curves.to_parquet(path.with_suffix(".curves.parquet"), index=False)
+    return path
+
+
 @pytest.fixture(scope="module")
 def scores(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A score table in which more bodies help, and error goes with kinematic distance."""
@@ -72,13 +83,7 @@ def scores(tmp_path_factory: pytest.TempPathFactory) -> Path:
         error = 0.2 + 0.5 * DISTANCES[body]
         add("scaling_seen-optical_flow-robot_render", "reference", body, error, 40 * (1 - error))
         add("", "copy_first_frame", body, 0.4 - 0.1 * LOOKS[body], 15.0)
-    table = pd.DataFrame(rows).assign(frames=9, exact_frames=0)
-    table.attrs = attributes()
-    table.attrs["metrics"] = {name: table.attrs["metrics"][name] for name in ("lpips", "psnr")}
-    table.to_parquet(path, index=False)
-    curves = table.assign(frame=1).drop(columns=["frames", "exact_frames"])
-    curves.to_parquet(path.with_suffix(".curves.parquet"), index=False)
-    return path
+    return write_scores(path, rows)
 
 
 def distances_of(bodies: Mapping[str, float], looks: Mapping[str, float]) -> Distances:
@@ -196,13 +201,7 @@ def halves(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for variant, (model, error) in scores.items():
                 names = {"variant": variant, "model": model, "condition": variant, "task": task, "seed": seed, "robot": body}
                 rows += [names | {"metric": "lpips", "value": error}, names | {"metric": "psnr", "value": 30 - 20 * error}]
-    table = pd.DataFrame(rows).assign(frames=9, exact_frames=0)
-    table.attrs = attributes()
-    table.attrs["metrics"] = {name: table.attrs["metrics"][name] for name in ("lpips", "psnr")}
-    table.to_parquet(path, index=False)
-    curves = table.assign(frame=1).drop(columns=["frames", "exact_frames"])
-    curves.to_parquet(path.with_suffix(".curves.parquet"), index=False)
-    return path
+    return write_scores(path, rows)
 
 
 def distances_between_halves() -> Distances:
