@@ -256,17 +256,16 @@ class SharedFeatures:
         plain: list[Any] = []
         weighted: list[Any] = []
         layers: Layers | None = None
-        own = np.s_[0:0]
+        own = made_of = np.s_[0:0]
         masks = itertools.repeat(None) if robot is None else cut(robot)
         for frames, true, mask in zip(cut(prediction), cut(target), masks, strict=False):
-            before, own = own, np.s_[own.stop : own.stop + len(frames)]
+            own = np.s_[own.stop : own.stop + len(frames)]
             if equal[own].all():
-                layers = None
                 plain.append(np.zeros(len(frames), np.float32))
                 weighted.append(plain[-1])
                 continue
-            if layers is None or not np.array_equal(prediction[own], prediction[before]):
-                layers = _layers(_weights(), frames, box)
+            if layers is None or not np.array_equal(prediction[own], prediction[made_of]):
+                layers, made_of = _layers(_weights(), frames, box), own
             true_layers = self._of_target(own.start, true, box)
             plain.append(_distance_of_layers(_weights(), layers, true_layers))
             if mask is not None:
