@@ -288,9 +288,11 @@ def test_motions_are_compared_on_the_scenes_that_both_have(both_motions: tuple[P
     assert [column.group for column in table.columns[:2]] == ["LPIPS ↓"] * 2
     assert [column.title for column in table.columns[:2]] == ["shared", "own"]
     for section in table.sections:
-        joints, *others = section.rows
+        joints, *others, frozen, pasted = section.rows
         assert joints.cells[1].value == pytest.approx(2 * joints.cells[0].value) and joints.cells[1].verdict == "worse"
         assert all(row.cells[1].verdict == "unresolved" and row.cells[1].value == row.cells[0].value for row in others)
+        assert frozen.cells[1].value == frozen.cells[0].value and frozen.cells[1].verdict == "unresolved"
+        assert (frozen.labels, pasted.labels) == (("frozen first frame",), ("pasted render",))
     scenes = len(shared.rows[["task", "seed"]].drop_duplicates())
     assert [section.rows[0].cells[0].episodes for section in table.sections] == [3 * (scenes - 1), scenes - 1, scenes - 1]
 
@@ -318,6 +320,9 @@ def test_the_report_sets_both_motions_side_by_side(both_motions: tuple[Path, Pat
     main(Args(both_motions[0], other_motion=both_motions[1], out=tmp_path))
     text = (tmp_path / "report.md").read_text()
     assert "## Shared and own motion" in text and "one tool path" in text
+    for robot in ("Franka Panda", "Piper"):
+        joints = "+100\u00a0% (+100\u00a0% to +100\u00a0%) with joint pose, +0\u00a0% (+0\u00a0% to +0\u00a0%) with ray map"
+        assert f"- Where each robot moves in its own way, LPIPS on {robot} differs by {joints}" in text
     assert "Shared and own motion" in (tmp_path / "index.html").read_text()
     drawn = pd.read_csv(tmp_path / "figures" / "motion.csv").set_index(["robots", "action", "motion"])
     joints, others = drawn["value"].xs("joints", level="action"), drawn["value"].drop("joints", level="action")

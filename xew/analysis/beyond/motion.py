@@ -16,11 +16,13 @@ from xew.analysis.tables.builder import interval_ends, mean_cell
 from xew.analysis.tables.labels import ACTIONS, GROUP_TITLES
 from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, metric_title
 from xew.config import ConfigError
-from xew.protocol import MOTIONS, OWN_MOTION, SHARED_MOTION, reference
+from xew.protocol import BASELINES, COPY_FIRST_FRAME, MOTIONS, OWN_MOTION, PASTED_RENDER, SHARED_MOTION, reference
 from xew.statistics import LEVEL, Mean, combine, noise_floor, strict_metrics, verdict
 
 METRICS = ("lpips", "mask_iou", "pck")
 """Metrics of the table, one of each dimension that it can tell apart; a metric of the suite strict stands for the paper's."""
+UNLEARNED = {name: BASELINES[name] for name in (COPY_FIRST_FRAME, PASTED_RENDER)}
+"""Titles of what no model made, by name: how hard the episodes of each kind of motion are by themselves."""
 CELL = ["task", "seed", "robot"]
 
 
@@ -50,13 +52,22 @@ class Motions:
         axes: Mapping[str, np.ndarray] = {}
         self._grades = StudyGrades(pd.concat(rows, ignore_index=True), tuple(self.metrics.values()), axes)
 
-    def mean(self, motion: str, action: str, robots: str, metric: str) -> Mean | None:
-        """The mean of an action representation's model on some robots in a kind of motion; None where it was not graded.
+    def mean(self, motion: str, row: str, robots: str, metric: str) -> Mean | None:
+        """The mean score on some robots in a kind of motion; None where it was not graded.
 
-        Robots are a key of GROUP_TITLES.
+        Args:
+            motion: one of MOTIONS.
+            row: an action representation, for its model, or a name of UNLEARNED.
+            robots: key of GROUP_TITLES.
+            metric: its name.
         """
-        variant = reference(action=action)
-        return self._grades.variant_mean(_named(variant.name, motion), pooled(variant, robots), metric)
+        name = row if row in UNLEARNED else reference(action=row).name
+        return self._grades.variant_mean(_named(name, motion), pooled(reference(), robots), metric)
+
+    def change(self, action: str, robots: str, metric: str) -> Mean | None:
+        """By which share of its mean in shared motion an action representation's model differs in own motion; None likewise."""
+        shared, own = (self.mean(motion, action, robots, metric) for motion in (SHARED_MOTION, OWN_MOTION))
+        return combine(lambda after, before: after / before - 1, own, shared) if own and shared else None
 
     def floor(self, robots: str, metric: str) -> float:
         """The larger of both noise floors, by the truth through codecs where it was graded; NaN where one is not known."""
@@ -70,15 +81,17 @@ def motion_table(motions: Motions) -> Table:
     strict = strict_metrics(motions.metrics)
     shown = [name for metric in METRICS if (name := strict.get(metric, metric)) in motions.metrics]
 
-    def row(action: str, robots: str) -> TableRow:
-        return TableRow((ACTIONS[action],), tuple(c for metric in shown for c in _cells(motions, action, robots, metric)))
+    def row(name: str, robots: str) -> TableRow:
+        return TableRow((titles[name],), tuple(c for metric in shown for c in _cells(motions, name, robots, metric)))
 
-    sections = [TableSection(title, tuple(row(action, name) for action in ACTIONS)) for name, title in GROUP_TITLES.items()]
+    titles = ACTIONS | UNLEARNED
+    sections = [TableSection(title, tuple(row(name, robots) for name in titles)) for robots, title in GROUP_TITLES.items()]
     return Table(
         "motion",
         "Action representation in shared and in own motion",
         "Shared: all robots follow one tool path, so that the body alone is new. Own: each robot moves as its own planner "
-        "would have it. Both have models of their own, graded on the same scenes. Marks: own against shared.",
+        "would have it. Both have models of their own, graded on the same scenes; the last two rows learned nothing. "
+        "Marks: own against shared.",
         ("action representation",),
         tuple(Column(motion, metric_title(motions.metrics[metric])) for metric in shown for motion in MOTIONS),
         tuple(sections),
@@ -100,10 +113,10 @@ def motion_frame(motions: Motions, metric: str) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["robots", "action", "motion", "value", "low", "high"])
 
 
-def _cells(motions: Motions, action: str, robots: str, metric: str) -> Sequence[TableCell]:
+def _cells(motions: Motions, row: str, robots: str, metric: str) -> Sequence[TableCell]:
     """The scores in shared and in own motion, the latter with the verdict on their difference."""
     info = motions.metrics[metric]
-    means = [motions.mean(motion, action, robots, metric) for motion in (SHARED_MOTION, OWN_MOTION)]
+    means = [motions.mean(motion, row, robots, metric) for motion in (SHARED_MOTION, OWN_MOTION)]
     shared, own = (mean_cell(mean, info, LEVEL) if mean else TableCell() for mean in means)
     if means[0] is None or means[1] is None:
         return shared, own

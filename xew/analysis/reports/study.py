@@ -156,7 +156,7 @@ def build(
     findings, by_paper, by_print = (ask(g) if of_paper else [] for g in (StrictGrades(grades), grades, printed))
     missing = find_missing_scores(scores.rows)
     content = Content(
-        study_sentences(grades, known, (difficulty.get("lpips"), gaps.get("lpips")), findings, by_paper),
+        study_sentences(grades, known, (difficulty.get("lpips"), gaps.get("lpips")), motions, findings, by_paper),
         findings,
         by_paper,
         by_print,

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pandas as pd
 
-from xew.analysis.beyond import OverBodies
+from xew.analysis.beyond import Motions, OverBodies
 from xew.analysis.paper import AXES
 from xew.analysis.scores import Scores, describe_scores
 from xew.analysis.statistics.grades import BODIES, Grades, StudyGrades, relative_gain
@@ -37,6 +37,7 @@ def study_sentences(
     grades: StudyGrades,
     distances: Distances,
     over_bodies: tuple[OverBodies | None, OverBodies | None],
+    motions: Motions | None,
     findings: Sequence[Finding],
     by_paper: Sequence[Finding],
 ) -> list[str]:
@@ -50,6 +51,7 @@ def study_sentences(
         *_scaling_sentence(grades),
         *_bodies_sentence(errors),
         *_halves_sentence(gaps),
+        *_motion_sentences(motions),
     ]
     return [
         *([_answer_sentence(findings)] if findings else []),
@@ -199,6 +201,21 @@ def _halves_sentence(gaps: OverBodies | None) -> Iterator[str]:
             f"{_format_change(shares.mean())} on average, {_format_change(shares.min())} to {_format_change(shares.max())}. "
             f"This gap correlates {', '.join(parts)}."
         )
+
+
+def _motion_sentences(motions: Motions | None) -> Iterator[str]:
+    """How each action representation's LPIPS differs in own motion from that in shared motion, on each held-out robot."""
+    if motions is None:
+        return
+    for robot in HELD_OUT_ROBOTS:
+        changes = {title: motions.change(action, robot, "lpips") for action, title in ACTIONS.items()}
+        parts = [
+            f"{_format_change(change.value)} ({' to '.join(map(_format_change, change.interval()))}) with {title.lower()}"
+            for title, change in changes.items()
+            if change
+        ]
+        if parts:
+            yield f"Where each robot moves in its own way, LPIPS on {ROBOT_TITLES[robot]} differs by {', '.join(parts)}."
 
 
 def _correlations(difficulty: OverBodies) -> list[str]:
