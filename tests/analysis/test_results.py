@@ -8,13 +8,16 @@ import pytest
 from xew.analysis.report import Args, main
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
+OTHER_MOTION = {"own_motion": RESULTS / "six_tasks" / "scores.parquet"}
+"""Score tables of the same study in the other kind of motion, by the folder whose page sets both side by side."""
 FOLDERS = sorted(path.parent for path in RESULTS.glob("*/scores.parquet"))
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_published_tables_and_sentences_are_those_of_the_scores(folder: Path, tmp_path: Path) -> None:
     distances = folder / "distances"
-    main(Args(folder / "scores.parquet", distances=distances if distances.is_dir() else None, out=tmp_path))
+    other = OTHER_MOTION.get(folder.name)
+    main(Args(folder / "scores.parquet", distances=distances if distances.is_dir() else None, other_motion=other, out=tmp_path))
     published = sorted((folder / "tables").glob("*.csv"))
     assert published, f"{folder} publishes no table"
     for path in published:
@@ -25,4 +28,4 @@ def test_published_tables_and_sentences_are_those_of_the_scores(folder: Path, tm
 
 
 def test_there_are_results() -> None:
-    assert [folder.name for folder in FOLDERS] == ["bodies_debug", "six_tasks", "small_size"]
+    assert [folder.name for folder in FOLDERS] == ["bodies_debug", "own_motion", "six_tasks", "small_size"]
