@@ -332,8 +332,10 @@ class Blocks:
 
 
 def _cut(array: np.ndarray, block: int, whole: bool) -> list[np.ndarray]:
-    filled = _fill(array, 0, block, "last")
-    return [filled] if whole else [filled[first : first + block] for first in range(0, len(filled), block)]
+    if whole:
+        return [_fill(array, 0, block, "last")]
+    parts = [array[first : first + block] for first in range(0, len(array), block)]
+    return [*parts[:-1], _fill(parts[-1], 0, block, "last")]
 
 
 def _curve(name: str, arrays: Arrays, blocks: Blocks) -> np.ndarray:
