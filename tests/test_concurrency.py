@@ -7,10 +7,24 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 import pytest
 
-from xew.concurrency import leave_with_parent, map_in_order, map_in_processes
+from xew.concurrency import free_gpu_memory, leave_with_parent, map_in_order, map_in_processes
+
+
+def test_free_memory_of_gpus_is_asked_of_nvidias_tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tool = tmp_path / "nvidia-smi"
+    tool.write_text(
+        '#!/bin/sh\n[ "$*" = "--query-gpu=memory.free --format=csv,noheader,nounits -i 1,3" ] && echo 80000 && echo 500\n'
+    )
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    assert free_gpu_memory(("1", "3")) == pytest.approx((83.886, 0.524), abs=0.001)
+    assert free_gpu_memory(("0",)) == (), "the tool knows no such GPU"
+    monkeypatch.setenv("PATH", "")
+    assert free_gpu_memory(("1", "3")) == ()
 
 
 def test_results_come_in_order_and_not_too_far_ahead() -> None:

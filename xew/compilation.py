@@ -22,6 +22,12 @@ def keep_compiled_programs() -> None:
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
+ALLOCATOR = "XLA_PYTHON_CLIENT_ALLOCATOR"
+"""Environment variable by which JAX is told how to take a GPU's memory."""
+GIVING_BACK = "platform"
+"""Value of ALLOCATOR with which JAX gives memory back after each use, for others on the same GPU; it takes longer."""
+
+
 def take_memory_as_needed() -> None:
     """Have JAX take a GPU's memory as it needs it and not three quarters at once, unless it was told otherwise.
 

@@ -38,6 +38,16 @@ def visible_gpus() -> tuple[str, ...]:
     return tuple(map(str, range(count))) if limited is None else tuple(part for part in limited.split(",") if part)
 
 
+def free_gpu_memory(gpus: Sequence[str]) -> tuple[float, ...]:
+    """How much memory is free on each of some GPUs [GB], as NVIDIA's tool tells it; nothing where it does not."""
+    query = ("nvidia-smi", "--query-gpu=memory.free", "--format=csv,noheader,nounits", "-i", ",".join(gpus))
+    try:
+        told = subprocess.run(query, capture_output=True, text=True, check=True).stdout.split()
+        return tuple(float(mebibytes) * 2**20 / 1e9 for mebibytes in told)
+    except (OSError, subprocess.CalledProcessError, ValueError):
+        return ()
+
+
 def map_in_order(
     function: Callable[[Item], Result],
     items: Iterable[Item],

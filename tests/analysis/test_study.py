@@ -1,5 +1,6 @@
 """The study runner on commands that cost nothing: order, skipping, failing, stopping, killing, Ray, what it says."""
 
+import itertools
 import json
 import os
 import signal
@@ -242,6 +243,17 @@ def test_a_gpu_has_one_training_and_a_few_steps_beside(tmp_path: Path) -> None:
             for step in steps]  # fmt: skip
     assert used == ["on 4", "on 7", "on 7", "on 4"], "the least busy GPU first, and never two trainings on one"
     assert all(machine.has_room_for(step) for step in steps)
+
+
+def test_gradings_beside_trainings_give_memory_back(tmp_path: Path) -> None:
+    shows = (sys.executable, "-c", "import os; print('by', os.environ.get('XLA_PYTHON_CLIENT_ALLOCATOR'), flush=True)")
+    told = {}
+    for beside, kind in itertools.product((0, 1), ("train", "evaluate")):
+        machine, log = ThisMachine(("4",), 1, {}, beside=beside), tmp_path / f"{kind}{beside}.log"
+        machine.start(Step(kind, "a", (), (), None, tmp_path / "a", launcher=shows), (), log)
+        machine.wait()
+        told[beside, kind] = log.read_text().split("by ")[1].split()[0]
+    assert told == {(0, "train"): "None", (0, "evaluate"): "None", (1, "train"): "None", (1, "evaluate"): "platform"}
 
 
 def test_a_gpu_may_have_two_trainings(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ import pandas as pd
 import tyro
 from tqdm import tqdm
 
-from xew.concurrency import begin_importing, map_in_order, map_in_processes, visible_gpus
+from xew.concurrency import begin_importing, free_gpu_memory, map_in_order, map_in_processes, visible_gpus
 from xew.config import ConfigError, pick, suggestion, user_errors
 from xew.dataset import demand_one_motion, find_accepted
 from xew.episode import EpisodeError, read_record, verify_episode
@@ -52,7 +52,7 @@ from xew.metrics.grading.scores import (
 )
 from xew.metrics.grading.summary import summarize, to_markdown
 from xew.metrics.grading.weights import check_weights
-from xew.metrics.grading.workers import worker_count
+from xew.metrics.grading.workers import choose_allocator, worker_count
 from xew.metrics.metric import SUITES
 from xew.metrics.truth import read_truth
 from xew.names import csv_text
@@ -121,8 +121,8 @@ class Args:
     """Threads that read, estimate and grade, shared out to the devices; 0: one for each processor core."""
     processes: int = 1
     """Processes that episodes are shared out to, in place of threads, and that have the GPUs in turn. Threads wait for Python's
-    lock, so that only processes keep more than about six cores, or a GPU, busy; each takes some ten seconds to start. 8 suit a
-    GPU."""
+    lock, so that only processes keep more than about six cores, or a GPU, busy; each takes some ten seconds to start. 8 to 12
+    suit a GPU that nothing else uses, if there are as many cores."""
     check: Path | None = None
     """Grade nothing: check that a bundle is consistent, and, where rollouts are named, that it was made from them."""
     regrade: int = 0
@@ -333,7 +333,9 @@ def _grade_groups(
     """
     opener = make_grader_opener(args, metrics, store)
     if args.processes > 1 and len(groups) > 1:
-        yield from map_in_processes(opener.open_in_process, groups, args.processes, IMPORTED, visible_gpus())
+        gpus = visible_gpus()
+        choose_allocator(args.processes, free_gpu_memory(gpus))
+        yield from map_in_processes(opener.open_in_process, groups, args.processes, IMPORTED, gpus)
         return
     stop = threading.Event()
     yield from map_in_order(opener.open(stop, codecs), groups, worker_count(args.workers), stop)

@@ -20,7 +20,7 @@ from xew.metrics.metric import AnyArray, ByFrame, Contacts, Scalar, Tracks, Vali
 
 PointValues: TypeAlias = Float32[jax.Array, "t k"]
 Known: TypeAlias = tuple[jax.Array, jax.Array, jax.Array]
-"""What `_path_cost` carries on: the cells diagonal to the next ones [t], the last ones [t], and the cost so far."""
+"""Arrays that `_path_cost` carries on: the cells diagonal to the next ones [t], the last ones [t], and the cost so far."""
 
 TAPVID_SIDE = 256.0
 """Side [pixels] of the square images that TAP-Vid's tolerances are stated for."""

@@ -4,7 +4,6 @@ Everything that opens a grader can be sent to another process, and so can videos
 """
 
 import itertools
-import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -75,8 +74,7 @@ class GraderOpener:
         return Grader(self, self._open_bench(), {codec.key: codec for codec in codecs.values()}, stop)
 
     def open_in_process(self) -> "Grader":
-        """Open a grader in a process of its own, which gives a GPU's memory back for the others after each use."""
-        os.environ.setdefault("XLA_PYTHON_CLIENT_ALLOCATOR", "platform")
+        """Open a grader in a process of its own."""
         prepare_process(self.trust)
         return self.open(threading.Event())
 

@@ -4,14 +4,17 @@ Threads share compiled programs, and decoding, OpenCV and XLA let go of Python's
 (`evaluate --processes`).
 """
 
+import math
+import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
+from xew.compilation import ALLOCATOR, GIVING_BACK
 from xew.concurrency import usable_cores
 from xew.config import ConfigError, pick
 from xew.metrics.backends import Masker, Tracker
@@ -21,6 +24,22 @@ MOST_WORKERS = {"cpu": 32, "gpu": 12}
 """Largest number of workers of a CPU and of each GPU. At full length each holds an episode, a prediction and their optical
 flow, half a gigabyte of the host's memory and as much of a GPU's, and features of the true video
 (`perceptual.KEPT_FEATURES`)."""
+
+
+MEMORY_OF_PROCESS = 6.0
+"""Memory of a GPU that a process which grades may come to hold [GB] if it gives none back: 12 fit on a card of 80 GB that was
+empty, 16 did not (docs/performance.md)."""
+
+
+def choose_allocator(processes: int, free: Sequence[float]) -> None:
+    """Have processes to come give back a GPU's memory after each use where it is too little for all, unless JAX was told how.
+
+    Args:
+        processes: their number, shared out to the GPUs.
+        free: memory of each GPU that is free [GB]; nothing where that is not known.
+    """
+    if not free or math.ceil(processes / len(free)) * MEMORY_OF_PROCESS > min(free):
+        os.environ.setdefault(ALLOCATOR, GIVING_BACK)
 
 
 def worker_count(asked: int) -> int:
