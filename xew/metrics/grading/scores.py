@@ -195,15 +195,16 @@ def _row_table(cell: Cell, grades: Grades, metrics: Sequence[str]) -> pa.Table:
 
 
 def _curve_table(cell: Cell, grades: Grades, metrics: Sequence[str]) -> pa.Table:
-    tables = []
-    for name in (name for name in metrics if name in grades.curves and math.isfinite(grades.values[name])):
-        curve = grades.curves[name]
-        frames = np.arange(cell.frames - len(curve), cell.frames)
-        finite = np.isfinite(curve)
-        count = int(finite.sum())
-        columns = [*_repeat_key(cell, count), pa.repeat(name, count), pa.array(frames[finite]), pa.array(curve[finite])]
-        tables.append(pa.table(columns, names=CURVES.names).cast(CURVES))
-    return pa.concat_tables(tables) if tables else CURVES.empty_table()
+    names = [name for name in metrics if name in grades.curves and math.isfinite(grades.values[name])]
+    if not names:
+        return CURVES.empty_table()
+    curves = [grades.curves[name] for name in names]
+    known = [np.flatnonzero(np.isfinite(curve)) for curve in curves]
+    frames = np.concatenate([cell.frames - len(curve) + some for curve, some in zip(curves, known, strict=True)])
+    values = np.concatenate([curve[some] for curve, some in zip(curves, known, strict=True)])
+    of = pa.array(names, pa.string()).take(pa.array(np.repeat(np.arange(len(names)), list(map(len, known)))))
+    columns = [*_repeat_key(cell, len(values)), of, pa.array(frames), pa.array(values)]
+    return pa.table(columns, names=CURVES.names).cast(CURVES)
 
 
 def _repeat_key(cell: Cell, count: int) -> list[pa.Array]:
