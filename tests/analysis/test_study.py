@@ -206,6 +206,21 @@ def test_a_budget_begins_only_what_ends_in_time_and_ends_what_is_begun_first(
     assert run(study, steps) == {} and begun(study.out)["data"] == 1
 
 
+def test_only_some_kinds_of_steps_are_run(study: Study) -> None:
+    """What makes pictures on one machine, what grades them later; the report waits for all."""
+    steps = chain(study.out)
+    for kind, variant, needs in (("evaluate", "graded", "train/end"), ("analyse", "", "evaluate/graded")):
+        path = study.out / (variant or "report")
+        step = Step(kind, variant, (STEPS, str(path), path.name), (needs,), None, path)
+        steps[step.name] = step
+    machines, ledger, paths = ThisMachine((), 2, {}), Ledger(study.out), dict.fromkeys(steps, 1.0)
+    for only, made in ((("evaluate",), 0), (("train",), 4), (("evaluate", "train"), 5), ((), 6)):
+        assert StudyRunner(study, steps, ledger, machines, paths, None, only).run() == {}
+        assert sum(bool(ledger.outcome(name)) for name in steps) == made
+    with pytest.raises(ConfigError, match=r"--only trian is no kind of step; did you mean 'train'\? there are generate, "):
+        runner.check_kinds(runner.read_arguments([str(ROOT / "configs" / "study_debug.yaml"), "--only", "train", "trian"]).only)
+
+
 @pytest.mark.parametrize(("name", "firsts"), [("six", {"fixed"}), ("debug", {"fixed", "loeo_piper"})])
 def test_latents_wait_for_the_first_of_their_codec(name: str, firsts: set[str]) -> None:
     """A codec that is fitted is another one for each split; of another, folds need the streams that the fixed split encodes."""

@@ -21,7 +21,7 @@ from typing import Annotated, Any, NoReturn
 
 import tyro
 
-from xew.analysis.studies.config import Study, check_study
+from xew.analysis.studies.config import KINDS, Study, check_study
 from xew.analysis.studies.cost import correct_by_ledger, critical_paths, estimate
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import open_machines, usable_gpus
@@ -29,7 +29,7 @@ from xew.analysis.studies.merge import merge_piece
 from xew.analysis.studies.plan import Step, plan, write_configs
 from xew.analysis.studies.runner import Budget, StudyRunner
 from xew.analysis.studies.status import exit_with_failures, format_cost, format_status
-from xew.config import ConfigError, admit_named, load, read_yaml, save, user_errors
+from xew.config import ConfigError, admit_named, load, read_yaml, save, suggestion, user_errors
 from xew.files import hold_lock, write_text
 
 CHECK_CONFIGS = """
@@ -60,6 +60,8 @@ class Args:
     """Steps to make anew, such as 'train/loeo_*'."""
     minutes: Annotated[float | None, tyro.conf.arg(metavar="{None}|FLOAT")] = None
     """Time that this run may take: by the estimates nothing is begun that would not be graded by then."""
+    only: tuple[str, ...] = ()
+    """Kinds of steps to run now, such as 'generate latents train rollout'; all where left out."""
     merge: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="PIECE [PIECE ...]")] = ()
     """Folders of the same study from other machines: what they have done is taken over, and nothing is run."""
 
@@ -76,11 +78,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         slots = len(usable_gpus(study)) or study.machine.workers
         print(format_status(study, steps, ledger), format_cost(study, steps, ledger, slots), sep="\n\n")
         return
+    check_kinds(args.only)
     with lock_study(study.out), stop_on_sigterm():
         prepare(study)
         for step in select_steps(steps, args.redo):
             ledger.forget(step)
-        failed = merge_pieces(steps, ledger, args.merge) if args.merge else run_steps(study, steps, ledger, args.minutes)
+        failed = merge_pieces(steps, ledger, args.merge) if args.merge else run_steps(args, steps, ledger)
         table = format_status(study, steps, ledger, failed)
         write_text(study.out / "status.txt", table + "\n")
     print(table)
@@ -90,13 +93,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"{len(left)} steps are left" if left else f"report: {study.out / 'report' / 'index.html'}")
 
 
-def run_steps(study: Study, steps: Mapping[str, Step], ledger: Ledger, minutes: float | None) -> dict[str, str]:
-    """Run what is left, within a time if there is one; returns the steps that failed, with the reason."""
-    machines = open_machines(study)
+def run_steps(args: Args, steps: Mapping[str, Step], ledger: Ledger) -> dict[str, str]:
+    """Run what is left and wanted, within a time if there is one; returns the steps that failed, with the reason."""
+    study, machines = args.study, open_machines(args.study)
     print(format_status(study, steps, ledger), format_cost(study, steps, ledger, machines.slots), sep="\n\n", flush=True)
     seconds = correct_by_ledger(estimate(study, steps), steps, ledger)
-    budget = None if minutes is None else Budget(study, steps, ledger, 60 * minutes)
-    return StudyRunner(study, steps, ledger, machines, critical_paths(steps, seconds), budget).run()
+    budget = None if args.minutes is None else Budget(study, steps, ledger, 60 * args.minutes)
+    return StudyRunner(study, steps, ledger, machines, critical_paths(steps, seconds), budget, args.only).run()
 
 
 def merge_pieces(steps: Mapping[str, Step], ledger: Ledger, pieces: Sequence[Path]) -> dict[str, str]:
@@ -144,6 +147,13 @@ def check_configs(paths: Sequence[Path]) -> None:
     if checked.returncode:
         message = checked.stderr.strip().removeprefix("error: ")
         raise ConfigError(f"the study's experiments cannot be run here.\n{message}")
+
+
+def check_kinds(names: Sequence[str]) -> None:
+    """Raise ConfigError for a name that is no kind of step."""
+    for name in names:
+        if name not in KINDS:
+            raise ConfigError(f"--only {name} is no kind of step;{suggestion(name, KINDS)} there are {', '.join(KINDS)}.")
 
 
 def select_steps(steps: Mapping[str, Step], patterns: Sequence[str]) -> list[Step]:

@@ -1,7 +1,7 @@
 """The loop of a study: skips what is done, starts what can be started, and notes what ended."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -31,6 +31,8 @@ class StudyRunner:
     """Seconds from the start of each step to the end of the study."""
     budget: "Budget | None" = None
     """Time after which nothing may run, if there is such a time."""
+    only: Collection[str] = ()
+    """Kinds of steps that are begun; all kinds where it is empty."""
     started: dict[str, float] = field(default_factory=dict)
     """Start times of the steps that run [s]."""
     settled: int = 0
@@ -39,7 +41,7 @@ class StudyRunner:
     """Steps that failed, and steps that could not be made because of them, with the reason."""
 
     def run(self) -> dict[str, str]:
-        """Run every step that can be run and for which there is time; returns those that failed, with the reason."""
+        """Run every step that can be run, is wanted and fits the time; returns those that failed, with the reason."""
         order = TopologicalSorter({name: step.predecessors for name, step in self.steps.items()})
         order.prepare()
         self.ledger.find_all_done(self.steps)
@@ -49,7 +51,7 @@ class StudyRunner:
                 waiting |= set(order.get_ready())
                 ended = self._settle_or_start(waiting)
                 if not ended and not self.started:
-                    break  # there is no time for any of those that are left
+                    break  # none of those that are left is wanted, or there is no time for any
                 if not ended:
                     ended = [self._finish(name, code) for name, code in self.machines.wait()]
                 order.done(*ended)
@@ -68,13 +70,16 @@ class StudyRunner:
             if reason:
                 self.failed[name] = reason
             elif not self.ledger.find_done(step):
-                if self.machines.has_room_for(step) and (self.budget is None or self.budget.fits(name)):
+                if self._is_wanted(step) and self.machines.has_room_for(step):
                     waiting.discard(name)
                     self._start(step)
                 continue
             waiting.discard(name)
             ended.append(name)
         return ended
+
+    def _is_wanted(self, step: Step) -> bool:
+        return (not self.only or step.kind in self.only) and (self.budget is None or self.budget.fits(step.name))
 
     def _find_blocker(self, step: Step) -> str:
         """Why a step cannot be made, or ''. The analysis is of whatever was graded."""
