@@ -206,6 +206,15 @@ def test_a_budget_begins_only_what_ends_in_time_and_ends_what_is_begun_first(
     assert run(study, steps) == {} and begun(study.out)["data"] == 1
 
 
+def test_how_many_share_a_grading_changes_nothing_that_is_done(study: Study) -> None:
+    def inputs(*options: str) -> list[object]:
+        steps = plan(replace(study, evaluate=options)).values()
+        return [step.inputs for step in steps if step.kind in ("baselines", "evaluate")]
+
+    assert inputs("--processes", "8", "--masks", "sam2") == inputs("--masks", "sam2", "--workers", "2", "--processes", "3")
+    assert inputs("--masks", "sam2") != inputs() == inputs("--workers", "1")
+
+
 def test_only_some_kinds_of_steps_are_run(study: Study) -> None:
     """What makes pictures on one machine, what grades them later; the report waits for all."""
     steps = chain(study.out)
@@ -260,7 +269,7 @@ def test_a_gpu_has_one_training_and_a_few_steps_beside(tmp_path: Path) -> None:
     assert all(machine.has_room_for(step) for step in steps)
 
 
-def test_gradings_beside_trainings_give_memory_back(tmp_path: Path) -> None:
+def test_gradings_beside_trainings_give_memory_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shows = (sys.executable, "-c", "import os; print('by', os.environ.get('XLA_PYTHON_CLIENT_ALLOCATOR'), flush=True)")
     told = {}
     for beside, kind in itertools.product((0, 1), ("train", "evaluate")):
@@ -269,6 +278,10 @@ def test_gradings_beside_trainings_give_memory_back(tmp_path: Path) -> None:
         machine.wait()
         told[beside, kind] = log.read_text().split("by ")[1].split()[0]
     assert told == {(0, "train"): "None", (0, "evaluate"): "None", (1, "train"): "None", (1, "evaluate"): "platform"}
+    monkeypatch.setenv("XLA_PYTHON_CLIENT_ALLOCATOR", "default")
+    machine.start(Step("evaluate", "a", (), (), None, tmp_path / "a", launcher=shows), (), tmp_path / "told.log")
+    machine.wait()
+    assert "by default" in (tmp_path / "told.log").read_text()
 
 
 def test_a_gpu_may_have_two_trainings(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ GRADINGS = ("baselines", "evaluate")
 """Kinds of steps that keep processors busy, and let those go first that feed a GPU."""
 GRADING_NICENESS = 10
 SHARING = {"XLA_PYTHON_CLIENT_ALLOCATOR": "platform"}
-"""Environment in which JAX gives a GPU's memory back after each use, for a training that begins later."""
+"""Environment in which JAX gives a GPU's memory back after each use, for a training that begins later; a user's own wins."""
 PATIENCE_S = 120.0
 """Time that steps have to end after they were asked to [s]; training saves in that time."""
 
@@ -114,7 +114,8 @@ class ThisMachine:
         slots = tuple(self._open_slots(step)[: self._count_slots(step)])
         own = {"CUDA_VISIBLE_DEVICES": ",".join(slots)} if self.gpus else {}
         grades_beside = bool(self.beside) and step.kind in GRADINGS
-        environment = {**(SHARING if grades_beside else {}), **self.environment, **step.environment, **own}
+        sharing = {name: os.environ.get(name, value) for name, value in SHARING.items()} if grades_beside else {}
+        environment = {**sharing, **self.environment, **step.environment, **own}
         niceness = GRADING_NICENESS if grades_beside else 0
         process = start_step(command, log, environment, launcher=step.launcher, niceness=niceness)
         self._running[step.name] = _Running(process, step, slots)

@@ -193,7 +193,7 @@ def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Ste
         "",
         ("xew.metrics.evaluate", "--data", str(study.data_folder), "--out", str(out), *asked, *study.evaluate),
         needs=("generate", f"latents/{variant.name}"),
-        inputs=[frames, study.evaluate, GRADING_PROTOCOL],
+        inputs=[frames, _what_is_graded(study.evaluate), GRADING_PROTOCOL],
         product=out,
         every_gpu=study.machine.beside > 0,  # alone it would wait for all GPUs to be free, or trainings for it
     )
@@ -209,9 +209,15 @@ def _plan_evaluate(study: Study, variant: Variant) -> Step:
         variant.name,
         ("xew.metrics.evaluate", str(_rollouts_path(study, variant.name)), *given, *asked),
         needs=("generate", _training_name(variant), f"rollout/{variant.name}"),
-        inputs=[study.evaluate, GRADING_PROTOCOL],
+        inputs=[_what_is_graded(study.evaluate), GRADING_PROTOCOL],
         product=out,
     )
+
+
+def _what_is_graded(options: Sequence[str]) -> list[str]:
+    """Options of `evaluate` but how many share the work, on which no score depends: another machine may take another number."""
+    shared = [place + i for place, option in enumerate(options) if option in ("--processes", "--workers") for i in (0, 1)]
+    return [option for place, option in enumerate(options) if place not in shared]
 
 
 def _plan_distances(study: Study) -> Step:
