@@ -187,13 +187,21 @@ def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Ste
     It keeps processors busy while the first models train; later gradings find what it has graded, and nothing waits for it.
     """
     out, frames = study.baselines_path, experiment.get("rollout", {}).get("max_frames", 0)
-    asked = ("--baselines-of", "test", "--codec", str(_config_path(study, variant)), "--max-frames", str(frames))
+    asked = (
+        "--baselines-of",
+        "test",
+        "--codec",
+        str(_config_path(study, variant)),
+        "--max-frames",
+        str(frames),
+        *_graders(study),
+    )
     return Step(
         "baselines",
         "",
         ("xew.metrics.evaluate", "--data", str(study.data_folder), "--out", str(out), *asked, *study.evaluate),
         needs=("generate", f"latents/{variant.name}"),
-        inputs=[frames, _what_is_graded(study.evaluate), GRADING_PROTOCOL],
+        inputs=[frames, study.evaluate, GRADING_PROTOCOL],
         product=out,
         every_gpu=study.machine.beside > 0,  # alone it would wait for all GPUs to be free, or trainings for it
     )
@@ -203,21 +211,21 @@ def _plan_evaluate(study: Study, variant: Variant) -> Step:
     """Grading of a variant. The truth through a codec is graded once for all variants that share it."""
     out = study.scores_path(variant.name)
     given = ("--data", str(study.data_folder), "--out", str(out))
-    asked = ("--no-baselines", "--codec", str(run_folder(study, variant)), *study.evaluate)
+    asked = ("--no-baselines", "--codec", str(run_folder(study, variant)), *study.evaluate, *_graders(study))
     return Step(
         "evaluate",
         variant.name,
         ("xew.metrics.evaluate", str(_rollouts_path(study, variant.name)), *given, *asked),
         needs=("generate", _training_name(variant), f"rollout/{variant.name}"),
-        inputs=[_what_is_graded(study.evaluate), GRADING_PROTOCOL],
+        inputs=[study.evaluate, GRADING_PROTOCOL],
         product=out,
     )
 
 
-def _what_is_graded(options: Sequence[str]) -> list[str]:
-    """Options of `evaluate` but how many share the work, on which no score depends: another machine may take another number."""
-    shared = [place + i for place, option in enumerate(options) if option in ("--processes", "--workers") for i in (0, 1)]
-    return [option for place, option in enumerate(options) if place not in shared]
+def _graders(study: Study) -> tuple[str, ...]:
+    """Options of `evaluate` on how many processes share the work, which is no input: no score depends on it."""
+    count = study.machine.graders
+    return ("--processes", str(count), "--workers", "1") if count else ()
 
 
 def _plan_distances(study: Study) -> Step:

@@ -1,6 +1,5 @@
-"""The study runner on commands that cost nothing: order, skipping, failing, stopping, killing, Ray, what it says."""
+"""The study runner on commands that cost nothing: order, skipping, failing, stopping, killing, what it says."""
 
-import itertools
 import json
 import os
 import signal
@@ -13,70 +12,21 @@ from pathlib import Path
 
 import pytest
 
+from tests.analysis.studies.chains import ROOT, STEPS, begun, chain, run
 from tests.synthetic import write_synthetic_data
 from xew.analysis import study as runner
-from xew.analysis.studies import ledger as study_ledger
-from xew.analysis.studies import merge, processes
 from xew.analysis.studies.config import Study, load_study
 from xew.analysis.studies.cost import critical_paths
 from xew.analysis.studies.ledger import Ledger
-from xew.analysis.studies.machines import Machines, RayCluster, ThisMachine, open_machines
+from xew.analysis.studies.machines import ThisMachine
 from xew.analysis.studies.plan import Step, plan
 from xew.analysis.studies.processes import last_lines, start_step
 from xew.analysis.studies.runner import Budget, StudyRunner, complete_command
 from xew.analysis.studies.status import exit_with_failures
-from xew.concurrency import visible_gpus
 from xew.config import ConfigError
 from xew.episode import EpisodeError
 
-ROOT = Path(__file__).parents[2]
-STEPS = "tests.analysis.steps"
-CHAIN = (("data", ""), ("left", "data"), ("right", "data"), ("end", "left right"))
-"""Steps and what each needs."""
-
-
-@pytest.fixture(autouse=True)
-def at_the_root(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)
-
-
-@pytest.fixture(autouse=True)
-def outcomes_of_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps here make one file each, whatever stage they claim to be."""
-    for module in (study_ledger, merge):
-        monkeypatch.setattr(module, "digest_product", lambda kind, product: study_ledger._digest_file(product))
-
-
-@pytest.fixture(autouse=True)
-def steps_import_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps here need no model; what real ones find imported is at work in studies/test_study_debug.py."""
-    monkeypatch.setattr(processes, "PRELOADED", ())
-
-
-@pytest.fixture
-def study(tmp_path: Path) -> Study:
-    return load_study(ROOT / "configs" / "study_debug.yaml", ["--out", str(tmp_path)])
-
-
-def chain(out: Path, **changes: tuple[str, ...]) -> dict[str, Step]:
-    """The steps of CHAIN; `changes` are more arguments of single ones."""
-    steps = [
-        Step("train", name, (STEPS, str(out / name), name, *changes.get(name, ())), tuple(f"train/{n}" for n in needs.split()),
-             list(changes.get(name, ())), out / name)
-        for name, needs in CHAIN
-    ]  # fmt: skip
-    return {step.name: step for step in steps}
-
-
-def begun(out: Path) -> dict[str, int]:
-    """How often each step was started."""
-    return {path.stem: len(path.read_text().splitlines()) for path in out.glob("*.begun")}
-
-
-def run(study: Study, steps: dict[str, Step], machines: Machines | None = None) -> dict[str, str]:
-    """One pass over the steps; what failed."""
-    machines = machines or ThisMachine((), 2, {})
-    return StudyRunner(study, steps, Ledger(study.out), machines, dict.fromkeys(steps, 1.0)).run()
+pytestmark = pytest.mark.usefixtures("cheap_steps")
 
 
 def test_what_is_done_is_not_done_again(study: Study) -> None:
@@ -206,15 +156,6 @@ def test_a_budget_begins_only_what_ends_in_time_and_ends_what_is_begun_first(
     assert run(study, steps) == {} and begun(study.out)["data"] == 1
 
 
-def test_how_many_share_a_grading_changes_nothing_that_is_done(study: Study) -> None:
-    def inputs(*options: str) -> list[object]:
-        steps = plan(replace(study, evaluate=options)).values()
-        return [step.inputs for step in steps if step.kind in ("baselines", "evaluate")]
-
-    assert inputs("--processes", "8", "--masks", "sam2") == inputs("--masks", "sam2", "--workers", "2", "--processes", "3")
-    assert inputs("--masks", "sam2") != inputs() == inputs("--workers", "1")
-
-
 def test_only_some_kinds_of_steps_are_run(study: Study) -> None:
     """What makes pictures on one machine, what grades them later; the report waits for all."""
     steps = chain(study.out)
@@ -250,49 +191,6 @@ def test_what_follows_is_counted_within_a_variant() -> None:
     paths = critical_paths(steps, dict.fromkeys(steps, 1.0), own=True)
     assert paths == {"generate": 1.0, "train/a": 2.0, "evaluate/a": 1.0, "adapt/b": 1.0}
     assert critical_paths(steps, dict.fromkeys(steps, 1.0))["generate"] == 3.0
-
-
-def test_a_gpu_has_one_training_and_a_few_steps_beside(tmp_path: Path) -> None:
-    machine = ThisMachine(("4", "7"), 1, {}, beside=1)
-    shows = (sys.executable, "-c", "import os; print('on', os.environ['CUDA_VISIBLE_DEVICES'], flush=True)")
-    steps = [Step(kind, name, (), (), None, tmp_path / name, launcher=shows) for kind, name in
-             (("train", "a"), ("rollout", "b"), ("adapt", "c"), ("evaluate", "d"))]  # fmt: skip
-    for step in steps:
-        assert machine.has_room_for(step)
-        machine.start(step, (), tmp_path / f"{step.variant}.log")
-    assert not any(machine.has_room_for(step) for step in steps)
-    while machine._running:
-        machine.wait()
-    used = [next(line for line in (tmp_path / f"{step.variant}.log").read_text().splitlines() if line.startswith("on "))
-            for step in steps]  # fmt: skip
-    assert used == ["on 4", "on 7", "on 7", "on 4"], "the least busy GPU first, and never two trainings on one"
-    assert all(machine.has_room_for(step) for step in steps)
-
-
-def test_gradings_beside_trainings_give_memory_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shows = (sys.executable, "-c", "import os; print('by', os.environ.get('XLA_PYTHON_CLIENT_ALLOCATOR'), flush=True)")
-    told = {}
-    for beside, kind in itertools.product((0, 1), ("train", "evaluate")):
-        machine, log = ThisMachine(("4",), 1, {}, beside=beside), tmp_path / f"{kind}{beside}.log"
-        machine.start(Step(kind, "a", (), (), None, tmp_path / "a", launcher=shows), (), log)
-        machine.wait()
-        told[beside, kind] = log.read_text().split("by ")[1].split()[0]
-    assert told == {(0, "train"): "None", (0, "evaluate"): "None", (1, "train"): "None", (1, "evaluate"): "platform"}
-    monkeypatch.setenv("XLA_PYTHON_CLIENT_ALLOCATOR", "default")
-    machine.start(Step("evaluate", "a", (), (), None, tmp_path / "a", launcher=shows), (), tmp_path / "told.log")
-    machine.wait()
-    assert "by default" in (tmp_path / "told.log").read_text()
-
-
-def test_a_gpu_may_have_two_trainings(tmp_path: Path) -> None:
-    machine = ThisMachine(("4", "7"), 1, {}, beside=1, trainings=2)
-    steps = [Step("train", name, (), (), None, tmp_path / name, launcher=("sleep", "1")) for name in "abcde"]
-    started = [
-        step for step in steps if machine.has_room_for(step) and not machine.start(step, (), tmp_path / f"{step.variant}.log")
-    ]
-    assert started == steps[:4] and machine.has_room_for(replace(steps[4], kind="rollout"))
-    machine.stop()
-    assert all(machine.has_room_for(step) for step in steps)
 
 
 def test_a_failing_cell_is_named_and_the_others_go_on(study: Study, capsys: pytest.CaptureFixture[str]) -> None:
@@ -387,7 +285,10 @@ def alive(name: Path) -> bool:
 SCRIPT = """
 import sys
 from pathlib import Path
-from tests.analysis.test_study import ROOT, chain, load_study, processes, run, runner
+from tests.analysis.studies.chains import ROOT, chain, run
+from xew.analysis import study as runner
+from xew.analysis.studies import processes
+from xew.analysis.studies.config import load_study
 
 if __name__ == "__main__":
     processes.PRELOADED = ()
@@ -460,51 +361,6 @@ def test_the_end_of_a_log_has_no_progress_bars(tmp_path: Path) -> None:
     assert last_lines(tmp_path / "none.log") == ""
 
 
-def test_a_launcher_starts_the_command(tmp_path: Path) -> None:
-    """As srun would; here env, which also sets a variable."""
-    process = start_step(
-        ("json.tool", "--help"), tmp_path / "step.log", {}, method="spawn", launcher=("env", "PYTHONIOENCODING=utf-8")
-    )
-    process.join()
-    assert process.exitcode == 0
-    assert (tmp_path / "step.log").read_text().startswith("$ env PYTHONIOENCODING=utf-8 python -m json.tool")
-
-
-def test_gpus_are_shared_out(study: Study) -> None:
-    machine = ThisMachine(("2", "5", "7"), 1, {})
-    one, two = Step("rollout", "a", (), (), None, study.out), Step("train", "b", (), (), None, study.out, gpus=2)
-    assert machine.slots == 3 and machine.has_room_for(two)
-    for step in (two, one):
-        machine.start(step, (STEPS, str(study.out / step.variant), "x", "--wait", "0.2"), study.out / f"{step.variant}.log")
-    assert machine._running["train/b"].slots == ("2", "5") and machine._running["rollout/a"].slots == ("7",)
-    assert not machine.has_room_for(one)
-    while machine._running:
-        machine.wait()
-    assert machine.has_room_for(Step("train", "c", (), (), None, study.out, gpus=3))
-
-
-def test_data_are_made_on_every_gpu(study: Study) -> None:
-    machine, generate = ThisMachine(("2", "5", "7"), 1, {}, beside=2), plan(study)["generate"]
-    machine.start(generate, (STEPS, str(study.out / "x"), "x"), study.out / "generate.log")
-    assert machine._running["generate"].slots == ("2", "5", "7")
-    assert machine.has_room_for(Step("distances", "", (), (), None, study.out)), "others go beside"
-    steps, beside = plan(study), plan(replace(study, machine=replace(study.machine, beside=2)))
-    assert generate.gpus_of(3) == 3 and steps["distances"].gpus_of(3) == 1
-    assert [step.gpus_of(3) for step in steps.values() if step.kind == "latents"][:2] == [3, 1], "others wait for the first"
-    assert [found["baselines"].gpus_of(3) for found in (steps, beside)] == [1, 3], "what trains need not wait for them"
-    while machine._running:
-        machine.wait()
-    assert ThisMachine((), 2, {}).has_room_for(generate)
-
-
-def test_gpus_that_are_not_there(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PATH", "")
-    assert visible_gpus() == ()
-    asked = load_study(ROOT / "configs" / "study_debug.yaml", ["--machine.gpus", "0", "--machine.gpus-per-training", "8"])
-    with pytest.raises(ConfigError, match="gpus_per_training is 8, there are 1 GPUs"):
-        open_machines(asked)
-
-
 def test_help_lists_what_may_be_overridden(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         runner.main([str(ROOT / "configs" / "study_debug.yaml"), "--help"])
@@ -574,33 +430,3 @@ def test_experiments_that_the_model_does_not_take_are_said_before_anything_start
     assert stop.value.code == 2
     assert "unknown key 'epoch'; did you mean 'epochs'" in capsys.readouterr().err
     assert not (tmp_path / "study" / "state").exists()
-
-
-def test_cells_run_as_tasks_on_a_ray_cluster(study: Study) -> None:
-    """Two nodes of one core each: two steps that wait for one another run at once, so on both; a failure is told."""
-    pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
-
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-    try:
-        cluster.add_node(num_cpus=1)
-        machines = RayCluster(cluster.address, {})
-        try:
-            assert machines.slots == 2
-            left = ("--until", str(study.out / "right.begun"))
-            right = ("--until", str(study.out / "left.begun"), "--fail")
-            assert run(study, chain(study.out, left=left, right=right), machines) == {
-                "train/right": "exit status 1",
-                "train/end": "needs train/right",
-            }
-            assert (study.out / "left").read_text() == "left"
-        finally:
-            machines.stop()
-    finally:
-        cluster.shutdown()
-
-
-def test_a_ray_cluster_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("ray")
-    with pytest.raises(ConfigError, match="ray start --head"):
-        RayCluster("auto", {})
