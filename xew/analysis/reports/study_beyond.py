@@ -11,9 +11,10 @@ from xew.analysis.beyond import Motions, OverBodies, motion_frame, scaling_frame
 from xew.analysis.beyond.scaling import ALONE, GROUPS, WITH_ROBOTS
 from xew.analysis.reports import charts
 from xew.analysis.reports.charts import SERIES, Chart, Panel, Series
+from xew.analysis.statistics.grades import SEEN
 from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import AXIS_TITLES, format_signed
-from xew.analysis.tables.labels import ACTIONS, GROUP_TITLES
+from xew.analysis.tables.labels import ACTIONS, GROUP_TITLES, HELD_OUT_TITLES
 from xew.analysis.tables.table import metric_title
 from xew.protocol import MOTIONS
 
@@ -76,6 +77,7 @@ def _positions(counts: Sequence[int] | pd.Series) -> np.ndarray:
 def motion_chart(motions: Motions) -> Chart:
     """LPIPS of each action representation in shared and in own motion, a panel for robots seen and for each held out."""
     data, metric = motion_frame(motions, METRIC), motions.metrics[METRIC]
+    longest = float(np.nanmax(data[["value", "high"]].to_numpy(np.float64)))
 
     def draw(axes: Axes, robots: str) -> None:
         groups = []
@@ -83,8 +85,10 @@ def motion_chart(motions: Motions) -> Chart:
             chosen = data[(data["robots"] == robots) & (data["motion"] == motion)]
             groups.append((color, chosen[["value", "low", "high"]].to_numpy(), np.full(len(chosen), np.nan)))
         charts.bars(axes, list(ACTIONS.values()), groups, metric_title(metric))
+        axes.set_xlim(0, 1.05 * longest)
 
-    panels = [Panel(title, partial(draw, robots=robots)) for robots, title in GROUP_TITLES.items()]
+    titles = {robots: "Robots of the training" if robots == SEEN else HELD_OUT_TITLES[robots] for robots in GROUP_TITLES}
+    panels = [Panel(title, partial(draw, robots=robots)) for robots, title in titles.items()]
     caption = "Shared motion, in which all robots follow one tool path, and own motion. Lines: 95 % intervals over scenes."
     legend = [Series(f"{motion} motion", color) for motion, color in MOTION_COLORS.items()]
     return Chart("motion", caption, panels, data, legend)
