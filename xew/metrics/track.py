@@ -334,13 +334,11 @@ def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray, most: 
     a = jnp.where(found[:, None], a, 0)
     t = len(a)
     rows, end = jnp.arange(t), jnp.maximum(jnp.sum(tracked) - 1, 0)
-    # The other path backwards with room at both ends, of which each anti-diagonal reads a slice; a gather takes longer.
-    backwards = jnp.pad(b[::-1].T, ((0, 0), (t, t)))
     x, y = a.T
 
     def fill(known: Known, d: jax.Array) -> tuple[Known, None]:
         diagonal, last, total = known
-        facing_x, facing_y = lax.dynamic_slice_in_dim(backwards, 2 * t - 1 - d, t, axis=1)
+        facing_x, facing_y = b[jnp.clip(d - rows, 0, t - 1)].T
         cost = jnp.where(found, jnp.minimum(_root(jnp.square(x - facing_x) + jnp.square(y - facing_y)), most), most)
         up = jnp.concatenate([jnp.full(1, jnp.inf, jnp.float32), last[:-1]])
         cells = cost + jnp.where(d == 0, 0, jnp.minimum(jnp.minimum(up, last), diagonal))
