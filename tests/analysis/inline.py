@@ -10,7 +10,8 @@ from xew.analysis.studies.processes import wait_for_lock
 class InlineMachines:
     """Machines whose steps are done as soon as they were started; one that fails ends the test with what it printed.
 
-    Programs, weights and imports are then shared by all steps. What steps are in processes of their own, test_study_runner.py tests.
+    Programs, weights and imports are then shared by all steps. test_study_runner.py tests what steps are in processes of their
+    own.
     """
 
     slots = 1

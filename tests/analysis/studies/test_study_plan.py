@@ -137,7 +137,9 @@ def test_a_study_of_bodies_makes_what_its_variants_ask_for() -> None:
     assert [study.training_count(variant) for variant in (first, last)] == [60, 17 * 60]
     command = steps["distances"].command
     assert command[command.index("--robot") + 1 :][:8] == study.graded_robots[-8:]
-    assert estimate(study, steps)["generate"].amount == 6 * (10 * 18 + 2 * 12)
+    costs = estimate(study, steps)
+    assert costs["generate"].amount == 6 * (10 * 18 + 2 * 12)
+    assert costs["distances"].amount == 13 * 12 / 2, "of the five robots and eight bodies"
 
 
 def test_a_condition_may_stand_in_for_one_of_the_protocol() -> None:

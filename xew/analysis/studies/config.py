@@ -75,6 +75,8 @@ class Rates:
     """Size of one predicted episode."""
     episode_frames: int = 178
     """Mean number of frames of an episode; 178 over all tasks."""
+    pair_s: float = 0.0
+    """Time to measure how far two robots are from one another; it counts where there are many bodies."""
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ Where steps of a kind are done in this study already, the others of that kind ar
 """
 
 import heapq
+import math
 import shutil
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -13,8 +14,8 @@ from typing import Any
 from xew.analysis.studies.config import KINDS, Settings, Study, build_experiment, has_fitted_codec
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import TRAININGS, usable_gpus
-from xew.analysis.studies.plan import Step, sort_steps
-from xew.protocol import BASELINES, Variant, training_counts
+from xew.analysis.studies.plan import Step, measured_bodies, sort_steps
+from xew.protocol import BASELINES, ROBOT_NAMES, Variant, training_counts
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,9 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
         }
     videos = tested * len(BASELINES)
     costs["baselines"] = Cost(videos, "videos", rates.start_s + videos * rates.grade_s)
-    costs |= {"distances": Cost(1, "table", 2 * rates.start_s), "analyse": Cost(1, "report", 2 * rates.start_s)}
+    pairs = math.comb(len(ROBOT_NAMES) + len(measured_bodies(study)), 2)
+    costs["distances"] = Cost(pairs, "pairs", 2 * rates.start_s + pairs * rates.pair_s)
+    costs["analyse"] = Cost(1, "report", 2 * rates.start_s)
     return {name: costs[name] for name in steps}
 
 

@@ -228,11 +228,15 @@ def _graders(study: Study) -> tuple[str, ...]:
     return ("--processes", str(count), "--workers", "1") if count else ()
 
 
+def measured_bodies(study: Study) -> list[str]:
+    """Keys of the bodies whose distances are measured, beside those of the five robots."""
+    asks = {"bodies", "halves"}.intersection(study.parts)
+    return [robot for robot in study.graded_robots if robot in DISTANCE_BODIES] if asks else []
+
+
 def _plan_distances(study: Study) -> Step:
     """Distances of the robots as they are rendered here, with which the errors of folds and bodies are correlated."""
-    folder = study.out / "distances"
-    asks = {"bodies", "halves"}.intersection(study.parts)
-    bodies = [robot for robot in study.graded_robots if robot in DISTANCE_BODIES] if asks else []
+    folder, bodies = study.out / "distances", measured_bodies(study)
     asked = (*(("--robot", *bodies) if bodies else ()), *study.distances)
     return Step(
         "distances",
