@@ -40,6 +40,8 @@ def visible_gpus() -> tuple[str, ...]:
 
 def free_gpu_memory(gpus: Sequence[str]) -> tuple[float, ...]:
     """How much memory is free on each of some GPUs [GB], as NVIDIA's tool tells it; nothing where it does not."""
+    if not gpus:
+        return ()
     query = ("nvidia-smi", "--query-gpu=memory.free", "--format=csv,noheader,nounits", "-i", ",".join(gpus))
     try:
         told = subprocess.run(query, capture_output=True, text=True, check=True).stdout.split()

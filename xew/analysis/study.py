@@ -78,7 +78,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         slots = len(usable_gpus(study)) or study.machine.workers
         print(format_status(study, steps, ledger), format_cost(study, steps, ledger, slots), sep="\n\n")
         return
-    check_kinds(args.only)
     with lock_study(study.out), stop_on_sigterm():
         prepare(study)
         for step in select_steps(steps, args.redo):
@@ -122,6 +121,7 @@ def read_arguments(arguments: Sequence[str]) -> Args:
         return tyro.cli(Args, args=arguments, prog=prog)
     args = tyro.cli(Args, args=arguments, prog=prog, default=Args(path, load(Study, path)))
     check_study(args.study, path)
+    check_kinds(args.only)
     return args
 
 

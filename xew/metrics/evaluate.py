@@ -334,7 +334,7 @@ def _grade_groups(
     opener = make_grader_opener(args, metrics, store)
     if args.processes > 1 and len(groups) > 1:
         gpus = visible_gpus()
-        choose_allocator(args.processes, free_gpu_memory(gpus))
+        choose_allocator(min(args.processes, len(groups)), free_gpu_memory(gpus))
         yield from map_in_processes(opener.open_in_process, groups, args.processes, IMPORTED, gpus)
         return
     stop = threading.Event()

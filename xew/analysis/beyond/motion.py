@@ -65,7 +65,7 @@ class Motions:
         return self._grades.variant_mean(_named(name, motion), pooled(reference(), robots), metric)
 
     def change(self, action: str, robots: str, metric: str) -> Mean | None:
-        """By which share of its mean in shared motion an action representation's model differs in own motion; None likewise."""
+        """Share of its mean in shared motion by which an action representation's model differs in own motion; None as `mean`."""
         shared, own = (self.mean(motion, action, robots, metric) for motion in (SHARED_MOTION, OWN_MOTION))
         return combine(lambda after, before: after / before - 1, own, shared) if own and shared else None
 

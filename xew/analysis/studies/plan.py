@@ -187,19 +187,12 @@ def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Ste
     It keeps processors busy while the first models train; later gradings find what it has graded, and nothing waits for it.
     """
     out, frames = study.baselines_path, experiment.get("rollout", {}).get("max_frames", 0)
-    asked = (
-        "--baselines-of",
-        "test",
-        "--codec",
-        str(_config_path(study, variant)),
-        "--max-frames",
-        str(frames),
-        *_graders(study),
-    )
+    given = ("--data", str(study.data_folder), "--out", str(out), "--codec", str(_config_path(study, variant)))
+    asked = ("--baselines-of", "test", "--max-frames", str(frames), *study.evaluate, *_graders(study))
     return Step(
         "baselines",
         "",
-        ("xew.metrics.evaluate", "--data", str(study.data_folder), "--out", str(out), *asked, *study.evaluate),
+        ("xew.metrics.evaluate", *given, *asked),
         needs=("generate", f"latents/{variant.name}"),
         inputs=[frames, study.evaluate, GRADING_PROTOCOL],
         product=out,
