@@ -65,7 +65,7 @@ class Motions:
         return self._grades.variant_mean(_named(name, motion), pooled(reference(), robots), metric)
 
     def change(self, action: str, robots: str, metric: str) -> Mean | None:
-        """Share of its mean in shared motion by which an action representation's model differs in own motion; None as `mean`."""
+        """Share of its score in shared motion by which a representation's model differs in own motion; None as `mean`."""
         shared, own = (self.mean(motion, action, robots, metric) for motion in (SHARED_MOTION, OWN_MOTION))
         return combine(lambda after, before: after / before - 1, own, shared) if own and shared else None
 
