@@ -4,6 +4,7 @@ Both are reached from outside the registries, as a user's own would be: TASK and
 """
 
 import resource
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -65,7 +66,9 @@ class InlineWorkers:
         pass
 
     def run(self, function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterator[Any]:
-        return map(function, jobs)
+        waiting = jobs if isinstance(jobs, deque) else deque(jobs)  # to which whoever takes results may add
+        while waiting:
+            yield function(waiting.popleft())
 
 
 def work_inline(patch: "pytest.MonkeyPatch") -> None:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -292,24 +293,30 @@ def test_test_seeds_may_be_of_other_robots() -> None:
     assert [(family.first_seed, family.robots) for family in families] == [(0, ("a", "b")), (TEST_SEED_START, ("b", "c"))]
 
 
-@pytest.mark.parametrize(("physics", "sizes"), [(None, [4, 1]), ("cpu", [1] * 5)])
+@pytest.mark.parametrize("physics", [None, "cpu"])
 def test_physics_on_the_cpu_leaves_the_gpu_to_the_pictures(
-    physics: Literal["cpu"] | None, sizes: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    physics: Literal["cpu"] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Five scenes of two robots on a GPU that steps eight worlds together: batches, devices of the jobs, compiled kernels."""
     compiled: dict[str, str] = {}
-    made: list[tuple[int, object]] = []
+    stepped: list[int] = []
+    shared: list[dict[str, Any]] = []
     gpus = [SimpleNamespace(is_cuda=True, alias=f"cuda:{number}", total_memory=1e12) for number in range(2)]
     monkeypatch.setattr(command, "find_devices", lambda name: gpus)
     monkeypatch.setattr(command, "compile_on_devices", lambda pool, devices, batch: compiled.update(devices))
-    monkeypatch.setattr(command, "_make", lambda jobs, physics, **_: made.append((len(jobs), physics)) or [])
+    monkeypatch.setattr(command, "_make", lambda jobs, **_: stepped.append(len(jobs)) or [])
+    monkeypatch.setattr(command, "make_by_robot", lambda *arguments: shared.extend(p.keywords for p in arguments[2:]) or [])
     work_inline(monkeypatch)
     args = Args((TASK,), ("a", "b"), out=tmp_path, batch=8, physics=physics)
     with command.start_workers(args, dict.fromkeys("ab", WITH_SLOW[SLOW])) as make:
         assert list(make([Job(TASK, seed, ("a", "b")) for seed in range(5)])) == []
-    stepped = physics or "cuda:0"
-    assert made == [(size, physics) for size in sizes]
-    assert compiled == {"physics": stepped, "kinematics": stepped, "rendering": "cuda:0"}
+    if physics is None:
+        assert stepped == [4, 1] and not shared, "scenes together, as many as the GPU steps worlds of"
+    else:
+        simulate, write = shared
+        assert not stepped and simulate["physics"] == "cpu" and write["painter"], "on the CPU, robot by robot"
+    device = physics or "cuda:0"
+    assert compiled == {"physics": device, "kinematics": device, "rendering": "cuda:0"}
 
 
 def test_unpaired_robots_share_no_seed(tmp_path: Path) -> None:
@@ -408,6 +415,17 @@ def test_workers_have_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_worker_has_its_device_as_warps_default() -> None:
     with Workers(1, [wp.get_device("cpu")]) as pool:
         assert list(pool.run(name_of_own_device, [0])) == ["cpu"]
+
+
+def test_workers_take_what_is_added_while_they_work() -> None:
+    """What is put on the left is done before what waits, beyond the two jobs that each worker has under way."""
+    jobs, found = deque([16, *range(40, 60, 2)]), []
+    with Workers(1) as workers:
+        for number in workers.run(half, jobs):
+            found.append(number)
+            if number in (8, 4, 2):
+                jobs.appendleft(number)
+    assert sorted(found) == [1, 2, 4, 8, *range(20, 30)] and found.index(1) < found.index(29)
 
 
 def test_workers_hand_over_results_and_errors() -> None:

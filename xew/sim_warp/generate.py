@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-import warp as wp
 from tqdm import tqdm
 
 from xew.config import user_errors
@@ -39,8 +38,9 @@ from xew.protocol import (
 )
 from xew.sim_warp.devices.workers import FRAMES_OF_A_PAINTER, Workers, find_device, find_devices, quiet_warp, worker_count
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
-from xew.sim_warp.production.cells import Job
-from xew.sim_warp.production.produce import produce
+from xew.sim_warp.production.by_robot import Timed, make_by_robot
+from xew.sim_warp.production.cells import Cell, Job
+from xew.sim_warp.production.produce import produce, simulate_jobs, write_seeds
 from xew.sim_warp.production.warm_up import compile_on_devices
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS, RobotSpec, adopt_robots, get_robot, is_path
@@ -180,25 +180,23 @@ Made = tuple[list[Record], float]
 
 @contextmanager
 def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Callable[[Sequence[Job]], Iterator[Made]]]:
-    """Start worker processes; what is given runs jobs in them, one at a time on a CPU, in large batches on a GPU."""
+    """Start worker processes; what is given runs jobs in them: on a GPU in large batches, on a CPU robot by robot."""
     devices = find_devices(args.device)
     physics = find_device(args.physics) if args.physics else devices[0]
-    together = 1 if args.unpaired else len(robots)
-    size = max(1, args.batch // together) if physics.is_cuda else 1
-    make = partial(
-        _make,
-        robots=robots,
-        out=args.out,
-        physics=args.physics,
-        batch=args.batch,
-        videos=not args.states_only,
-    )
     with Workers(args.workers or worker_count(devices, physics), devices) as workers:
         parts = {"physics": physics.alias, "kinematics": physics.alias, "rendering": devices[0].alias}
         compile_on_devices(workers, parts, args.batch)
 
         def run(jobs: Sequence[Job]) -> Iterator[Made]:
+            videos = not args.states_only
+            if not physics.is_cuda:
+                simulate = partial(_simulate, robots=robots, physics=physics.alias)
+                write = partial(_write, out=args.out, videos=videos, painter=devices[0].is_cuda)
+                yield from make_by_robot(workers, jobs, simulate, write)
+                return
+            size = max(1, args.batch // (1 if args.unpaired else len(robots)))
             batches = [jobs[start : start + size] for start in range(0, len(jobs), size)]
+            make = partial(_make, robots=robots, out=args.out, batch=args.batch, videos=videos)
             for made in workers.run(make, batches):
                 yield from made
 
@@ -211,15 +209,28 @@ def _renderer(painter: bool) -> Renderer:
     return Renderer(frames_per_chunk=FRAMES_OF_A_PAINTER if painter else None)
 
 
-def _make(
-    jobs: Sequence[Job], robots: Mapping[str, RobotSpec], out: Path, physics: str | None, batch: int, videos: bool
-) -> list[Made]:
-    """Make some jobs in a worker process, on its own device, with physics there or on another."""
+def _make(jobs: Sequence[Job], robots: Mapping[str, RobotSpec], out: Path, batch: int, videos: bool) -> list[Made]:
+    """Make some jobs in a worker process, on its own device."""
     begin = time.perf_counter()
-    painter = physics is not None and physics != wp.get_device().alias
-    seeds = produce(jobs, out, _renderer(painter), batch, videos, robots, physics)
+    seeds = produce(jobs, out, _renderer(painter=False), batch, videos, robots)
     seconds = (time.perf_counter() - begin) / len(jobs)
     return [(records, seconds) for records in seeds]
+
+
+def _simulate(job: Job, robots: Mapping[str, RobotSpec], physics: str) -> Timed:
+    """The cell of a job of one robot with its motion, and the seconds it took, in a worker process."""
+    begin = time.perf_counter()
+    ((cell,),) = simulate_jobs([job], physics, robots=robots)
+    _ = cell.failure  # found here once, it travels with the cell
+    return cell, time.perf_counter() - begin
+
+
+def _write(cell: Cell, rejected: bool, out: Path, videos: bool, painter: bool) -> Timed:
+    """Write a cell in a worker process, rendered on its own device unless its scene is rejected; its header, and seconds."""
+    begin = time.perf_counter()
+    places = {(cell.task_name, cell.scene.seed)} if rejected else set()
+    ((record,),) = write_seeds([[cell]], places, out, _renderer(painter), videos)
+    return record, time.perf_counter() - begin
 
 
 def generate(args: Args) -> list[Family]:

@@ -12,11 +12,11 @@ from xew.metrics.grading.workers import choose_allocator
 @pytest.mark.parametrize(
     ("processes", "free", "told"),
     [
-        (12, (84.0,), None),
-        (16, (84.0,), GIVING_BACK),
-        (16, (84.0, 84.0), None),
-        (9, (84.0, 29.0), GIVING_BACK),  # five on the first, four on the second: there may be five on either
-        (1, (5.0,), GIVING_BACK),
+        (9, (84.0,), None),
+        (10, (84.0,), GIVING_BACK),
+        (18, (84.0, 84.0), None),
+        (9, (84.0, 44.0), GIVING_BACK),  # five on the first, four on the second: there may be five on either
+        (1, (8.0,), GIVING_BACK),
         (8, (), GIVING_BACK),
     ],
 )

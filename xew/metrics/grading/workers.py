@@ -26,9 +26,9 @@ flow, half a gigabyte of the host's memory and as much of a GPU's, and features 
 (`perceptual.KEPT_FEATURES`)."""
 
 
-MEMORY_OF_PROCESS = 6.0
-"""Memory of a GPU that a process which grades may come to hold [GB] if it gives none back: 12 fit on a card of 80 GB that was
-empty, 16 did not (docs/performance.md)."""
+MEMORY_OF_PROCESS = 9.0
+"""Memory of a GPU that a process which grades may come to hold [GB] if it gives none back: with 8 for each of ten processes a
+card ran out of it (docs/performance.md)."""
 
 
 def choose_allocator(processes: int, free: Sequence[float]) -> None:

@@ -10,8 +10,9 @@ A worker ignores Ctrl-C (its parent decides) and leaves when its parent is kille
 """
 
 import os
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
@@ -77,6 +78,7 @@ class Workers:
 
     def __init__(self, count: int, devices: Sequence[warp.Device] = ()) -> None:
         os.environ.setdefault("OMP_NUM_THREADS", "1")  # a worker is a core; more threads would wait for one another
+        self._count = count
         self._pool = open_processes(count, IMPORTED, _begin_worker, own=[device.alias for device in devices])
 
     def __enter__(self) -> "Workers":
@@ -88,12 +90,22 @@ class Workers:
     def run(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[Result]:
         """Results of `function` on every job, in the order in which they are done.
 
+        Args:
+            function: called in a worker.
+            jobs: whoever takes results may meanwhile add to a deque, on the left what is to be done next.
+
         Raises:
             EpisodeError: a worker was killed.
         """
+        waiting = jobs if isinstance(jobs, deque) else deque(jobs)
+        under_way: set[Future[Result]] = set()
         try:
-            for future in as_completed([self._pool.submit(function, job) for job in jobs]):
-                yield future.result()
+            while waiting or under_way:
+                while waiting and len(under_way) < 2 * self._count:  # one more for each, so that none waits for its next
+                    under_way.add(self._pool.submit(function, waiting.popleft()))
+                done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
+                for future in done:
+                    yield future.result()
         except BrokenProcessPool as error:
             raise EpisodeError(
                 "a worker process was killed, perhaps for want of memory. What is done is kept: give the command again, "

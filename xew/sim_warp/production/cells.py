@@ -7,6 +7,7 @@ Writes `Cell`s: first with scene, plan and joint commands (`plan_cells`), then w
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -55,6 +56,13 @@ class Cell:
     """Motion that physics made of the commands; None before, and where the robot cannot follow the plan."""
     motion_kind: str = SHARED_MOTION
     """Kind of motion that the commands are of, one of `xew.protocol.MOTIONS`."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What travels to another process: all but the task, whose functions may be lambdas and are found there by name."""
+        return {name: value for name, value in self.__dict__.items() if name != "task"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, task=get_task(state["task_name"]))
 
     @property
     def known_motion(self) -> Motion:

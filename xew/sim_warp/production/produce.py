@@ -3,10 +3,10 @@
 Reads  `Job`s: (task, seed) and the robots that still lack it
 Writes episodes and, for what did not succeed, their headers with the reason
 
-The robots of a seed are made together, because a seed counts only when all of them succeed; only then it is rendered.
+A seed counts only when all of its robots succeed, and only then it is rendered: so all of them are simulated first.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -43,9 +43,31 @@ def produce(
         robots: the robots of the jobs by name.
         physics: Warp's name of the device that plans and steps physics; the renderer's if left out.
     """
-    physics = physics or renderer.device.alias
-    seeds = simulate_cells(plan_cells(jobs, robots, physics), physics, batch)
-    rejected = {(job.task, job.seed) for job in jobs if job.rejected}
+    seeds = simulate_jobs(jobs, physics or renderer.device.alias, batch, robots)
+    return write_seeds(seeds, {(job.task, job.seed) for job in jobs if job.rejected}, out, renderer, videos)
+
+
+def simulate_jobs(
+    jobs: Sequence[Job], physics: str, batch: int | None = None, robots: Mapping[str, RobotSpec] = ROBOTS
+) -> list[list[Cell]]:
+    """The cells of each job with the motion that physics made of their plans; the arguments are those of `produce`."""
+    return simulate_cells(plan_cells(jobs, robots, physics), physics, batch)
+
+
+def write_seeds(
+    seeds: Sequence[Sequence[Cell]],
+    rejected: Collection[tuple[str, int]],
+    out: Path,
+    renderer: Renderer,
+    videos: bool = True,
+) -> list[list[Record]]:
+    """Render and write simulated cells; their headers, in the same order.
+
+    Args:
+        seeds: the cells of each seed, or some of them.
+        rejected: tasks and seeds on which a robot has failed that is not among the cells; then nothing is rendered.
+        out, renderer, videos: as for `produce`.
+    """
     records: list[list[Record]] = []
     writing: list[list[Future[Record]]] = []
     with ThreadPoolExecutor(usable_cores()) as pool:  # codecs, zlib and hashes let go of the interpreter's lock
@@ -60,9 +82,9 @@ def produce(
         return records + [[future.result() for future in cells] for cells in writing]
 
 
-def _group_seeds(seeds: list[list[Cell]]) -> Iterator[list[list[Cell]]]:
+def _group_seeds(seeds: Sequence[Sequence[Cell]]) -> Iterator[list[Sequence[Cell]]]:
     """The seeds in order, about `FRAMES_AT_ONCE` frames at a time."""
-    group: list[list[Cell]] = []
+    group: list[Sequence[Cell]] = []
     for cells in seeds:
         group.append(cells)
         if sum(cell.path.frame_count for others in group for cell in others) >= FRAMES_AT_ONCE:
@@ -72,6 +94,6 @@ def _group_seeds(seeds: list[list[Cell]]) -> Iterator[list[list[Cell]]]:
         yield group
 
 
-def _is_accepted(cells: Sequence[Cell], rejected: set[tuple[str, int]]) -> bool:
+def _is_accepted(cells: Sequence[Cell], rejected: Collection[tuple[str, int]]) -> bool:
     """Whether all robots of a seed have succeeded, those that were made before included."""
     return not any((cell.task_name, cell.scene.seed) in rejected or cell.failure for cell in cells)
