@@ -170,6 +170,8 @@ def test_chamfer_equals_brute_force_and_is_a_distance() -> None:
     assert chamfer(again, b) == pytest.approx((cdist(again, b).min(1).mean() + table.min(0).mean()) / 2)
     assert chamfer_matrix([a, b, again])[1, 2] == pytest.approx(chamfer(again, b))
     assert chamfer(a, a + [0.001, 0, 0]) == pytest.approx(0.001, rel=1e-6)
+    clouds = [rng.normal(size=(30, 3)) for _ in range(5)]
+    np.testing.assert_array_equal(chamfer_matrix(clouds, workers=-1), chamfer_matrix(clouds))
 
 
 def robot_picture(
@@ -204,8 +206,9 @@ def test_matrices_are_of_pairs() -> None:
     matrix = appearance_matrix(robots)
     assert matrix.shape == (2, 2) and matrix[0, 0] == 0
     assert matrix[0, 1] == matrix[1, 0] == cosine_distance(*(appearance_descriptor(views) for views in robots))
-    by_view = perceptual_matrices(robots, lambda a, b: np.abs(a.astype(float) - b).mean(axis=(1, 2, 3)))
-    assert by_view.shape == (2, 2, 2) and by_view[1, 0, 1] == np.abs(robots[0][1].astype(float) - robots[1][1]).mean()
+    by_view = perceptual_matrices(robots, lambda images: images.astype(float).reshape(len(images), -1))
+    assert by_view.shape == (2, 2, 2)
+    assert by_view[1, 0, 1] == np.square(robots[0][1].astype(float) - robots[1][1]).sum()
     np.testing.assert_array_equal(by_view, by_view.transpose(0, 2, 1))
 
 

@@ -13,6 +13,7 @@ import pytest
 from xew.config import ConfigError
 from xew.metrics import (
     lpips,
+    lpips_embedding,
     lpips_features,
     lpips_from_features,
     region_lpips,
@@ -140,6 +141,18 @@ def test_features_of_a_target_serve_all_its_predictions() -> None:
         expected = region_lpips_frames(prediction, target, mask)
         np.testing.assert_allclose(lpips_from_features(prediction, region), expected, atol=1e-6)
     np.testing.assert_allclose(lpips_from_features(target, whole), 0, atol=1e-7)
+
+
+def test_embeddings_are_as_far_apart_as_frames() -> None:
+    a, b = noise(3), noise(3)
+    b[1] = a[1]
+    first, second = np.asarray(lpips_embedding(a)), np.asarray(lpips_embedding(b, chunk=2))
+    assert first.dtype == np.float32 and first.shape == second.shape
+    np.testing.assert_allclose(np.square(first - second).sum(axis=1), lpips(a, b), rtol=1e-5, atol=1e-7)
+    broken = np.where(np.arange(3)[:, None, None, None] == 2, np.nan, a / 255)
+    assert np.isnan(lpips_embedding(broken)).all(axis=1).tolist() == [False, False, True]
+    with pytest.raises(ValueError, match="31"):
+        lpips_embedding(noise(1, 30, 56))
 
 
 @pytest.mark.parametrize("most_bytes", [10**9, 0])

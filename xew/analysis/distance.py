@@ -19,7 +19,7 @@ import pandas as pd
 import tyro
 
 from xew.analysis.distances.appearance import (
-    ImageDistance,
+    ImageEmbedding,
     appearance_descriptor,
     appearance_matrix,
     cosine_distance,
@@ -47,7 +47,7 @@ from xew.sim_warp.robots import RobotSpec, Urdf, get_robot, load_urdf
 __all__ = [
     "Features",
     "Frame",
-    "ImageDistance",
+    "ImageEmbedding",
     "Workspace",
     "appearance_descriptor",
     "appearance_matrix",
@@ -67,7 +67,7 @@ TITLES = {
     "arm_base": "The same in the frame of the arm's base [m] (ours)",
     "arm_alone": "The same of the arm alone [m] (ours)",
     "appearance": "Appearance distance: cosine of hue-saturation histogram and Hu moments of nine views",
-    "perceptual": "Perceptual distance of the nine views, mean of {} (ours)",
+    "perceptual": "Perceptual distance of the nine views, mean of squared distances of {} (ours)",
 }
 OTHER_FRAMES: tuple[Frame, ...] = ("arm_base", "arm_alone")
 FLOOR_SEEDS = 20
@@ -86,10 +86,11 @@ class Args:
     """Number of draws of configurations, from seed 0 on; they give the spread."""
     looks: bool = True
     """Render the robots, for the distances of appearance."""
-    perceptual: str = "xew.metrics:lpips"
-    """module:NAME of a distance of two videos [t h w 3] uint8, frame by frame; empty for none."""
+    perceptual: str = "xew.metrics:lpips_embedding"
+    """module:NAME of a function from images [n h w 3] uint8 to vectors [n d], whose squared distances are measured; empty for
+    none. The default's are LPIPS."""
     workers: int = -1
-    """Threads of the nearest-neighbor search; -1 for all cores."""
+    """Threads that compare workspaces; -1 for one a core."""
 
 
 @user_errors
@@ -99,13 +100,13 @@ def main(args: Args) -> None:
         raise ConfigError(f"--seeds is {args.seeds}; expected 1 or more.")
     if args.workers != -1 and args.workers < 1:
         raise ConfigError(f"--workers is {args.workers}; expected 1 or more, or -1 for all cores.")
-    distance = _import_image_distance(args.perceptual) if args.looks and args.perceptual else None
+    embed = _import_embedding(args.perceptual) if args.looks and args.perceptual else None
     robots = find_robots((*ROBOT_NAMES, *args.robot))
     with hold_lock(args.out):
-        write_distances(args, robots, distance)
+        write_distances(args, robots, embed)
 
 
-def write_distances(args: Args, robots: dict[str, RobotSpec | Urdf], distance: ImageDistance | None) -> None:
+def write_distances(args: Args, robots: dict[str, RobotSpec | Urdf], embed: ImageEmbedding | None) -> None:
     """Measure the distances between robots, by name, and write and print both tables."""
     features = measure(robots, range(args.seeds), workers=args.workers)
     axes = {"kinematic": Axis(features.robots, features.kinematic.mean(axis=0), features.kinematic)}
@@ -113,7 +114,7 @@ def write_distances(args: Args, robots: dict[str, RobotSpec | Urdf], distance: I
         draws = measure(robots, range(args.seeds), other, args.workers).kinematic
         axes[other] = Axis(features.robots, draws.mean(axis=0), draws)
     if args.looks:
-        axes |= _measure_looks([robot for robot in robots.values() if isinstance(robot, RobotSpec)], distance)
+        axes |= _measure_looks([robot for robot in robots.values() if isinstance(robot, RobotSpec)], embed)
     floor = chamfer_floor(robots, range(min(args.seeds, FLOOR_SEEDS)))
     pairs, singles = distance_frame(axes), robot_frame(features, axes, floor)
     for title, axis in axes.items():
@@ -143,7 +144,7 @@ def find_robots(names: Iterable[str]) -> dict[str, RobotSpec | Urdf]:
     return found
 
 
-def _measure_looks(specs: Sequence[RobotSpec], distance: ImageDistance | None) -> dict[str, Axis]:
+def _measure_looks(specs: Sequence[RobotSpec], embed: ImageEmbedding | None) -> dict[str, Axis]:
     """Distances of appearance between robots."""
     from xew.sim_warp.rendering.streams import VIEW_COUNT, nine_views  # loads Warp, which no other part of the analysis needs
 
@@ -151,17 +152,17 @@ def _measure_looks(specs: Sequence[RobotSpec], distance: ImageDistance | None) -
     without_one = [appearance_matrix([np.delete(views, i, axis=0) for views in renders]) for i in range(VIEW_COUNT)]
     jackknife = (VIEW_COUNT - 1) / np.sqrt(VIEW_COUNT)
     axes = {"appearance": Axis(robots, appearance_matrix(renders), np.array(without_one), jackknife)}
-    if distance is not None:
-        by_view = _measure_perceptual(renders, distance)
+    if embed is not None:
+        by_view = _measure_perceptual(renders, embed)
         without_one = (by_view.sum(axis=0) - by_view) / (VIEW_COUNT - 1)
         axes["perceptual"] = Axis(robots, by_view.mean(axis=0), without_one, jackknife)
     return axes
 
 
-def _measure_perceptual(renders: Sequence[np.ndarray], distance: ImageDistance) -> np.ndarray:
-    """`perceptual_matrices`, with a ConfigError where the weights of the distance are not installed."""
+def _measure_perceptual(renders: Sequence[np.ndarray], embed: ImageEmbedding) -> np.ndarray:
+    """`perceptual_matrices`, with a ConfigError where the weights of the embedding are not installed."""
     try:
-        return perceptual_matrices(renders, distance)
+        return perceptual_matrices(renders, embed)
     except FileNotFoundError as error:  # the weights
         raise ConfigError(f'{error} Or leave it out: --perceptual "".') from error
 
@@ -177,7 +178,7 @@ def _find_robot(name: str) -> RobotSpec | Urdf:
         return urdf
 
 
-def _import_image_distance(name: str) -> ImageDistance:
+def _import_embedding(name: str) -> ImageEmbedding:
     module, _, attribute = name.partition(":")
     try:
         return getattr(importlib.import_module(module), attribute)

@@ -15,6 +15,7 @@ from xew.metrics.mask import boundary_f1, mask_iou, mask_scores
 from xew.metrics.metric import Metric
 from xew.metrics.perceptual import (
     lpips,
+    lpips_embedding,
     lpips_features,
     lpips_from_features,
     region_lpips,
@@ -123,6 +124,7 @@ __all__ = [
     "keypoint_error",
     "keypoint_error_strict",
     "lpips",
+    "lpips_embedding",
     "lpips_features",
     "lpips_from_features",
     "mask_iou",

@@ -169,9 +169,14 @@ def robot_lpips_parts(
     return _weighted_distance(_weights(), prediction, target, mask, chunk), jnp.any(mask, axis=(1, 2))
 
 
+def check_video(video: Any) -> None:
+    """Raise ValueError or TypeError unless a video is [t h w 3] with sides that LPIPS takes."""
+    check_videos(video, video, SMALLEST_SIDE)
+
+
 def check_target(target: Any, target_mask: Any = None) -> None:
     """Raise ValueError or TypeError unless a video is [t h w 3] and large enough, and its mask None or bool [t h w]."""
-    check_videos(target, target, SMALLEST_SIDE)
+    check_video(target)
     if target_mask is not None:
         _check_mask(target, target_mask)
 
@@ -216,6 +221,24 @@ def lpips_from_features(prediction: Video, target: Features, *, chunk: int | Non
         ValueError: the prediction has another size than the target.
     """
     return _distance_from_features(_weights(), prediction, target.layers, target.box, chunk)
+
+
+@check_first(check_video)
+def lpips_embedding(video: Video, *, chunk: int | None = None) -> jax.Array:
+    """Vectors whose squared Euclidean distances are `lpips`: where all of many images are compared, each is described once.
+
+    Args:
+        video: [t h w 3] RGB, uint8, or floating in [0, 1]; sides of at least 31 pixels.
+        chunk: as in `lpips`.
+
+    Returns:
+        [t d] float32, 3.0 MB a frame of 320x240; NaN where a pixel of the frame is NaN.
+
+    Raises:
+        ValueError: the video has another shape, or a side is under 31 pixels.
+        FileNotFoundError: the weights are not installed.
+    """
+    return _embed(_weights(), video, _whole_box(video), chunk)
 
 
 class SharedFeatures:
@@ -465,6 +488,22 @@ def _distance_from_features(
         return jnp.where(_is_broken(image), jnp.nan, found)
 
     return map_chunks(of_frames, (prediction, target), chunk)
+
+
+@functools.partial(jax.jit, static_argnames="chunk")
+def _embed(weights: Weights, video: jax.Array, box: Box, chunk: int | None) -> jax.Array:
+    """The unit vectors of the five layers of a video's frames, weighted so that squared differences add up to LPIPS: [t d]."""
+
+    def of_frames(frames: jax.Array) -> jax.Array:
+        image = _input(frames, box)
+        layers = [
+            _unit(x) * jnp.sqrt(weights[f"head{i}"] / (height * width).astype(jnp.float32)).reshape(1, 1, 1, -1)
+            for i, (x, height, width) in enumerate(_features(weights, image, *box[2:]))
+        ]
+        found = jnp.concatenate([layer.reshape(len(frames), -1) for layer in layers], axis=1)
+        return jnp.where(_is_broken(image)[:, None], jnp.nan, found)
+
+    return map_chunks(of_frames, video, chunk)
 
 
 def _input(frames: jax.Array, box: Box) -> jax.Array:

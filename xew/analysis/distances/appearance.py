@@ -1,10 +1,10 @@
-"""Appearance distance: what robots look like, alone on white, by the paper's descriptor or by any distance of images."""
+"""Appearance distance: what robots look like, alone on white, by the paper's descriptor or by any embedding of images."""
 
 from collections.abc import Callable, Sequence
-from itertools import combinations
 
 import cv2
 import numpy as np
+from scipy.spatial.distance import pdist, squareform
 
 from xew.analysis.distances.matrices import symmetric_matrix
 
@@ -13,8 +13,8 @@ HUE_BINS = SATURATION_BINS = 16
 WHITE = 250
 """Level from which on, in all channels, a pixel of a robot-only render is background."""
 
-ImageDistance = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Distance of two videos or lists of views, both [n h w 3] uint8, frame by frame: [n] float."""
+ImageEmbedding = Callable[[np.ndarray], np.ndarray]
+"""Vectors [n d] of images [n h w 3] uint8, whose squared Euclidean distances say how different the images look."""
 
 
 def appearance_descriptor(renders: np.ndarray) -> np.ndarray:
@@ -47,15 +47,13 @@ def appearance_matrix(renders: Sequence[np.ndarray]) -> np.ndarray:
     return symmetric_matrix(len(renders), lambda a, b: cosine_distance(descriptors[a], descriptors[b]))
 
 
-def perceptual_matrices(renders: Sequence[np.ndarray], distance: ImageDistance) -> np.ndarray:
+def perceptual_matrices(renders: Sequence[np.ndarray], embed: ImageEmbedding) -> np.ndarray:
     """Distances of n robots' renders, each [v h w 3] uint8, as a matrix for each view [v n n] float64. Ours.
 
-    `distance` may be `xew.metrics.lpips`. View i has the same azimuth for every robot, so the same sides are compared.
+    `embed` may be `xew.metrics.lpips_embedding`. View i has the same azimuth for every robot, so the same sides are compared.
     """
-    matrices = np.zeros((len(renders[0]), len(renders), len(renders)))
-    for a, b in combinations(range(len(renders)), 2):
-        matrices[:, a, b] = matrices[:, b, a] = distance(renders[a], renders[b])
-    return matrices
+    by_view = [np.asarray(embed(np.stack(views))) for views in zip(*renders, strict=True)]
+    return np.stack([squareform(pdist(vectors, "sqeuclidean")) for vectors in by_view])
 
 
 def _describe_view(view: np.ndarray, index: int) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, KDTree
 
 from xew.analysis.distances.matrices import symmetric_matrix
+from xew.concurrency import usable_cores
 from xew.sim_warp.kinematics.forward import link_matrices
 from xew.sim_warp.robots import RobotSpec, Urdf, UrdfError, load_urdf
 
@@ -68,7 +69,7 @@ def measure(
         robots: entries of ROBOTS or URDFs, by name.
         seeds: seeds of the sampling, one draw for each.
         frame: frame that the clouds are in.
-        workers: threads of the nearest-neighbor search; -1 for all cores.
+        workers: threads that compare clouds; -1 for one a core.
 
     Returns:
         Features of n robots over s seeds.
@@ -144,16 +145,17 @@ def chamfer(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def chamfer_matrix(clouds: Sequence[np.ndarray], workers: int = 1) -> np.ndarray:
-    """`chamfer` of every two of n clouds, each [p 3]: [n n] float64; `workers` threads search, -1 for all cores."""
+    """`chamfer` of every two of n clouds, each [p 3]: [n n] float64; `workers` threads share the pairs, -1 for one a core."""
     # A body's links are in a cloud hundreds of times: each place is searched from once, and counted as often as it occurs.
     places = [np.unique(cloud, axis=0, return_counts=True) for cloud in clouds]
     trees = [KDTree(points) for points, _ in places]
 
     def measure_directed(a: int, b: int) -> float:
         points, counts = places[a]
-        return float(np.average(trees[b].query(points, workers=workers)[0], weights=counts))
+        return float(np.average(trees[b].query(points)[0], weights=counts))  # which lets go of Python's lock
 
-    return symmetric_matrix(len(clouds), lambda a, b: (measure_directed(a, b) + measure_directed(b, a)) / 2)
+    threads = usable_cores() if workers == -1 else workers
+    return symmetric_matrix(len(clouds), lambda a, b: (measure_directed(a, b) + measure_directed(b, a)) / 2, threads)
 
 
 def _choose_joints(robot: RobotSpec | Urdf) -> tuple[Urdf, tuple[str, ...], dict[str, float]]:
