@@ -305,7 +305,7 @@ def test_physics_on_the_cpu_leaves_the_gpu_to_the_pictures(
     monkeypatch.setattr(command, "find_devices", lambda name: gpus)
     monkeypatch.setattr(command, "compile_on_devices", lambda pool, devices, batch: compiled.update(devices))
     monkeypatch.setattr(command, "_make", lambda jobs, **_: stepped.append(len(jobs)) or [])
-    monkeypatch.setattr(command, "make_by_robot", lambda *arguments: shared.extend(p.keywords for p in arguments[2:]) or [])
+    monkeypatch.setattr(command, "make_by_robot", lambda *arguments: shared.extend(p.keywords for p in arguments[3:]) or [])
     work_inline(monkeypatch)
     args = Args((TASK,), ("a", "b"), out=tmp_path, batch=8, physics=physics)
     with command.start_workers(args, dict.fromkeys("ab", WITH_SLOW[SLOW])) as make:

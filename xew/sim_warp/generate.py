@@ -190,9 +190,9 @@ def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Calla
         def run(jobs: Sequence[Job]) -> Iterator[Made]:
             videos = not args.states_only
             if not physics.is_cuda:
-                simulate = partial(_simulate, robots=robots, physics=physics.alias)
+                simulate = partial(_simulate, physics=physics.alias)
                 write = partial(_write, out=args.out, videos=videos, painter=devices[0].is_cuda)
-                yield from make_by_robot(workers, jobs, simulate, write)
+                yield from make_by_robot(workers, jobs, robots, simulate, write)
                 return
             size = max(1, args.batch // (1 if args.unpaired else len(robots)))
             batches = [jobs[start : start + size] for start in range(0, len(jobs), size)]
@@ -217,10 +217,10 @@ def _make(jobs: Sequence[Job], robots: Mapping[str, RobotSpec], out: Path, batch
     return [(records, seconds) for records in seeds]
 
 
-def _simulate(job: Job, robots: Mapping[str, RobotSpec], physics: str) -> Timed:
+def _simulate(job: Job, robot: RobotSpec, physics: str) -> Timed:
     """The cell of a job of one robot with its motion, and the seconds it took, in a worker process."""
     begin = time.perf_counter()
-    ((cell,),) = simulate_jobs([job], physics, robots=robots)
+    ((cell,),) = simulate_jobs([job], physics, robots=dict.fromkeys(job.robots, robot))
     _ = cell.failure  # found here once, it travels with the cell
     return cell, time.perf_counter() - begin
 

@@ -12,6 +12,7 @@ from xew.sim_warp.production import cells as cells_module
 from xew.sim_warp.production.by_robot import Timed, make_by_robot
 from xew.sim_warp.production.cells import Cell, Job
 from xew.sim_warp.production.produce import simulate_jobs
+from xew.sim_warp.robots import RobotSpec
 
 ROBOTS = ("franka_panda", SLOW)
 
@@ -20,8 +21,8 @@ def make(jobs: list[Job]) -> tuple[list[tuple[list[Record], float]], list[tuple[
     """What comes of some jobs, and the shares of them in the order in which they were done; a share takes a second."""
     done: list[tuple[Any, ...]] = []
 
-    def simulate(job: Job) -> Timed:
-        ((cell,),) = simulate_jobs([job], "cpu", robots=WITH_SLOW)
+    def simulate(job: Job, robot: RobotSpec) -> Timed:
+        ((cell,),) = simulate_jobs([job], "cpu", robots={job.robots[0]: robot})
         done.append(("simulate", job.seed, job.robots))
         return cell, 1.0
 
@@ -29,7 +30,7 @@ def make(jobs: list[Job]) -> tuple[list[tuple[list[Record], float]], list[tuple[
         done.append(("write", cell.scene.seed, cell.robot_name, rejected))
         return Record(cell.task_name, cell.scene.seed, cell.robot_name, cell.failure is None), 1.0
 
-    return list(make_by_robot(cast(Any, InlineWorkers(1)), jobs, simulate, write)), done
+    return list(make_by_robot(cast(Any, InlineWorkers(1)), jobs, WITH_SLOW, simulate, write)), done
 
 
 def test_a_scene_is_written_as_soon_as_all_robots_are_simulated() -> None:

@@ -8,12 +8,13 @@ last of them is there they are written, before any other scene is begun.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 from xew.episode import Record
 from xew.sim_warp.devices.workers import Workers
+from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.production.cells import Cell, Job
 
 Timed = tuple[Cell | Record, float]
@@ -31,19 +32,24 @@ class _Scene:
 
 
 def make_by_robot(
-    workers: Workers, jobs: Sequence[Job], simulate: Callable[[Job], Timed], write: Callable[[Cell, bool], Timed]
+    workers: Workers,
+    jobs: Sequence[Job],
+    robots: Mapping[str, RobotSpec],
+    simulate: Callable[[Job, RobotSpec], Timed],
+    write: Callable[[Cell, bool], Timed],
 ) -> Iterator[tuple[list[Record], float]]:
     """Make some scenes; the headers of each job in the order of its robots, and the seconds spent on it.
 
     Args:
         workers: processes to which the functions and their arguments travel by pickle.
         jobs: no two of them of the same task and seed.
-        simulate: gives the cell of a job of one robot with its motion.
+        robots: the robots of the jobs by name.
+        simulate: gives the cell of a job of one robot, and of that robot, with its motion.
         write: renders and writes a cell, or where its scene is rejected the header alone, and gives the header.
     """
     scenes = {(job.task, job.seed): _Scene(job) for job in jobs}
-    shares = (replace(job, robots=(robot,)) for job in jobs for robot in job.robots)
-    work: deque[Callable[[], Timed]] = deque(partial(simulate, share) for share in shares)
+    shares = ((replace(job, robots=(robot,)), robots[robot]) for job in jobs for robot in job.robots)
+    work: deque[Callable[[], Timed]] = deque(partial(simulate, *share) for share in shares)
     for made, seconds in workers.run(_call, work):
         scene = scenes[(made.task_name, made.scene.seed) if isinstance(made, Cell) else (made.task, made.seed)]
         scene.seconds += seconds
