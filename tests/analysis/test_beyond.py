@@ -22,7 +22,7 @@ from xew.analysis.beyond import (
     scaling_table,
 )
 from xew.analysis.beyond.difficulty import LEAST_BODIES
-from xew.analysis.beyond.scaling import ALONE, GROUPS, WITH_ROBOTS
+from xew.analysis.beyond.scaling import ALONE, GROUPS, PASTED, WITH_ROBOTS
 from xew.analysis.paper import read_paper
 from xew.analysis.report import Args, main
 from xew.analysis.scores import read_scores
@@ -79,6 +79,8 @@ def scores(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for split, error in ERRORS.items():
         for robot in (*HELD_OUT_ROBOTS, *UNSEEN_BODIES[:4]):
             add(f"{split}-optical_flow-robot_render", "reference", robot, error, 20.0)
+    for robot in (*HELD_OUT_ROBOTS, *UNSEEN_BODIES[:4]):
+        add("", "pasted_render", robot, 0.22, 18.0)
     for body in DISTANCE_BODIES:
         error = 0.2 + 0.5 * DISTANCES[body]
         add("scaling_seen-optical_flow-robot_render", "reference", body, error, 40 * (1 - error))
@@ -113,6 +115,8 @@ def test_bodies_that_help_are_seen_to_help(scores: Path) -> None:
         assert own["bodies"].tolist() == [0, 4, 16] and own["value"].is_monotonic_decreasing
         assert (own["low"] < own["value"]).all() and (own["value"] < own["high"]).all()
         assert frame[(frame["robots"] == robots) & (frame["trained_on"] == ALONE)]["bodies"].tolist() == [16]
+        (pasted,) = frame[(frame["robots"] == robots) & (frame["trained_on"] == PASTED)].itertuples()
+        assert pasted.low < pasted.value < pasted.high and pasted.value == pytest.approx(0.22, abs=0.02)
     table = scaling_table(builder)
     first = {row.labels[0]: row.cells[-1] for row in table.sections[0].rows}
     assert first["three robots and bodies, K = 16"].verdict == "better" and not first["three robots and bodies, K = 0"].verdict

@@ -1,17 +1,21 @@
 """Scores of robots that no model has seen, by the number of bodies that it was trained on."""
 
+import math
+
 import pandas as pd
 
 from xew.analysis.statistics.grades import BODIES, find_variant, pooled
 from xew.analysis.tables.builder import Builder, interval_ends
 from xew.analysis.tables.labels import HELD_OUT_TITLES
 from xew.analysis.tables.table import Table, TableSection, metric_columns
-from xew.protocol import BODY_SCALES
+from xew.protocol import BASELINES, BODY_SCALES, PASTED_RENDER
 
 PART = "scaling"
 BASE = "scaling_seen"
 """Row that all others are compared with: the three robots alone."""
 WITH_ROBOTS, ALONE = "three robots and bodies", "bodies alone"
+PASTED = BASELINES[PASTED_RENDER]
+"""Name of what learned nothing and is set beside the models."""
 ROWS = {
     BASE: (WITH_ROBOTS, 0),
     **{f"scaling_seen_bodies_{count}": (WITH_ROBOTS, count) for count in BODY_SCALES},
@@ -47,13 +51,16 @@ def scaling_frame(builder: Builder, metric: str) -> pd.DataFrame:
     """Means of a metric with the ends of their intervals, over the episodes that all models have.
 
     Returns:
-        Table with the columns robots (a key of GROUPS), trained_on (WITH_ROBOTS or ALONE), bodies (K), value, low, high; rows
-        that were not run are left out.
+        Table with the columns robots (a key of GROUPS), trained_on (WITH_ROBOTS, ALONE, or PASTED, which learned nothing),
+        bodies (K; NaN of the last), value, low, high; rows that were not run are left out.
     """
-    rows = []
+    rows: list[tuple[str, str, float, float, float, float]] = []
     for robots in GROUPS:
         for key, (kind, count) in ROWS.items():
             mean = builder.ours.mean(PART, key, robots, metric, shared=True)
             if mean is not None:
                 rows.append((robots, kind, count, mean.value, *interval_ends(mean, builder.ours.level)))
+        pasted = builder.baseline(PASTED_RENDER, pooled(find_variant(PART, BASE), robots), metric)
+        if pasted.value is not None:
+            rows.append((robots, PASTED, math.nan, pasted.value, pasted.low, pasted.high))
     return pd.DataFrame(rows, columns=["robots", "trained_on", "bodies", "value", "low", "high"])

@@ -8,9 +8,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from xew.analysis.beyond import Motions, OverBodies, motion_frame, scaling_frame
-from xew.analysis.beyond.scaling import ALONE, GROUPS, WITH_ROBOTS
+from xew.analysis.beyond.scaling import ALONE, GROUPS, PASTED, WITH_ROBOTS
 from xew.analysis.reports import charts
-from xew.analysis.reports.charts import SERIES, Chart, Panel, Series
+from xew.analysis.reports.charts import SERIES, SOFT, Chart, Panel, Series
 from xew.analysis.statistics.grades import SEEN
 from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import AXIS_TITLES, format_signed
@@ -22,6 +22,8 @@ METRIC = "lpips"
 """Metric that the charts draw, the paper's primary outcome."""
 KINDS = {kind: Series(kind, color) for kind, color in zip((WITH_ROBOTS, ALONE), SERIES, strict=False)}
 """Lines of the chart of scaling, by what a model was trained on."""
+UNLEARNED = Series(PASTED, SOFT, "-.")
+"""Line there of what learned nothing."""
 MOTION_COLORS = dict(zip(MOTIONS, SERIES, strict=False))
 """Colors of the kinds of motion."""
 
@@ -49,8 +51,11 @@ def charts_beyond(
 
 
 def scaling_chart(builder: Builder) -> Chart:
-    """LPIPS by the number of training bodies, a panel for each group of robots that no model has seen."""
+    """LPIPS by the number of training bodies, a panel for each group of robots that no model has seen, on one scale."""
     data = scaling_frame(builder, METRIC)
+    counts = sorted(int(count) for count in data["bodies"].dropna().unique())
+    ends = data[["value", "low", "high"]].to_numpy(np.float64)
+    margin = 0.05 * (np.nanmax(ends) - np.nanmin(ends))
 
     def draw(axes: Axes, robots: str) -> None:
         lines = []
@@ -60,12 +65,14 @@ def scaling_chart(builder: Builder) -> Chart:
                 band = chosen[["low", "high"]].to_numpy() if chosen["low"].notna().all() else None
                 lines.append((style, _positions(chosen["bodies"]), chosen["value"].to_numpy(), band))
         charts.lines(axes, lines, "bodies in training, K", metric_title(builder.ours.metrics[METRIC]))
-        counts = sorted(data["bodies"].unique())
+        for value in data[(data["robots"] == robots) & (data["trained_on"] == PASTED)]["value"]:
+            axes.axhline(value, color=UNLEARNED.color, linestyle=UNLEARNED.dash, linewidth=1.5)
         axes.set_xticks(_positions(counts), [str(count) for count in counts])
+        axes.set_ylim(np.nanmin(ends) - margin, np.nanmax(ends) + margin)
 
     panels = [Panel(title, partial(draw, robots=robots)) for robots, title in GROUPS.items() if robots in set(data["robots"])]
     caption = "What more bodies in training are worth, at equal numbers of steps. Bands: 95 % intervals over scenes."
-    used = [style for kind, style in KINDS.items() if kind in set(data["trained_on"])]
+    used = [style for kind, style in (*KINDS.items(), (PASTED, UNLEARNED)) if kind in set(data["trained_on"])]
     return Chart("scaling", caption, panels, data, used)
 
 
