@@ -8,6 +8,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from tests.sim_warp.small import TASK, work_inline
+from xew.episode import Record
+
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
@@ -38,6 +41,23 @@ def test_kinematics_that_differ_are_refused() -> None:
     assert module.check(urdf, [right, right]) == 0
     with pytest.raises(AssertionError, match="differs from xew kernel"):
         module.check(urdf, [right, wrong])
+
+
+def test_a_scene_is_the_same_both_ways_before_it_is_timed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    module = benchmark("scene")
+    work_inline(monkeypatch)
+    module.main(module.Args(("piper", "franka_panda"), TASK, workers=1, repeats=1))
+    told = capsys.readouterr().out.splitlines()
+    assert told[0].startswith("one process") and told[1].startswith("robot by robot, 1 workers")
+    assert told[2].startswith("2 robots: ") and told[2].endswith(" times as fast")
+    others = [[Record(TASK, 0, "piper", True, hashes={"rgb": text})] for text in "01"]
+    with pytest.raises(AssertionError, match="the ways made different episodes"):
+        module.time_by_turns({"one": lambda: others[0], "other": lambda: others[1]}, 1)
+    failed = [Record(TASK, 0, "piper", False, "grasp")]
+    with pytest.raises(AssertionError, match="grasp"):
+        module.time_by_turns({"one": lambda: failed}, 1)
 
 
 def test_render_workloads_have_the_triangles_that_they_name() -> None:
