@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 
 import warp as wp
 
@@ -20,3 +21,8 @@ def half(number: int) -> int:
 def name_of_own_device(_: int) -> str:
     """Warp's name of its default device here."""
     return wp.get_device().alias
+
+
+def has_imported(name: str) -> bool:
+    """Whether this process has a module."""
+    return name in sys.modules

@@ -25,8 +25,8 @@ from xew.episode import EpisodeError
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-IMPORTED = ("xew.sim_warp.production.produce",)
-"""Modules that workers are forked with: physics and the renderer."""
+IMPORTED = ("xew.sim_warp.production.preloaded",)
+"""Modules that workers are forked with."""
 MEMORY_PER_WORKER = 9e9
 """Memory of a GPU that a worker takes [bytes]: a batch of 256 worlds, 512 frames in flight and what CUDA itself takes."""
 FRAMES_OF_A_PAINTER = 192

@@ -313,7 +313,7 @@ class _Problems:
             self.solver.step(self.joint_pos, self.joint_pos, iterations=iterations)
 
 
-def _chain(device: str) -> newton.Model:
+def _chain(device: str) -> "newton.Model":
     """Seven joints one after another, each where the one before it is."""
     builder = newton.ModelBuilder()
     handles = [

@@ -153,14 +153,14 @@ def _solid(mass: float, hulls: tuple[bytes, ...]) -> tuple[float, np.ndarray, np
     return mass, center, inertia * mass / volume
 
 
-def new_builder() -> newton.ModelBuilder:
+def new_builder() -> "newton.ModelBuilder":
     """A builder with the attributes that the template sets on MuJoCo's side."""
     builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, -9.81))
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     return builder
 
 
-def add_world(builder: newton.ModelBuilder, robot: RobotSpec, scene: Scene) -> None:
+def add_world(builder: "newton.ModelBuilder", robot: RobotSpec, scene: Scene) -> None:
     """Append one world of the template: `robot` before `scene`. Raises ConfigError if the scene has more than it holds."""
     builder.begin_world(label=f"{scene.task}/{scene.seed}/{robot.key}")
     for side, arm in zip(SIDES, robot.arms, strict=True):
@@ -169,7 +169,7 @@ def add_world(builder: newton.ModelBuilder, robot: RobotSpec, scene: Scene) -> N
     builder.end_world()
 
 
-def _add_arm(builder: newton.ModelBuilder, side: str, arm: Arm, path: Path) -> None:
+def _add_arm(builder: "newton.ModelBuilder", side: str, arm: Arm, path: Path) -> None:
     links, fingers = arm_groups(path, arm)
     root = wp.transform(*arm.root_pose)
     joints: list[int] = []
@@ -190,7 +190,7 @@ def _add_arm(builder: newton.ModelBuilder, side: str, arm: Arm, path: Path) -> N
     builder.set_joint_mimic(joints[-1], joints[-2])
 
 
-def _add_body(builder: newton.ModelBuilder, side: str, name: str, group: RigidGroup | None) -> int:
+def _add_body(builder: "newton.ModelBuilder", side: str, name: str, group: RigidGroup | None) -> int:
     """Add a body with a group's mass and shapes or, without a group, a speck that only carries the pinned joint."""
     mass, center, inertia = (group.mass, group.center, group.inertia) if group else (0.1, np.zeros(3), np.eye(3) * 1e-4)
     body = builder.add_link(
@@ -209,7 +209,7 @@ def _add_body(builder: newton.ModelBuilder, side: str, name: str, group: RigidGr
 
 
 def _add_arm_joint(
-    builder: newton.ModelBuilder, label: str, before: list[int], child: int, frame: wp.transform, joint: Joint
+    builder: "newton.ModelBuilder", label: str, before: list[int], child: int, frame: wp.transform, joint: Joint
 ) -> int:
     return builder.add_joint_revolute(
         child - 1 if before else -1,
@@ -227,7 +227,7 @@ def _add_arm_joint(
     )
 
 
-def _add_pin(builder: newton.ModelBuilder, label: str, parent: int, child: int) -> int:
+def _add_pin(builder: "newton.ModelBuilder", label: str, parent: int, child: int) -> int:
     return builder.add_joint_revolute(
         parent,
         child,
@@ -243,7 +243,7 @@ def _add_pin(builder: newton.ModelBuilder, label: str, parent: int, child: int) 
 
 
 def _add_finger_joint(
-    builder: newton.ModelBuilder, label: str, parent: int, child: int, group: RigidGroup, closed: float, opened: float
+    builder: "newton.ModelBuilder", label: str, parent: int, child: int, group: RigidGroup, closed: float, opened: float
 ) -> int:
     """Add a slide whose position is the finger's way from closed, so that both fingers of all robots count alike."""
     frame = group.parent_to_joint.copy()
@@ -264,7 +264,7 @@ def _add_finger_joint(
     )
 
 
-def _add_objects(builder: newton.ModelBuilder, scene: Scene) -> None:
+def _add_objects(builder: "newton.ModelBuilder", scene: Scene) -> None:
     table = trimesh.creation.box((TABLE_SIZE[0], TABLE_SIZE[1], TABLE_SIZE[2]))
     _add_hull(builder, -1, table.vertices + [0, 0, TABLE_TOP - TABLE_SIZE[2] / 2], LINK_FRICTION, OBJECT_GROUP, "table")
     free = [thing for thing in scene.objects if not thing.is_fixed]
@@ -290,7 +290,7 @@ def object_label(scene: Scene, thing: SceneObject) -> str:
     return f"object{scene.index(thing.name)}"
 
 
-def _add_free_slot(builder: newton.ModelBuilder, slot: int, thing: SceneObject | None, scene: Scene) -> None:
+def _add_free_slot(builder: "newton.ModelBuilder", slot: int, thing: SceneObject | None, scene: Scene) -> None:
     label = f"free{slot}"
     if thing is None:
         body = builder.add_link(
@@ -316,7 +316,7 @@ def _add_free_slot(builder: newton.ModelBuilder, slot: int, thing: SceneObject |
     builder.add_articulation([builder.add_joint_free(child=body, label=f"{label}_free")], label=label)
 
 
-def _add_hinge_slot(builder: newton.ModelBuilder, thing: SceneObject | None, scene: Scene) -> None:
+def _add_hinge_slot(builder: "newton.ModelBuilder", thing: SceneObject | None, scene: Scene) -> None:
     """Add a lid on a hinge in the world or, where no object has one, a pinned speck below the table."""
     if thing is None or thing.hinge is None:
         parts = (0.1, np.zeros(3), np.eye(3) * 1e-4)
@@ -360,7 +360,7 @@ def _add_hinge_slot(builder: newton.ModelBuilder, thing: SceneObject | None, sce
     builder.add_articulation([joint], label="lid")
 
 
-def _add_hull(builder: newton.ModelBuilder, body: int, points: np.ndarray, friction: float, group: int, label: str) -> None:
+def _add_hull(builder: "newton.ModelBuilder", body: int, points: np.ndarray, friction: float, group: int, label: str) -> None:
     builder.add_shape_convex_hull(
         body,
         mesh=_hull(np.asarray(points, np.float32).tobytes()),
@@ -373,7 +373,7 @@ def _add_hull(builder: newton.ModelBuilder, body: int, points: np.ndarray, frict
 
 
 @lru_cache(maxsize=4096)
-def _hull(points: bytes) -> newton.Mesh:
+def _hull(points: bytes) -> "newton.Mesh":
     """The convex hull of float32 points [k 3]; a batch holds the same links hundreds of times."""
     hull = _convex(points)
     return newton.Mesh(hull.vertices.astype(np.float32), hull.faces.flatten().astype(np.int32), compute_inertia=False)

@@ -109,7 +109,7 @@ def control_targets(robot: RobotSpec, action: np.ndarray) -> np.ndarray:
     return np.stack([position, velocity], axis=-1).reshape(*position.shape[:2], 2 * ROBOT_DOFS)
 
 
-def build_solver(worlds: list[World], device: str, **options: object) -> newton.solvers.SolverMuJoCo:
+def build_solver(worlds: list[World], device: str, **options: object) -> "newton.solvers.SolverMuJoCo":
     """One Newton model of all worlds, compiled for MuJoCo's C engine ("cpu") or for MuJoCo Warp."""
     builder = new_builder()
     for world in worlds:
