@@ -17,7 +17,7 @@ import pytest
 import warp as wp
 
 from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, fill_disk, work_inline
-from tests.sim_warp.worker_jobs import half, has_imported, name_of_own_device
+from tests.sim_warp.worker_jobs import half, name_of_own_device
 from xew.config import ConfigError
 from xew.dataset import find_accepted, find_records
 from xew.episode import EpisodeError, Record, episode_folder, read_record, verify_episode, write_episode
@@ -419,11 +419,13 @@ def test_a_worker_has_its_device_as_warps_default() -> None:
 
 def test_newton_is_imported_where_it_works_and_not_where_work_is_handed_out() -> None:
     """It takes seconds. Workers are forked from a process that has it."""
-    code = "import sys, xew.sim_warp.generate; print({'newton', 'mujoco_warp'} & set(sys.modules))"
+    code = (
+        "import sys, xew.sim_warp.generate as command; from tests.sim_warp.worker_jobs import has_imported; "
+        "here = has_imported('newton'); workers = command.Workers(1); "
+        "print(here, *workers.run(has_imported, ['newton.solvers'])); workers.__exit__()"
+    )
     found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "set()"
-    with Workers(1) as workers:
-        assert list(workers.run(has_imported, ["newton.solvers"])) == [True]
+    assert found.stdout.strip() == "False True", found.stderr
 
 
 def test_workers_take_what_is_added_while_they_work() -> None:
