@@ -29,7 +29,7 @@ def load_newton() -> ModuleType:
 
 
 class _Newton:
-    """The module in name, until something of it is asked for."""
+    """Stands for the module, which is imported when something of it is asked for."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(load_newton(), name)

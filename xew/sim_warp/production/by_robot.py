@@ -4,7 +4,7 @@ Reads  `Job`s, and functions that simulate and write one robot's share of a scen
 Writes what those write; gives the headers of each job as soon as all of its robots are done
 
 A scene counts only when all of its robots succeed, and only then it is rendered. So its shares are first simulated; when the
-last of them is there they are written, before any other scene is begun.
+last of them is there they are written, ahead of all that has not begun.
 """
 
 from collections import deque
