@@ -44,7 +44,7 @@ def main(args: Args) -> None:
         asked = generate.Args((args.task,), tuple(robots), out=Path(folder), workers=args.workers, device="cpu")
         with generate.start_workers(asked, robots) as make:
             ways: dict[str, Callable[[], list[Record]]] = {
-                "one process": lambda: produce([job], Path(folder), renderer, robots=robots, physics="cpu")[0],
+                "one process": lambda: produce([job], Path(folder), renderer, robots=robots)[0],
                 f"robot by robot, {args.workers} workers": lambda: next(iter(make([job])))[0],
             }
             seconds = time_by_turns(ways, args.repeats)

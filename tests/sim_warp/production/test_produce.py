@@ -86,16 +86,13 @@ def test_the_same_bytes_alone_among_others_and_in_groups(
             assert record_of(tmp_path / "alone", job.seed, robot) == expected
 
 
-@pytest.mark.parametrize(("asked", "used"), [(None, "cuda:0"), ("cpu", "cpu")])
-def test_physics_is_stepped_where_it_is_asked_for(
-    asked: str | None, used: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_physics_is_stepped_where_pictures_are_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     devices: list[tuple[str, str]] = []
     monkeypatch.setattr(produce_module, "plan_cells", lambda jobs, robots, device: devices.append(("plan", device)) or [])
     monkeypatch.setattr(produce_module, "simulate_cells", lambda cells, device, batch: devices.append(("step", device)) or [])
     renderer = SimpleNamespace(device=SimpleNamespace(alias="cuda:0"))
-    assert produce([], tmp_path, renderer, physics=asked) == []  # type: ignore[arg-type]
-    assert devices == [("plan", used), ("step", used)]
+    assert produce([], tmp_path, renderer) == []  # type: ignore[arg-type]
+    assert devices == [("plan", "cuda:0"), ("step", "cuda:0")]
 
 
 def shorten_plans(plan_cells: object) -> object:

@@ -28,11 +28,10 @@ def produce(
     batch: int | None = None,
     videos: bool = True,
     robots: Mapping[str, RobotSpec] = ROBOTS,
-    physics: str | None = None,
 ) -> list[list[Record]]:
     """Make all episodes of some seeds and write them under `out`; the headers of each job in the order of its robots.
 
-    Seeds are rendered a group at a time while the group before is being written: that bounds the pixels in memory.
+    All is done on the renderer's device. Seeds are rendered a group at a time while the group before is being written: that bounds the pixels in memory.
 
     Args:
         jobs: the seeds, and which robots do each.
@@ -41,16 +40,20 @@ def produce(
         batch: worlds that a GPU steps together, None for all.
         videos: store them; without, an episode has all states and hashes, and `rerender.add_videos` makes its videos.
         robots: the robots of the jobs by name.
-        physics: Warp's name of the device that plans and steps physics; the renderer's if left out.
     """
-    seeds = simulate_jobs(jobs, physics or renderer.device.alias, batch, robots)
+    seeds = simulate_jobs(jobs, renderer.device.alias, batch, robots)
     return write_seeds(seeds, {(job.task, job.seed) for job in jobs if job.rejected}, out, renderer, videos)
 
 
 def simulate_jobs(
     jobs: Sequence[Job], physics: str, batch: int | None = None, robots: Mapping[str, RobotSpec] = ROBOTS
 ) -> list[list[Cell]]:
-    """The cells of each job with the motion that physics made of their plans; the arguments are those of `produce`."""
+    """The cells of each job with the motion that physics made of their plans.
+
+    Args:
+        jobs, batch, robots: as for `produce`.
+        physics: Warp's name of the device that plans and steps physics.
+    """
     return simulate_cells(plan_cells(jobs, robots, physics), physics, batch)
 
 
