@@ -31,7 +31,8 @@ def produce(
 ) -> list[list[Record]]:
     """Make all episodes of some seeds and write them under `out`; the headers of each job in the order of its robots.
 
-    All is done on the renderer's device. Seeds are rendered a group at a time while the group before is being written: that bounds the pixels in memory.
+    All is done on the renderer's device. Seeds are rendered a group at a time while the group before is being written: that
+    bounds the pixels in memory.
 
     Args:
         jobs: the seeds, and which robots do each.
