@@ -238,7 +238,7 @@ def lpips_embedding(video: Video, *, chunk: int | None = None) -> jax.Array:
         ValueError: the video has another shape, or a side is under 31 pixels.
         FileNotFoundError: the weights are not installed.
     """
-    return _embed(_weights(), video, _whole_box(video), chunk)
+    return _embed(_weights(), video, chunk)
 
 
 class SharedFeatures:
@@ -491,19 +491,13 @@ def _distance_from_features(
 
 
 @functools.partial(jax.jit, static_argnames="chunk")
-def _embed(weights: Weights, video: jax.Array, box: Box, chunk: int | None) -> jax.Array:
-    """The unit vectors of the five layers of a video's frames, weighted so that squared differences add up to LPIPS: [t d]."""
-
-    def of_frames(frames: jax.Array) -> jax.Array:
-        image = _input(frames, box)
-        layers = [
-            _unit(x) * jnp.sqrt(weights[f"head{i}"] / (height * width).astype(jnp.float32)).reshape(1, 1, 1, -1)
-            for i, (x, height, width) in enumerate(_features(weights, image, *box[2:]))
-        ]
-        found = jnp.concatenate([layer.reshape(len(frames), -1) for layer in layers], axis=1)
-        return jnp.where(_is_broken(image)[:, None], jnp.nan, found)
-
-    return map_chunks(of_frames, video, chunk)
+def _embed(weights: Weights, video: jax.Array, chunk: int | None) -> jax.Array:
+    """The features of whole frames, weighted so that squared differences add up to LPIPS: [t d]."""
+    vectors = []
+    for i, layer in enumerate(_box_features(weights, video, _whole_box(video), chunk)):
+        weighted = layer * jnp.sqrt(weights[f"head{i}"] / (layer.shape[1] * layer.shape[2])).reshape(1, 1, 1, -1)
+        vectors.append(weighted.reshape(len(layer), -1))
+    return jnp.where(_is_broken(video)[:, None], jnp.nan, jnp.concatenate(vectors, axis=1))
 
 
 def _input(frames: jax.Array, box: Box) -> jax.Array:
