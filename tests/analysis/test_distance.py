@@ -25,6 +25,7 @@ from xew.analysis.distance import (
     workspace,
     workspace_cloud,
 )
+from xew.analysis.distances.appearance import describe_views, descriptor_matrix
 from xew.protocol import ROBOT_NAMES
 from xew.sim_warp.robots import ROBOTS, UrdfError, load_urdf
 
@@ -206,6 +207,8 @@ def test_matrices_are_of_pairs() -> None:
     matrix = appearance_matrix(robots)
     assert matrix.shape == (2, 2) and matrix[0, 0] == 0
     assert matrix[0, 1] == matrix[1, 0] == cosine_distance(*(appearance_descriptor(views) for views in robots))
+    described = np.stack([describe_views(views) for views in robots])
+    np.testing.assert_array_equal(descriptor_matrix(described[:, 1:]), appearance_matrix([views[1:] for views in robots]))
     by_view = perceptual_matrices(robots, lambda images: images.astype(float).reshape(len(images), -1))
     assert by_view.shape == (2, 2, 2)
     assert by_view[1, 0, 1] == np.square(robots[0][1].astype(float) - robots[1][1]).sum()

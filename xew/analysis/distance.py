@@ -23,6 +23,8 @@ from xew.analysis.distances.appearance import (
     appearance_descriptor,
     appearance_matrix,
     cosine_distance,
+    describe_views,
+    descriptor_matrix,
     perceptual_matrices,
 )
 from xew.analysis.distances.frames import Axis, distance_frame, matrix_text, robot_frame, robot_text
@@ -149,9 +151,10 @@ def _measure_looks(specs: Sequence[RobotSpec], embed: ImageEmbedding | None) -> 
     from xew.sim_warp.rendering.streams import VIEW_COUNT, nine_views  # loads Warp, which no other part of the analysis needs
 
     renders, robots = [nine_views(robot) for robot in specs], tuple(robot.key for robot in specs)
-    without_one = [appearance_matrix([np.delete(views, i, axis=0) for views in renders]) for i in range(VIEW_COUNT)]
+    described = np.stack([describe_views(views) for views in renders])
+    without_one = [descriptor_matrix(np.delete(described, i, axis=1)) for i in range(VIEW_COUNT)]
     jackknife = (VIEW_COUNT - 1) / np.sqrt(VIEW_COUNT)
-    axes = {"appearance": Axis(robots, appearance_matrix(renders), np.array(without_one), jackknife)}
+    axes = {"appearance": Axis(robots, descriptor_matrix(described), np.array(without_one), jackknife)}
     if embed is not None:
         by_view = _measure_perceptual(renders, embed)
         without_one = (by_view.sum(axis=0) - by_view) / (VIEW_COUNT - 1)

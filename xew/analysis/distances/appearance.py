@@ -33,7 +33,12 @@ def appearance_descriptor(renders: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: a view shows no robot.
     """
-    return np.mean([_describe_view(view, i) for i, view in enumerate(renders)], axis=0)
+    return describe_views(renders).mean(axis=0)
+
+
+def describe_views(renders: np.ndarray) -> np.ndarray:
+    """The descriptors of one robot's views by themselves, [v 263] float64; see `appearance_descriptor`."""
+    return np.stack([_describe_view(view, i) for i, view in enumerate(renders)])
 
 
 def cosine_distance(a: np.ndarray, b: np.ndarray) -> float:
@@ -43,8 +48,13 @@ def cosine_distance(a: np.ndarray, b: np.ndarray) -> float:
 
 def appearance_matrix(renders: Sequence[np.ndarray]) -> np.ndarray:
     """Cosine distances [n n] float64 of the descriptors of n robots' renders, each [v h w 3] uint8."""
-    descriptors = [appearance_descriptor(views) for views in renders]
-    return symmetric_matrix(len(renders), lambda a, b: cosine_distance(descriptors[a], descriptors[b]))
+    return descriptor_matrix(np.stack([describe_views(views) for views in renders]))
+
+
+def descriptor_matrix(views: np.ndarray) -> np.ndarray:
+    """Cosine distances [n n] float64 of n robots, each described by the mean of its views' descriptors [n v 263]."""
+    descriptors = views.mean(axis=1)
+    return symmetric_matrix(len(descriptors), lambda a, b: cosine_distance(descriptors[a], descriptors[b]))
 
 
 def perceptual_matrices(renders: Sequence[np.ndarray], embed: ImageEmbedding) -> np.ndarray:
