@@ -52,15 +52,18 @@ def scaling_frame(builder: Builder, metric: str) -> pd.DataFrame:
 
     Returns:
         Table with the columns robots (a key of GROUPS), trained_on (WITH_ROBOTS, ALONE, or PASTED, which learned nothing),
-        bodies (K; NaN of the last), value, low, high; rows that were not run are left out.
+        bodies (K; NaN of the last), value, low, high; rows that were not run are left out, and PASTED where it was graded on
+        fewer episodes than the models.
     """
     rows: list[tuple[str, str, float, float, float, float]] = []
     for robots in GROUPS:
+        most = 0
         for key, (kind, count) in ROWS.items():
             mean = builder.ours.mean(PART, key, robots, metric, shared=True)
             if mean is not None:
                 rows.append((robots, kind, count, mean.value, *interval_ends(mean, builder.ours.level)))
+                most = max(most, mean.count)
         pasted = builder.baseline(PASTED_RENDER, pooled(find_variant(PART, BASE), robots), metric)
-        if pasted.value is not None:
+        if pasted.value is not None and pasted.episodes >= most:
             rows.append((robots, PASTED, math.nan, pasted.value, pasted.low, pasted.high))
     return pd.DataFrame(rows, columns=["robots", "trained_on", "bodies", "value", "low", "high"])

@@ -263,6 +263,11 @@ class StudyGrades:
         """Was anything of a variant graded?"""
         return variant in self._trainings
 
+    def count_episodes(self, variant: str, robots: Sequence[str]) -> int:
+        """Number of episodes of some robots of which a variant, or a baseline, has any score."""
+        held = [~np.isnan(self._scores(variant, tuple(robots), metric)).all(axis=0) for metric in self.metrics]
+        return int(np.logical_or.reduce(held).sum())
+
     def baseline(self, model: str, robots: Sequence[str], metric: str) -> Mean | None:
         """Mean of a baseline."""
         return self.variant_mean(model, tuple(robots), metric)
