@@ -90,22 +90,19 @@ class Builder:
 
     def baselines(self, robots: Sequence[str], metrics: Sequence[str]) -> list[TableRow]:
         """Rows of the baselines, the true video last, where they were graded; of fewer episodes than a model's, they say so."""
-        rows = [
-            TableRow(
-                (title + self._lacks(name, robots),), tuple(self.baseline(name, robots, m) for m in metrics), baseline=True
-            )
-            for name, title in BASELINES.items()
-            if name not in (CODEC_TRUTH, TRUTH)
-        ]
+        most, rows = self._most_episodes(robots), []
+        for name, title in BASELINES.items():
+            if name not in (CODEC_TRUTH, TRUTH):
+                graded = self.ours.count_episodes(name, robots) if isinstance(self.ours, StudyGrades) else most
+                label = f"{title} ({graded} of {most} episodes)" if graded < most else title
+                rows.append(TableRow((label,), tuple(self.baseline(name, robots, m) for m in metrics), baseline=True))
         return [*_keep_graded(rows), *self.truth((TRUE,), [(robots, metric) for metric in metrics])]
 
-    def _lacks(self, baseline: str, robots: Sequence[str]) -> str:
-        """What is added to a baseline's label where it was graded on fewer episodes of some robots than a model was, or ''."""
+    def _most_episodes(self, robots: Sequence[str]) -> int:
+        """Number of episodes of some robots on which the model was graded that was graded on most."""
         if not isinstance(self.ours, StudyGrades):
-            return ""
-        most = max((self.ours.count_episodes(variant, robots) for variant in self.ours.variants), default=0)
-        graded = self.ours.count_episodes(baseline, robots)
-        return f" ({graded} of {most} episodes)" if graded < most else ""
+            return 0
+        return max((self.ours.count_episodes(variant, robots) for variant in self.ours.variants), default=0)
 
     def truth(self, labels: tuple[str, ...], places: Sequence[tuple[Sequence[str], str]]) -> list[TableRow]:
         """Rows of the true video and of the truth through codecs, which show the noise floors; none that was not graded.
