@@ -2,7 +2,7 @@
 
 import re
 from dataclasses import replace
-from itertools import permutations
+from itertools import permutations, product
 from pathlib import Path
 
 import cv2
@@ -35,7 +35,7 @@ from xew.analysis.tables.labels import PAPER_METRICS
 from xew.analysis.tables.layouts import build_tables, ladder_table
 from xew.analysis.tables.table import Table
 from xew.episode import episode_folder, read_video
-from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, SEEN_ROBOTS, TEST_SEED_START, VARIANTS
+from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, SEEN_ROBOTS, SHOTS, TEST_SEED_START, VARIANTS
 from xew.rollout import write_rollout
 
 SHOWN = ("fixed-joints-none", "fixed-optical_flow-none", "fixed-optical_flow-nine_views")
@@ -132,8 +132,9 @@ def test_tables_are_those_of_the_paper_with_our_means_and_its_values_beside(
     models = {name: [row for b in t.sections for row in b.rows if not row.baseline] for name, t in tables.items()}
     counts = {name: len(found) for name, found in models.items()}
     assert counts["actions"] == 4 * 2 and counts["actions_full"] == 4 * 3 and counts["ladder"] == 5 * 2
-    assert counts["ladder_full"] == 5 * 3 and counts["few_shot"] == 3 * 2 and counts["few_shot_full"] == 1 + 4 * 2
-    assert counts["forgetting_full"] == 7 + 12 and counts["baselines"] == 4 + 1 and counts["loeo_full"] == 5
+    assert counts["ladder_full"] == 5 * 3 and counts["few_shot"] == 3 * 2
+    assert counts["few_shot_full"] == 1 + 4 * 2 + 12 and counts["forgetting_full"] == 7 + 12  # twelve with remedies, ours
+    assert counts["baselines"] == 4 + 1 and counts["loeo_full"] == 5
     columns = {"few_shot": 5}  # the sixth is ours
     printed = [c.published for name, found in models.items() for row in found[:4] for c in row.cells[: columns.get(name)]]
     assert all(printed)
@@ -445,3 +446,23 @@ def test_the_same_scores_make_the_same_bytes(small: Path, tmp_path: Path) -> Non
     for path in sorted((small / "report").rglob("*")):
         if path.is_file():
             assert path.read_bytes() == (tmp_path / path.relative_to(small / "report")).read_bytes(), path.name
+
+
+def test_remedies_stand_beside_plain_adaptation_on_the_target_and_on_ur5(tmp_path: Path) -> None:
+    remedies = ("", "-replay", "-lora")
+    adapted = [f"few_shot-{robot}-{shots}{remedy}" for robot in HELD_OUT_ROBOTS for shots in SHOTS for remedy in remedies]
+    path = write_study(tmp_path / "scores.parquet", ["fixed-optical_flow-nine_views", *adapted], TASKS[:2])
+    main(Args(path, out=tmp_path / "report"))
+    drawn = pd.read_csv(tmp_path / "report" / "figures" / "remedies.csv").set_index(["target", "on", "remedy", "shots"])[
+        "value"
+    ]
+    for robot, remedy, shots in product(HELD_OUT_ROBOTS, ("replay", "lora"), SHOTS):
+        variant = f"few_shot-{robot}-{shots}-{remedy}"
+        for on, place in (("target", robot), ("ur5_wsg", "ur5_wsg")):
+            expected = mean(read_scores(path).rows, variant, (place,), "lpips")
+            assert drawn[robot, on, remedy, shots] == pytest.approx(expected)
+    said = (tmp_path / "report" / "report.md").read_text()
+    assert len(re.findall("The same demonstrations of .* change both, with replay by .* and .*, with LoRA by", said)) == 2
+    for table, rows in (("few_shot_full", 3 * 2), ("forgetting_full", 3 * 4)):
+        labels = pd.read_csv(tmp_path / "report" / "tables" / f"{table}.csv")["row"].unique()
+        assert sum(label.endswith("(ours)") for label in labels) == rows, labels

@@ -9,7 +9,7 @@ from xew.analysis.paper import read_paper
 from xew.analysis.scores import Scores, read_scores
 from xew.analysis.statistics.grades import SEEN, PaperGrades, StudyGrades, find_variant, relative_gain, row_keys
 from xew.protocol import PAPER_PARTS, PARTS, ROBOT_NAMES, SEEN_ROBOTS
-from xew.statistics import bootstrap_means
+from xew.statistics import bootstrap_means, combine
 
 
 @pytest.fixture(scope="module")
@@ -141,6 +141,23 @@ def test_an_adapted_model_is_compared_with_the_training_that_it_started_from(gra
     assert gains[0] and gains[1] and gains[1].value == gains[0].value and gains[1].interval() == gains[0].interval()
     means = [each.mean("ladder", "nine_views", "piper", "lpips") for each in (grades, more)]
     assert means[0] and means[1] and means[1].value < means[0].value, "elsewhere all trainings count"
+
+
+def test_an_adaptation_is_drawn_with_the_training_that_it_started_from(grades: StudyGrades, scores: Scores) -> None:
+    """What one training of the start has of luck, the adaptation of it has too, and is in no comparison of the two."""
+    rows = train_thrice(scores.rows, "fixed-optical_flow-nine_views", 0.2)
+    rows = pd.concat([rows, train_thrice(scores.rows, "few_shot-piper-1", 0.2).query("training > 0")], ignore_index=True)
+    more = StudyGrades(rows, scores.metrics, paper_axes(read_paper()))
+    ratios = []
+    for each in (grades, more):
+        after, before = (each.mean("few_shot", row, "piper", "lpips") for row in ("piper-1", "piper-0"))
+        assert after and before
+        ratios.append(combine(np.divide, after, before))
+    assert [ratio.trainings for ratio in ratios] == [1, 3]
+    assert ratios[1].value == pytest.approx(ratios[0].value) and ratios[1].interval() == pytest.approx(ratios[0].interval())
+    after, joints = (more.mean(*address, "piper", "lpips") for address in (("few_shot", "piper-1"), ("actions", "joints")))
+    assert after and joints
+    assert np.ptp(combine(np.divide, after, joints).interval()) > 2 * np.ptp(ratios[1].interval()), "others are not its start"
 
 
 def test_episodes_that_one_training_lacks_count_for_none(scores: Scores) -> None:

@@ -67,7 +67,7 @@ SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]]
     "fixed": ((), ("gap",), ()),
     "actions": (("gains_actions",), ("actions",), ("actions_full",)),
     "ladder": (("gains_ladder",), ("ladder",), ("ladder_full",)),
-    "few_shot": (("forgetting", "gains_few_shot"), ("few_shot",), ("few_shot_full", "forgetting_full")),
+    "few_shot": (("forgetting", "remedies", "gains_few_shot"), ("few_shot",), ("few_shot_full", "forgetting_full")),
     "loeo": (
         ("distance", "distance_gap"),
         ("correlations", "gap_correlations", "correlations_own", "loeo_full"),

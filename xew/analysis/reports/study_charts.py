@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -57,6 +58,8 @@ def study_charts(builder: Builder, distances: Distances, curves: pd.DataFrame) -
     made = {f"gains_{gain.part}": gain_chart(builder, gain) for gain in GAIN_ROWS if builder.has_results(gain.part)}
     if builder.has_results("forgetting"):
         made["forgetting"] = forgetting_chart(builder)
+    if builder.has_results("remedies"):
+        made["remedies"] = remedies_chart(builder)
     by_distance = (distance_chart(builder.ours, distances), gap_chart(builder.ours, distances))
     made |= {chart.name: chart for chart in by_distance if chart}
     for part, labels in (("actions", ACTIONS), ("ladder", LADDER)):
@@ -94,66 +97,82 @@ def gain_chart(builder: Builder, gain: GainRows) -> Chart:
 
 def forgetting_chart(builder: Builder) -> Chart:
     """LPIPS on the target and on UR5 by the number of demonstrations, a panel for each target."""
-    data = pd.DataFrame(_adaptation_rows(builder))
-
-    def draw(axes: Axes, target: str) -> None:
-        lines = []
-        for style, (kind, source) in _adaptation_styles().items():
-            chosen = data[(data["target"] == target) & (data["line"] == kind) & (data["of"] == source)].dropna(subset="value")
-            if len(chosen):
-                band = chosen[["low", "high"]].to_numpy() if source == "here" and chosen["low"].notna().all() else None
-                lines.append((style, chosen["shots"].to_numpy(), chosen["value"].to_numpy(), band))
-        charts.lines(axes, lines, "demonstrations of each task, M", "LPIPS ↓")
-        axes.set_xticks((0, *SHOTS))
-        axes.set_ylim(bottom=0)
-
-    panels = [Panel(f"Adapted to {ROBOT_TITLES[robot]}", partial(draw, target=robot)) for robot in HELD_OUT_ROBOTS]
-    used = set(zip(data["line"], data["of"], strict=True))
-    legend = [style for style, place in _adaptation_styles().items() if place in used]
+    lost = SHORT_ROBOTS[FORGETTING_ROBOT]
+    styles: dict[tuple[str, ...], Series] = {
+        ("target", "here"): Series("target", SERIES[0]),
+        (FORGETTING_ROBOT, "here"): Series(lost, SERIES[1]),
+        ("target", "paper"): Series("target, the paper", SERIES[0], "--"),
+        (FORGETTING_ROBOT, "paper"): Series(f"{lost}, the paper", SERIES[1], "--"),
+    }
+    data = pd.DataFrame(_adaptation_rows(builder, {"full": ""}))
+    panels = [
+        Panel(
+            f"Adapted to {ROBOT_TITLES[robot]}",
+            partial(_draw_by_shots, data=data[data["target"] == robot], columns=["on", "of"], styles=styles),
+        )
+        for robot in HELD_OUT_ROBOTS
+    ]
+    used = set(zip(data["on"], data["of"], strict=True))
+    legend = [style for line, style in styles.items() if line in used]
     caption = "What adaptation gains on the target, and what it costs on a robot seen before. Bands: 95 % intervals."
     return Chart("forgetting", caption, panels, data, legend)
 
 
-def _adaptation_styles() -> dict[Series, tuple[str, str]]:
-    """The line that each style draws: what it shows, and whether it is ours (here) or the paper's."""
-    lost = SHORT_ROBOTS[FORGETTING_ROBOT]
-    return {
-        Series("target", SERIES[0]): ("target", "here"),
-        Series(lost, SERIES[1]): ("forgetting", "here"),
-        **{Series(f"{lost}, {REMEDIES[r]}", SERIES[2 + i]): (r, "here") for i, r in enumerate(REMEDIES)},
-        Series("target, the paper", SERIES[0], "--"): ("target", "paper"),
-        Series(f"{lost}, the paper", SERIES[1], "--"): ("forgetting", "paper"),
+def remedies_chart(builder: Builder) -> Chart:
+    """LPIPS with and without the remedies by the number of demonstrations: a panel for each target and for UR5 after it."""
+    titles = {"full": "all weights", **REMEDIES}
+    styles: dict[tuple[str, ...], Series] = {
+        (remedy,): Series(title, SERIES[i]) for i, (remedy, title) in enumerate(titles.items())
     }
+    data = pd.DataFrame(_adaptation_rows(builder, {"full": "", **{remedy: f"-{remedy}" for remedy in REMEDIES}}))
+    data = data[data["of"] == "here"]
+
+    def panel(target: str, on: str) -> Panel:
+        title = ROBOT_TITLES[target] if on == "target" else f"{ROBOT_TITLES[on]}, after {SHORT_ROBOTS[target]}"
+        chosen = data[(data["target"] == target) & (data["on"] == on)]
+        return Panel(title, partial(_draw_by_shots, data=chosen, columns=["remedy"], styles=styles))
+
+    panels = [panel(target, on) for target in HELD_OUT_ROBOTS for on in ("target", FORGETTING_ROBOT)]
+    caption = (
+        "Adaptation of all weights, with replay and with LoRA: on the new robot, and on one seen before. Bands: 95 % intervals."
+    )
+    return Chart("remedies", caption, panels, data, list(styles.values()))
 
 
-def _adaptation_rows(builder: Builder) -> Iterator[dict[str, object]]:
+def _draw_by_shots(axes: Axes, data: pd.DataFrame, columns: list[str], styles: Mapping[tuple[str, ...], Series]) -> None:
+    """Draw LPIPS by the number of demonstrations, a line in the style of each value of some columns."""
+    lines = []
+    for line, style in styles.items():
+        chosen = data[(data[columns] == list(line)).all(axis=1)].dropna(subset="value")
+        if len(chosen):
+            ends = chosen[["low", "high"]].to_numpy()
+            band = None if "paper" in line or np.isnan(ends).any() else ends
+            lines.append((style, chosen["shots"].to_numpy(), chosen["value"].to_numpy(), band))
+    charts.lines(axes, lines, "demonstrations of each task, M", "LPIPS ↓")
+    axes.set_xticks((0, *SHOTS))
+    axes.set_ylim(bottom=0)
+
+
+def _adaptation_rows(builder: Builder, remedies: Mapping[str, str]) -> Iterator[dict[str, object]]:
+    """LPIPS before and after each adaptation, on its target and on UR5, here and in the paper.
+
+    Args:
+        builder: of the study.
+        remedies: endings of the rows of each remedy, by its key.
+    """
     sources: list[tuple[str, Grades]] = [("here", builder.ours)]
-    if builder.paper:
+    if builder.paper and set(remedies) == {"full"}:
         sources.append(("paper", builder.paper))
-    for target in HELD_OUT_ROBOTS:
-        for shots in (0, *SHOTS):
-            after = f"{target}-{shots}"
-            places = {
-                "target": ("few_shot", after, target),
-                "forgetting": ("forgetting", after if shots else "none", FORGETTING_ROBOT),
-            }
-            if builder.has_results("remedies"):
-                places |= {r: ("forgetting", f"{after}-{r}" if shots else "none", FORGETTING_ROBOT) for r in REMEDIES}
-            for line, (part, row, robot) in places.items():
-                for source, grades in sources:
-                    if source == "paper" and line in REMEDIES:
-                        continue
-                    mean = grades.mean(part, row, robot, "lpips")
-                    value, low, high = _mean_and_ends(mean, grades.level)
-                    yield {
-                        "target": target,
-                        "shots": shots,
-                        "line": line,
-                        "of": source,
-                        "value": value,
-                        "low": low,
-                        "high": high,
-                    }
+    for target, shots, (remedy, ending) in product(HELD_OUT_ROBOTS, (0, *SHOTS), remedies.items()):
+        after = f"{target}-{shots}{ending if shots else ''}"
+        places = {
+            "target": ("few_shot", after, target),
+            FORGETTING_ROBOT: ("forgetting", after if shots else "none", FORGETTING_ROBOT),
+        }
+        for (on, place), (source, grades) in product(places.items(), sources):
+            value, low, high = _mean_and_ends(grades.mean(*place, "lpips"), grades.level)
+            row = {"target": target, "remedy": remedy, "shots": shots, "on": on, "of": source}
+            yield row | {"value": value, "low": low, "high": high}
 
 
 def distance_chart(grades: Grades, distances: Distances, metric: str = "lpips") -> Chart | None:

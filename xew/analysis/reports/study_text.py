@@ -14,7 +14,7 @@ from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.comparisons import OTHER_ROBOTS, NotMeasuredError, Reader
 from xew.analysis.tables.distances import Distances, correlate, format_signed
 from xew.analysis.tables.findings import BEATS, FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding
-from xew.analysis.tables.labels import ACTIONS, LADDER, SHORT_ROBOTS
+from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, SHORT_ROBOTS
 from xew.protocol import BODY_SCALES, FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
 from xew.statistics import strict_metrics
 
@@ -153,6 +153,15 @@ def _adaptation_sentences(grades: Grades) -> Iterator[str]:
                 f"One demonstration of each task changes LPIPS by {_format_change(-gain)} on {ROBOT_TITLES[robot]}, and by "
                 f"{_format_change(-loss)} on {ROBOT_TITLES[FORGETTING_ROBOT]}, which the model had been trained on."
             )
+        changes = {}
+        for remedy, title in REMEDIES.items():
+            gain = _gain(grades, "few_shot", f"{robot}-1-{remedy}", f"{robot}-0", robot)
+            loss = _gain(grades, "forgetting", f"{robot}-1-{remedy}", "none", FORGETTING_ROBOT)
+            if gain is not None and loss is not None:
+                changes[title] = f"by {_format_change(-gain)} and {_format_change(-loss)}"
+        if changes:
+            parts = ", ".join(f"{title} {change}" for title, change in changes.items())
+            yield f"The same demonstrations of {ROBOT_TITLES[robot]} change both, {parts}."
 
 
 def _distance_sentence(grades: Grades, distances: Distances) -> Iterator[str]:

@@ -155,14 +155,32 @@ def find_variant(part: str, row: str) -> Variant:
     raise KeyError(f"no variant of the protocol fills the row {row!r} of {part!r}")
 
 
+def _list_adaptations() -> list[tuple[str, str]]:
+    """Names of all adapted variants, each with that of the variant that it starts from."""
+    variants = (variant for part in ADAPTED_PARTS for variant in variants_of(part))
+    return [(variant.name, variant.start.name) for variant in variants if variant.start is not None]
+
+
 def _adapted_trainings(trainings: Mapping[str, set[int]]) -> dict[str, set[int]]:
     """By variant that adaptations start from: those of its trainings that one started from, where it has others as well."""
     adapted: dict[str, set[int]] = {}
-    for variant in (variant for part in ADAPTED_PARTS for variant in variants_of(part)):
-        if variant.start is not None:
-            start = variant.start.name
-            adapted[start] = adapted.get(start, set()) | (trainings.get(variant.name, set()) & trainings.get(start, set()))
+    for variant, start in _list_adaptations():
+        adapted[start] = adapted.get(start, set()) | (trainings.get(variant, set()) & trainings.get(start, set()))
     return {start: found for start, found in adapted.items() if found and found != trainings[start]}
+
+
+def _drawn_together(trainings: Mapping[str, set[int]]) -> dict[str, str]:
+    """By adapted variant, the name under which its start's scores stand, where both have the same trainings.
+
+    An adaptation is its start trained on, so what one training of the start has of luck its adaptation has too: their trainings
+    are drawn together, and a difference of the two is paired by training.
+    """
+    found = {}
+    for variant, start in _list_adaptations():
+        stands = start + ADAPTED if start + ADAPTED in trainings else start
+        if variant in trainings and trainings[variant] == trainings.get(stands):
+            found[variant] = stands
+    return found
 
 
 def pooled(variant: Variant, robots: str) -> tuple[str, ...]:
@@ -222,7 +240,12 @@ class StudyGrades:
             own = [(key, i) for key, i in self._columns.items() if key[0] == start and key[-1] in adapted]
             self._columns |= {(start + ADAPTED, *key[1:]): i for key, i in own}
         self._trainings = {variant: tuple(sorted(found)) for variant, found in trainings.items()}
-        self._several = [(name, len(found)) for name, found in sorted(self._trainings.items()) if len(found) > 1]
+        self._drawn_with = _drawn_together(trainings)
+        self._several = [
+            (name, len(found))
+            for name, found in sorted(self._trainings.items())
+            if len(found) > 1 and name not in self._drawn_with
+        ]
         self._cache: dict[tuple[str, tuple[str, ...], str, str], Mean | None] = {}
 
     @property
@@ -346,7 +369,7 @@ class StudyGrades:
         means = []
         for i in range(len(scores)):
             own = [mean for mean in found[i * trainings : (i + 1) * trainings] if mean is not None]
-            mean = pool_trainings(own, variant, self._several) if own else None
+            mean = pool_trainings(own, self._drawn_with.get(variant, variant), self._several) if own else None
             means.append(replace(mean, trainings=0) if mean and variant.partition(" ")[0] in BASELINES else mean)
         return means
 

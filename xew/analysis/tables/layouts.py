@@ -140,12 +140,12 @@ def few_shot_table(builder: Builder) -> Table:
 
 
 def recovery_full(builder: Builder) -> Table:
-    """The appendix's complete table of few-shot recovery."""
+    """The appendix's complete table of few-shot recovery, and with it the remedies against forgetting."""
     metrics = builder.reported
     seen = builder.row("few_shot", REFERENCE, SEEN, metrics, (REFERENCE,))
     sections = [TableSection("Seen pool, before adaptation", (seen,), builder.note("few_shot", [(REFERENCE, SEEN, REFERENCE)]))]
     for robot in HELD_OUT_ROBOTS:
-        keys = {f"{robot}-{shots}": f"M = {shots}" for shots in (0, *SHOTS)}
+        keys = {f"{robot}-{shots}": f"M = {shots}" for shots in (0, *SHOTS)} | _list_remedies(builder, robot, "")
         sections.append(_build_section(builder, HELD_OUT_TITLES[robot], "few_shot", keys, robot, metrics, f"{robot}-0"))
     caption = "Marks: against M = 0."
     columns = metric_columns(builder.ours.metrics, metrics)
@@ -154,18 +154,24 @@ def recovery_full(builder: Builder) -> Table:
     )
 
 
+def _list_remedies(builder: Builder, robot: str, before: str) -> dict[str, str]:
+    """Rows of the adaptations to a robot with a remedy, and their labels; none where the study has no such part."""
+    if not builder.has_results("remedies"):
+        return {}
+    return {
+        f"{robot}-{shots}-{remedy}": f"{before}M = {shots}, {title} (ours)"
+        for remedy, title in REMEDIES.items()
+        for shots in SHOTS
+    }
+
+
 def forgetting_full(builder: Builder) -> Table:
     """The appendix's complete table of forgetting, and with it the remedies, which the paper does not have."""
     metrics = builder.reported
     keys = {"none": "none (before)"}
     keys |= {f"{robot}-{shots}": f"{SHORT_ROBOTS[robot]}, M = {shots}" for robot in HELD_OUT_ROBOTS for shots in SHOTS}
-    if builder.has_results("remedies") and builder.paper:
-        keys |= {
-            f"{robot}-{shots}-{remedy}": f"{SHORT_ROBOTS[robot]}, M = {shots}, {title} (ours)"
-            for remedy, title in REMEDIES.items()
-            for robot in HELD_OUT_ROBOTS
-            for shots in SHOTS
-        }
+    for robot in HELD_OUT_ROBOTS:
+        keys |= _list_remedies(builder, robot, f"{SHORT_ROBOTS[robot]}, ")
     section = _build_section(builder, "", "forgetting", keys, FORGETTING_ROBOT, metrics, "none")
     plain = tuple(replace(row, cells=tuple(replace(cell, best=False) for cell in row.cells)) for row in section.rows)
     return Table(
