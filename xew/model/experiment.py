@@ -95,7 +95,7 @@ class Experiment:
         shapes = {"rgb": _latent_shape(self.clip, self.codec)}
         shapes |= {name: _condition_shape(shapes["rgb"], condition, len(history)) for name, condition in conditions.items()}
         shapes["text"] = (size.text_tokens,) if self.text_encoder.learned else (size.text_tokens, size.text_dim)
-        return ClipInputs(self.clip, self.train.chunks, history, conditions, shapes)
+        return ClipInputs(self.clip, self.train.chunks, history, conditions, shapes, size.patch)
 
     @property
     def instructions(self) -> Instructions:

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,8 @@ from tests.networks import draw_network, normal
 from xew.config import ConfigError
 from xew.model.network import blocks, dit
 from xew.model.network.dit import MODELS, STREAMS, WorldModel
+from xew.model.network.dit_layouts import diffusers_config
+from xew.model.network.tokens import WAN_PATCH
 from xew.model.training.memory import kept_bytes
 
 CHANNELS = 3
@@ -76,7 +79,7 @@ def test_one_stream_is_the_plain_block_stack(inputs: tuple[jax.Array, jax.Array,
     for layer in range(MODELS["tiny"].depth):
         block = nnx.merge(graph, jax.tree.map(lambda leaf, layer=layer: leaf[layer], layers))
         tokens = block(tokens, modulation, levels, rotary, context)
-    expected = dit.unpatchify(model.head(tokens, time, levels), latents.shape)
+    expected = dit.unpatchify(model.head(tokens, time, levels), latents.shape, model.size.patch)
     np.testing.assert_allclose(model(latents, {}, sigma, text), expected, atol=TOLERANCE)
 
 
@@ -100,12 +103,13 @@ def test_streams_are_one_sequence(inputs: tuple[jax.Array, jax.Array, jax.Array]
     model, condition = tiny(("embodiment",)), normal(4, 2, 1, 4, 6, CHANNELS)
     tokens, levels, (cos, _) = model.embed_streams(latents, {"embodiment": condition})
     rgb_tokens, _, (rgb_cos, _) = tiny().embed_streams(latents, {})
-    np.testing.assert_allclose(tokens[:, :18], model.patch_embedding(dit.patchify(latents)), atol=TOLERANCE)
+    np.testing.assert_allclose(tokens[:, :18], model.patch_embedding(dit.patchify(latents, model.size.patch)), atol=TOLERANCE)
     assert rgb_tokens.shape == tokens[:, :18].shape
     np.testing.assert_array_equal(cos[:18], rgb_cos)
     np.testing.assert_array_equal(cos[18:], cos[:6])
     assert tokens.shape[1] == 3 * 2 * 3 + 1 * 2 * 3
-    own = model.stream_inputs["embodiment"](dit.patchify(condition)) + model.stream_embeddings["embodiment"][None, None]
+    patches = dit.patchify(condition, model.size.patch)
+    own = model.stream_inputs["embodiment"](patches) + model.stream_embeddings["embodiment"][None, None]
     np.testing.assert_allclose(tokens[:, 18:], own, atol=TOLERANCE)
     np.testing.assert_array_equal(levels, [0] * 6 + [1] * 12 + [0] * 6)
 
@@ -130,7 +134,7 @@ def test_two_levels_equal_a_timestep_for_every_token(inputs: tuple[jax.Array, ja
     every = np.arange(tokens.shape[1])
     tokens = model.apply_blocks(tokens, model.modulation(time), every, rotary, model.text_embedding(text))
     rgb = every[: tokens.shape[1] // 2]
-    expected = dit.unpatchify(model.head(tokens[:, rgb], time, rgb), latents.shape)
+    expected = dit.unpatchify(model.head(tokens[:, rgb], time, rgb), latents.shape, model.size.patch)
     np.testing.assert_allclose(model(latents, conditions, sigma, text), expected, atol=TOLERANCE)
 
 
@@ -174,8 +178,21 @@ def test_sinusoid_is_cosine_first() -> None:
 def test_patchify_orders_features_as_wan() -> None:
     """In: channel slowest, then row and column of the patch. Out: row, column, channel fastest."""
     latents = np.arange(4 * CHANNELS, dtype=np.float32).reshape(1, 1, 2, 2, CHANNELS)
-    np.testing.assert_array_equal(dit.patchify(jnp.asarray(latents))[0, 0], latents[0, 0].transpose(2, 0, 1).ravel())
-    np.testing.assert_array_equal(dit.unpatchify(jnp.asarray(latents.reshape(1, 1, -1)), latents.shape), latents)
+    np.testing.assert_array_equal(dit.patchify(jnp.asarray(latents), WAN_PATCH)[0, 0], latents[0, 0].transpose(2, 0, 1).ravel())
+    np.testing.assert_array_equal(dit.unpatchify(jnp.asarray(latents.reshape(1, 1, -1)), latents.shape, WAN_PATCH), latents)
+
+
+def test_a_token_may_be_one_latent_pixel(inputs: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+    """Four times as many tokens as Wan's, in every stream and in what is joined to RGB's channels."""
+    latents, sigma, text = inputs
+    size, streams = replace(MODELS["tiny"], patch=(1, 1, 1)), ("action", "map_channels")
+    model = draw_network(lambda: WorldModel(size, CHANNELS, streams, rngs=nnx.Rngs(0)))
+    conditions = {"action": normal(4, *SHAPE), "map_channels": normal(5, *SHAPE)}
+    tokens, levels, _ = model.embed_streams(latents, conditions)
+    assert tokens.shape[1] == len(levels) == 2 * 3 * 4 * 6
+    velocity = model(latents, conditions, sigma, text)
+    assert velocity.shape == SHAPE and np.ptp(velocity) > 0
+    assert diffusers_config(model)["patch_size"] == [1, 1, 1]
 
 
 def test_query_norm_spans_all_heads() -> None:

@@ -24,6 +24,7 @@ from xew.model.network import dit
 from xew.model.network.dit import MODELS, STREAMS, WorldModel
 from xew.model.network.dit_layouts import dit_layout, load_dit
 from xew.model.network.mechanisms import MECHANISMS, frames_of_groups, ray_maps
+from xew.model.network.tokens import WAN_PATCH
 from xew.model.weights.layout import checkpoint_shapes
 
 ROOT = Path(__file__).parents[3]
@@ -173,7 +174,7 @@ def test_levels_of_frames_equal_a_timestep_of_every_token() -> None:
     time, levels = model.add_frame_vectors(model.embed_time(SIGMA), levels, LATENTS.shape, conditions)
     every, of_tokens = np.arange(tokens.shape[1]), time[:, levels]
     seen = model.apply_blocks(tokens, model.modulation(of_tokens), every, rotary, model.context(TEXT), len(every))
-    expected = dit.unpatchify(model.head(seen, of_tokens, every), LATENTS.shape)
+    expected = dit.unpatchify(model.head(seen, of_tokens, every), LATENTS.shape, WAN_PATCH)
     np.testing.assert_allclose(model(LATENTS, conditions, SIGMA, TEXT), expected, atol=2e-5)
 
 
@@ -248,7 +249,7 @@ def test_pooled_tokens_know_the_order_of_actions() -> None:
 
 def test_channels_are_a_wider_patch_embedding() -> None:
     model, conditions = model_of(("map_channels",)), make_conditions(("map_channels",))
-    joined = jnp.concatenate([dit.patchify(LATENTS), dit.patchify(conditions["map_channels"])], axis=-1)
+    joined = jnp.concatenate([dit.patchify(pictures, WAN_PATCH) for pictures in (LATENTS, conditions["map_channels"])], axis=-1)
     kernel = jnp.concatenate([model.patch_embedding.kernel[...], model.mechanisms["map_channels"].columns.kernel[...]])
     expected = joined @ kernel + model.patch_embedding.bias[...][None, None]
     np.testing.assert_allclose(model.embed_streams(LATENTS, conditions)[0], expected, atol=2e-5)
@@ -278,7 +279,8 @@ def test_rays_go_through_the_pixels_they_belong_to() -> None:
 def test_earlier_frames_are_rgb_at_their_own_times() -> None:
     model, conditions = model_of(("action", "history")), make_conditions(("action", "history"))
     tokens, levels, (cos, _) = model.embed_streams(LATENTS, conditions)
-    embedded = model.patch_embedding(dit.patchify(conditions["history"])) + model.stream_embeddings["history"][...][None, None]
+    patches = dit.patchify(conditions["history"], WAN_PATCH)
+    embedded = model.patch_embedding(patches) + model.stream_embeddings["history"][...][None, None]
     np.testing.assert_allclose(tokens[:, 18:30], embedded, atol=1e-5)
     assert levels[18:30].tolist() == [0] * 12
     angles = dit.rotary_angles((2, 2, 3), 16, times=EARLIER)

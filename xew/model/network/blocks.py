@@ -26,7 +26,7 @@ from jaxtyping import Float, Int, Key
 from xew.config import ConfigError
 from xew.model.devices.sharding import shard_over_batch
 from xew.model.network.mechanisms import FramedContext
-from xew.model.network.tokens import WAVELENGTH_BASE
+from xew.model.network.tokens import WAN_PATCH, WAVELENGTH_BASE, Patch
 
 EPSILON = 1e-6
 """Added to the variance in every norm."""
@@ -69,6 +69,8 @@ class ModelSize:
     a model of few positions tells them apart sooner with less."""
     epsilon: float = EPSILON
     """Number that all norms add to a mean square; Wan's, but for checkpoints whose config.json says otherwise."""
+    patch: Patch = WAN_PATCH
+    """Latent frames (always one), rows and columns of a token: smaller ones make finer pictures of more tokens."""
 
     @property
     def head_dim(self) -> int:

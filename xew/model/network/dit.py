@@ -42,7 +42,6 @@ from xew.model.network.blocks import (
 )
 from xew.model.network.mechanisms import MECHANISMS, FramedContext, create_mechanism, ray_maps
 from xew.model.network.tokens import (
-    PATCH,
     TIME_FREQUENCIES,
     patchify,
     rotary_angles,
@@ -143,7 +142,7 @@ class WorldModel(nnx.Module):
         self.history = tuple(history)
         # Earlier frames come right after RGB's tokens, so that all frames that have a context of their own are one piece.
         self.condition_streams = tuple(sorted((name for name in streams if name in STREAMS), key="history".__ne__))
-        features = channels * int(np.prod(PATCH))
+        features = channels * int(np.prod(size.patch))
         self.patch_embedding = linear(features, size.dim, dtype, rngs)
         self.text_embedding = TwoLayer(size.text_dim, size.dim, size.dim, gelu, dtype, EMBEDDING_INIT, rngs)
         self.time_embedding = TwoLayer(TIME_FREQUENCIES, size.dim, size.dim, nnx.silu, jnp.float32, EMBEDDING_INIT, rngs)
@@ -159,7 +158,7 @@ class WorldModel(nnx.Module):
                 self.stream_inputs[name] = self._stream_input(STREAMS[name], rngs)
         self.mechanisms = nnx.data({})
         for name in (name for name in streams if name not in STREAMS):
-            self.mechanisms[name] = create_mechanism(name, size, features, dtype, rngs)
+            self.mechanisms[name] = create_mechanism(name, size, channels, dtype, rngs)
 
     def _stream_input(self, stream: Stream, rngs: nnx.Rngs) -> nnx.Module:
         """Pixel streams start from a copy of RGB's patch embedding, as FlowWAM and the paper do."""
@@ -188,12 +187,13 @@ class WorldModel(nnx.Module):
         Returns:
             [b t h w c] float32; frame 0 carries no meaning.
         """
-        rgb = np.prod(token_grid(latents.shape)).item()
+        rgb = np.prod(token_grid(latents.shape, self.size.patch)).item()
         tokens, levels, rotary = self.embed_streams(latents, conditions, cached=cache is not None)
         time, levels = self.add_frame_vectors(self.embed_time(sigma), levels, latents.shape, conditions)
         context = self.framed_context(text, latents.shape, conditions)
         tokens = self.apply_blocks(tokens, self.modulation(time), levels, rotary, context, rgb, cache)
-        predicted = unpatchify(self.head(tokens[:, :rgb].astype(jnp.float32), time, levels[:rgb]), latents.shape)
+        features = self.head(tokens[:, :rgb].astype(jnp.float32), time, levels[:rgb])
+        predicted = unpatchify(features, latents.shape, self.size.patch)
         if self.prediction == "velocity":
             return predicted
         if self.prediction == "clean":
@@ -243,7 +243,8 @@ class WorldModel(nnx.Module):
         streams = {name: conditions[name] for name in self.condition_streams if not cached}
         tokens, levels, rotary = self._join({"rgb": latents} | streams)
         for name in self._entering("channels"):
-            columns = self.mechanisms[name](patchify(self._pictures(name, latents, conditions))).astype(jnp.float32)
+            pictures = patchify(self._pictures(name, latents, conditions), self.size.patch)
+            columns = self.mechanisms[name](pictures).astype(jnp.float32)
             tokens = tokens.at[:, : columns.shape[1]].add(columns.astype(self.residual))
         return tokens, levels, rotary
 
@@ -255,7 +256,7 @@ class WorldModel(nnx.Module):
         return ray_maps(conditions[name], latents.shape) if source == "camera" else conditions[name]
 
     def _join(self, inputs: Mapping[str, Array]) -> tuple[Array, np.ndarray, Rotary]:
-        grids = {name: token_grid(array.shape) for name, array in inputs.items()}
+        grids = {name: token_grid(array.shape, self.size.patch) for name, array in inputs.items()}
         tokens = jnp.concatenate([self._embed(name, array) for name, array in inputs.items()], axis=1)
         levels = np.concatenate([token_levels(self._stream(name), grid) for name, grid in grids.items()])
         head_dim, base, times = self.size.head_dim, self.size.rotary_base, {"history": self.history}
@@ -270,8 +271,8 @@ class WorldModel(nnx.Module):
 
     def _embed(self, name: str, array: Array) -> Array:
         if name == "rgb":
-            return self.patch_embedding(patchify(array)).astype(jnp.float32)
-        values = array if STREAMS[name].source == "joints" else patchify(array)
+            return self.patch_embedding(patchify(array, self.size.patch)).astype(jnp.float32)
+        values = array if STREAMS[name].source == "joints" else patchify(array, self.size.patch)
         embed = self.patch_embedding if STREAMS[name].source == "history" else self.stream_inputs[name]
         return embed(values).astype(jnp.float32) + self.stream_embeddings[name][None, None]
 
@@ -303,7 +304,7 @@ class WorldModel(nnx.Module):
         names = self._entering("time")
         if not names:
             return time, levels
-        frames, height, width = token_grid(shape)
+        frames, height, width = token_grid(shape, self.size.patch)
         of_frames = select_levels(time, token_levels(STREAMS["rgb"], (frames, 1, 1)))
         vectors = sum((self.mechanisms[name](conditions[name]) for name in names), of_frames)
         own = np.repeat(time.shape[1] + np.arange(frames), height * width)
@@ -339,7 +340,7 @@ class WorldModel(nnx.Module):
         shared, names = self.context(text, conditions), self._entering("frame")
         if not names:
             return shared
-        frames, height, width = token_grid(shape)
+        frames, height, width = token_grid(shape, self.size.patch)
         framed = jnp.concatenate([self.mechanisms[name](conditions[name]).astype(self.dtype) for name in names], axis=2)
         earlier = framed.shape[1] - frames
         return FramedContext(shared, jnp.concatenate([framed[:, earlier:], framed[:, :earlier]], axis=1), height * width)
@@ -422,7 +423,7 @@ def flops(
     pairs = rgb * (rgb + conditions) + (
         0 if cached else conditions * (conditions if visibility == "one_way" else rgb + conditions)
     )
-    dim, features = size.dim, channels * int(np.prod(PATCH))
+    dim, features = size.dim, channels * int(np.prod(size.patch))
     of_block = tokens * (6 * dim * dim + 2 * dim * size.ffn_dim) + 2 * dim * pairs
     of_text = 2 * text * dim * dim + 2 * dim * tokens * text
     of_ends = (tokens + rgb) * features * dim + text * (size.text_dim + dim) * dim

@@ -17,7 +17,7 @@ from flax import nnx
 from xew.config import ConfigError
 from xew.files import write_text
 from xew.model.network.dit import STREAMS, WorldModel
-from xew.model.network.tokens import PATCH, TIME_FREQUENCIES
+from xew.model.network.tokens import TIME_FREQUENCIES, Patch
 from xew.model.weights.filling import check_fit, fill
 from xew.model.weights.layout import Layout, Source
 from xew.model.weights.reading import Tensors, read_tensors
@@ -76,7 +76,7 @@ an embedding that its network does not use."""
 def wan_layout(model: WorldModel, naming: Naming) -> Layout:
     """The 825 tensors (at full size) of Wan2.2-TI2V-5B, under the names of either project."""
     column, layers = COLUMN[naming], range(model.size.depth)
-    layout = dict(_patches("patch_embedding", "patch_embedding"))
+    layout = dict(_patches("patch_embedding", "patch_embedding", model.size.patch))
     layout["head.modulation"] = Source((("head.modulation", "scale_shift_table")[column],))
     for ours, theirs in LINEARS.items():
         layout |= dict(_linear(ours, (theirs[column],)))
@@ -93,7 +93,7 @@ def flowwam_layout(model: WorldModel) -> Layout:
     if FLOW_STREAM not in model.condition_streams:
         return {}
     embedding = Source(("flow_stream.stream_embed",), "leading_ones", (1, 1))
-    patches = _patches(f"stream_inputs.{FLOW_STREAM}", "flow_stream.flow_patch_embedding")
+    patches = _patches(f"stream_inputs.{FLOW_STREAM}", "flow_stream.flow_patch_embedding", model.size.patch)
     return {f"stream_embeddings.{FLOW_STREAM}": embedding, **dict(patches)}
 
 
@@ -201,7 +201,7 @@ def diffusers_config(model: WorldModel) -> dict[str, Any]:
         "num_attention_heads": size.heads,
         "num_layers": size.depth,
         "out_channels": model.channels,
-        "patch_size": list(PATCH),
+        "patch_size": list(model.size.patch),
         "qk_norm": "rms_norm_across_heads",
         "rope_max_seq_len": 1024,
         "text_dim": size.text_dim,
@@ -219,6 +219,6 @@ def _linear(ours: str, theirs: tuple[str, ...], stacked: bool = False) -> Iterat
     yield f"{ours}.bias", Source(tuple(f"{name}.bias" for name in theirs), stacked=stacked)
 
 
-def _patches(ours: str, theirs: str) -> Iterator[tuple[str, Source]]:
-    yield f"{ours}.kernel", Source((f"{theirs}.weight",), "patches", PATCH)
+def _patches(ours: str, theirs: str, patch: Patch) -> Iterator[tuple[str, Source]]:
+    yield f"{ours}.kernel", Source((f"{theirs}.weight",), "patches", patch)
     yield f"{ours}.bias", Source((f"{theirs}.bias",))

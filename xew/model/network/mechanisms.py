@@ -13,6 +13,7 @@ Each mechanism enters the network in one of four places, and a system is a combi
 Shape letters: b batch, t h w c latent video, f latent frames (earlier ones first), n numbers, d width, k context tokens.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -32,8 +33,8 @@ TOOLS = 14
 """Number of numbers of two tools: position, roll, pitch, yaw and gripper of each."""
 CAMERA = 16
 """Number of numbers of a camera: fx fy cx cy [pixels of the camera], rotation from world to camera [9], position [3, m]."""
-RAY_PATCH = 6 * 4
-"""Number of numbers in a patch of a ray map: direction and origin of 2x2 latent pixels."""
+RAY_CHANNELS = 6
+"""Number of numbers of a latent pixel of a ray map: direction and origin."""
 HIDDEN = 4
 """Width of the hidden layer of per-frame vectors, in widths of the network (IRASim and BWM alike)."""
 POOLED_TOKENS, POOLING_LAYERS = 16, 2
@@ -195,10 +196,11 @@ class FramedContext(NamedTuple):
     """Number of tokens of a frame."""
 
 
-def create_mechanism(name: str, size: Any, features: int, dtype: DTypeLike, rngs: nnx.Rngs) -> nnx.Module:
-    """The module of a mechanism for a network of this size whose RGB patches have `features` numbers."""
+def create_mechanism(name: str, size: Any, channels: int, dtype: DTypeLike, rngs: nnx.Rngs) -> nnx.Module:
+    """The module of a mechanism for a network of this size whose latents have so many channels."""
     mechanism = MECHANISMS[name]
-    return mechanism.build(size, RAY_PATCH if mechanism.source == "camera" else features, dtype, rngs)
+    of_pixel = RAY_CHANNELS if mechanism.source == "camera" else channels
+    return mechanism.build(size, of_pixel * math.prod(size.patch), dtype, rngs)
 
 
 def frames_of_groups(numbers: Float[Array, "b t n"]) -> Float[Array, "b k m"]:

@@ -12,8 +12,9 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-PATCH = (1, 2, 2)
+Patch = tuple[int, int, int]
 """Latent frames, rows and columns of a token."""
+WAN_PATCH: Patch = (1, 2, 2)
 WAVELENGTH_BASE = 10_000.0
 TIME_FREQUENCIES = 256
 
@@ -49,11 +50,11 @@ def rounded_sinusoid(timestep: Float[Array, "*n"]) -> Float[Array, "*n 256"]:
     return sinusoid(timestep.astype(jnp.bfloat16).astype(jnp.float32)).astype(jnp.bfloat16).astype(jnp.float32)
 
 
-def token_grid(shape: Sequence[int]) -> tuple[int, int, int]:
+def token_grid(shape: Sequence[int], patch: Patch) -> tuple[int, int, int]:
     """Frames, rows and columns of the tokens of latents [b t h w c] or of joint positions [b t 16]."""
     if len(shape) == 3:
         return shape[1], 1, 1
-    return shape[1] // PATCH[0], shape[2] // PATCH[1], shape[3] // PATCH[2]
+    return shape[1] // patch[0], shape[2] // patch[1], shape[3] // patch[2]
 
 
 def rotary_angles(
@@ -78,17 +79,17 @@ def rotary_angles(
     return np.concatenate([np.outer(positions[:, axis], frequencies) for axis, frequencies in enumerate(series)], axis=-1)
 
 
-def patchify(latents: Float[Array, "b t h w c"]) -> Float[Array, "b s features"]:
+def patchify(latents: Float[Array, "b t h w c"], patch: Patch) -> Float[Array, "b s features"]:
     """Latents [b t h w c] -> tokens [b s c*ph*pw] in the feature order of Wan's convolution weights."""
     b, _, _, _, c = latents.shape
-    t, h, w = token_grid(latents.shape)
-    cut = latents.reshape(b, t, PATCH[0], h, PATCH[1], w, PATCH[2], c)
+    t, h, w = token_grid(latents.shape, patch)
+    cut = latents.reshape(b, t, patch[0], h, patch[1], w, patch[2], c)
     return cut.transpose(0, 1, 3, 5, 7, 2, 4, 6).reshape(b, t * h * w, -1)
 
 
-def unpatchify(features: Float[Array, "b s features"], shape: Sequence[int]) -> Float[Array, "b t h w c"]:
+def unpatchify(features: Float[Array, "b s features"], shape: Sequence[int], patch: Patch) -> Float[Array, "b t h w c"]:
     """Features of the head [b s pt*ph*pw*c] -> latents of `shape` [b t h w c]; here c runs fastest."""
     b, _, _, _, c = shape
-    t, h, w = token_grid(shape)
-    cut = features.reshape(b, t, h, w, *PATCH, c)
+    t, h, w = token_grid(shape, patch)
+    cut = features.reshape(b, t, h, w, *patch, c)
     return cut.transpose(0, 1, 4, 2, 5, 3, 6, 7).reshape(shape)

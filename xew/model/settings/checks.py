@@ -9,7 +9,7 @@ from xew.model.codecs.codec import codec_class
 from xew.model.codecs.contract import CodecSettings
 from xew.model.conditions import Condition
 from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES
-from xew.model.network.dit import PATCH, STREAMS, ModelSize
+from xew.model.network.dit import STREAMS, ModelSize
 from xew.model.network.mechanisms import MECHANISMS
 from xew.model.settings.parts import pick_conditions
 from xew.model.settings.settings import (
@@ -137,7 +137,7 @@ def _check_conditions(conditions: Sequence[Condition], source: str) -> None:
 
 
 def _check_sizes(experiment: Settings, source: str) -> None:
-    clip, factor = experiment.clip, experiment.codec.spatial_factor * PATCH[1]
+    clip, factor = experiment.clip, experiment.codec.spatial_factor * experiment.size.patch[1]
     if clip.frames < 5 or clip.frames % TEMPORAL_FACTOR != 1:
         near = max(5, clip.frames // TEMPORAL_FACTOR * TEMPORAL_FACTOR + 1)
         raise ConfigError(f"{source}: clip.frames is {clip.frames}; it must be 4 k + 1 and at least 5, for example {near}.")

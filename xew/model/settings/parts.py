@@ -13,6 +13,7 @@ from xew.model.codecs.contract import CodecSettings
 from xew.model.codecs.vae import VaeSize
 from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition, list_conditions
 from xew.model.network.dit import STREAMS, token_grid
+from xew.model.network.tokens import Patch
 from xew.model.settings.network import Network
 from xew.model.settings.settings import Clip, ModelSettings, TrainSettings
 from xew.model.text.instructions import TextEncoder, TextSource, encode_instructions
@@ -33,6 +34,8 @@ class ClipInputs:
     shapes: dict[str, tuple[int, ...]]
     """Shapes of a clip's arrays by stream or mechanism, rgb and text included: latents [t h w c], numbers [t n], text [l e] or
     [l]."""
+    patch: Patch
+    """Latent frames, rows and columns of a token of the network."""
 
     @property
     def latent_shape(self) -> tuple[int, ...]:
@@ -43,7 +46,7 @@ class ClipInputs:
     def grids(self) -> list[tuple[int, int, int]]:
         """Tokens (t', h', w') of each stream, RGB first."""
         streams = ["rgb", *(name for name in self.conditions if name in STREAMS)]
-        return [token_grid((1, *self.shapes[name])) for name in streams]
+        return [token_grid((1, *self.shapes[name]), self.patch) for name in streams]
 
 
 @dataclass(frozen=True)
