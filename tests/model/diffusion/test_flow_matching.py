@@ -54,6 +54,21 @@ def test_loss_ignores_the_reference_frame(latents: jax.Array) -> None:
     np.testing.assert_allclose(fm.sample_losses(pair.velocity + 2, pair), np.full(len(latents), 4.0), rtol=1e-5)
 
 
+def test_what_moves_weighs_more() -> None:
+    """A place that changes by far more than latents spread weighs 1 + 4 times one that stands still, and the mean is 1."""
+    latents = np.zeros((1, 3, 2, 2, 5), np.float32)
+    latents[:, 1:, 0, 0] = 1e3
+    weights = fm.moving_weights(jnp.asarray(latents), 4.0)
+    np.testing.assert_allclose(weights[:, 1:, 0, 0] / weights[:, 1:, 1, 1], 5, rtol=1e-5)
+    np.testing.assert_allclose(weights[:, 1:].mean(), 1, rtol=1e-6)
+    pair = fm.training_pair(jax.random.key(0), jnp.asarray(latents), 5.0)
+    wrong = np.zeros(latents.shape, np.float32)
+    wrong[:, :, 0, 0] = 1
+    alike, weighed = (fm.sample_losses(pair.velocity + wrong, pair, weights=given) for given in (None, weights))
+    np.testing.assert_allclose(weighed / alike, 5 / 2, rtol=1e-4)
+    assert np.ptp(fm.moving_weights(jnp.asarray(latents), 0.0)) == 0
+
+
 def test_the_target_is_the_video_behind_the_shown_reference(latents: jax.Array) -> None:
     """Where later latents are differences from the first, the pair's are those from the perturbed one; else none changes."""
     plain = fm.training_pair(jax.random.key(1), latents, 5.0)

@@ -67,8 +67,23 @@ def training_pair(
     return TrainingPair(jnp.concatenate([reference, noisy[:, 1:]], axis=1), noise - latents, sigma)
 
 
+def moving_weights(latents: Float[Array, "b t h w c"], more: float) -> Float[Array, "b t h w"]:
+    """Weights [b t h w] of places in the loss: what moves weighs up to 1 + `more` times what stands still; mean 1.
+
+    Args:
+        latents: [b t h w c], clean and of variance 1; a place moves as far as it differs from the first frame.
+        more: 0 weighs all places alike.
+    """
+    change = jnp.square(latents - latents[:, :1]).mean(axis=-1)
+    weights = 1 + more * change / (change + GUESS_SPREAD**2)
+    return weights / weights[:, 1:].mean(axis=(1, 2, 3), keepdims=True)
+
+
 def sample_losses(
-    predicted: Float[Array, "b t h w c"], pair: TrainingPair, valid: Num[Array, "b t"] | None = None
+    predicted: Float[Array, "b t h w c"],
+    pair: TrainingPair,
+    valid: Num[Array, "b t"] | None = None,
+    weights: Float[Array, "b t h w"] | None = None,
 ) -> Float[Array, " b"]:
     """Mean squared error of the velocity of each sample, over latent frames 1 and on.
 
@@ -76,11 +91,13 @@ def sample_losses(
         predicted: [b t h w c] float32, velocity.
         pair: what it was predicted for.
         valid: [b t] float32, 1 for latent frames that show the episode and 0 past its end; all count if left out.
+        weights: [b t h w] of places, as from `moving_weights`; all weigh alike if left out.
 
     Returns:
         [b] float32; 0 where no frame counts.
     """
-    errors = jnp.square(predicted[:, 1:] - pair.velocity[:, 1:]).mean(axis=(2, 3, 4))
+    places = jnp.square(predicted[:, 1:] - pair.velocity[:, 1:]).mean(axis=4)
+    errors = (places if weights is None else weights[:, 1:] * places).mean(axis=(2, 3))
     if valid is None:
         return errors.mean(axis=1)
     return (errors * valid[:, 1:]).sum(axis=1) / jnp.maximum(valid[:, 1:].sum(axis=1), 1)

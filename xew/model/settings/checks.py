@@ -47,6 +47,7 @@ LEAST = LEAST_OF_STEPS | {
     "train.epochs": 0,
     "train.accumulate": 1,
     "train.history_noise": 0,
+    "train.moving": 0,
     "adapt.lora_rank": 0,
     "rollout.steps": 1,
     "rollout.batch": 1,

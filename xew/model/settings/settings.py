@@ -107,6 +107,8 @@ class TrainSettings(StepSettings):
     """Type of the optimizer's first moment; bfloat16 saves two bytes a parameter."""
     shift: float = 5.0
     """Shift of the noise levels, in training and in sampling."""
+    moving: float = 0.0
+    """Places that differ from the clip's first frame weigh up to 1 + this times as much in the loss; 0 weighs all alike."""
     history_noise: float = 0.0
     """Standard deviation of what is added to earlier frames' latents in training; Ctrl-World has 0.3."""
 

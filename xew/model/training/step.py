@@ -24,7 +24,14 @@ from jax.sharding import Mesh
 
 from xew.model.codecs.contract import Codec
 from xew.model.devices.sharding import gather_parameters, place_shapes
-from xew.model.diffusion.flow_matching import ReplaceReference, TrainingPair, put_first, sample_losses, training_pair
+from xew.model.diffusion.flow_matching import (
+    ReplaceReference,
+    TrainingPair,
+    moving_weights,
+    put_first,
+    sample_losses,
+    training_pair,
+)
 from xew.model.network.dit import cast_params
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs.checkpoint import TrainState
@@ -100,7 +107,7 @@ class Learner:
         """
         settings, graph, optimizer = self.learning.settings, self.graph, self.learning.optimizer
         places = list_shardings(self.network_shapes)
-        objective = Objective(graph, places, settings.shift, settings.accumulate, settings.history_noise)
+        objective = Objective(graph, places, settings.shift, settings.accumulate, settings.history_noise, settings.moving)
 
         def step(state: TrainState, batch: Batch, codec: Codec | None) -> tuple[TrainState, StepResult]:
             key = jax.random.fold_in(jax.random.key(settings.seed), state.step)
@@ -193,6 +200,8 @@ class Objective:
     """Number of parts of the batch that are computed one after another."""
     history_noise: float = 0.0
     """Standard deviation of the noise on earlier frames' latents."""
+    moving: float = 0.0
+    """What moves weighs up to this much more in the loss."""
 
     def place(self, tree: Any) -> Any:
         """Keep a tree like that of the parameters cut along fsdp as they are: the compiler might gather it too soon."""
@@ -239,9 +248,11 @@ class Objective:
     def _chunk_gradients(self, params: Any, chunk: Batch, pair: TrainingPair, shares: Array) -> tuple[Any, Array, Array]:
         """Gradients, losses [b] and prediction of one chunk, whose samples have these shares in the loss [b]."""
 
+        weights = moving_weights(chunk.latents, self.moving) if self.moving else None
+
         def loss(params: Any) -> tuple[Array, tuple[Array, Array]]:
             predicted = nnx.merge(self.graph, gather_parameters(params))(pair.noisy, chunk.conditions, pair.sigma, chunk.text)
-            losses = sample_losses(predicted, pair, chunk.valid)
+            losses = sample_losses(predicted, pair, chunk.valid, weights)
             return (shares * losses).sum(), (losses, predicted)
 
         gradients, (losses, predicted) = jax.grad(loss, has_aux=True)(params)
