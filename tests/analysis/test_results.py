@@ -28,5 +28,5 @@ def test_published_tables_and_sentences_are_those_of_the_scores(folder: Path, tm
 
 
 def test_there_are_results() -> None:
-    names = ["bodies", "bodies_debug", "own_motion", "remedies", "six_tasks", "small_size"]
+    names = ["bodies", "bodies_debug", "own_motion", "remedies", "six_tasks", "small_fine", "small_size"]
     assert [folder.name for folder in FOLDERS] == names

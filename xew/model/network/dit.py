@@ -70,6 +70,7 @@ MODELS = {
     "tiny": ModelSize(dim=32, depth=2, heads=2, ffn_dim=64, text_dim=16, text_tokens=8),
     "debug": ModelSize(dim=256, depth=4, heads=2, ffn_dim=768, text_dim=32, text_tokens=16, rotary_base=10.0),
     "small": ModelSize(dim=768, depth=12, heads=12, ffn_dim=3072, text_dim=256, text_tokens=32, rotary_base=100.0),
+    "small_fine": ModelSize(768, 12, 6, 3072, text_dim=256, text_tokens=32, rotary_base=100.0, patch=(1, 1, 1)),
     "wan5b": ModelSize(dim=3072, depth=30, heads=24, ffn_dim=14336, text_dim=4096, text_tokens=512),
 }
 
