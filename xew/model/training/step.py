@@ -201,7 +201,7 @@ class Objective:
     history_noise: float = 0.0
     """Standard deviation of the noise on earlier frames' latents."""
     moving: float = 0.0
-    """What moves weighs up to this much more in the loss."""
+    """Additional weight in the loss of what moves, at most."""
 
     def place(self, tree: Any) -> Any:
         """Keep a tree like that of the parameters cut along fsdp as they are: the compiler might gather it too soon."""
