@@ -16,6 +16,8 @@ HELD_OUT_ROBOTS = ("franka_panda", "piper")
 BODY_NAME = re.compile(r"body[:_](\d+)")
 BODY_RANGE = re.compile(r"body:(\d+)-(\d+)")
 """Forms of the names of one procedural body and of several in a row, as users write them."""
+PAINTED_NAME = re.compile(r"(\w[\w.+-]*)_paint_(\d+)")
+"""Form of the key of a robot in other colors: arx_x5_paint_3."""
 
 ACTION_DIM = 16
 """Length of a command: left arm 7 joints [rad], left gripper, right arm 7 joints [rad], right gripper. Grippers go from 0,
@@ -76,6 +78,17 @@ def expand_robots(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(keys)
 
 
+def painted_key(robot: str, paint: int) -> str:
+    """The key of a robot in the colors of a number, from 1 (`xew.sim_warp.embodiment.paint`)."""
+    return f"{robot}_paint_{paint}"
+
+
+def unpainted_key(robot: str) -> str:
+    """The key of the same robot in its own colors."""
+    found = PAINTED_NAME.fullmatch(robot)
+    return found[1] if found else robot
+
+
 @dataclass(frozen=True)
 class Split:
     """Robots that a model trains on, and robots that it must render unseen."""
@@ -117,6 +130,13 @@ HALVES = {
 }
 """The protocol of halves: every body is rendered by a model that trained on it and by one that did not, as in the folds of
 LOEO, but with 32 bodies in place of five robots. Keys say which half trains, by the bodies' numbers."""
+PAINT_COUNT = 40
+"""Number of paints that training robots are shown in: one for each training seed of a small study."""
+PAINTED = Split(
+    (*SEEN_ROBOTS, *(painted_key(robot, paint) for robot in SEEN_ROBOTS for paint in range(1, PAINT_COUNT + 1))),
+    HELD_OUT_ROBOTS,
+)
+"""The fixed split, with its training robots also in other colors."""
 VALIDATION = Split(SEEN_ROBOTS, VALIDATION_BODIES)
 """The fixed split's training robots, with the bodies by which choices are made in place of the held-out robots."""
 
@@ -132,7 +152,11 @@ def split_key(split: str, motion: str) -> str:
 
 
 _SHARED_SPLITS = (
-    {"fixed": FIXED} | {f"loeo_{robot}": split for robot, split in LOEO.items()} | SCALING | HALVES | {"validation": VALIDATION}
+    {"fixed": FIXED}
+    | {f"loeo_{robot}": split for robot, split in LOEO.items()}
+    | SCALING
+    | HALVES
+    | {"painted": PAINTED, "validation": VALIDATION}
 )
 SPLITS = {
     split_key(key, motion): replace(split, motion=motion)

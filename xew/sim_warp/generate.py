@@ -25,7 +25,7 @@ import tyro
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.dataset import count_motions, find_records
+from xew.dataset import count_motions, find_records, read_dataset
 from xew.episode import EpisodeError, Record, episode_folder, remove_left_overs
 from xew.files import hold_lock
 from xew.protocol import (
@@ -34,6 +34,7 @@ from xew.protocol import (
     TEST_SEEDS_PER_TASK,
     TRAIN_SEEDS_PER_TASK,
     expand_robots,
+    painted_key,
     seed_split,
 )
 from xew.sim_warp.devices.workers import FRAMES_OF_A_PAINTER, Workers, find_device, find_devices, quiet_warp, worker_count
@@ -41,6 +42,7 @@ from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.by_robot import Timed, make_by_robot
 from xew.sim_warp.production.cells import Cell, Job
 from xew.sim_warp.production.produce import produce, simulate_jobs, write_seeds
+from xew.sim_warp.production.rerender import paint_again
 from xew.sim_warp.production.warm_up import compile_on_devices
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS, RobotSpec, adopt_robots, get_robot, is_path
@@ -93,6 +95,9 @@ class Args:
     """Let a data set have episodes of both kinds, each cell of one."""
     states_only: bool = False
     """Store no videos, only states and all hashes; `python -m xew.sim_warp.inspect DATA --render` makes them on demand."""
+    paints: int = 0
+    """Number of paints: each training episode is also written with its robot in other colors, as robot NAME_paint_N, where N
+    follows from the seed. Shapes, motion and scene stay the same, and nothing is simulated for it."""
     manifest: Path = PACKAGED
     """File that says which seeds are known to fail."""
     search: bool = False
@@ -259,7 +264,27 @@ def generate(args: Args) -> list[Family]:
                 bar.n = sum(f.accepted for f in families)
                 bar.set_postfix_str(f"{records[0].task} {records[0].seed}", refresh=True)
     _print_speed(frames, spent)
+    if args.paints:
+        paint_episodes(args, tuple(robots))
     return families
+
+
+def paint_episodes(args: Args, robots: Sequence[str]) -> None:
+    """Write what is missing of the accepted training episodes of some robots in other colors; see `Args.paints`."""
+    episodes = read_dataset(args.out).select(robots=robots, tasks=args.tasks, split="train")
+    asked = [(folder, 1 + record.seed % args.paints) for folder, record in episodes]
+    todo = [(folder, paint) for folder, paint in asked if not folder.with_name(painted_key(folder.name, paint)).is_dir()]
+    devices = find_devices(args.device)
+    with Workers(args.workers or worker_count(devices, find_device("cpu")), devices) as workers:
+        compile_on_devices(workers, {"rendering": devices[0].alias}, 1)
+        painted = workers.run(partial(_paint, painter=devices[0].is_cuda), todo)
+        for _ in tqdm(painted, desc="painted episodes", total=len(todo), unit="episode"):
+            pass
+
+
+def _paint(episode: tuple[Path, int], painter: bool) -> None:
+    """Write an episode with its robot in the colors of a paint, in a worker process, rendered on its own device."""
+    paint_again(*episode, _renderer(painter))
 
 
 def _check(args: Args) -> None:

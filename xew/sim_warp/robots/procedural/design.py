@@ -8,12 +8,13 @@ Numbers from `WIDE` on are of a second family, in which sizes and roots differ m
 reach from .5 to 1 m, on bases like those of the first family or on stands whose foot is the root, up to the floor's.
 """
 
-import colorsys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
+
+from xew.sim_warp.embodiment.paint import draw_color
 
 Vector = tuple[float, float, float]
 Option = TypeVar("Option")
@@ -26,15 +27,6 @@ FINGERS = ("paddle", "bar", "jaw", "wedge")
 MOUNTS = ("upright", "tilted", "frame")
 """Kinds of base: a foot, a wedge on which the base leans forward or back, a column that is part of the base and ends below the
 root."""
-COLORS = {
-    "white": (228, 229, 231),
-    "light": (186, 189, 194),
-    "silver": (146, 150, 157),
-    "slate": (92, 97, 106),
-    "dark": (58, 60, 66),
-    "black": (30, 31, 34),
-}
-"""Colors that most real arms have, sRGB."""
 WIDE = 1_000_000
 """Number of the first design of the wide family."""
 WIDE_REACH = (0.5, 1.0)
@@ -257,28 +249,19 @@ def _look(rng: np.random.Generator, joints: int) -> Look:
     style = _choose(rng, STYLES)
     mixed = rng.random() < 0.4
     styles = tuple(_choose(rng, STYLES) if mixed else style for _ in range(joints))
-    body = _color(rng)
-    second = body if rng.random() < 0.55 else _color(rng)
+    body = draw_color(rng)
+    second = body if rng.random() < 0.55 else draw_color(rng)
     return Look(
         styles=styles,
         body=body,
         second=second,
-        housing=_color(rng, plain=0.8),
-        accent=_color(rng, plain=0.1),
+        housing=draw_color(rng, plain=0.8),
+        accent=draw_color(rng, plain=0.1),
         radii=radii,
         slenderness=_rounded(rng.uniform(0.55, 0.95)),
         rings=int(rng.integers(0, 4)),
         cable=bool(rng.random() < 0.3),
     )
-
-
-def _color(rng: np.random.Generator, plain: float = 0.6) -> tuple[int, int, int]:
-    """A color of real arms with the probability `plain`, else any hue; sRGB."""
-    if rng.random() < plain:
-        return COLORS[_choose(rng, tuple(COLORS))]
-    hue, saturation, value = rng.uniform([0, 0.35, 0.3], [1, 0.95, 0.95])
-    red, green, blue = (round(255 * channel) for channel in colorsys.hsv_to_rgb(hue, saturation, value))
-    return red, green, blue
 
 
 def _hand(rng: np.random.Generator) -> HandDesign:
