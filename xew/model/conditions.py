@@ -322,6 +322,14 @@ ACTIONS: dict[str, Condition | System] = {
     "optical_flow": Condition("optical_flow", "action", optical_flow, title="Optical flow", label="optical flow"),
     "mask": Condition("mask", "action", robot_mask, title="Mask", label="mask"),
     "ray_map": Condition("ray_map", "action", ray_map, title="Ray map", label="ray map"),
+    "mask_channels": System(
+        (Condition("mask", "mask_channels", robot_mask),), title="Mask as channels", label="mask as channels"
+    ),
+    "mask_and_flow_channels": System(
+        (Condition("mask", "mask_channels", robot_mask), Condition("optical_flow", "flow_channels", optical_flow)),
+        title="Mask and optical flow as channels",
+        label="mask and optical flow as channels",
+    ),
     "joints": Condition("joints", "joints", joints, title="Joint pose", label="joint pose"),
     "irasim": System(
         (Condition("relative_tool_poses", "relative_time", tool_poses, change=relative_tool_poses, group=True),),

@@ -180,6 +180,8 @@ MECHANISMS = {
         width=TEMPORAL_FACTOR * TOOLS,
     ),
     "map_channels": Mechanism("channels", "latents", _channels),
+    "mask_channels": Mechanism("channels", "latents", _channels),
+    "flow_channels": Mechanism("channels", "latents", _channels),
     "reference_channels": Mechanism("channels", "reference", _channels),
     "ray_channels": Mechanism("channels", "camera", _channels, width=CAMERA),
 }
