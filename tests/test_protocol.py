@@ -102,7 +102,7 @@ def test_the_model_knows_every_action_conditioning_and_split() -> None:
         assert variant.action in ACTIONS and variant.embodiment in CONDITIONS and variant.split in SPLITS
         assert variant.start is None or variant.start in VARIANTS.values()
     loeo = {f"loeo_{robot}" for robot in LOEO}
-    shared = {"fixed", "validation", *loeo, *SCALING, *HALVES}
+    shared = {"fixed", "painted", "validation", *loeo, *SCALING, *HALVES}
     assert set(SPLITS) == {key + ending for key in shared for ending in ("", "_own", "_mixed")}
 
 
