@@ -1,5 +1,6 @@
 """Work done ahead by threads is in order and ends where something fails; a process ends with the one that started it."""
 
+import functools
 import multiprocessing
 import os
 import signal
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from xew.concurrency import free_gpu_memory, leave_with_parent, map_in_order, map_in_processes
+from xew.concurrency import call_in_processes, free_gpu_memory, leave_with_parent, map_in_order, map_in_processes
 
 
 def test_free_memory_of_gpus_is_asked_of_nvidias_tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,3 +159,60 @@ def test_processes_have_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> Non
     found = dict(map(reversed, map_in_processes(open_slow_reader, ["CUDA_VISIBLE_DEVICES"] * 6, 3, gpus=("4", "7"))))
     assert sorted(found.values()) == ["4", "4", "7"], "each has one, and keeps it"
     assert {gpu for gpu, _ in map_in_processes(open_reader, ["CUDA_VISIBLE_DEVICES"], 1)} == {"4,7"}
+
+
+def open_square(folder: Path, delay: float = 0) -> Callable[[int], int]:
+    """Tell that this process opens, by a file named after it, which may take a while."""
+    (folder / str(os.getpid())).touch()
+    time.sleep(delay)
+    return lambda number: number * number
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 60) -> bool:
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.02)
+    return condition()
+
+
+def processes_of(folder: Path) -> list[int]:
+    return [int(file.name) for file in folder.iterdir()]
+
+
+def test_processes_open_before_there_are_items_and_leave_after_the_last(tmp_path: Path) -> None:
+    with call_in_processes(functools.partial(open_square, tmp_path, 0.5), 3) as call:
+        assert wait_for(lambda: len(processes_of(tmp_path)) == 3), "each opens, though nothing is called yet"
+        assert list(call([2, 3])) == [4, 9], "fewer items than processes"
+        assert wait_for(lambda: all(map(is_gone, processes_of(tmp_path)))), "they leave while the block goes on"
+    assert len(processes_of(tmp_path)) == 3, "none was started beside them"
+
+
+def test_no_process_is_left_behind_the_block(tmp_path: Path) -> None:
+    with call_in_processes(functools.partial(open_square, tmp_path, 0.5), 2) as call:
+        assert wait_for(lambda: len(processes_of(tmp_path)) == 2)
+        assert next(call([2, 3, 4])) == 4
+    assert all(map(is_gone, processes_of(tmp_path)))
+    with call_in_processes(functools.partial(open_square, tmp_path), 2):
+        assert wait_for(lambda: len(processes_of(tmp_path)) > 2)
+    assert all(map(is_gone, processes_of(tmp_path))), "nor where nothing was called"
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_an_error_before_there_are_items_ends_processes_that_are_opening(error: type[BaseException], tmp_path: Path) -> None:
+    begun = time.monotonic()
+    with pytest.raises(error), call_in_processes(functools.partial(open_square, tmp_path, 600), 2):
+        assert wait_for(lambda: len(processes_of(tmp_path)) == 2)
+        raise error
+    assert all(map(is_gone, processes_of(tmp_path))) and time.monotonic() - begun < 300
+
+
+def open_nothing() -> Callable[[int], int]:
+    raise FileNotFoundError("no weights")
+
+
+def test_the_first_item_gets_what_the_opener_raises() -> None:
+    with call_in_processes(open_nothing, 2) as call, pytest.raises(FileNotFoundError, match="no weights"):
+        next(call([1, 2, 3]))
+    with pytest.raises(FileNotFoundError, match="no weights"):
+        list(map_in_processes(open_nothing, [1, 2, 3], 2))
+    assert list(map_in_processes(open_nothing, [], 2)) == []

@@ -12,55 +12,45 @@ Writes scores.parquet, one row per model, condition, task, seed, robot and metri
     python -m xew.metrics.evaluate --data demo/data --baselines-of test --out demo/baselines.parquet
 """
 
+import gc
 import itertools
 import os
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import pandas as pd
 import tyro
 from tqdm import tqdm
 
-from xew.concurrency import begin_importing, free_gpu_memory, map_in_order, map_in_processes, visible_gpus
+from xew.concurrency import begin_importing, call_in_processes, free_gpu_memory, map_in_order, visible_gpus
 from xew.config import ConfigError, pick, suggestion, user_errors
 from xew.dataset import demand_one_motion, find_accepted
 from xew.episode import EpisodeError, read_record, verify_episode
-from xew.files import hold_lock, write_section
+from xew.files import hold_lock
 from xew.metrics import METRICS
 from xew.metrics.backends import MASKERS, TRACKERS, identity
 from xew.metrics.grade import DIAGNOSTICS, input_kind
 from xew.metrics.grading.baselines import BASELINES
-from xew.metrics.grading.bundle import Bundle, differences, disagreements, raise_if_any, read_bundle, write_bundle
+from xew.metrics.grading.bundle import Bundle, differences, disagreements, raise_if_any, read_bundle
 from xew.metrics.grading.codecs import OPENER, ModelCodec, open_codecs
 from xew.metrics.grading.grader import Graded, GraderOpener, Group, prepare_process
 from xew.metrics.grading.jobs import Job, list_baseline_jobs, list_jobs
-from xew.metrics.grading.power import HEADING, power_section
-from xew.metrics.grading.scores import (
-    CellStore,
-    baselines_folder,
-    check_out,
-    describe,
-    path_beside,
-    surfaces_folder,
-    write_diagnostics,
-    write_tables,
-    write_whole,
-)
-from xew.metrics.grading.summary import summarize, to_markdown
+from xew.metrics.grading.scores import CellStore, baselines_folder, check_out, describe, path_beside, surfaces_folder
 from xew.metrics.grading.weights import check_weights
-from xew.metrics.grading.workers import choose_allocator, worker_count
+from xew.metrics.grading.workers import choose_allocator, reader_count, worker_count
 from xew.metrics.metric import SUITES
 from xew.metrics.truth import read_truth
-from xew.names import csv_text
-from xew.protocol import GRADING_PROTOCOL, HELD_OUT_ROBOTS, seed_split
+from xew.protocol import GRADING_PROTOCOL, seed_split
 from xew.rollout import find_rollouts
 
-IMPORTED = ("xew.metrics.grading.grader",)
-"""Modules that processes that grade need."""
+IMPORTED = ("xew.metrics.grading.grader", "xew.sim_warp.production.surfaces")
+"""Modules that processes that grade need; the second is imported for points on surfaces, and takes as long as the first."""
+GradeGroups = Callable[[Sequence[Group]], Iterator[Graded]]
+"""Function of groups, each of one episode, that gives what came of grading each, in their order."""
 DIMENSIONS = tuple(dict.fromkeys(metric.dimension for metric in METRICS.values()))
 
 
@@ -133,20 +123,6 @@ class Args:
     """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
-POWER_COMMAND = "python -m xew.metrics.evaluate --data data --baselines-of validation --power-page docs/tasks.md"
-"""Command that the page of the tasks names."""
-WRITTEN = {
-    "parquet": "scores",
-    "curves.parquet": "the same by frame",
-    "summary.md": "means and differences between models",
-    "summary.csv": "means, intervals, noise",
-    "pairs.csv": "differences between models",
-    "power.csv": "which tasks tell the frozen first frame from the truth",
-    "bundle.json": "for others to check",
-}
-"""Files that are written beside each other, by the ending of the name, with what each holds."""
-
-
 @user_errors
 def main(args: Args) -> None:
     """Grade, write, and print what came out; or check a bundle."""
@@ -165,54 +141,26 @@ def main(args: Args) -> None:
 
 def grade_tables(args: Args) -> None:
     """Grade, write the tables and print the summary. Raises EpisodeError where a rollout could not be graded."""
+    from xew.metrics.grading.outcome import write_outcome  # here, while the process that others are forked from imports
+
     metrics = choose_metrics(args)
     check_weights(metrics)
     attributes = describe(settings(args), metrics)
     store = CellStore(path_beside(args.out, "cells"), baselines_folder(args.data, args.out))
     errors: list[str] = []
-    codecs = find_codecs(args)
-    if args.rollouts and codecs:
-        attributes |= {"codecs": {model: [codec.key] for model, codec in sorted(codecs.items())}}
-    jobs = find_jobs(args, tuple(BASELINES) if args.baselines else (), errors if args.keep_going else None, codecs)
-    records = map(read_record, dict.fromkeys(job.episode for job in jobs))
-    attributes["motion"] = demand_one_motion(args.data, records, args.mixed_motion)
-    total = len(jobs) + len(errors)
     diagnostics = tuple(DIAGNOSTICS) if args.diagnostics else ()
-    errors += grade_all(jobs, (*metrics, *diagnostics), args, store, codecs)
-    cells = [job.cell for job in jobs]
-    write_tables(args.out, attributes, cells, store)
-    if diagnostics:
-        write_diagnostics(path_beside(args.out, "diagnostics.parquet"), attributes, diagnostics, cells, store)
-    rows = pd.read_parquet(args.out)
-    write_bundle(path_beside(args.out, "bundle.json"), args.out, rows, cells)
-    print(_write_summary(args, rows))
+    with open_graders(args, (*metrics, *diagnostics), store) as (codecs, grade_groups):
+        if args.rollouts and codecs:
+            attributes |= {"codecs": {model: [codec.key] for model, codec in sorted(codecs.items())}}
+        jobs = find_jobs(args, tuple(BASELINES) if args.baselines else (), errors if args.keep_going else None, codecs)
+        records = map(read_record, dict.fromkeys(job.episode for job in jobs))
+        attributes["motion"] = demand_one_motion(args.data, records, args.mixed_motion)
+        total = len(jobs) + len(errors)
+        errors += grade_all(jobs, (*metrics, *diagnostics), args, store, grade_groups)
+        cells = [job.cell for job in jobs]
+        print(write_outcome(args.out, attributes, diagnostics, cells, store, args.resample, args.power_page))
     if errors:
         raise EpisodeError(f"{len(errors)} of {total} could not be graded:\n  " + "\n  ".join(errors))
-
-
-def _write_summary(args: Args, rows: pd.DataFrame) -> str:
-    """Write the summary's files and return what is printed."""
-    if rows.empty:
-        return "no scores"
-    summary = summarize(rows, args.resample, HELD_OUT_ROBOTS)
-    write_whole(path_beside(args.out, "summary.md"), to_markdown(summary).encode())
-    write_whole(path_beside(args.out, "summary.csv"), csv_text(summary.means).encode())
-    write_whole(path_beside(args.out, "pairs.csv"), csv_text(summary.pairs).encode())
-    write_whole(path_beside(args.out, "power.csv"), csv_text(summary.power).encode())
-    if args.power_page:
-        write_power(args.power_page, summary.power, rows)
-    written = "\n".join(f"{path_beside(args.out, ending)}  {what}" for ending, what in WRITTEN.items())
-    return f"{to_markdown(summary, with_pairs=False)}\n{written}"
-
-
-def write_power(page: Path, power: pd.DataFrame, rows: pd.DataFrame) -> None:
-    """Write what the metrics can tell on each task into a page. Raises ConfigError where the power is not known."""
-    if power.empty:
-        raise ConfigError("--power-page needs the frozen first frame and the true video in a metric of the suite strict.")
-    try:
-        write_section(page, HEADING, f"`{POWER_COMMAND}`.\n{power_section(power, rows)}")
-    except OSError as error:
-        raise EpisodeError(f"cannot write {page}: {error.strerror}. Choose another file with --power-page.") from error
 
 
 def choose_metrics(args: Args) -> tuple[str, ...]:
@@ -284,17 +232,15 @@ def find_jobs(
             "frame 0 of the frozen first frame is the truth: with --frame-zero predicted say --no-baselines, and no --codec."
         )
     if args.baselines_of is None:
-        workers = worker_count(args.workers)
-        return list_jobs(args.rollouts, args.data, str(settings(args)), baselines, workers, problems, codecs)
+        readers = reader_count(args.workers)
+        return list_jobs(args.rollouts, args.data, str(settings(args)), baselines, readers, problems, codecs)
     if args.rollouts or not baselines:
         raise ConfigError("--baselines-of grades baselines alone: leave out the rollouts, and --no-baselines.")
     episodes = [episode for episode in find_accepted(args.data) if seed_split(episode[1].seed) == args.baselines_of]
     return list_baseline_jobs(episodes, str(settings(args)), baselines, codecs or {}, args.max_frames)
 
 
-def grade_all(
-    jobs: list[Job], metrics: tuple[str, ...], args: Args, store: CellStore, codecs: Mapping[str, ModelCodec]
-) -> list[str]:
+def grade_all(jobs: list[Job], metrics: tuple[str, ...], args: Args, store: CellStore, grade_groups: GradeGroups) -> list[str]:
     """Grade what is not in the store yet, and return what went wrong.
 
     Episodes are read and graded by threads or processes, a few ahead of each other, so that memory does not grow with their
@@ -312,7 +258,7 @@ def grade_all(
     errors: list[str] = []
     without_shapes: list[Path] = []
     with tqdm(total=len(jobs), initial=len(jobs) - len(todo), desc="evaluate", unit="video", disable=None) as bar:
-        for group, graded in zip(groups, _grade_groups(groups, metrics, args, store, codecs), strict=True):
+        for group, graded in zip(groups, grade_groups(groups) if groups else (), strict=True):
             errors += graded.errors
             without_shapes += [] if graded.has_shapes else [group[0][0].episode]
             bar.update(len(group))
@@ -324,21 +270,40 @@ def grade_all(
     return errors
 
 
-def _grade_groups(
-    groups: Sequence[Group], metrics: tuple[str, ...], args: Args, store: CellStore, codecs: Mapping[str, ModelCodec]
-) -> Iterator[Graded]:
-    """What came out of each group, in their order, from threads of this process or from processes of their own.
+@contextmanager
+def open_graders(
+    args: Args, metrics: tuple[str, ...], store: CellStore
+) -> Iterator[tuple[Mapping[str, ModelCodec], GradeGroups]]:
+    """Give the codecs, and what grades groups: threads of this process, or processes, which open the codecs for themselves.
 
-    Processes open the codecs for themselves.
+    Processes begin here where there is no table yet, so that they get ready while this process opens the codecs and lists what
+    there is to grade. A table says that an earlier run came to its end: then they begin with the first group, if there is one.
     """
     opener = make_grader_opener(args, metrics, store)
-    if args.processes > 1 and len(groups) > 1:
-        gpus = visible_gpus()
-        choose_allocator(min(args.processes, len(groups)), free_gpu_memory(gpus))
-        yield from map_in_processes(opener.open_in_process, groups, args.processes, IMPORTED, gpus)
-        return
-    stop = threading.Event()
-    yield from map_in_order(opener.open(stop, codecs), groups, worker_count(args.workers), stop)
+    with ExitStack() as stack:
+
+        def begin(count: int) -> GradeGroups:
+            gpus = visible_gpus()
+            choose_allocator(count, free_gpu_memory(gpus))
+            return stack.enter_context(call_in_processes(opener.open_in_process, count, IMPORTED, gpus))
+
+        def grade_late(groups: Sequence[Group]) -> Iterator[Graded]:
+            count = min(args.processes, len(groups))
+            if count > 1:
+                return begin(count)(groups)
+            stop = threading.Event()
+            return map_in_order(opener.open(stop, codecs), groups, worker_count(args.workers), stop)
+
+        early = 0 if args.out.exists() and not args.overwrite else min(args.processes, most_groups(args))
+        grade_groups = begin(early) if early > 1 else grade_late
+        codecs = find_codecs(args)
+        yield codecs, grade_groups
+
+
+def most_groups(args: Args) -> int:
+    """Largest number of episodes that there can be to grade, told by folders alone."""
+    roots = args.rollouts if args.baselines_of is None else (args.data,)
+    return sum(1 for root in roots for _ in root.glob("*/*/*"))
 
 
 def begin_processes() -> None:
@@ -404,3 +369,4 @@ def check(args: Args, path: Path) -> None:
 
 if __name__ == "__main__":
     main(tyro.cli(Args, prog="python -m xew.metrics.evaluate"))
+    gc.freeze()  # Python would go through all that is imported once more at its end, for nothing

@@ -25,7 +25,7 @@ from xew.dataset import find_accepted
 from xew.episode import EpisodeError, read_video
 from xew.metrics import evaluate
 from xew.metrics.evaluate import Args, main
-from xew.metrics.grading import grader
+from xew.metrics.grading import grader, outcome
 from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.workers import Bench
 from xew.rollout import write_rollout
@@ -93,8 +93,8 @@ PLACES = [
     (files.os, "replace", 11),
     (files.os, "replace", CELLS + 1),  # the curves
     (files.os, "replace", CELLS + 2),  # the scores, whose curves are there
-    (evaluate, "write_bundle", 1),
-    (evaluate, "summarize", 1),
+    (outcome, "write_bundle", 1),
+    (outcome, "summarize", 1),
 ]
 
 
@@ -251,8 +251,29 @@ def test_processes_write_the_same_bytes_and_tell_mistakes(world: Path, whole: di
     jobs = evaluate.find_jobs(several, ())
     gone = [(replace(job, episode=tmp_path / "gone"), ("psnr",)) for job in jobs[:2]]
     store = evaluate.CellStore(tmp_path / "cells", tmp_path / "baselines")
-    with pytest.raises(EpisodeError, match="gone"):
-        list(evaluate._grade_groups([[job] for job in gone], ("psnr",), several, store, {}))
+    with evaluate.open_graders(several, ("psnr",), store) as (_, grade_groups), pytest.raises(EpisodeError, match="gone"):
+        list(grade_groups([[job] for job in gone]))
+
+
+def test_processes_begin_before_the_jobs_are_known_where_there_is_no_table(
+    world: Path, whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where there is one, they begin with what is to be graded, and not at all where that is nothing."""
+    events: list[str | int] = []
+    begin, find = evaluate.call_in_processes, evaluate.find_jobs
+    monkeypatch.setattr(evaluate, "call_in_processes", lambda *given: events.append(given[1]) or begin(*given))
+    monkeypatch.setattr(evaluate, "find_jobs", lambda *given: events.append("list") or find(*given))
+    args = replace(arguments(world, tmp_path / "scores.parquet"), processes=EPISODES + 2)
+    main(args)
+    assert events == [EPISODES, "list"], "no more of them than there are episodes"
+    events.clear()
+    main(args)
+    assert events == ["list"]
+    for cell in sorted(args.out.with_suffix(".cells").glob("*/*/*/*.json"))[:2]:
+        cell.unlink()  # the model's, of two episodes
+    events.clear()
+    main(args)
+    assert events == ["list", 2] and read_all(args.out) == whole
 
 
 def test_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from xew.config import ConfigError
 from xew.episode import EpisodeError
-from xew.metrics.evaluate import write_power
+from xew.metrics.grading.outcome import write_power
 from xew.metrics.grading.power import power_section
 from xew.metrics.grading.summary import summarize, to_markdown
 

@@ -13,14 +13,16 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from xew.config import ConfigError, parse
 from xew.files import digest_files, read_json
 from xew.metrics.grading.scores import KEY, Cell, write_whole
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 FORMAT = 1
 DIGESTS = ("prediction", "rgb", "states")
@@ -33,7 +35,7 @@ AGREEMENT = 1e-3
 Bundle = dict[str, Any]
 
 
-def write_bundle(path: Path, table: Path, rows: pd.DataFrame, cells: Sequence[Cell]) -> None:
+def write_bundle(path: Path, table: Path, rows: "pd.DataFrame", cells: Sequence[Cell]) -> None:
     """Write the bundle of a score table. Raises ConfigError if the disk does not take it.
 
     Args:

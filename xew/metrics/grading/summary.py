@@ -188,15 +188,19 @@ def to_markdown(summary: Summary, with_pairs: bool = True) -> str:
 
 
 def _mean_lines(means: pd.DataFrame) -> list[str]:
+    by_metric: dict[str, list[Any]] = {}
+    row: Any
+    for row in means.itertuples():
+        by_metric.setdefault(row.metric, []).append(row)
     models = list(dict.fromkeys(zip(means["model"], means["condition"], strict=True)))
     lines = [f"| metric | {' | '.join(title(model) for model in models)} | noise |", "|---" * (len(models) + 2) + "|"]
-    for metric, rows in means.groupby("metric", sort=False):
-        by_model = {(row.model, row.condition): row for row in rows.itertuples()}
+    for metric, rows in by_metric.items():
+        by_model = {(row.model, row.condition): row for row in rows}
         cells = [_mean_text(by_model.get(model)) for model in models]
-        unit = f" [{rows['unit'].iloc[0]}]" if rows["unit"].iloc[0] else ""
-        arrow = "↑" if METRICS[str(metric)].higher_is_better else "↓"
-        own = rows[~rows["model"].isin(BASELINES)]
-        noise = dict.fromkeys(_noise_text(value) for value in (own if len(own) else rows)["noise"])
+        unit = f" [{rows[0].unit}]" if rows[0].unit else ""
+        arrow = "↑" if METRICS[metric].higher_is_better else "↓"
+        own = [row for row in rows if row.model not in BASELINES]
+        noise = dict.fromkeys(_noise_text(row.noise) for row in own or rows)
         lines.append(f"| {metric}{unit} {arrow} | {' | '.join(cells)} | {' or '.join(noise)} |")
     return lines
 

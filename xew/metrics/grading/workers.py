@@ -42,13 +42,25 @@ def choose_allocator(processes: int, free: Sequence[float]) -> None:
         os.environ.setdefault(ALLOCATOR, GIVING_BACK)
 
 
-def worker_count(asked: int) -> int:
-    """How many threads to use; 0 asks for one for each processor core. Raises ConfigError for a negative number."""
+def reader_count(asked: int) -> int:
+    """How many threads list what there is to grade; it asks for no GPU, which a process that only lists leaves to others.
+
+    Args:
+        asked: their number; 0 for one for each processor core.
+
+    Raises:
+        ConfigError: it is negative.
+    """
     if asked < 0:
         raise ConfigError(f"--workers is {asked}, expected a positive number, or 0 for one for each core.")
-    devices = jax.local_devices()
+    return asked or usable_cores()
+
+
+def worker_count(asked: int) -> int:
+    """How many threads grade; 0 asks for one for each processor core. Raises ConfigError for a negative number."""
+    cores, devices = reader_count(asked), jax.local_devices()
     most = MOST_WORKERS["cpu"] if jax.default_backend() == "cpu" else MOST_WORKERS["gpu"] * len(devices)
-    return asked or max(len(devices), min(usable_cores(), most))
+    return asked or max(len(devices), min(cores, most))
 
 
 class Bench(threading.local):
