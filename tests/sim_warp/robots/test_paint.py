@@ -1,4 +1,4 @@
-"""Robots in other colors: only colors differ, each follows from robot and number, and episodes are painted from their states."""
+"""Robots in other colors: only colors differ, each follows from robot and number; episodes are painted from their states."""
 
 from pathlib import Path
 
