@@ -17,7 +17,7 @@ from xew.model import latents, rollout, train
 from xew.model.cache.codecs import load_codec
 from xew.model.cache.keys import scales_path
 from xew.model.cache.scales import load_scales
-from xew.model.conditions import ACTIONS, System
+from xew.model.conditions import ACTIONS, list_conditions
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import create_model, load_experiment
 from xew.model.sampling.predict import Predictor
@@ -26,8 +26,9 @@ from xew.rollout import find_rollouts
 
 FRAMES = 9
 ROBOTS = ("aloha_agilex", "arx_x5", "piper")
-SYSTEMS = [name for name, entry in ACTIONS.items() if isinstance(entry, System) and entry.conditions]
-BASELINES = Path(__file__).parents[2] / "configs" / "baselines"
+CONFIGS = Path(__file__).parents[2] / "configs"
+SHIPPED = {path.stem: path for path in sorted((CONFIGS / "baselines").glob("*.yaml"))}
+SYSTEMS = [*SHIPPED, "mask_and_flow_channels"]
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}
 codec: {spatial_factor: 8, channels: 4}
@@ -42,7 +43,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("systems")
     synthetic.write_synthetic_data(root / "data", seeds=(0, 1_000_000), robots=ROBOTS, frames=FRAMES)
     for name in SYSTEMS:
-        shipped = load_experiment(BASELINES / f"{name}.yaml").model
+        shipped = load_experiment(SHIPPED.get(name, CONFIGS / "small_fine.yaml")).model
         model = {"size": "tiny", "action": shipped.action, "history": [frame // 10 for frame in shipped.history]}
         text = f"data: {root / 'data'}\nout: {root / name}\nmodel: {json.dumps(model)}\n{CONFIG}"
         (root / f"{name}.yaml").write_text(text)
@@ -59,7 +60,7 @@ def test_a_system_is_trained_and_rolled_out(world: Path, name: str) -> None:
     assert [(rolled.robot, rolled.condition) for rolled in made] == [("piper", name)]
     logged = [json.loads(line) for line in (world / name / "metrics.jsonl").read_text().splitlines()]
     assert np.isfinite([line["train/loss"] for line in logged if "train/loss" in line]).sum() == 2
-    scaled = any(condition.scale != "none" for condition in ACTIONS[name])
+    scaled = any(condition.scale != "none" for condition in list_conditions(ACTIONS[name]))
     assert (world / name / "scales.json").exists() == scaled
 
 
