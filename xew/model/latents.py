@@ -35,6 +35,8 @@ from xew.protocol import validation_split
 
 CEILING_CLIPS = 8
 """Number of clips that the codec's reconstruction is measured on."""
+MOST_NAMED = 8
+"""Largest number of robots that are named one by one."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,8 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
         header |= {"ceiling": ceiling}
         write_text(encoding.folder / "header.json", json.dumps(header, indent=1) + "\n")
     robots, streams = sorted({record.robot for _, record in episodes}), ", ".join(cache.streams)
-    print(f"{encoding.folder}: {len(episodes)} episodes of {', '.join(robots)}")
+    named = ", ".join(robots) if len(robots) <= MOST_NAMED else f"{len(robots)} robots"
+    print(f"{encoding.folder}: {len(episodes)} episodes of {named}")
     print(f"streams {streams}, {written / 1e6:.1f} MB new")
 
 
