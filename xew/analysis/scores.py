@@ -18,7 +18,7 @@ import pandas as pd
 from xew.config import IMPORT_PATH, ConfigError, parse
 from xew.files import demand_regular, replacing
 from xew.names import EpisodeError, check_label, check_name
-from xew.protocol import BASELINES, BODY_NAME, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES, SHARED_MOTION
+from xew.protocol import BASELINES, BODY_NAME, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES, SHARED_MOTION, unpainted_key
 from xew.statistics import find_power
 
 VARIANT = "variant"
@@ -180,12 +180,17 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
     _check_texts(path, rows)
     metrics = _read_metric_infos(path, rows.attrs["metrics"])
     names = rows["robot"].unique()
-    added = {robot for robot in names if IMPORT_PATH.fullmatch(str(robot)) or BODY_NAME.fullmatch(str(robot))}
-    known = {*ROBOT_NAMES, *added, *rows.attrs.get("robots", ()), *own_robots}
+    known = {*ROBOT_NAMES, *rows.attrs.get("robots", ()), *own_robots}
+    known |= {robot for robot in names if _is_named_by_form(unpainted_key(str(robot))) or unpainted_key(str(robot)) in known}
     wrong = _find_wrong_rows(rows, metrics, known)
     if wrong:
         raise ConfigError(f"{path} cannot be averaged over:\n{_format_wrong_rows(wrong)}\nGrade anew: {command} --overwrite")
     return Scores(rows, curves, metrics, rows.attrs)
+
+
+def _is_named_by_form(robot: str) -> bool:
+    """Does the form of a robot's name say by itself whose it is: a user's module, or a body by its number?"""
+    return bool(IMPORT_PATH.fullmatch(robot) or BODY_NAME.fullmatch(robot))
 
 
 def merge_scores(tables: Sequence[tuple[str, Path]], trainings: Sequence[int] = ()) -> Scores:

@@ -274,6 +274,8 @@ def paint_episodes(args: Args, robots: Sequence[str]) -> None:
     episodes = read_dataset(args.out).select(robots=robots, tasks=args.tasks, split="train")
     asked = [(folder, 1 + record.seed % args.paints) for folder, record in episodes]
     todo = [(folder, paint) for folder, paint in asked if not folder.with_name(painted_key(folder.name, paint)).is_dir()]
+    if not todo:
+        return
     devices = find_devices(args.device)
     with Workers(args.workers or worker_count(devices, find_device("cpu")), devices) as workers:
         compile_on_devices(workers, {"rendering": devices[0].alias}, 1)
@@ -293,6 +295,8 @@ def _check(args: Args) -> None:
         get_task(task)
     if args.workers is not None and args.workers < 1:
         raise EpisodeError(f"--workers is {args.workers}; expected at least 1, or none for as many as there are cores.")
+    if args.paints < 0:
+        raise EpisodeError(f"--paints is {args.paints}; expected a number of paints, or 0 for none.")
     if not args.tasks or not args.robots or min(args.train_seeds, args.test_seeds) < 0 or args.batch < 1:
         raise EpisodeError(
             f"nothing to make of {len(args.tasks)} tasks, {len(args.robots)} robots, {args.train_seeds} training and "

@@ -8,12 +8,13 @@ import pytest
 from tests.sim_warp.small import TASK, work_inline
 from xew.config import ConfigError
 from xew.dataset import find_accepted
-from xew.episode import episode_folder, read_record, verify_episode
+from xew.episode import EpisodeError, episode_folder, read_record, verify_episode
 from xew.protocol import painted_key, unpainted_key
 from xew.sim_warp.generate import Args, generate
 from xew.sim_warp.rendering.bodies import robot_bodies
 from xew.sim_warp.rendering.streams import home_action
 from xew.sim_warp.robots import ROBOTS, get_robot, recorded_robot
+from xew.sim_warp.robots.user.own import robot_key
 
 robots = pytest.mark.parametrize("robot", ROBOTS)
 
@@ -53,6 +54,15 @@ def test_names_of_painted_robots() -> None:
         get_robot("arx_x4_paint_1")
 
 
+def test_a_robot_of_ones_own_takes_no_painted_name() -> None:
+    assert robot_key(Path("lab/arx_x5_paint_3.urdf")) == "arx_x5_paint_3_own"
+
+
+def test_a_negative_number_of_paints_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(EpisodeError, match="--paints is -1; expected"):
+        generate(Args(tasks=(TASK,), robots=("piper",), out=tmp_path, device="cpu", paints=-1))
+
+
 def test_training_episodes_are_painted_from_their_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     work_inline(monkeypatch)
     args = Args(tasks=(TASK,), robots=("piper",), train_seeds=3, test_seeds=1, out=tmp_path, device="cpu", paints=2)
@@ -66,5 +76,6 @@ def test_training_episodes_are_painted_from_their_states(tmp_path: Path, monkeyp
         assert own.hashes["states"] == other.hashes["states"] and own.scene_hash == other.scene_hash
         assert own.hashes["rgb"] != other.hashes["rgb"] and own.hashes["robot"] != other.hashes["robot"]
     times = {folder: (folder / "episode.json").stat().st_mtime_ns for folder, _ in find_accepted(tmp_path)}
-    generate(args)
+    monkeypatch.delattr("xew.sim_warp.generate.paint_again")
+    generate(args)  # nothing is painted again
     assert times == {folder: (folder / "episode.json").stat().st_mtime_ns for folder, _ in find_accepted(tmp_path)}
