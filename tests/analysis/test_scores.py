@@ -132,7 +132,7 @@ def test_painted_robots_are_known_where_the_robot_is(tmp_path: Path) -> None:
     robots = ("piper_paint_3", "body_17_paint_1")
     path = written(tmp_path / "scores.parquet", graded(robots=robots))
     assert set(read_scores(path).rows["robot"]) == set(robots)
-    with pytest.raises(ConfigError, match="the robot is unknown, .* my_robot_paint_3"):
+    with pytest.raises(ConfigError, match=r"the robot is unknown, .* my_robot_paint_3"):
         read_scores(written(tmp_path / "scores.parquet", graded(robots=("piper", "my_robot_paint_3"))))
 
 
