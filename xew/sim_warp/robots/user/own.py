@@ -66,7 +66,7 @@ def _load(description: Path, modified: int) -> RobotSpec:
 
 
 def robot_key(description: Path) -> str:
-    """A name for folders, of a URDF file or else the folder; `_own` sets it apart from ours, painted or not, and from bodies."""
+    """A name for folders, of a URDF file or else the folder; `_own` sets it apart from ours, painted or not, and bodies."""
     name = description.stem if description.suffix == ".urdf" else description.parent.name
     key = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_-")
     if not key:
