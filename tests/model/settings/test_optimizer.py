@@ -1,5 +1,8 @@
 """Optimizers: what each keeps of a network's parameters, and how it moves them."""
 
+from dataclasses import replace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,11 +36,24 @@ def test_muon_takes_the_matrices_of_blocks_and_nothing_else(params: dict) -> Non
     assert shapes.count((8, 16)) == shapes.count((2, 6, 8)) == 2, "AdamW has two"
 
 
-def test_updates_of_muon_are_near_orthogonal_and_as_large_as_those_of_adamw(params: dict) -> None:
-    settings = TrainSettings(batch=1, steps=2, optimizer="muon", learning_rate=1.0, weight_decay=0.0)
+@pytest.mark.parametrize("mu_dtype", ["float32", "bfloat16"])
+def test_updates_of_muon_are_near_orthogonal_and_as_large_as_those_of_adamw(params: dict, mu_dtype: Any) -> None:
+    settings = TrainSettings(batch=1, steps=2, optimizer="muon", learning_rate=1.0, weight_decay=0.0, mu_dtype=mu_dtype)
     optimizer = make_optimizer(settings)
     updates, _ = optimizer.update(params, optimizer.init(params), jax.tree.map(jnp.zeros_like, params))
-    for update in updates["blocks"]["first"]["kernel"]:
+    for update in np.asarray(updates["blocks"]["first"]["kernel"], np.float32):
         values = np.linalg.svd(update, compute_uv=False)
         assert values.min() > 0.5 * values.max()
         assert np.sqrt(np.square(update).mean()) == pytest.approx(RMS_OF_ADAM, rel=0.3)
+
+
+def test_muon_computes_in_the_type_of_its_moments(params: dict) -> None:
+    """Its products are in bfloat16 where that is asked for; the updates stay near those of float32."""
+    settings = TrainSettings(batch=1, steps=2, optimizer="muon", learning_rate=1.0, weight_decay=0.0)
+    exact, rounded = (make_optimizer(replace(settings, mu_dtype=dtype)) for dtype in ("float32", "bfloat16"))
+    kept = rounded.init(params)
+    program = str(jax.make_jaxpr(rounded.update)(params, kept, params))
+    assert "bf16[2,8,8] = dot_general" in program and "f32[2,8,8] = dot_general" not in program
+    updates = [one.update(params, one.init(params), params)[0]["blocks"]["first"]["kernel"] for one in (exact, rounded)]
+    true, found = (np.asarray(update, np.float32) for update in updates)
+    assert 0 < np.linalg.norm(found - true) < 0.1 * np.linalg.norm(true)

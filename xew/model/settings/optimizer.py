@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from jax.typing import DTypeLike
 from optax.contrib import MuonDimensionNumbers, muon
 
 from xew.model.devices.sharding import path_names
@@ -30,7 +31,11 @@ al. 2025, arXiv:2502.16982, equation 4)."""
 
 
 def make_optimizer(settings: TrainSettings) -> optax.GradientTransformation:
-    """Make the optimizer of `train.optimizer` after clipping by the global norm; the first moments are in `mu_dtype`."""
+    """Make the optimizer of `train.optimizer` after clipping by the global norm; the first moments are in `mu_dtype`.
+
+    Muon makes its updates orthogonal in that type too: in bfloat16 the products take half the time, and their error is small
+    beside that of the iteration itself, which its author stops long before it converges (Jordan 2024).
+    """
     rate, decay, mu_dtype = learning_rate(settings), settings.weight_decay, jnp.dtype(settings.mu_dtype)
     if settings.optimizer == "muon":
         update = muon(
@@ -41,9 +46,21 @@ def make_optimizer(settings: TrainSettings) -> optax.GradientTransformation:
             consistent_rms=RMS_OF_ADAM,
             muon_weight_dimension_numbers=find_matrices,
         )
+        if mu_dtype != jnp.float32:
+            update = optax.chain(round_matrices(mu_dtype), update)
     else:
         update = optax.adamw(rate, weight_decay=decay, mu_dtype=mu_dtype)
     return optax.chain(optax.clip_by_global_norm(settings.clip_norm), update)
+
+
+def round_matrices(dtype: DTypeLike) -> optax.GradientTransformation:
+    """Bring the gradients of `find_matrices` to a type: optax's Muon computes in the type of its gradients and moments."""
+
+    def rounded(updates: Any, params: Any) -> Any:
+        axes = find_matrices(updates)
+        return jax.tree.map(lambda update, axis: update if axis is None else update.astype(dtype), updates, axes)
+
+    return optax.stateless(rounded)
 
 
 def find_matrices(params: Any) -> Any:

@@ -104,7 +104,8 @@ class TrainSettings(StepSettings):
     optimizer: Literal["adamw", "muon"] = "adamw"
     """AdamW as in the paper, or Muon for the matrices of the blocks and AdamW for the rest."""
     mu_dtype: Literal["float32", "bfloat16"] = "float32"
-    """Type of the optimizer's first moment; bfloat16 saves two bytes a parameter."""
+    """Type of the optimizer's first moment, and of what Muon makes orthogonal; bfloat16 saves two bytes a parameter, and
+    half the time of Muon's products."""
     shift: float = 5.0
     """Shift of the noise levels, in training and in sampling."""
     moving: float = 0.0
