@@ -38,7 +38,7 @@ from xew.model.runs.checkpoint import TrainState
 from xew.model.runs.session import open_session
 from xew.model.sampling.predict import Predictor
 from xew.model.settings.network import check_network
-from xew.model.settings.optimizer import learning_rate, make_optimizer, set_steps
+from xew.model.settings.optimizer import learning_rate, make_optimizer, set_steps, tell_stale_average
 from xew.model.training.data import ClipSource
 from xew.model.training.flops import flops_of_step
 from xew.model.training.loop import STOPPED, Meter, Timetable, run_steps
@@ -120,6 +120,8 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     source.check()
     dataset = make_dataset(source, settings.batch, settings.seed, adapt.replay, own)
     settings = set_steps(settings, source.fresh, adapt.replay)
+    if (told := tell_stale_average(settings)) and jax.process_index() == 0:
+        print(told, file=sys.stderr)
     rates = learning_rate(settings)
     learning = replace(experiment.learning, settings=settings, optimizer=make_optimizer(settings))
     learner = make_learner(learning, mesh)

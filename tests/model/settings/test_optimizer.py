@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from xew.model.settings.optimizer import RMS_OF_ADAM, find_matrices, make_optimizer
+from xew.model.settings.optimizer import RMS_OF_ADAM, find_matrices, make_optimizer, tell_stale_average
 from xew.model.settings.settings import TrainSettings
 
 SHAPES = {
@@ -57,3 +57,13 @@ def test_muon_computes_in_the_type_of_its_moments(params: dict) -> None:
     updates = [one.update(params, one.init(params), params)[0]["blocks"]["first"]["kernel"] for one in (exact, rounded)]
     true, found = (np.asarray(update, np.float32) for update in updates)
     assert 0 < np.linalg.norm(found - true) < 0.1 * np.linalg.norm(true)
+
+
+def test_an_average_that_holds_the_start_is_told() -> None:
+    """.999 to the power of 2,000 is .135; of 7,500 it is 5e-4."""
+    short = TrainSettings(batch=1, steps=2000, ema_decay=0.999)
+    said = tell_stale_average(short)
+    assert said == "train.ema_decay 0.999 leaves 14 % of the start in the average of 2000 steps; 0.9977 would leave 1 %"
+    assert tell_stale_average(replace(short, ema_decay=0.9977)) is None
+    assert tell_stale_average(replace(short, steps=7500)) is None
+    assert tell_stale_average(replace(short, ema_decay=0.0)) is None

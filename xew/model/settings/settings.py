@@ -85,7 +85,8 @@ class StepSettings:
     clip_norm: float = 1.0
     """Largest global norm of the gradients; larger ones are scaled down to it."""
     ema_decay: float = 0.0
-    """Decay of the moving average of the parameters; 0 keeps none."""
+    """Decay of the moving average of the parameters; 0 keeps none. It reaches over 1 / (1 - decay) steps: a tenth of the
+    training is enough, and where that is half of it the average still holds the random start."""
     log_every: int = 20
     save_every: int = 1000
     sample_every: int = 1000
