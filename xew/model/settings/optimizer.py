@@ -81,7 +81,7 @@ def find_matrices(params: Any) -> Any:
 
 
 def tell_stale_average(settings: TrainSettings) -> str | None:
-    """What to tell of an average of parameters that still holds the start at the end of the training; None where it does not."""
+    """What to tell of an average of parameters that holds the start at the end of the training; None where it does not."""
     left = settings.ema_decay**settings.steps if settings.ema_decay else 0.0
     if left <= MOST_OF_THE_START:
         return None
