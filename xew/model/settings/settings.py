@@ -85,8 +85,8 @@ class StepSettings:
     clip_norm: float = 1.0
     """Largest global norm of the gradients; larger ones are scaled down to it."""
     ema_decay: float = 0.0
-    """Decay of the moving average of the parameters; 0 keeps none. It reaches over 1 / (1 - decay) steps: a tenth of the
-    training is enough, and where that is half of it the average still holds the random start."""
+    """Decay of the moving average of the parameters; 0 keeps none. It reaches over 1 / (1 - decay) steps, of which a tenth of the
+    training is enough: that of `train` begins with the start's parameters, and of a longer one they are still a part."""
     log_every: int = 20
     save_every: int = 1000
     sample_every: int = 1000
@@ -106,7 +106,7 @@ class TrainSettings(StepSettings):
     """AdamW as in the paper, or Muon for the matrices of the blocks and AdamW for the rest."""
     mu_dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the optimizer's first moment, and of what Muon makes orthogonal; bfloat16 saves two bytes a parameter, and
-    half the time of Muon's products."""
+    some of the time of Muon's products (docs/performance.md)."""
     shift: float = 5.0
     """Shift of the noise levels, in training and in sampling."""
     moving: float = 0.0
