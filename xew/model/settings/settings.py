@@ -85,8 +85,8 @@ class StepSettings:
     clip_norm: float = 1.0
     """Largest global norm of the gradients; larger ones are scaled down to it."""
     ema_decay: float = 0.0
-    """Decay of the moving average of the parameters; 0 keeps none. It reaches over 1 / (1 - decay) steps, of which a tenth of the
-    training is enough: that of `train` begins with the start's parameters, and of a longer one they are still a part."""
+    """Decay of the moving average of the parameters; 0 keeps none. It reaches over 1 / (1 - decay) steps, for which a tenth of
+    the training is enough: that of `train` begins with the start's parameters, which stay a part of a longer one."""
     log_every: int = 20
     save_every: int = 1000
     sample_every: int = 1000
