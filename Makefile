@@ -18,7 +18,7 @@ STAMP := .venv/.installed
 REFERENCE := .venv/.reference
 DOCS := .venv/.docs
 
-.PHONY: setup demo test test-fast test-faults test-fresh docs lint clean
+.PHONY: setup demo test test-lab test-fast test-faults test-fresh docs lint clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
@@ -41,10 +41,13 @@ TESTS ?=
 PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 test: $(REFERENCE)
-	$(PYTEST) $(TESTS)
+	$(PYTEST) -m "not lab" $(TESTS)
+
+test-lab: $(REFERENCE)
+	$(PYTEST) -m lab $(TESTS)
 
 test-fast: $(STAMP)
-	$(PYTEST) -m "not slow" $(TESTS)
+	$(PYTEST) -m "not slow and not lab" $(TESTS)
 
 test-faults: $(STAMP)
 	XEW_ALL_FAULTS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/faults
