@@ -37,6 +37,8 @@ CONFIGS = Path(__file__).parent / "configs"
 """Folder of the configs that come with xew; in the repository a link to the folder at its root."""
 PACKAGED = "xew:"
 """Beginning of the names of configs that come with xew."""
+BASE = "base"
+"""Key of a config that names the config that it changes."""
 LARGEST = 2**63 - 1
 """Largest whole number of a config."""
 IMPORT_PATH = re.compile(r"([^\W\d]\w*(?:\.[^\W\d]\w*)*):[^\W\d]\w*")
@@ -96,18 +98,50 @@ def is_packaged(path: Path) -> bool:
 
 
 def read_yaml(path: Path | str) -> Any:
-    """The content of a YAML file, which may be one that comes with xew. Raises ConfigError if it is missing or not YAML."""
+    """The content of a YAML file, which may be one that comes with xew, on top of the config that its key `base` names.
+
+    `base: fixed.yaml` is a path from the file's own folder, or `xew:NAME`. The file's keys replace those of its base, section by
+    section. A base has no base itself.
+
+    Raises:
+        ConfigError: a file is missing or not YAML, or the base has a base.
+    """
     path = find_config(path)
+    content = _read_content(path)
+    if not isinstance(content, Mapping) or BASE not in content:
+        return content
+    changes = dict(content)
+    base = changes.pop(BASE)
+    if not isinstance(base, str):
+        raise ConfigError(f"{path}: {BASE} is {base!r}; expected the path of a config from this folder, or xew:NAME.")
+    below = _read_content(find_config(base if is_packaged(base) else path.parent / base))
+    if not isinstance(below, Mapping):
+        raise ConfigError(f"{path}: its base {base} has no keys and values.")
+    if BASE in below:
+        raise ConfigError(f"{path}: its base {base} has the base {below[BASE]}; name that, since there is one level only.")
+    return merge_settings(below, changes)
+
+
+def _read_content(path: Path) -> Any:
     try:
         return yaml.safe_load(demand_regular(path).read_text())
     except OSError as error:
-        beside = sorted(str(p) for p in path.parent.glob("*.yaml"))
-        known = f" There is: {', '.join(beside)}." if beside else ""
+        siblings = sorted(str(p) for p in path.parent.glob("*.yaml"))
+        known = f" There is: {', '.join(siblings)}." if siblings else ""
         raise ConfigError(f"cannot read the config {path}: {error.strerror or error}.{known}") from error
     except RecursionError as error:
         raise ConfigError(f"{path} is nested too deeply for a config.") from error
     except (yaml.YAMLError, ValueError) as error:
         raise ConfigError(f"{path} is not YAML: {error}") from error
+
+
+def merge_settings(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge nested settings; where both have a key, `above` wins."""
+    merged = dict(below)
+    for key, value in above.items():
+        both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
+        merged[key] = merge_settings(merged[key], value) if both else value
+    return merged
 
 
 def parse(cls: type[T], content: Any, source: str) -> T:

@@ -69,6 +69,32 @@ def test_mistakes_are_named(tmp_path: Path, text: str, said: str) -> None:
     assert said in str(error.value)
 
 
+def test_a_config_changes_its_base(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text("name: x\ninner: {depth: 4, names: [a, b]}")
+    path = write(tmp_path, "base: base.yaml\ninner: {names: [c]}")
+    assert config.load(Outer, path) == Outer("x", Inner(4, names=("c",)))
+    config.save(config.load(Outer, path), tmp_path / "saved.yaml")
+    assert "base" not in (tmp_path / "saved.yaml").read_text(), "a saved config is resolved"
+    (tmp_path / "variants").mkdir()
+    assert config.load(Outer, write(tmp_path / "variants", "base: ../base.yaml\nname: y")) == Outer(
+        "y", Inner(4, names=("a", "b"))
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("base: config.yaml", "has the base config.yaml; name that, since there is one level only"),
+        ("base: nowhere.yaml", "cannot read the config .*nowhere.yaml"),
+        ("base: 3", "base is 3; expected the path of a config"),
+        ("base: xew:fixd", "did you mean 'fixed'"),
+    ],
+)
+def test_mistakes_of_a_base_are_named(text: str, said: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=said):
+        config.read_yaml(write(tmp_path, text))
+
+
 def test_all_mistakes_at_once(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as error:
         config.load(Outer, write(tmp_path, "inner: {depth: x, rate: y}"))

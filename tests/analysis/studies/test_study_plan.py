@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 import xew
-from xew.analysis.studies.config import Study, build_experiment, check_study, load_study, merge_settings, run_folder
+from xew.analysis.studies.config import Study, build_experiment, check_study, load_study, run_folder
 from xew.analysis.studies.cost import (
     correct_by_ledger,
     count_optimizer_steps,
@@ -23,7 +23,7 @@ from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import ThisMachine
 from xew.analysis.studies.plan import Step, plan, sort_steps, source_digest, step_key
 from xew.analysis.study_analyse import format_coverage
-from xew.config import ConfigError
+from xew.config import ConfigError, merge_settings
 from xew.protocol import PAPER_PARTS, PARTS, VARIANTS, expand_robots
 
 CONFIGS = Path(__file__).parents[3] / "configs"

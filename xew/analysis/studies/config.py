@@ -7,12 +7,12 @@ and conditioning of each variant follow from the protocol.
 
 import fnmatch
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from xew.config import ConfigError, check_finite, load, read_yaml, suggestion
+from xew.config import ConfigError, check_finite, load, merge_settings, read_yaml, suggestion
 from xew.protocol import (
     MOTIONS,
     PAPER_PARTS,
@@ -375,12 +375,3 @@ def has_fitted_codec(experiment: Settings) -> bool:
 def run_folder(study: Study, variant: Variant) -> Path:
     """Folder that the training of a variant writes."""
     return study.out / "runs" / variant.name
-
-
-def merge_settings(below: Mapping[str, Any], above: Mapping[str, Any]) -> Settings:
-    """Merge nested settings; where both have a key, `above` wins."""
-    result = dict(below)
-    for key, value in above.items():
-        both = isinstance(value, Mapping) and isinstance(result.get(key), Mapping)
-        result[key] = merge_settings(result[key], value) if both else value
-    return result
