@@ -100,8 +100,8 @@ def is_packaged(path: Path) -> bool:
 def read_yaml(path: Path | str) -> Any:
     """The content of a YAML file, which may be one that comes with xew, on top of the config that its key `base` names.
 
-    `base: fixed.yaml` is a path from the file's own folder, or `xew:NAME`. The file's keys replace those of its base, section by
-    section. A base has no base itself.
+    `base: fixed.yaml` is a path from the file's own folder, or `xew:NAME`. The file's keys replace those of its base, section
+    by section. A base has no base itself.
 
     Raises:
         ConfigError: a file is missing or not YAML, or the base has a base.
