@@ -20,19 +20,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, TypeVar
 
+import numpy as np
 import tyro
 from tqdm import tqdm
 
 from xew.config import ConfigError, user_errors
-from xew.episode import complete_folder
-from xew.files import hold_lock
+from xew.episode import complete_folder, encode_png
+from xew.files import hold_lock, write_bytes
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
+from xew.sim_warp.kinematics.reachability import work_reach
 from xew.sim_warp.rendering.streams import nine_views
 from xew.sim_warp.robots import ROBOTS
-from xew.sim_warp.robots.reach import work_reach
-from xew.sim_warp.robots.sheet import save, sheet
 from xew.sim_warp.robots.user.draft import OWN, RobotDraft, find_description, read_draft
 from xew.sim_warp.robots.user.hands import graft_hand, slide_fingers
 from xew.sim_warp.robots.user.infer import complete_arms
@@ -61,8 +61,6 @@ class Args:
     """Robot of the project whose hand is put on the arm in place of what moves beyond its last joint: ur5_wsg, franka_panda."""
     last_joint: str | None = None
     """Name of the arm's last joint, for --hand; default: the last before one that carries two joints, or of all."""
-    sheet: bool = True
-    """Draw nine views."""
 
 
 def adopt(args: Args) -> Path:
@@ -98,13 +96,17 @@ def adopt(args: Args) -> Path:
         reach = [float(work_reach(robot, arm).mean()) for arm in (0, 1)]
         begin(5)
         _write(robot, draft, folder)
-        if args.sheet:
-            save(args.out / f"{key}.png", sheet(nine_views(load_robot(folder))))
+        write_bytes(args.out / f"{key}.png", encode_png(view_sheet(nine_views(load_robot(folder)))))
         bar.update()
     print("\n".join(robot_lines(robot, problems, reach)))
     for note in notes:
         print(f"note: {note}")
     return folder
+
+
+def view_sheet(views: np.ndarray) -> np.ndarray:
+    """Nine images [9 h w 3] as three rows of three, [3h 3w 3]."""
+    return np.vstack([np.hstack(list(views[row : row + 3])) for row in (0, 3, 6)])
 
 
 def _pairs(given: Sequence[str], kind: Callable[[str], Value]) -> dict[str, Value]:
