@@ -1,7 +1,7 @@
 """Reading URDFs: `load_urdf(path)` gives links, joints, colored meshes and convex collision shapes.
 
 yourdfpy parses the XML, trimesh the mesh files; what comes out is a small tree of our own, so that the rest of the
-room knows neither. Units are meters, kilograms and radians; every shape is in the frame of its link.
+package knows neither. Units are meters, kilograms and radians; every shape is in the frame of its link.
 """
 
 import math
@@ -119,9 +119,9 @@ class Urdf:
             below.setdefault(joint.parent, []).append(joint)
         ordered, links = [], [self.root]
         while links:
-            found = below.get(links.pop(), [])
-            ordered += found
-            links += [joint.child for joint in found]
+            joints = below.get(links.pop(), [])
+            ordered += joints
+            links += [joint.child for joint in joints]
         return tuple(ordered)
 
     def chain(self, link: str) -> tuple[Joint, ...]:
@@ -132,6 +132,10 @@ class Urdf:
             path.append(above[link])
             link = above[link].parent
         return tuple(reversed(path))
+
+    def moved_links(self, joint: str) -> list[Link]:
+        """The links that a joint moves."""
+        return [link for link in self.links.values() if joint in [above.name for above in self.chain(link.name)]]
 
 
 def load_urdf(path: Path | str) -> Urdf:
