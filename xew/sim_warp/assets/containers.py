@@ -85,6 +85,24 @@ def column(radii: tuple[float, float], low: float, high: float, sides: int) -> n
     return np.concatenate(ends).astype(np.float32)
 
 
+def ring(radius: float, sides: int, z: float) -> np.ndarray:
+    """[sides 3] corners of a polygon about z whose inscribed circle has `radius` [m]; a flat side faces +x."""
+    angle = (np.arange(sides) + 0.5) * 2 * np.pi / sides
+    outer = radius / np.cos(np.pi / sides)
+    return np.column_stack([outer * np.cos(angle), outer * np.sin(angle), np.full(sides, z)])
+
+
+def walls(size: tuple[float, float], thickness: float, height: float, color: Color, z: float = 0.0) -> list[Shape]:
+    """Four upright walls along the edges of a rectangle of outer `size` x y [m], standing at height `z`."""
+    width, depth = size
+    front = objects.block((width, thickness, height), color)
+    side = objects.block((thickness, depth - 2 * thickness, height), color)
+    return [
+        *(objects.move(front, (0, sign * (depth - thickness) / 2, z)) for sign in (-1, 1)),
+        *(objects.move(side, (sign * (width - thickness) / 2, 0, z)) for sign in (-1, 1)),
+    ]
+
+
 def center_of_mass(shape: Shape) -> np.ndarray:
     """[3] center of mass [m] of a shape's convex pieces, all of one density."""
     pieces = [trimesh.convex.convex_hull(np.asarray(points, float)) for points in shape.hulls]
