@@ -108,9 +108,7 @@ def _inertial(boxes: Sequence[Box]) -> ElementTree.Element:
 def _revolute(index: int, joint: JointDesign) -> ElementTree.Element:
     parent = "base_link" if index == 0 else f"link{index}"
     element = _joint(f"joint{index + 1}", "revolute", parent, f"link{index + 1}", joint.origin, joint.axis)
-    limits = {"lower": joint.lower, "upper": joint.upper, "velocity": SPEED[index], "effort": EFFORT}
-    ElementTree.SubElement(element, "limit", {name: _numbers([value]) for name, value in limits.items()})
-    return element
+    return _limited(element, joint.lower, joint.upper, SPEED[index], EFFORT)
 
 
 def _prismatic(design: BodyDesign, name: str, side: int) -> ElementTree.Element:
@@ -118,9 +116,14 @@ def _prismatic(design: BodyDesign, name: str, side: int) -> ElementTree.Element:
     origin = (round(x + design.hand.palm[0], 6), y, z)
     parent = f"link{len(design.joints)}"
     element = _joint(f"{name}_finger_joint", "prismatic", parent, f"{name}_finger", origin, (0.0, float(side), 0.0))
-    limits = {"lower": 0.0, "upper": design.hand.stroke, "velocity": FINGER_SPEED, "effort": FINGER_EFFORT}
-    ElementTree.SubElement(element, "limit", {key: _numbers([value]) for key, value in limits.items()})
-    return element
+    return _limited(element, 0.0, design.hand.stroke, FINGER_SPEED, FINGER_EFFORT)
+
+
+def _limited(joint: ElementTree.Element, lower: float, upper: float, velocity: float, effort: float) -> ElementTree.Element:
+    """The joint with limits."""
+    limits = {"lower": lower, "upper": upper, "velocity": velocity, "effort": effort}
+    ElementTree.SubElement(joint, "limit", {name: _numbers([value]) for name, value in limits.items()})
+    return joint
 
 
 def _joint(name: str, kind: str, parent: str, child: str, origin: Vector, axis: Vector) -> ElementTree.Element:

@@ -18,6 +18,8 @@ from xew.sim_warp.geometry.poses import Pose
 
 OWN, ROBOTWIN = "robot.yaml", "config.yml"
 """Names of the file that describes a robot in our own way, and in RoboTwin's."""
+Near = tuple[np.ndarray | None, np.ndarray | None]
+"""Postures [d] rad near which homes of the left and right arm are sought; None is near the joints' zero."""
 
 
 @dataclass(frozen=True)

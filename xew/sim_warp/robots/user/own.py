@@ -29,7 +29,7 @@ from xew.names import EpisodeError, check_name, path_below
 from xew.protocol import BODY_NAME, PAINTED_NAME, ROBOT_NAMES, expand_robots
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
-from xew.sim_warp.robots.user.draft import OWN, ArmDraft, RobotDraft, find_description, read_draft
+from xew.sim_warp.robots.user.draft import OWN, ArmDraft, Near, RobotDraft, find_description, read_draft
 from xew.sim_warp.robots.user.infer import check_own_motion, complete_arms, complete_limits, fill_right_arm
 
 FOLDERS = "XEW_ROBOTS"
@@ -124,7 +124,7 @@ def _settle(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
     return placed
 
 
-def _find_place(draft: RobotDraft, robot: RobotSpec, near: tuple[np.ndarray | None, np.ndarray | None]) -> RobotSpec:
+def _find_place(draft: RobotDraft, robot: RobotSpec, near: Near) -> RobotSpec:
     """The robot with bases and homes, searched for near postures [d] rad."""
     from xew.sim_warp.robots.user import placement
 

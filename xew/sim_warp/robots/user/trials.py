@@ -22,6 +22,7 @@ from xew.sim_warp.kinematics.forward import link_matrices
 from xew.sim_warp.kinematics.inverse import ArmSolver, arm_bases
 from xew.sim_warp.kinematics.reachability import GRASP_TILT, radial_yaw
 from xew.sim_warp.plan import ASIDE, HOME, Tool, ToolPath, tool
+from xew.sim_warp.robots.user.draft import Near
 from xew.sim_warp.scene import scene_rng
 from xew.sim_warp.stage import TABLE_SIZE, TABLE_TOP
 from xew.sim_warp.tasks import TASKS
@@ -101,11 +102,11 @@ class Trials:
         errors = solution.position_error.reshape(shape), solution.rotation_error.reshape(shape)
         return solution.joint_pos.reshape(*shape, -1), *errors
 
-    def find_homes(self, near: tuple[np.ndarray | None, np.ndarray | None], seeds: int, most: int) -> Postures:
+    def find_homes(self, near: Near, seeds: int, most: int) -> Postures:
         """Postures that bring the tools home, at most so many an arm of a candidate, the nearest to `near` first.
 
         Args:
-            near: posture [d] rad that each arm would like to be near; None is near the joints' zero.
+            near: preferred postures.
             seeds: number of postures from which the search begins.
             most: number of postures that are kept.
         """
@@ -113,7 +114,7 @@ class Trials:
         rows = rows[_are_home(position, rotation)]
         return self._choose(rows[self._is_clear(rows)], near, most)
 
-    def find_miss(self, near: tuple[np.ndarray | None, np.ndarray | None], seeds: int) -> str:
+    def find_miss(self, near: Near, seeds: int) -> str:
         """Why the candidates have no home, in words that follow a colon; `near` are postures [d] rad as in `find_homes`."""
         rows, position, rotation = self._search_homes(near, seeds)
         for arm in (0, 1):
@@ -124,9 +125,7 @@ class Trials:
                 return f"the nearest of the {('left', 'right')[arm]} arm is {off}"
         return "a link would stand in the table or on the other arm's side"
 
-    def _search_homes(
-        self, near: tuple[np.ndarray | None, np.ndarray | None], seeds: int
-    ) -> tuple[Postures, np.ndarray, np.ndarray]:
+    def _search_homes(self, near: Near, seeds: int) -> tuple[Postures, np.ndarray, np.ndarray]:
         """Postures from all starts of both arms of all candidates, and how far from home [e] m and rad they leave the tool."""
         starts = [_start_postures(self.candidates[0], wanted, seeds) for wanted in near]
         pairs = np.array(list(product(range(len(self.candidates)), (0, 1))))
@@ -136,7 +135,7 @@ class Trials:
         every = Postures(rows.candidate.repeat(seeds), rows.arm.repeat(seeds), joint_pos.reshape(-1, joint_pos.shape[-1]))
         return every, position.ravel(), rotation.ravel()
 
-    def _choose(self, rows: Postures, near: tuple[np.ndarray | None, np.ndarray | None], most: int) -> Postures:
+    def _choose(self, rows: Postures, near: Near, most: int) -> Postures:
         """The postures of each arm that differ by more than 0.1 rad, with room to the limits where there are such."""
         lower, upper = self.solver.lower, self.solver.upper
         wanted = [np.zeros(len(lower)) if posture is None else posture for posture in near]
