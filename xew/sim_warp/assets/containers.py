@@ -24,7 +24,13 @@ METAL: Color = (190, 192, 196)
 PAPER: Color = (240, 238, 230)
 WHITE: Color = (238, 240, 242)
 DARK: Color = (48, 48, 52)
-AMBER: Color = (214, 120, 30)
+PILL_COLORS: tuple[tuple[str, Color], ...] = (
+    ("orange", (214, 120, 30)),
+    ("white", WHITE),
+    ("brown", (110, 66, 38)),
+    ("green", (70, 130, 90)),
+    ("blue", (70, 110, 180)),
+)
 
 SECTIONS = 32
 """Number of facets round a body of revolution."""
@@ -151,7 +157,7 @@ def pill_bottle(rng: np.random.Generator) -> tuple[Shape, str]:
     """A short bottle with a wide screw cap, and the name of its body's color: radius 23 to 27 mm, 80 to 100 mm high."""
     radius, top = rng.uniform([0.023, 0.080], [0.027, 0.100])
     cap = rng.uniform(0.018, 0.023)
-    name, color = _pill_colors()[rng.integers(len(_pill_colors()))]
+    name, color = PILL_COLORS[rng.integers(len(PILL_COLORS))]
     lid = [WHITE, WHITE, objects.PALETTE["red"], objects.PALETTE["blue"], DARK][rng.integers(5)]
     stripe = objects.PALETTE[draw_color_names(rng, 1)[0]]
     low, high = 0.012, top - cap - 0.014
@@ -172,10 +178,6 @@ def pill_bottle(rng: np.random.Generator) -> tuple[Shape, str]:
     body = revolve_painted(outline, color, bands, rng.uniform(-np.pi, np.pi))
     ribs = [_rib(radius, angle, top - cap + 0.003, top - 0.004, lid) for angle in np.arange(24) * np.pi / 12]
     return Shape(meshes.merge([body, *ribs]), (column((radius, radius), 0.0, top, SIDES),)), name
-
-
-def _pill_colors() -> list[tuple[str, Color]]:
-    return [("orange", AMBER), ("white", WHITE), ("brown", (110, 66, 38)), ("green", (70, 130, 90)), ("blue", (70, 110, 180))]
 
 
 def _rib(radius: float, angle: float, low: float, high: float, color: Color) -> Mesh:

@@ -76,25 +76,26 @@ def adopt(args: Args) -> Path:
         tqdm(total=len(STAGES), desc=STAGES[0], unit="stage") as bar,
         tempfile.TemporaryDirectory() as work,
     ):
+        following = iter(STAGES[1:])
 
-        def begin(stage: int) -> None:
-            bar.update(stage - bar.n)
-            bar.set_description(STAGES[stage])
+        def end_stage() -> None:
+            bar.update()
+            bar.set_description(next(following, STAGES[-1]))
 
         tree = read_description(source.parent / draft.urdf, _pairs(args.package, Path), _pairs(args.argument, str))
-        begin(1)
+        end_stage()
         urdf, notes = _normalize(tree, draft, args, Path(work), str(source))
-        begin(2)
+        end_stage()
         robot = complete_draft(draft, urdf, key, str(source))
         notes += warning_lines(robot)
-        begin(3)
+        end_stage()
         problems = check_plans(robot).problems
-        begin(4)
+        end_stage()
         reach = [float(work_reach(robot, arm).mean()) for arm in (0, 1)]
-        begin(5)
+        end_stage()
         write_robot(robot, folder, commented_yaml(robot, draft, urdf_name(robot)))
         write_bytes(args.out / f"{key}.png", encode_png(view_sheet(nine_views(load_robot(folder)))))
-        bar.update()
+        end_stage()
     print("\n".join(robot_lines(robot, problems, reach)))
     for note in notes:
         print(f"note: {note}")

@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from xew.sim_warp import objects
+from xew.sim_warp.geometry.poses import Pose
 from xew.sim_warp.plan import Timeline, tool
 from xew.sim_warp.scene import Point, Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
@@ -24,21 +25,23 @@ GRASP_BELOW_TOP = 0.014
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
     half = rng.uniform(0.015, 0.025)
-    targets = [(rng.uniform(low, high), 0.0) for low, high in ((-0.09, -0.08), (-0.01, 0.01), (0.08, 0.09))]
+    targets = [rng.uniform(low, high) for low, high in ((-0.09, -0.08), (-0.01, 0.01), (0.08, 0.09))]
     row = rng.uniform(-0.2, -0.1)
     starts = draw_starts(rng, is_free)
     yaws = rng.uniform(-0.75, 0.75, 3)
     blocks = tuple(
-        SceneObject(
-            f"{color}_block",
-            objects.block((2 * half,) * 3, objects.PALETTE[color]),
-            upright(start, TABLE_TOP, yaw),
-            mass=float(400 * (2 * half) ** 3),
-        )
+        cube(f"{color}_block", half, color, 400, upright(start, TABLE_TOP, yaw))
         for color, start, yaw in zip(COLORS, starts, yaws, strict=True)
     )
-    row_places = {f"{color}_block": (float(x), float(row)) for color, (x, _) in zip(COLORS, targets, strict=True)}
-    return Scene("blocks_ranking_rgb", seed, blocks, targets=row_places)
+    row_targets = {block.name: (float(x), float(row)) for block, x in zip(blocks, targets, strict=True)}
+    return Scene("blocks_ranking_rgb", seed, blocks, targets=row_targets)
+
+
+def cube(name: str, half: float, color: str, density: float, pose: Pose) -> SceneObject:
+    """A block of half an edge `half` [m], a color's name and a density [kg/m^3]."""
+    return SceneObject(
+        name, objects.block((2 * half,) * 3, objects.PALETTE[color]), pose, mass=float(density * (2 * half) ** 3)
+    )
 
 
 def draw_starts(
@@ -85,7 +88,8 @@ def move_block(timeline: Timeline, block: SceneObject, target: Point, *, opening
 
 
 def success(scene: Scene, now: Moment) -> bool:
-    return are_in_order(now.object_pose[[scene.index(f"{color}_block") for color in COLORS], :2]) and now.both_open
+    """Do all objects of the scene, which are the blocks from left to right, stand in order?"""
+    return are_in_order(now.object_pose[:, :2]) and now.both_open
 
 
 TASK = Task(

@@ -12,10 +12,10 @@ import numpy as np
 
 from xew.sim_warp import objects
 from xew.sim_warp.plan import Timeline
-from xew.sim_warp.scene import Scene, SceneObject, upright
+from xew.sim_warp.scene import Scene, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.blocks_ranking_rgb import are_in_order, draw_starts, is_free, move_block
-from xew.sim_warp.tasks.task import Moment, Task, opening_for
+from xew.sim_warp.tasks.blocks_ranking_rgb import cube, draw_starts, is_free, move_block, success
+from xew.sim_warp.tasks.task import Task, opening_for
 
 SIZES = {"large": (0.028, 0.031), "medium": (0.023, 0.026), "small": (0.018, 0.021)}
 """Half edges [m], from the left end of the row to the right."""
@@ -31,16 +31,11 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     yaws = rng.uniform(-0.75, 0.75, 3)
     colors = [str(color) for color in rng.permutation(sorted(objects.PALETTE))]
     blocks = tuple(
-        SceneObject(
-            f"{size}_block",
-            objects.block((2 * half,) * 3, objects.PALETTE[color]),
-            upright(start, TABLE_TOP, yaw),
-            mass=float(700 * (2 * half) ** 3),
-        )
+        cube(f"{size}_block", half, color, 700, upright(start, TABLE_TOP, yaw))
         for size, half, color, start, yaw in zip(SIZES, halves, colors, starts, yaws, strict=False)
     )
-    row_places = {f"{size}_block": (float(x), float(y)) for size, (x, y) in zip(SIZES, targets, strict=True)}
-    return Scene("blocks_ranking_size", seed, blocks, words=dict(zip(SIZES, colors, strict=False)), targets=row_places)
+    row_targets = {block.name: (float(x), float(y)) for block, (x, y) in zip(blocks, targets, strict=True)}
+    return Scene("blocks_ranking_size", seed, blocks, words=dict(zip(SIZES, colors, strict=False)), targets=row_targets)
 
 
 def _is_free(point: np.ndarray, others: list[np.ndarray], targets: list[np.ndarray]) -> bool:
@@ -56,10 +51,6 @@ def plan(scene: Scene) -> Timeline:
         target = scene.targets[block.name]
         move_block(timeline, block, target, opening=opening_for(width, 0.020), release=opening_for(width))
     return timeline
-
-
-def success(scene: Scene, now: Moment) -> bool:
-    return are_in_order(now.object_pose[[scene.index(f"{size}_block") for size in SIZES], :2]) and now.both_open
 
 
 TASK = Task(

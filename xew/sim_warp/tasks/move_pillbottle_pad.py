@@ -12,7 +12,7 @@ from xew.sim_warp.assets import containers, household
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, carry, is_upright, radial_turn
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, carry, is_upright, point_above, radial_turn
 
 PAD = 0.08
 """Side of the pad [m]."""
@@ -37,7 +37,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 def plan(scene: Scene) -> Timeline:
     bottle, pad = scene.object("bottle"), scene.object("pad")
-    goal = np.array(pad.pose[:3]) + [0, 0, household.MAT_THICKNESS]
+    goal = point_above(pad, household.MAT_THICKNESS)
     timeline = Timeline()
     carry(timeline, bottle, goal, radial_turn(arm_for(bottle.pose[0]), bottle.pose, goal), lift=0.06, tilt=GRASP_TILT)
     return timeline

@@ -17,7 +17,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, aside_poses, pick, place, radial_turn, radial_yaw
+from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, aside_poses, pick, place, point_above, radial_turn, radial_yaw
 
 TRAY = (0.30, 0.19)
 """Outer size of the tray [m]."""
@@ -129,7 +129,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 def spots(scene: Scene) -> dict[str, np.ndarray]:
     """Where burger and fries go on the tray's floor, [3] world."""
-    middle = np.array(scene.object("tray").pose[:3]) + [0, 0, TRAY_FLOOR]
+    middle = point_above(scene.object("tray"), TRAY_FLOOR)
     return {"burger": middle - [SPOT, 0, 0], "fries": middle + [SPOT, 0, 0]}
 
 

@@ -15,7 +15,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, carry_by_rim, vessel_pose
+from xew.sim_warp.tasks.task import Moment, Task, carry_by_rim, point_above, vessel_pose
 
 WALL = 0.005
 RIM_DEPTH = 0.007
@@ -67,7 +67,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 
 def plan(scene: Scene) -> Timeline:
-    goal = np.array(scene.object("plate").pose[:3]) + [0, 0, WALL + 0.002]
+    goal = point_above(scene.object("plate"), WALL + 0.002)
     timeline = Timeline()
     carry_by_rim(timeline, scene.object("container"), goal, WALL, RIM_DEPTH)
     return timeline

@@ -23,7 +23,19 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool, tool
 from xew.sim_warp.scene import Grasp, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import HOVER, Moment, Task, aside_poses, grasp_of, object_axis, opening_for, pick, place, side_sign
+from xew.sim_warp.tasks.task import (
+    HOVER,
+    Moment,
+    Task,
+    aside_poses,
+    grasp_of,
+    object_axis,
+    opening_for,
+    pick,
+    place,
+    point_above,
+    side_sign,
+)
 
 BOX = (0.0, -0.14)
 BOX_SIZE = (0.236, 0.214)
@@ -155,7 +167,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 def slots(scene: Scene) -> dict[str, np.ndarray]:
     """Where the shoes stand in the box, [3] world."""
-    middle = np.array(scene.object("box").pose[:3]) + [0, 0, FLOOR]
+    middle = point_above(scene.object("box"), FLOOR)
     return {"left_shoe": middle - [0, SLOT, 0], "right_shoe": middle + [0, SLOT, 0]}
 
 

@@ -12,7 +12,7 @@ from xew.sim_warp import objects
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, carry_by_rim, vessel_pose
+from xew.sim_warp.tasks.task import Moment, Task, carry_by_rim, point_above, vessel_pose
 
 COASTER_HEIGHT = 0.008
 WALL = 0.005
@@ -40,14 +40,14 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 
 def plan(scene: Scene) -> Timeline:
-    goal = np.array(scene.object("coaster").pose[:3]) + [0, 0, COASTER_HEIGHT + 0.002]
+    goal = point_above(scene.object("coaster"), COASTER_HEIGHT + 0.002)
     timeline = Timeline()
     carry_by_rim(timeline, scene.object("cup"), goal, WALL, RIM_DEPTH)
     return timeline
 
 
 def success(scene: Scene, now: Moment) -> bool:
-    goal = np.array(scene.object("coaster").pose[:3]) + [0, 0, COASTER_HEIGHT]
+    goal = point_above(scene.object("coaster"), COASTER_HEIGHT)
     offset = now.object_pose[scene.index("cup"), :3] - goal
     return bool(np.hypot(*offset[:2]) < 0.035 and abs(offset[2]) < 0.015 and now.both_open)
 

@@ -13,7 +13,7 @@ from xew.sim_warp.assets import household
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, aligning_turn, carry, graspable_yaw, object_axis
+from xew.sim_warp.tasks.task import Moment, Task, aligning_turn, carry, graspable_yaw, object_axis, point_above
 
 MAT = (0.07, 0.13)
 
@@ -38,7 +38,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 def plan(scene: Scene) -> Timeline:
     mouse, mat = scene.object("mouse"), scene.object("mat")
-    goal = np.array(mat.pose[:3]) + [0, 0, household.MAT_THICKNESS]
+    goal = point_above(mat, household.MAT_THICKNESS)
     timeline = Timeline()
     carry(timeline, mouse, goal, aligning_turn(mouse, goal, 0.0))
     return timeline

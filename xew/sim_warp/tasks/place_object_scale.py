@@ -17,7 +17,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, carry, draw_pair, easy_turn, graspable_yaw
+from xew.sim_warp.tasks.task import Moment, Task, carry, draw_pair, easy_turn, graspable_yaw, point_above
 
 KINDS = ("mouse", "stapler", "bell")
 GAP = 0.02
@@ -67,7 +67,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 def pan_center(scene: Scene) -> np.ndarray:
     """[3] the middle of the pan's upper face, world [m]."""
     scale = scene.object("scale")
-    return np.array(scale.pose[:3]) + [0, 0, scale.shape.mesh.vertices[:, 2].max()]
+    return point_above(scale, scale.shape.mesh.vertices[:, 2].max())
 
 
 def plan(scene: Scene) -> Timeline:

@@ -18,7 +18,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, carry, draw_pair, easy_turn, graspable_yaw
+from xew.sim_warp.tasks.task import Moment, Task, carry, draw_pair, easy_turn, graspable_yaw, point_above
 
 KINDS = ("bell", "mouse", "remote", "rubik_cube", "stapler", "toy_car")
 COLORS = ("black", "gray", "teal", "purple", "blue", "green")
@@ -77,7 +77,7 @@ def top_height(scene: Scene) -> float:
 
 
 def plan(scene: Scene) -> Timeline:
-    thing, goal = scene.object("thing"), np.array(scene.object("stand").pose[:3]) + [0, 0, top_height(scene)]
+    thing, goal = scene.object("thing"), point_above(scene.object("stand"), top_height(scene))
     timeline = Timeline()
     carry(timeline, thing, goal, easy_turn(thing, goal))
     return timeline

@@ -70,6 +70,11 @@ class Task:
     """Function (scene, moment) -> is the task done?"""
 
 
+def point_above(thing: SceneObject, height: float) -> np.ndarray:
+    """The point [3] m at `height` [m] over an object's origin."""
+    return np.array(thing.pose[:3]) + [0, 0, height]
+
+
 def object_axis(pose: np.ndarray | Pose, axis: Point) -> np.ndarray:
     """An axis [3] of an object at a pose [7] in the world's frame [3]."""
     return Rotation.from_quat(pose[3:]).apply(axis)
@@ -174,7 +179,7 @@ def hand_yaw(thing: SceneObject) -> float:
 
 def grasp_across(thing: SceneObject, tilt: float = TURN_TILT) -> Tool:
     """The grasp from above of an object by the arm on its side."""
-    return tool(np.array(thing.pose[:3]) + [0, 0, grasp_of(thing).height], hand_yaw(thing), tilt)
+    return tool(point_above(thing, grasp_of(thing).height), hand_yaw(thing), tilt)
 
 
 def radial_turn(arm: int, start: Point, goal: Point) -> float:

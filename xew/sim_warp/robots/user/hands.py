@@ -115,12 +115,14 @@ def _slide(tree: ElementTree.Element, urdf: Urdf, linkage: Linkage, number: int)
         raise ConfigError(f"{urdf.path}: the fingers of the hand on {linkage.base} do not both move apart; {OTHER_HAND}")
     middle = (_tip(ends[shut][fingers[0]], approach) + _tip(ends[shut][fingers[1]], approach)) / 2
     frames = pose_links(urdf, linkage.positions(closed))
-    for top in tops:
-        side = float((ends[shut][top.name].mean(0) - middle) @ opening)
-        first = top.name == fingers[0] or (top.name != fingers[1] and side > 0)
-        _hang(tree, top, f"{linkage.base}_slide_{number}{'ab'[not first]}", frames[linkage.base], frames[top.parent])
     for joint in linkage.joints:
-        _fix(tree, joint, linkage.positions(closed)[joint.name])
+        origin = joint.origin
+        if joint in tops:
+            side = float((ends[shut][joint.name].mean(0) - middle) @ opening)
+            first = joint.name == fingers[0] or (joint.name != fingers[1] and side > 0)
+            _set_parent(tree, joint, f"{linkage.base}_slide_{number}{'ab'[not first]}")
+            origin = np.linalg.inv(frames[linkage.base]) @ frames[joint.parent] @ origin
+        _fix(tree, joint, origin @ joint_motion(joint, np.array([linkage.positions(closed)[joint.name]]))[0])
     for letter, sign in (("a", 1.0), ("b", -1.0)):
         _add_slide(tree, linkage.base, f"{linkage.base}_slide_{number}{letter}", sign * opening, stroke)
     turn = _turn(urdf, linkage, fingers[0])
@@ -180,20 +182,15 @@ def _element(tree: ElementTree.Element, joint: Joint) -> ElementTree.Element:
     return next(entry for entry in tree.findall("joint") if entry.get("name") == joint.name)
 
 
-def _hang(tree: ElementTree.Element, joint: Joint, link: str, base: np.ndarray, parent: np.ndarray) -> None:
-    """Hang a joint on a slide's link, which lies in the base [4 4]; its parent's pose is that of the closed hand."""
-    entry = _element(tree, joint)
-    entry.find("parent").set("link", link)  # type: ignore[union-attr]
-    _set_origin(entry, np.linalg.inv(base) @ parent @ joint.origin)
+def _set_parent(tree: ElementTree.Element, joint: Joint, link: str) -> None:
+    _element(tree, joint).find("parent").set("link", link)  # type: ignore[union-attr]
 
 
-def _fix(tree: ElementTree.Element, joint: Joint, position: float) -> None:
-    """Make a joint a fixed one, at a position [rad or m]."""
+def _fix(tree: ElementTree.Element, joint: Joint, origin: np.ndarray) -> None:
+    """Make a joint a fixed one with an origin [4 4]."""
     entry = _element(tree, joint)
-    origin = entry.find("origin")
-    now = np.eye(4) if origin is None else _origin_matrix(origin)
     entry.set("type", "fixed")
-    _set_origin(entry, now @ joint_motion(joint, np.array([position]))[0])
+    _set_origin(entry, origin)
     for name in ("axis", "limit", "mimic", "dynamics", "safety_controller", "calibration"):
         for child in entry.findall(name):
             entry.remove(child)
@@ -207,13 +204,6 @@ def _add_slide(tree: ElementTree.Element, base: str, name: str, axis: np.ndarray
     ElementTree.SubElement(joint, "axis", xyz=_numbers(axis))
     limits = {"lower": 0.0, "upper": stroke, "velocity": FINGER_SPEED, "effort": FINGER_EFFORT}
     ElementTree.SubElement(joint, "limit", {key: f"{value:.6g}" for key, value in limits.items()})
-
-
-def _origin_matrix(origin: ElementTree.Element) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, 3] = [float(value) for value in origin.get("xyz", "0 0 0").split()]
-    pose[:3, :3] = Rotation.from_euler("xyz", [float(v) for v in origin.get("rpy", "0 0 0").split()]).as_matrix()
-    return pose
 
 
 def _set_origin(joint: ElementTree.Element, pose: np.ndarray) -> None:
