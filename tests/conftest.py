@@ -58,7 +58,6 @@ SLOW = (
     "tests/model/training/test_training.py",
     "tests/sim_warp/assets/",
     "tests/sim_warp/production/test_produce.py",
-    "tests/sim_warp/robots/test_bodies.py::test_two_processes_write_the_same_bytes",
     "tests/sim_warp/robots/test_own_robots.py::test_data_keep_their_robot",
     "tests/sim_warp/tasks/",
     "tests/sim_warp/test_benchmarks.py",

@@ -91,7 +91,7 @@ def test_an_episode_has_files_of_its_own(exported: Path) -> None:
 def test_a_red_block_stays_red(tmp_path: Path) -> None:
     video = np.full((4, HEIGHT, WIDTH, 3), 255, np.uint8)
     video[:, 80:160, 100:200] = (200, 30, 20)
-    film = lerobot._Films(tmp_path / "observation.images.head")
+    film = lerobot._VideoFiles(tmp_path / "observation.images.head")
     film.add(video)
     frames, _ = decoded(tmp_path / "observation.images.head/chunk-000/file-000.mp4")
     assert np.abs(frames[:, 90:150, 110:190].reshape(-1, 3).astype(int) - (200, 30, 20)).max() <= 8

@@ -42,10 +42,6 @@ WRITERS: tuple[tuple[str, str, str], ...] = (
     ("sim_warp.inspect", "data --page out", "out"),
     ("sim_warp.manifest", "data --out out.json", "out.json"),
     ("sim_warp.robots.adopt", "mine.urdf --out out", "out/mine"),
-    ("sim_warp.bodies", "--count 1 --out out.npz", "out.npz"),
-    ("sim_warp.robots.sheet", "--robots piper --out out", "out"),
-    ("sim_warp.robots.sheet", "--robots piper --references out", "out"),
-    ("sim_warp.robots.sheet", "--robots piper --grid out.png", "out.png"),
     ("sim_warp.yields", "--tasks lift_pot --page out.md", "out.md"),
 )
 """Commands with options, and what they write, whose lock they take."""
@@ -55,8 +51,6 @@ OTHERS = {
     "model.rollout": "needs a trained run: see below",
     "sim_warp.motions": "prints",
     "sim_warp.production.warm_up": "writes Warp's cache, whose folders Warp itself renames into place",
-    "sim_warp.robots.author": "writes the project's own files, for its developers",
-    "sim_warp.robots.reach": "prints",
 }
 """Other commands, with why they are none of WRITERS."""
 

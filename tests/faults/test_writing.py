@@ -26,7 +26,6 @@ MAY_WRITE_IN_PLACE = {
     "xew/model/runs/log.py": ("__init__",),  # lines are appended; a cut one is left out when it is read
     "xew/sim_warp/embodiment/prepared.py": ("write_prepared",),  # into such a folder
     "xew/sim_warp/generate.py": ("_prepare_folder",),  # whether anything can be written
-    "xew/sim_warp/robots/author.py": ("main",),  # the project's own files, for its developers
     "xew/analysis/studies/processes.py": ("_run", "wait_for_lock"),  # a log, and its lock
 }
 """Functions that write otherwise, by file, with why."""

@@ -10,7 +10,7 @@ quaternions are w x y z.
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +56,43 @@ class Recorded:
     """[4 4] world to camera."""
     instruction: str
     """Instruction; empty where the file has none."""
-    frame_rate: float = FRAME_RATE
+    frame_rate: float
     """Frames a second."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Names of the datasets of a layout; of arms, grippers and end poses left and right."""
+
+    name: str
+    arms: tuple[str, str]
+    grippers: tuple[str, str]
+    end_poses: tuple[str, str]
+    pictures: str
+    intrinsics: str
+    extrinsics: tuple[str, ...]
+    """Alternatives; the first that a file has is read."""
+
+
+LEGACY = Layout(
+    "legacy",
+    arms=("joint_action/left_arm", "joint_action/right_arm"),
+    grippers=("joint_action/left_gripper", "joint_action/right_gripper"),
+    end_poses=("endpose/left_endpose", "endpose/right_endpose"),
+    pictures="observation/head_camera/rgb",
+    intrinsics="observation/head_camera/intrinsic_cv",
+    extrinsics=("observation/head_camera/extrinsic_cv", "observation/head_camera/cam2world_gl"),
+)
+MODERN = Layout(
+    "1.0",
+    arms=("state/left_arm_joint_states", "state/right_arm_joint_states"),
+    grippers=("state/left_ee_joint_states", "state/right_ee_joint_states"),
+    end_poses=("state/left_ee_poses", "state/right_ee_poses"),
+    pictures="vision/cam_head/colors",
+    intrinsics="vision/cam_head/intrinsic_matrix",
+    extrinsics=("vision/cam_head/extrinsics_matrix",),
+)
+"""Version 1.0; `state` is what was in force at a frame. Its `action` is the state of the next frame and adds nothing."""
 
 
 def read_robotwin(path: Path) -> Recorded:
@@ -70,7 +105,7 @@ def read_robotwin(path: Path) -> Recorded:
         with h5py.File(demand_regular(path), "r") as file:
             demand_whole(path, file)
             reader = _Reader(path, file)
-            return _read_modern(reader) if "state" in file else _read_legacy(reader)
+            return _read(reader, MODERN if "state" in file else LEGACY)
     except EpisodeError:
         raise
     except Exception as error:  # h5py has OSError, RuntimeError and others for damaged files
@@ -87,63 +122,33 @@ def demand_whole(path: Path, file: h5py.File) -> None:
     Raises:
         EpisodeError: it does one of these.
     """
-    found: list[str] = []
+    problems: list[str] = []
     size = path.stat().st_size
 
     def look(name: str, link: Any) -> None:
         if not isinstance(link, (h5py.HardLink, h5py.SoftLink)):
-            found.append(f"{name} is a link to another file")
+            problems.append(f"{name} is a link to another file")
             return
         stored = file[name] if isinstance(link, h5py.HardLink) else None
         if isinstance(stored, h5py.Dataset) and stored.is_virtual:
-            found.append(f"{name} is put together from other files (a virtual dataset)")
+            problems.append(f"{name} is put together from other files (a virtual dataset)")
         elif isinstance(stored, h5py.Dataset) and stored.external:
-            found.append(f"{name} is stored in another file")
+            problems.append(f"{name} is stored in another file")
         elif isinstance(stored, h5py.Dataset) and stored.nbytes > LARGEST_RATIO * size:
-            found.append(f"{name} has {stored.nbytes:,} bytes, of a file of {size:,}")
+            problems.append(f"{name} has {stored.nbytes:,} bytes, of a file of {size:,}")
 
     file.visititems_links(look)
-    if found:
-        raise EpisodeError(f"{path}: {found[0]}; expected a file that holds all of its data itself. It is not read.")
+    if problems:
+        raise EpisodeError(f"{path}: {problems[0]}; expected a file that holds all of its data itself. It is not read.")
 
 
-def _read_legacy(reader: "_Reader") -> Recorded:
-    arms = [reader.numbers(f"joint_action/{side}_arm", 2) for side in ("left", "right")]
-    grippers = [reader.numbers(f"joint_action/{side}_gripper", 1) for side in ("left", "right")]
-    ends = [f"endpose/{side}_endpose" for side in ("left", "right")]
-    camera = "observation/head_camera"
-    extrinsics = _first_there(reader, camera, ("extrinsic_cv", "cam2world_gl"))
-    return _assemble(reader, "legacy", arms, grippers, ends, f"{camera}/rgb", f"{camera}/intrinsic_cv", extrinsics)
-
-
-def _read_modern(reader: "_Reader") -> Recorded:
-    """Version 1.0: `state` is what was in force at a frame; its `action` is the state of the next one and adds nothing."""
-    arms = [reader.numbers(f"state/{side}_arm_joint_states", 2) for side in ("left", "right")]
-    grippers = [reader.column(f"state/{side}_ee_joint_states") for side in ("left", "right")]
-    ends = [f"state/{side}_ee_poses" for side in ("left", "right")]
-    camera = "vision/cam_head"
-    extrinsics = _first_there(reader, camera, ("extrinsics_matrix", "extrinsic_matrix", "cam2world_gl"))
-    found = _assemble(reader, "1.0", arms, grippers, ends, f"{camera}/colors", f"{camera}/intrinsic_matrix", extrinsics)
-    return replace(found, frame_rate=reader.frame_rate("additional_info/frequency"))
-
-
-def _first_there(reader: "_Reader", group: str, names: Sequence[str]) -> str:
-    """The first of several datasets of a group that the file has; the first of all where it has none."""
-    return f"{group}/{next((name for name in names if f'{group}/{name}' in reader.file), names[0])}"
-
-
-def _assemble(
-    reader: "_Reader",
-    layout: str,
-    arms: list[np.ndarray],
-    grippers: list[np.ndarray],
-    ends: list[str],
-    pictures: str,
-    intrinsics: str,
-    extrinsics: str,
-) -> Recorded:
+def _read(reader: "_Reader", layout: Layout) -> Recorded:
+    arms = [reader.numbers(name, 2) for name in layout.arms]
+    grippers = [reader.column(name) for name in layout.grippers]
+    poses = (
+        [reader.numbers(name, 2) for name in layout.end_poses] if all(name in reader.file for name in layout.end_poses) else []
+    )
     frames = len(arms[0])
-    poses = [reader.numbers(name, 2) for name in ends] if all(name in reader.file for name in ends) else []
     if not frames or any(len(array) != frames for array in (*arms, *grippers, *poses)):
         counts = ", ".join(str(len(array)) for array in (*arms, *grippers, *poses))
         raise reader.error(f"arms, grippers and end poses have {counts} frames", "as many of each, at least one")
@@ -151,17 +156,18 @@ def _assemble(
         raise reader.error(f"the arms have {arms[0].shape[1]} and {arms[1].shape[1]} joints", "six or seven each")
     if any(pose.shape[1] != 7 for pose in poses):
         raise reader.error("the end poses have another shape", "[frames 7]")
-    rgb = reader.pictures(pictures, frames)
+    rgb = reader.pictures(layout.pictures, frames)
     if any(np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1).max() > 0.01 for pose in poses):
         raise reader.error("the end poses hold quaternions that are not of length 1", "x y z and a unit quaternion w x y z")
-    matrix = reader.constant(intrinsics, (3, 3))
+    matrix = reader.constant(layout.intrinsics, (3, 3))
     if min(matrix[0, 0], matrix[1, 1]) <= 0:
         raise reader.error(
-            f"{intrinsics} has the focal lengths {matrix[0, 0]:g} and {matrix[1, 1]:g}", "numbers of pixels over 0"
+            f"{layout.intrinsics} has the focal lengths {matrix[0, 0]:g} and {matrix[1, 1]:g}", "numbers of pixels over 0"
         )
     scale = rgb.shape[2] / WIDTH
+    extrinsics = next((name for name in layout.extrinsics if name in reader.file), layout.extrinsics[0])
     return Recorded(
-        layout,
+        layout.name,
         np.stack(arms, 1),
         np.stack(grippers, 1),
         np.stack([tool_center(pose) for pose in poses], 1) if poses else None,
@@ -169,6 +175,7 @@ def _assemble(
         _center_pixels(matrix, scale),
         _world_to_camera(reader, extrinsics),
         reader.instruction(),
+        reader.frame_rate("additional_info/frequency"),
     )
 
 
@@ -194,10 +201,10 @@ def _resize(image: np.ndarray) -> np.ndarray:
 
 def _center_pixels(intrinsics: np.ndarray, scale: float) -> np.ndarray:
     """K [3 3] of pixels that count from the center of the first, as ours do; RoboTwin counts from its upper left corner."""
-    found = intrinsics.copy()
-    found[:2] /= scale
-    found[:2, 2] -= 0.5
-    return found
+    centered = intrinsics.copy()
+    centered[:2] /= scale
+    centered[:2, 2] -= 0.5
+    return centered
 
 
 def _world_to_camera(reader: "_Reader", name: str) -> np.ndarray:
@@ -233,13 +240,13 @@ class _Reader:
     file: h5py.File
 
     def dataset(self, name: str) -> h5py.Dataset:
-        found = self.file.get(name)
-        if not isinstance(found, h5py.Dataset):
+        dataset = self.file.get(name)
+        if not isinstance(dataset, h5py.Dataset):
             known = ", ".join(sorted(self.file)) or "nothing"
             raise EpisodeError(
                 f"{self.path} has no {name} (at its top: {known}); expected a RoboTwin episode of the legacy or the 1.0 layout."
             )
-        return found
+        return dataset
 
     def numbers(self, name: str, dimensions: int) -> np.ndarray:
         """Finite numbers [...] float64 in so many dimensions."""
@@ -253,7 +260,7 @@ class _Reader:
 
     def column(self, name: str) -> np.ndarray:
         """Numbers [t] that are stored as [t] or [t 1]."""
-        array = self.numbers(name, self.dataset(name).ndim)
+        array = self.numbers(name, 2 if self.dataset(name).ndim == 2 else 1)
         if array.ndim != 1 and array.shape[1:] != (1,):
             raise self.error(f"{name} has shape {array.shape}", "[frames 1]: a gripper of one number")
         return array.reshape(len(array))
@@ -296,13 +303,13 @@ class _Reader:
 
     def instruction(self) -> str:
         """The first instruction in the file, or in the file of instructions beside it."""
-        found = self.file.get("instructions")
-        if isinstance(found, h5py.Dataset):
-            return _first_instruction(_as_text(found[()]))
+        stored = self.file.get("instructions")
+        if isinstance(stored, h5py.Dataset):
+            return _first_instruction(_as_text(stored[()]))
         return _first_instruction(text_beside(self.path, f"instructions/{self.path.stem}.json"))
 
-    def error(self, found: str, expected: str) -> EpisodeError:
-        return EpisodeError(f"{self.path}: {found}; expected {expected}.")
+    def error(self, problem: str, expected: str) -> EpisodeError:
+        return EpisodeError(f"{self.path}: {problem}; expected {expected}.")
 
 
 def text_beside(episode: Path, name: str) -> str:

@@ -1,14 +1,14 @@
 """Export accepted episodes as a LeRobotDataset (codebase v3.0), which LeRobot and what is built on it read.
 
-Reads  DATA: a data set of ours
+Reads  DATA: a data set
 Writes DIR: meta/ (info, tasks, episodes, statistics), data/ (parquet, many episodes a file) and videos/ (H.264 in mp4, one)
 
     action, observation.state     the canonical 16 numbers, commanded and measured
     observation.tool_pose         14 numbers: left and right tool, x y z [m] and quaternion x y z w, world
     observation.images.head       the head camera; observation.images.robot with --robot-video: the robot alone by its commands
     next.done, next.success       true at the last frame
-The table of episodes says of each its robot, task, seed and kind of motion (columns xew/…). What an imported episode
-does not know is left out of the whole set. Frames are 0.06 s apart, so `fps` is 50 / 3; video is lossy, all else is exact.
+The table of episodes says of each its robot, task, seed and kind of motion (columns xew/…). Features that an imported episode
+lacks are left out of the whole set. Frames are 0.06 s apart, so `fps` is 50 / 3; video is lossy, all else is exact.
 
 Command: python -m xew.exchange.lerobot DATA --out DIR [--robots … --tasks … --split train --robot-video]
 """
@@ -41,16 +41,17 @@ FILES_PER_CHUNK = 1000
 LARGEST_DATA, LARGEST_VIDEO = 100, 200
 """Sizes at which LeRobot's own tools close a file and begin the next [MB]; here a video has one episode."""
 ENCODER = {"crf": "16", "g": "2", "bf": "0", "preset": "veryfast"}
-"""Options of x264: every other frame is a key frame, so that single frames are read fast."""
+"""Options of x264: every other frame is a key frame, for fast reading of single frames."""
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 AXES = [f"{side}_{axis}" for side in ("left", "right") for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
 JOINTS = [f"{side}_{name}" for side in ("left", "right") for name in (*(f"joint{number}" for number in range(1, 8)), "gripper")]
-VECTORS = {
+Vectors = dict[str, tuple[str, list[str]]]
+"""Array of `States` and names of its numbers, by feature."""
+VECTORS: Vectors = {
     "action": ("action", JOINTS),
     "observation.state": ("joint_pos", JOINTS),
     "observation.tool_pose": ("tool_pose", AXES),
 }
-"""Array of `States` and names of its numbers, by feature."""
 SCALARS = {"next.done": "bool", "next.success": "bool", "timestamp": "float32"} | dict.fromkeys(
     ("frame_index", "episode_index", "index", "task_index"), "int64"
 )
@@ -95,13 +96,20 @@ def export(args: Args) -> tuple[int, list[str]]:
         EpisodeError: there is nothing to export, the folder exists or cannot be written, or another process writes it.
     """
     with hold_lock(args.out):
-        return _export(args)
+        if args.out.exists():
+            raise EpisodeError(f"{args.out} exists; choose another --out, or remove it first.")
+        chosen = _select_episodes(args)
+        vectors, videos = _select_features(args, chosen)
+        try:
+            with complete_folder(args.out) as root:
+                _write(root, chosen, vectors, videos)
+        except OSError as error:
+            raise EpisodeError(f"cannot write {args.out}: {error}. Free some space or choose another --out.") from error
+    return len(chosen), [feature for feature in VECTORS if feature not in vectors]
 
 
-def _export(args: Args) -> tuple[int, list[str]]:
-    if args.out.exists():
-        raise EpisodeError(f"{args.out} exists; choose another --out, or remove it first.")
-    chosen = _select_episodes(args)
+def _select_features(args: Args, chosen: Sequence[tuple[Path, Record]]) -> tuple[Vectors, dict[str, str]]:
+    """Vectors that all episodes know, and file names of videos by feature."""
     vectors = {
         feature: entry for feature, entry in VECTORS.items() if not any(entry[0] in record.unknown for _, record in chosen)
     }
@@ -110,12 +118,7 @@ def _export(args: Args) -> tuple[int, list[str]]:
         if without := [folder for folder, record in chosen if "robot" not in record.hashes]:
             raise EpisodeError(f"{without[0]} has no video of the robot alone; leave out --robot-video.")
         videos["observation.images.robot"] = "robot.mkv"
-    try:
-        with complete_folder(args.out) as root:
-            _write(root, chosen, vectors, videos)
-    except OSError as error:
-        raise EpisodeError(f"cannot write {args.out}: {error}. Free some space or choose another --out.") from error
-    return len(chosen), [feature for feature in VECTORS if feature not in vectors]
+    return vectors, videos
 
 
 def _select_episodes(args: Args) -> list[tuple[Path, Record]]:
@@ -126,26 +129,24 @@ def _select_episodes(args: Args) -> list[tuple[Path, Record]]:
     ):
         if missing := sorted(set(asked) - known):
             raise EpisodeError(f"{flag} {', '.join(missing)}: not in {args.data}; it has {', '.join(sorted(known))}.")
-    found = dataset.select(robots=robots or None, tasks=args.tasks or None, split=args.split)
-    if not found:
+    chosen = dataset.select(robots=robots or None, tasks=args.tasks or None, split=args.split)
+    if not chosen:
         raise EpisodeError(f"{args.data} has no episode of these robots, tasks and seeds; name fewer.")
-    return found
+    return chosen
 
 
-def _write(
-    root: Path, chosen: Sequence[tuple[Path, Record]], vectors: dict[str, tuple[str, list[str]]], videos: dict[str, str]
-) -> None:
-    told = [record.instruction or record.task for _, record in chosen]
-    tasks = {task: index for index, task in enumerate(dict.fromkeys(told))}
+def _write(root: Path, chosen: Sequence[tuple[Path, Record]], vectors: Vectors, videos: dict[str, str]) -> None:
+    instructions = [record.instruction or record.task for _, record in chosen]
+    tasks = {task: index for index, task in enumerate(dict.fromkeys(instructions))}
     episodes: list[dict[str, Any]] = []
     totals = _Totals()
     with _Tables(root / "data") as table:
-        films = {key: _Films(root / "videos" / key) for key in videos}
+        video_files = {key: _VideoFiles(root / "videos" / key) for key in videos}
         start = 0
         for number, (folder, record) in enumerate(tqdm(chosen, desc="exporting", unit="episode")):
-            columns = _columns(read_states(folder), vectors, number, start, tasks[told[number]])
+            columns = _columns(read_states(folder), vectors, number, start, tasks[instructions[number]])
             place = table.add(columns)
-            row: dict[str, Any] = {"episode_index": number, "tasks": [told[number]], "length": len(columns["index"])}
+            row: dict[str, Any] = {"episode_index": number, "tasks": [instructions[number]], "length": len(columns["index"])}
             row |= {"data/chunk_index": place.chunk, "data/file_index": place.file}
             row |= {"dataset_from_index": start, "dataset_to_index": start + row["length"]}
             statistics = {name: _statistics(values) for name, values in columns.items()}
@@ -153,9 +154,9 @@ def _write(
                 video = read_video(folder / name)
                 if len(video) != row["length"]:
                     raise EpisodeError(
-                        f"{folder / name} has {len(video)} frames, its states {row['length']}; generate it anew."
+                        f"{folder / name} has {len(video)} frames, its states {row['length']}; generate it again."
                     )
-                row |= films[key].add(video)
+                row |= video_files[key].add(video)
                 counts = color_counts(video)
                 statistics[key] = _color_statistics(counts, len(video))
                 totals.add_colors(key, counts)
@@ -168,9 +169,7 @@ def _write(
     _write_meta(root, episodes, tasks, totals, _features(vectors, videos), {record.robot for _, record in chosen})
 
 
-def _columns(
-    states: States, vectors: dict[str, tuple[str, list[str]]], episode: int, start: int, task: int
-) -> dict[str, np.ndarray]:
+def _columns(states: States, vectors: Vectors, episode: int, start: int, task: int) -> dict[str, np.ndarray]:
     """The rows of one episode, by feature: [t n] or [t]."""
     frames = np.arange(states.frame_count)
     last = frames == states.frame_count - 1
@@ -227,8 +226,8 @@ class _Tables:
         return self.place
 
 
-class _Films:
-    """H.264 files of one episode each, so that whoever splits or filters the set copies files and encodes nothing anew."""
+class _VideoFiles:
+    """H.264 files of one episode each, so a tool that splits or filters the set copies files and encodes nothing."""
 
     def __init__(self, root: Path) -> None:
         self.root, self.next = root, Place()
@@ -288,9 +287,9 @@ class _Totals:
 def _statistics(values: np.ndarray) -> dict[str, list[Any]]:
     """Statistics over the frames of numbers [t n] or [t], as lists of n numbers."""
     rows = values.reshape(len(values), -1).astype(np.float64)
-    found = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
-    found |= {name: np.quantile(rows, share, axis=0) for name, share in QUANTILES.items()}
-    return {name: numbers.tolist() for name, numbers in found.items()} | {"count": [len(rows)]}
+    statistics = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
+    statistics |= {name: np.quantile(rows, share, axis=0) for name, share in QUANTILES.items()}
+    return {name: numbers.tolist() for name, numbers in statistics.items()} | {"count": [len(rows)]}
 
 
 def color_counts(video: np.ndarray) -> np.ndarray:
@@ -302,21 +301,21 @@ def _color_statistics(counts: np.ndarray, frames: int) -> dict[str, list[Any]]:
     """Exact statistics of all pixels from their counts [3 256], as [3 1 1] lists of values 0 to 1."""
     value, total = np.arange(256) / 255, counts.sum(1)
     mean = counts @ value / total
-    found = {
+    statistics = {
         "min": value[(counts > 0).argmax(1)],
         "max": value[255 - (counts[:, ::-1] > 0).argmax(1)],
         "mean": mean,
         "std": np.sqrt(np.maximum(counts @ value**2 / total - mean**2, 0)),
     }
     below = counts.cumsum(1) / total[:, None]
-    found |= {name: value[(below >= share).argmax(1)] for name, share in QUANTILES.items()}
-    return {name: numbers.reshape(3, 1, 1).tolist() for name, numbers in found.items()} | {"count": [frames]}
+    statistics |= {name: value[(below >= share).argmax(1)] for name, share in QUANTILES.items()}
+    return {name: numbers.reshape(3, 1, 1).tolist() for name, numbers in statistics.items()} | {"count": [frames]}
 
 
 # --- meta/.
 
 
-def _features(vectors: dict[str, tuple[str, list[str]]], videos: Iterable[str]) -> dict[str, dict[str, Any]]:
+def _features(vectors: Vectors, videos: Iterable[str]) -> dict[str, dict[str, Any]]:
     features: dict[str, dict[str, Any]] = {
         name: {"dtype": "float32", "shape": [len(names)], "names": names} for name, (_, names) in vectors.items()
     }
@@ -373,7 +372,7 @@ def main() -> None:
     count, left_out = export(args)
     print(f"{count} episodes in {args.out}")
     for feature in left_out:
-        print(f"left out: {feature}, which imported episodes do not know")
+        print(f"left out: {feature}, which imported episodes lack")
 
 
 if __name__ == "__main__":

@@ -62,24 +62,24 @@ class Args:
     """Path of a RoboTwin episode (.hdf5), or of a folder with them at any depth."""
     out: Path = Path("data")
     robot: str | None = None
-    """Registry key, module:NAME or path of a robot; default: the one that the names of the folders tell."""
+    """Registry key, module:NAME or path of a robot; default: by the names of the folders."""
     task: str | None = None
     """Name of the task; default: that of the folder two above the one that holds the file, as RoboTwin lays them out."""
 
 
 def find_episodes(source: Path) -> list[Path]:
     """All RoboTwin episodes at or below a path. Raises EpisodeError if there is none."""
-    found = [source] if source.is_file() else sorted(source.rglob("episode*.hdf5"))
-    if not found:
+    paths = [source] if source.is_file() else sorted(source.rglob("episode*.hdf5"))
+    if not paths:
         raise EpisodeError(f"no episode*.hdf5 at {source}; name a RoboTwin episode or a folder of them.")
-    return found
+    return paths
 
 
 def import_episode(path: Path, args: Args) -> Record:
-    """Read one file and write one episode; what is there already is not made again.
+    """Read one file and write one episode; an existing episode is skipped.
 
-    RoboTwin numbers the seeds of each configuration anew, so that files of two (clean and randomized) may claim one episode:
-    the second is refused.
+    RoboTwin counts the seeds of each configuration from 0, so files of two (clean and randomized) may claim one episode: the
+    second is refused.
 
     Raises:
         EpisodeError, ConfigError: the file or the robot cannot be used.
@@ -171,19 +171,18 @@ def _robot(path: Path, recorded: Recorded, args: Args) -> tuple[str, RobotSpec |
     robot = get_robot(named, args.out)
     if is_path(named) and (tool := read_draft(find_description(Path(named))).arms[0].tool_pose):
         robot = replace(robot, arms=(replace(robot.arms[0], tool_pose=tool), replace(robot.arms[1], tool_pose=tool)))
-    placed = fit_bases(robot, recorded)
+    key, placed = f"{robot.key}_robotwin", fit_bases(robot, recorded)
     if placed is None:
-        return f"{robot.key}_robotwin", None
-    key = f"{robot.key}_robotwin"
+        return key, None
     placed = replace(placed, key=key)
-    kept = keep_robot(placed, args.out)
-    bases = [np.array([arm.root_pose for arm in spec.arms]) for spec in (placed, kept)]
-    if np.abs(bases[0] - bases[1])[:, :3].max() > SAME_PLACE:
+    earlier = keep_robot(placed, args.out)
+    bases = [np.array([arm.root_pose[:3] for arm in spec.arms]) for spec in (placed, earlier)]
+    if (moved := np.abs(bases[0] - bases[1]).max()) > SAME_PLACE:
         raise EpisodeError(
-            f"{path}: {robot.title} stands {1000 * np.abs(bases[0] - bases[1])[:, :3].max():.0f} mm from where it stood in the "
-            "episodes before; import episodes of another base distance into another --out."
+            f"{path}: {robot.title} stands {1000 * moved:.0f} mm from where it stood in the episodes before; import episodes "
+            "of another base distance into another --out."
         )
-    return key, kept
+    return key, earlier
 
 
 def _embodiment(path: Path) -> str:
@@ -262,7 +261,7 @@ def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
     if args.robot:
-        get_robot(args.robot, args.out)  # a mistake in it is told once, not for every file
+        get_robot(args.robot, args.out)  # a mistake is reported once, not for every file
     with hold_lock(args.out):
         records, refused = import_all(find_episodes(args.source), args)
     rendered = sum("robot" in record.hashes for record in records)

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,10 +20,9 @@ from xew.sim_warp.kinematics import (
 )
 from xew.sim_warp.kinematics.batched import BatchedKinematics
 from xew.sim_warp.kinematics.inverse import ArmSolver, arm_solver
+from xew.sim_warp.kinematics.reachability import work_reach
 from xew.sim_warp.plan import tool
 from xew.sim_warp.robots import ROBOTS, RobotSpec, load_urdf
-from xew.sim_warp.robots.reach import main as reach
-from xew.sim_warp.robots.reach import work_reach
 
 CHAINS = json.loads((Path(__file__).parents[1] / "data" / "chains.json").read_text())["robots"]
 robots = pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
@@ -278,12 +276,3 @@ def test_both_arms_reach_the_work_area(robot: RobotSpec, arm: int) -> None:
     assert found.mean() > 0.95
     straight = found[len(found) // 2]
     assert straight[:-1].mean() > 0.98, "hand pointing away from the shoulder, all but the column past the middle"
-
-
-def test_the_reach_of_an_unknown_robot_is_refused_in_a_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["reach", "--robots", "pipper"])
-    with pytest.raises(SystemExit) as left:
-        reach()
-    assert left.value.code == 2 and "did you mean 'piper'" in capsys.readouterr().err

@@ -105,7 +105,7 @@ def test_linked_fingers_become_a_gripper_of_one_number(tmp_path: Path) -> None:
 def test_fingers_that_do_not_meet_are_told(tmp_path: Path) -> None:
     source = placed_robot(tmp_path / "in", "small.urdf")
     write_text(source, linked_hand(0.012))
-    folder = adopt.adopt(Args(source, tmp_path / "out", sheet=False))
+    folder = adopt.adopt(Args(source, tmp_path / "out"))
     assert "closed, the fingers of the left hand are 12 mm apart: what is thinner cannot be held" in warning_lines(
         load_robot(folder)
     )
@@ -252,7 +252,7 @@ def test_a_robot_is_worked_out_once(
     """Printed, and kept in a folder that needs neither a search nor the files that it came from."""
     source = placed_robot(tmp_path / "lab" / "arm", "small.urdf")
     write_text(source, linked_hand())
-    flags = [str(source), "--out", str(tmp_path / "robots"), "--no-sheet"]
+    flags = [str(source), "--out", str(tmp_path / "robots")]
     monkeypatch.setattr(sys, "argv", ["adopt", *flags])
     adopt.main()
     printed = capsys.readouterr().out

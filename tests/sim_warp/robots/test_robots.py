@@ -12,7 +12,6 @@ from xew.sim_warp.geometry.camera import HEAD_CAMERA, project
 from xew.sim_warp.geometry.poses import matrix_from_pose
 from xew.sim_warp.kinematics import joint_positions, link_matrices, link_poses, tool_pose
 from xew.sim_warp.robots import ROBOTS, RobotSpec, UrdfError, get_robot, load_urdf
-from xew.sim_warp.robots.author import authored_files
 
 CHAINS = json.loads((Path(__file__).parents[1] / "data" / "chains.json").read_text())["robots"]
 LINK_COUNTS = {"aloha_agilex": 54, "arx_x5": 11, "ur5_wsg": 18, "franka_panda": 14, "piper": 11}
@@ -171,26 +170,6 @@ def test_home_hovers_over_the_near_table(robot: RobotSpec) -> None:
         pixel, depth = project(HEAD_CAMERA, home[None, :3])
         assert depth[0] > 0
         assert (pixel > 0).all() and (pixel < [HEAD_CAMERA.width, HEAD_CAMERA.height]).all()
-
-
-def triangles_of_stl(content: bytes) -> np.ndarray:
-    """[f 12] float32 normals and corners [m] of a binary STL file."""
-    return np.frombuffer(content, np.dtype([("numbers", "<f4", 12), ("attribute", "<u2")]), offset=84)["numbers"]
-
-
-@robots
-def test_authored_files_are_up_to_date(robot: RobotSpec) -> None:
-    """Text to the byte, triangles to a picometer: products of matrices are rounded otherwise by another processor's kernels."""
-    expected = authored_files(robot.key)
-    for path, content in expected.items():
-        kept = path.read_bytes()
-        if path.suffix == ".stl" and len(kept) == len(content):
-            kept, content = (triangles_of_stl(text) for text in (kept, content))
-            np.testing.assert_allclose(kept, content, rtol=0, atol=1e-12, err_msg=path.name)
-        else:
-            assert kept == content, f"{path.name}: run `python -m xew.sim_warp.robots.author`"
-    folder = robot.urdf.parent / "meshes" / robot.key
-    assert set(folder.iterdir()) | {robot.urdf} == set(expected)
 
 
 def test_unknown_robots_are_named() -> None:

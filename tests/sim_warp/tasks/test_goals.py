@@ -12,7 +12,7 @@ from xew.sim_warp.tasks import TASKS
 from xew.sim_warp.tasks.blocks_ranking_size import SIZES
 from xew.sim_warp.tasks.place_bread_basket import FLOOR, SLOT, breads
 from xew.sim_warp.tasks.place_burger_fries import spots
-from xew.sim_warp.tasks.place_dual_shoes import TIP_LEFT, places
+from xew.sim_warp.tasks.place_dual_shoes import TIP_LEFT, slots
 from xew.sim_warp.tasks.place_phone_stand import LEAN, ledge
 from xew.sim_warp.tasks.task import Moment
 
@@ -37,7 +37,7 @@ def tray_goals(scene: Scene) -> Goals:
 
 
 def shoe_goals(scene: Scene) -> Goals:
-    return {name: (place, Rotation.from_euler("z", TIP_LEFT)) for name, place in places(scene).items()}
+    return {name: (place, Rotation.from_euler("z", TIP_LEFT)) for name, place in slots(scene).items()}
 
 
 def phone_goals(scene: Scene, lean: float = LEAN) -> Goals:

@@ -24,7 +24,13 @@ METAL: Color = (190, 192, 196)
 PAPER: Color = (240, 238, 230)
 WHITE: Color = (238, 240, 242)
 DARK: Color = (48, 48, 52)
-AMBER: Color = (214, 120, 30)
+PILL_COLORS: tuple[tuple[str, Color], ...] = (
+    ("orange", (214, 120, 30)),
+    ("white", WHITE),
+    ("brown", (110, 66, 38)),
+    ("green", (70, 130, 90)),
+    ("blue", (70, 110, 180)),
+)
 
 SECTIONS = 32
 """Number of facets round a body of revolution."""
@@ -85,6 +91,24 @@ def column(radii: tuple[float, float], low: float, high: float, sides: int) -> n
     return np.concatenate(ends).astype(np.float32)
 
 
+def ring(radius: float, sides: int, z: float) -> np.ndarray:
+    """[sides 3] corners of a polygon about z whose inscribed circle has `radius` [m]; a flat side faces +x."""
+    angle = (np.arange(sides) + 0.5) * 2 * np.pi / sides
+    outer = radius / np.cos(np.pi / sides)
+    return np.column_stack([outer * np.cos(angle), outer * np.sin(angle), np.full(sides, z)])
+
+
+def walls(size: tuple[float, float], thickness: float, height: float, color: Color, z: float = 0.0) -> list[Shape]:
+    """Four upright walls along the edges of a rectangle of outer `size` x y [m], standing at height `z`."""
+    width, depth = size
+    front = objects.block((width, thickness, height), color)
+    side = objects.block((thickness, depth - 2 * thickness, height), color)
+    return [
+        *(objects.move(front, (0, sign * (depth - thickness) / 2, z)) for sign in (-1, 1)),
+        *(objects.move(side, (sign * (width - thickness) / 2, 0, z)) for sign in (-1, 1)),
+    ]
+
+
 def center_of_mass(shape: Shape) -> np.ndarray:
     """[3] center of mass [m] of a shape's convex pieces, all of one density."""
     pieces = [trimesh.convex.convex_hull(np.asarray(points, float)) for points in shape.hulls]
@@ -133,7 +157,7 @@ def pill_bottle(rng: np.random.Generator) -> tuple[Shape, str]:
     """A short bottle with a wide screw cap, and the name of its body's color: radius 23 to 27 mm, 80 to 100 mm high."""
     radius, top = rng.uniform([0.023, 0.080], [0.027, 0.100])
     cap = rng.uniform(0.018, 0.023)
-    name, color = _pill_colors()[rng.integers(len(_pill_colors()))]
+    name, color = PILL_COLORS[rng.integers(len(PILL_COLORS))]
     lid = [WHITE, WHITE, objects.PALETTE["red"], objects.PALETTE["blue"], DARK][rng.integers(5)]
     stripe = objects.PALETTE[draw_color_names(rng, 1)[0]]
     low, high = 0.012, top - cap - 0.014
@@ -154,10 +178,6 @@ def pill_bottle(rng: np.random.Generator) -> tuple[Shape, str]:
     body = revolve_painted(outline, color, bands, rng.uniform(-np.pi, np.pi))
     ribs = [_rib(radius, angle, top - cap + 0.003, top - 0.004, lid) for angle in np.arange(24) * np.pi / 12]
     return Shape(meshes.merge([body, *ribs]), (column((radius, radius), 0.0, top, SIDES),)), name
-
-
-def _pill_colors() -> list[tuple[str, Color]]:
-    return [("orange", AMBER), ("white", WHITE), ("brown", (110, 66, 38)), ("green", (70, 130, 90)), ("blue", (70, 110, 180))]
 
 
 def _rib(radius: float, angle: float, low: float, high: float, color: Color) -> Mesh:

@@ -54,8 +54,6 @@ def mat(size: tuple[float, float], color: Color) -> Shape:
 class Thing:
     """One variant of an everyday object."""
 
-    kind: str
-    """Key of `THINGS`."""
     words: str
     """Name in an instruction, without an article: "red toy car"."""
     shape: Shape
@@ -78,11 +76,6 @@ class Thing:
     def height(self) -> float:
         """Height of the top above the bottom [m]."""
         return float(max(hull[:, 2].max() for hull in self.shape.hulls))
-
-    @property
-    def length(self) -> float:
-        """Length along y [m]."""
-        return float(np.ptp(np.concatenate(self.shape.hulls)[:, 1]))
 
     @property
     def radius(self) -> float:
@@ -175,7 +168,7 @@ def mouse(rng: np.random.Generator) -> Thing:
         (0, 0.6 * back, 0.75 * height - 0.003), (0, np.pi / 2, 0)
     )
     keys = [seam, band]
-    return Thing("mouse", f"{name} mouse", _solid(body, seen=[wheel, *keys]), 0.06, LOWEST_GRASP, width, HALF_TURN)
+    return Thing(f"{name} mouse", _solid(body, seen=[wheel, *keys]), 0.06, LOWEST_GRASP, width, HALF_TURN)
 
 
 @dataclass(frozen=True)
@@ -189,7 +182,6 @@ class StaplerParts:
     hinge: tuple[float, float, float]
     """Point of the axis, which runs along x [m]."""
     width: float
-    length: float
     height: float
     """Height of the whole [m]."""
     opening: float
@@ -221,7 +213,6 @@ def stapler_parts(rng: np.random.Generator) -> StaplerParts:
         arm=_solid(arm, seen=[magazine, rest, nose]),
         hinge=(0.0, back + 0.008, foot + 0.005),
         width=width,
-        length=length,
         height=height,
         opening=float(np.arctan2(gap - 0.006, length * 0.9)),
     )
@@ -231,7 +222,6 @@ def stapler(rng: np.random.Generator) -> Thing:
     """A desk stapler as one rigid piece."""
     parts = stapler_parts(rng)
     return Thing(
-        "stapler",
         parts.words,
         objects.merge(parts.base, parts.arm),
         0.09,
@@ -255,7 +245,7 @@ def bell(rng: np.random.Generator) -> Thing:
     button = meshes.cylinder(0.005, 0.009, STEEL, sections=12).transformed((0, 0, height - 0.0045))
     collide = meshes.revolve([(0, foot), *arch[::2], (0, height)], metal, sections=12)
     shape = _solid(ring, seen=[dome, button], unseen=[collide])
-    return Thing("bell", f"{name} bell", shape, 0.10, LOWEST_GRASP, 2 * radius, np.pi / 6)
+    return Thing(f"{name} bell", shape, 0.10, LOWEST_GRASP, 2 * radius, np.pi / 6)
 
 
 def toy_car(rng: np.random.Generator) -> Thing:
@@ -304,7 +294,7 @@ def toy_car(rng: np.random.Generator) -> Thing:
     bed = [print_on((width * 0.8, 0.32 * length), (0, -0.29 * length, deck), DARK)] if form == "pickup" else []
     shape = Shape(meshes.merge([body, cabin, windows, *panes, *wheels, *lamps, *bed]), (under.vertices, cabin.vertices))
     words = {"car": "toy car", "van": "toy van", "pickup": "toy pickup"}[form]
-    return Thing("toy_car", f"{name} {words}", shape, 0.07, _holding_height(deck + roof), width, HALF_TURN)
+    return Thing(f"{name} {words}", shape, 0.07, _holding_height(deck + roof), width, HALF_TURN)
 
 
 CUBE_FACES: tuple[Color, ...] = ((200, 45, 40), (225, 120, 45), (240, 240, 235), (225, 195, 55), (50, 90, 190), (60, 150, 70))
@@ -325,7 +315,7 @@ def rubik_cube(rng: np.random.Generator) -> Thing:
             at[(axis + 1) % 3], at[(axis + 2) % 3] = (cell % 3 - 1) * edge * 0.323, (cell // 3 - 1) * edge * 0.323
             stickers.append(part(size.tolist(), (at + [0, 0, edge / 2]).tolist(), CUBE_FACES[colors[9 * face + cell]]))
     words = "scrambled magic cube" if scrambled else "solved magic cube"
-    return Thing("rubik_cube", words, _solid(body, seen=stickers), 0.08, edge / 2, edge, QUARTER_TURN)
+    return Thing(words, _solid(body, seen=stickers), 0.08, edge / 2, edge, QUARTER_TURN)
 
 
 def bread(rng: np.random.Generator) -> Thing:
@@ -354,7 +344,7 @@ def bread(rng: np.random.Generator) -> Thing:
             meshes.box((0.62 * width, 0.006, 0.004), pale).transformed((0, y * end, height - 0.0028), (0, 0, 0.5)) for y in cuts
         ]
     words = {"bun": "bread bun", "roll": "bread roll", "loaf": "loaf of bread", "baguette": "baguette"}[form]
-    return Thing("bread", words, _solid(body, seen=scores), 0.06, _holding_height(height), width, HALF_TURN)
+    return Thing(words, _solid(body, seen=scores), 0.06, _holding_height(height), width, HALF_TURN)
 
 
 def phone(rng: np.random.Generator) -> Thing:
@@ -372,7 +362,7 @@ def phone(rng: np.random.Generator) -> Thing:
     ]
     ear = print_on((0.014, 0.0025), (0, length / 2 - 0.009, thickness + SKIN), (95, 98, 105))
     shape = _solid(body, seen=[glass, picture, *icons, ear])
-    return Thing("phone", f"{name} phone", shape, 0.10, LOWEST_GRASP, width, HALF_TURN)
+    return Thing(f"{name} phone", shape, 0.10, LOWEST_GRASP, width, HALF_TURN)
 
 
 def playing_cards(rng: np.random.Generator) -> Thing:
@@ -386,7 +376,7 @@ def playing_cards(rng: np.random.Generator) -> Thing:
     diamond = meshes.box((0.02, 0.02, 2 * SKIN), CREAM).transformed((0, 0, height + 1.5 * SKIN), (0, 0, np.pi / 4))
     edges = [part((width + SKIN, length + SKIN, 0.0012), (0, 0, height * share), (200, 196, 186)) for share in (0.35, 0.65)]
     shape = _solid(body, seen=[back, frame, field, diamond, *edges])
-    return Thing("playing_cards", f"pack of {name} playing cards", shape, 0.09, LOWEST_GRASP, width, HALF_TURN)
+    return Thing(f"pack of {name} playing cards", shape, 0.09, LOWEST_GRASP, width, HALF_TURN)
 
 
 def wooden_block(rng: np.random.Generator) -> Thing:
@@ -398,7 +388,7 @@ def wooden_block(rng: np.random.Generator) -> Thing:
     lines = rng.uniform(-0.42, 0.42, 5) * width
     seen = [print_on((0.0022, length * 0.95), (x, 0, height - SKIN / 2), grain) for x in lines]
     seen += [part((0.0022, length + 2 * SKIN - 0.001, height * 0.9), (x, 0, height / 2), grain) for x in lines[:2]]
-    return Thing("wooden_block", "wooden block", _solid(body, seen=seen), 0.10, _holding_height(height), width, HALF_TURN)
+    return Thing("wooden block", _solid(body, seen=seen), 0.10, _holding_height(height), width, HALF_TURN)
 
 
 def tea_box(rng: np.random.Generator) -> Thing:
@@ -409,7 +399,6 @@ def tea_box(rng: np.random.Generator) -> Thing:
     leaf = _squeeze(leaf, 0.5).transformed((0, 0, height + SKIN), (0, 0, 0.7))
     rib = meshes.box((0.001, 0.026, 2 * SKIN), (190, 215, 160)).transformed((0, 0, height + 1.5 * SKIN), (0, 0, 0.7))
     return Thing(
-        "tea_box",
         f"{name} tea box",
         _carton((width, length, height), color, CREAM, [leaf, rib]),
         0.08,
@@ -427,7 +416,6 @@ def coffee_box(rng: np.random.Generator) -> Thing:
     bean = _squeeze(meshes.cylinder(0.013, 2 * SKIN, (70, 42, 28), sections=16), 0.66).transformed((0, 0, height + SKIN))
     cleft = meshes.box((0.002, 0.022, 2 * SKIN), (190, 150, 110)).transformed((0, 0, height + 1.5 * SKIN), (0, 0, 0.2))
     return Thing(
-        "coffee_box",
         f"coffee box with a {name} label",
         _carton((width, length, height), box, label, [bean, cleft]),
         0.08,
@@ -471,7 +459,7 @@ def soap(rng: np.random.Generator) -> Thing:
     deep = objects.darken(color, 0.86)
     oval = _squeeze(meshes.cylinder(length * 0.28, 0.003, deep, sections=20), 0.5).transformed((0, 0, height - 0.0008))
     inner = _squeeze(meshes.cylinder(length * 0.22, 0.003, color, sections=20), 0.45).transformed((0, 0, height - 0.0003))
-    return Thing("soap", f"{name} soap", _solid(body, seen=[oval, inner]), 0.08, LOWEST_GRASP, width, HALF_TURN)
+    return Thing(f"{name} soap", _solid(body, seen=[oval, inner]), 0.08, LOWEST_GRASP, width, HALF_TURN)
 
 
 def remote(rng: np.random.Generator) -> Thing:
@@ -488,7 +476,7 @@ def remote(rng: np.random.Generator) -> Thing:
     ring = meshes.cylinder(0.013, 0.002, STEEL, sections=20).transformed((0, length * 0.2, height))
     middle = meshes.cylinder(0.006, 0.003, DARK, sections=16).transformed((0, length * 0.2, height))
     shape = _solid(body, seen=[*keys, power, ring, middle])
-    return Thing("remote", f"{name} remote control", shape, 0.09, LOWEST_GRASP, width, HALF_TURN)
+    return Thing(f"{name} remote control", shape, 0.09, LOWEST_GRASP, width, HALF_TURN)
 
 
 THINGS: dict[str, Callable[[np.random.Generator], Thing]] = {

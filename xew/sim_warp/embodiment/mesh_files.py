@@ -76,7 +76,7 @@ def read_mesh(path: Path) -> MeshFile:
     count = sum(len(piece.faces) for piece in pieces)
     if count > MOST_TRIANGLES:
         raise MeshError(f"has {count} triangles, at most {MOST_TRIANGLES}; simplify it")
-    return MeshFile(tuple(Part(piece, face_colors(piece)) for piece in pieces), (path, *companions.found))
+    return MeshFile(tuple(Part(piece, face_colors(piece)) for piece in pieces), (path, *companions.files))
 
 
 def read_picture(path: Path) -> Image.Image:
@@ -150,19 +150,19 @@ def _join_lines(error: Exception) -> str:
 class _Companions(Resolver):
     """Finds what a mesh file names beside itself, `../textures/skin.png` included, and keeps a list of it."""
 
-    def __init__(self, folder: Path, found: list[Path] | None = None) -> None:
+    def __init__(self, folder: Path, files: list[Path] | None = None) -> None:
         self.folder = folder
-        self.found: list[Path] = [] if found is None else found
+        self.files: list[Path] = [] if files is None else files
 
     def get(self, name: str) -> bytes:
         path = self.folder / name.strip().replace("\\", "/")
         content = demand_regular(path).read_bytes()
-        if path not in self.found:
-            self.found.append(path)
+        if path not in self.files:
+            self.files.append(path)
         return content
 
     def namespaced(self, namespace: str) -> "_Companions":
-        return _Companions(self.folder / namespace, self.found)
+        return _Companions(self.folder / namespace, self.files)
 
     def keys(self) -> list[str]:
         return [str(path.relative_to(self.folder)) for path in self.folder.rglob("*") if path.is_file()]

@@ -1,7 +1,7 @@
 """Reading URDFs: `load_urdf(path)` gives links, joints, colored meshes and convex collision shapes.
 
 yourdfpy parses the XML, trimesh the mesh files; what comes out is a small tree of our own, so that the rest of the
-room knows neither. Units are meters, kilograms and radians; every shape is in the frame of its link.
+package knows neither. Units are meters, kilograms and radians; every shape is in the frame of its link.
 """
 
 import math
@@ -119,9 +119,9 @@ class Urdf:
             below.setdefault(joint.parent, []).append(joint)
         ordered, links = [], [self.root]
         while links:
-            found = below.get(links.pop(), [])
-            ordered += found
-            links += [joint.child for joint in found]
+            joints = below.get(links.pop(), [])
+            ordered += joints
+            links += [joint.child for joint in joints]
         return tuple(ordered)
 
     def chain(self, link: str) -> tuple[Joint, ...]:
@@ -132,6 +132,10 @@ class Urdf:
             path.append(above[link])
             link = above[link].parent
         return tuple(reversed(path))
+
+    def moved_links(self, joint: str) -> list[Link]:
+        """The links that a joint moves."""
+        return [link for link in self.links.values() if joint in [above.name for above in self.chain(link.name)]]
 
 
 def load_urdf(path: Path | str) -> Urdf:
@@ -172,28 +176,23 @@ def _load(path: Path, modified: int) -> Urdf:
     if not any(link.collisions for link in links.values()):
         source.notes.append("it has no collision shapes: the convex hulls of what is seen collide in their place")
         links = {name: _with_hull(link) for name, link in links.items()}
-    meshes = {name: file.files[0] for name, file in source.meshes.items()}
-    read = [
-        *(source.prepared.meshes.values() if source.prepared else ()),
-        *(f for mesh in source.meshes.values() for f in mesh.files),
-        *source.textures.values(),
-    ]
-    meshes, files = meshes | dict(source.prepared.meshes if source.prepared else {}), dict.fromkeys([path, *read])
-    meshes |= source.textures
-    urdf = Urdf(robot.name, path, root, links, joints, meshes, tuple(files), tuple(source.notes))
+    prepared = dict(source.prepared.meshes) if source.prepared else {}
+    meshes = {name: file.files[0] for name, file in source.meshes.items()} | prepared | source.textures
+    read = [*prepared.values(), *(f for mesh in source.meshes.values() for f in mesh.files), *source.textures.values()]
+    urdf = Urdf(robot.name, path, root, links, joints, meshes, tuple(dict.fromkeys([path, *read])), tuple(source.notes))
     _check_tree(urdf)
     return urdf
 
 
 def _read_all(entries: Iterable[Entry], read: Callable[[Entry], Result], problems: list[str]) -> dict[str, Result]:
-    """What `read` makes of each entry, by its name; what is wrong with them is added to `problems`, so that all is told."""
-    found: dict[str, Result] = {}
+    """What `read` makes of each entry, by its name; what is wrong with them is added to `problems`, so all are reported."""
+    results: dict[str, Result] = {}
     for entry in entries:
         try:
-            found[entry.name] = read(entry)
+            results[entry.name] = read(entry)
         except UrdfError as error:
             problems.append(str(error))
-    return found
+    return results
 
 
 def _with_hull(link: Link) -> Link:
@@ -344,12 +343,18 @@ def _visual(visual: yourdfpy.Visual, link: str, source: _Source) -> Iterable[Mes
         yield mesh if colors is None or (color and picture is None) else replace(mesh, colors=colors)
 
 
+def _material_entry(visual: yourdfpy.Visual, source: _Source, name: str) -> Any | None:
+    """The color or texture of a visual's material, or of the one that it names; None where neither has it."""
+    if visual.material is None:
+        return None
+    known = source.materials.get(visual.material.name)
+    return getattr(visual.material, name) or (known and getattr(known, name)) or None
+
+
 def _material_color(visual: yourdfpy.Visual, source: _Source) -> Color | None:
     """The visual's own color, or that of the material it names; None where the mesh file decides."""
-    material = visual.material
-    known = material and source.materials.get(material.name)
-    color = material and (material.color or (known and known.color))
-    if not color:
+    color = _material_entry(visual, source, "color")
+    if color is None:
         return None
     red, green, blue = (round(255 * min(max(float(value), 0.0), 1.0)) for value in color.rgba[:3])
     return red, green, blue
@@ -357,10 +362,8 @@ def _material_color(visual: yourdfpy.Visual, source: _Source) -> Color | None:
 
 def _material_texture(visual: yourdfpy.Visual, link: str, source: _Source) -> Any | None:
     """The picture of the visual's material, or of the one it names; None where there is none."""
-    material = visual.material
-    known = material and source.materials.get(material.name)
-    texture = material and (material.texture or (known and known.texture))
-    if not texture or not texture.filename:
+    texture = _material_entry(visual, source, "texture")
+    if texture is None or not texture.filename:
         return None
     path = _find_file(texture.filename, f"link {link} names the texture", source)
     source.textures[texture.filename] = path
@@ -407,11 +410,11 @@ def _shape(geometry: yourdfpy.Geometry, link: str, source: _Source) -> list[Part
 
 def _mesh_parts(mesh: yourdfpy.Mesh, link: str, source: _Source) -> list[Part]:
     if mesh.filename not in source.meshes:
-        found = _find_file(mesh.filename, f"link {link} names the mesh", source)
+        path = _find_file(mesh.filename, f"link {link} names the mesh", source)
         try:
-            source.meshes[mesh.filename] = read_mesh(found)
+            source.meshes[mesh.filename] = read_mesh(path)
         except MeshError as error:
-            raise UrdfError(f"{source.path}: link {link}: {found} {error}.") from error
+            raise UrdfError(f"{source.path}: link {link}: {path} {error}.") from error
     scale = np.broadcast_to(np.asarray(1.0 if mesh.scale is None else mesh.scale, float), 3)
     parts = [Part(part.shape.copy(), part.colors) for part in source.meshes[mesh.filename].parts]
     for part in parts:
@@ -426,9 +429,9 @@ def _find_file(name: str, who: str, source: _Source) -> Path:
     error's sentence.
     """
     folder = source.path.parent
-    found = Path(yourdfpy.urdf.filename_handler_magic(name, dir=str(folder)))
-    if found.is_file():
-        return found
+    path = Path(yourdfpy.urdf.filename_handler_magic(name, dir=str(folder)))
+    if path.is_file():
+        return path
     package = re.fullmatch(r"package://([^/]+)/.*", name)
     parts = [part for part in re.sub(r"^[a-z]+://", "", name).split("/") if part not in ("", ".", "..")]
     if not package and (name.startswith("file://") or Path(name).is_absolute()):

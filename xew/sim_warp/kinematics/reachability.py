@@ -4,9 +4,12 @@ Reads  an `ArmSolver` and tool poses
 Writes which of them are reached: along a straight path of the tool, inside the limits that experts keep, to 2 mm and 0.02 rad
 """
 
+from itertools import product
+
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.kinematics.forward import tool_pose
 from xew.sim_warp.kinematics.inverse import ArmSolver
 from xew.sim_warp.plan import tool
@@ -15,6 +18,8 @@ WORK_X, WORK_Y, WORK_Z = np.linspace(-0.30, 0.10, 5), np.linspace(-0.20, 0.12, 5
 """Grid over the part of the left arm's work volume where tasks grasp and place [m]; the right arm's is its mirror image."""
 GRASP_TILT = 30
 """Lean of the hand in the grasps of that grid [deg]."""
+RADIAL_OFFSETS = (-45, -22.5, 0, 22.5, 45)
+"""Turns of the hand from the radial yaw in the grasps of that grid [deg]."""
 PATH_STEPS = 8
 """Number of poses along the straight path from home that are solved one after the other."""
 POSITION_TOLERANCE, ROTATION_TOLERANCE = 2e-3, 0.02
@@ -48,6 +53,19 @@ def reaches(solver: ArmSolver, arm: int, positions: np.ndarray, tilts: np.ndarra
         solution = solver.solve(arm, pose, joint_pos)
         joint_pos = solution.joint_pos
     return (solution.position_error < POSITION_TOLERANCE) & (solution.rotation_error < ROTATION_TOLERANCE)
+
+
+def work_reach(robot: RobotSpec, arm: int) -> np.ndarray:
+    """Whether an arm reaches the grasps that tasks ask for: tilt 30 degrees, yaw up to 45 degrees off the radial one.
+
+    Returns:
+        [offsets x y z] bool over `RADIAL_OFFSETS`, `WORK_X`, `WORK_Y` and `WORK_Z`.
+    """
+    cells = list(product(RADIAL_OFFSETS, product(WORK_X, WORK_Y, WORK_Z)))
+    positions = np.array([position for _, position in cells])
+    yaws = np.array([radial_yaw(np.array(position)) + offset for offset, position in cells])
+    reached = reaches(ArmSolver(robot), arm, positions, np.full(len(cells), GRASP_TILT), yaws)
+    return reached.reshape(len(RADIAL_OFFSETS), len(WORK_X), len(WORK_Y), len(WORK_Z))
 
 
 def radial_yaw(position: np.ndarray) -> float:

@@ -1,18 +1,16 @@
-"""The command that works out an unknown robot once: from a URDF or xacro to a folder that every other command takes.
+"""Complete a robot's description once: a URDF or xacro becomes a folder that every other command takes.
 
     python -m xew.sim_warp.robots.adopt lab/my_arm.urdf
     python -m xew.sim_warp.robots.adopt lab/arm.urdf.xacro --package arm_description=lab/arm_description --argument name=arm
     python -m xew.sim_warp.robots.adopt lab/ur5e.urdf --hand ur5_wsg
 
-Writes <out>/<key>/ with the URDF, all files that it names and a robot.yaml that says of each entry whether it was given or
-found, and <out>/<key>.png, nine views. Prints what was found and what looks wrong.
+Writes <out>/<key>/ with the URDF, all files that it names and a robot.yaml that marks each entry as given or found, and
+<out>/<key>.png, nine views. Prints a summary of the robot and what looks wrong.
 
-What no other command does: it expands xacro, finds meshes of packages that lie elsewhere, makes linked fingers a hand of one
-number, puts a hand of ours on a bare arm, and gives mirrored arms the same limits.
+Only this command expands xacro, finds meshes of packages in other folders, converts linked fingers to sliding ones, puts one of
+the project's hands on a bare arm, and gives mirrored arms the same limits.
 """
 
-import os
-import shutil
 import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
@@ -20,23 +18,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, TypeVar
 
+import numpy as np
 import tyro
 from tqdm import tqdm
 
 from xew.config import ConfigError, user_errors
-from xew.episode import complete_folder
-from xew.files import hold_lock
+from xew.episode import encode_png
+from xew.files import hold_lock, write_bytes
 from xew.sim_warp.devices.workers import quiet_warp
-from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
+from xew.sim_warp.kinematics.reachability import work_reach
 from xew.sim_warp.rendering.streams import nine_views
 from xew.sim_warp.robots import ROBOTS
-from xew.sim_warp.robots.reach import work_reach
-from xew.sim_warp.robots.sheet import save, sheet
 from xew.sim_warp.robots.user.draft import OWN, RobotDraft, find_description, read_draft
 from xew.sim_warp.robots.user.hands import graft_hand, slide_fingers
 from xew.sim_warp.robots.user.infer import complete_arms
-from xew.sim_warp.robots.user.own import complete_draft, load_robot, robot_key
+from xew.sim_warp.robots.user.own import complete_draft, load_robot, robot_key, urdf_name, write_robot
 from xew.sim_warp.robots.user.placement import check_plans
 from xew.sim_warp.robots.user.plain import read_description, unfold_mirrored
 from xew.sim_warp.robots.user.summary import commented_yaml, robot_lines, warning_lines
@@ -47,26 +44,24 @@ STAGES = ("files", "hands", "place", "plans", "reach", "pictures")
 
 @dataclass(frozen=True)
 class Args:
-    """Work out an unknown robot once, into a folder that every other command takes."""
+    """Complete a robot's description once, into a folder that every other command takes."""
 
     robot: Annotated[Path, tyro.conf.Positional]
     """A .urdf, .xacro, or a folder with a robot.yaml, a RoboTwin config.yml or one URDF."""
     out: Path = Path("robots")
-    """Folder in which the robot's own is made."""
+    """Folder for the robot's folder."""
     package: tuple[str, ...] = ()
     """NAME=DIR, folders of packages that package:// or a xacro names."""
     argument: tuple[str, ...] = ()
     """NAME=VALUE, arguments of a xacro."""
     hand: str | None = None
-    """Robot of the project whose hand is put on the arm in place of what moves beyond its last joint: ur5_wsg, franka_panda."""
+    """Robot of the project whose hand replaces everything that moves beyond the arm's last joint: ur5_wsg, franka_panda."""
     last_joint: str | None = None
     """Name of the arm's last joint, for --hand; default: the last before one that carries two joints, or of all."""
-    sheet: bool = True
-    """Draw nine views."""
 
 
 def adopt(args: Args) -> Path:
-    """Work out a robot; the folder that was written.
+    """Complete a robot's description; returns the folder that was written.
 
     Raises:
         ConfigError: it cannot be read, or it cannot do what every robot must.
@@ -81,30 +76,35 @@ def adopt(args: Args) -> Path:
         tqdm(total=len(STAGES), desc=STAGES[0], unit="stage") as bar,
         tempfile.TemporaryDirectory() as work,
     ):
+        following = iter(STAGES[1:])
 
-        def begin(stage: int) -> None:
-            bar.update(stage - bar.n)
-            bar.set_description(STAGES[stage])
+        def end_stage() -> None:
+            bar.update()
+            bar.set_description(next(following, STAGES[-1]))
 
         tree = read_description(source.parent / draft.urdf, _pairs(args.package, Path), _pairs(args.argument, str))
-        begin(1)
-        urdf, notes = _make_plain(tree, draft, args, Path(work), str(source))
-        begin(2)
+        end_stage()
+        urdf, notes = _normalize(tree, draft, args, Path(work), str(source))
+        end_stage()
         robot = complete_draft(draft, urdf, key, str(source))
         notes += warning_lines(robot)
-        begin(3)
+        end_stage()
         problems = check_plans(robot).problems
-        begin(4)
+        end_stage()
         reach = [float(work_reach(robot, arm).mean()) for arm in (0, 1)]
-        begin(5)
-        _write(robot, draft, folder)
-        if args.sheet:
-            save(args.out / f"{key}.png", sheet(nine_views(load_robot(folder))))
-        bar.update()
+        end_stage()
+        write_robot(robot, folder, commented_yaml(robot, draft, urdf_name(robot)))
+        write_bytes(args.out / f"{key}.png", encode_png(view_sheet(nine_views(load_robot(folder)))))
+        end_stage()
     print("\n".join(robot_lines(robot, problems, reach)))
     for note in notes:
         print(f"note: {note}")
     return folder
+
+
+def view_sheet(views: np.ndarray) -> np.ndarray:
+    """Nine images [9 h w 3] as three rows of three, [3h 3w 3]."""
+    return np.vstack([np.hstack(list(views[row : row + 3])) for row in (0, 3, 6)])
 
 
 def _pairs(given: Sequence[str], kind: Callable[[str], Value]) -> dict[str, Value]:
@@ -114,7 +114,7 @@ def _pairs(given: Sequence[str], kind: Callable[[str], Value]) -> dict[str, Valu
     return {name: kind(value) for name, _, value in (text.partition("=") for text in given)}
 
 
-def _make_plain(tree: ElementTree.Element, draft: RobotDraft, args: Args, work: Path, source: str) -> tuple[Urdf, list[str]]:
+def _normalize(tree: ElementTree.Element, draft: RobotDraft, args: Args, work: Path, source: str) -> tuple[Urdf, list[str]]:
     """The robot's URDF with two sliding fingers a hand and equal limits of both arms, and what was changed for that."""
     urdf, notes = _load(tree, work), []
     if args.hand is not None:
@@ -141,37 +141,11 @@ def _load(tree: ElementTree.Element, work: Path) -> Urdf:
     return load_urdf(path)
 
 
-def _write(robot: RobotSpec, draft: RobotDraft, folder: Path) -> None:
-    """Write the robot's folder: its URDF, the files that it names under files/, and robot.yaml."""
-    urdf, name = load_urdf(robot.urdf), f"{robot.key}.urdf"
-    ours = Path(__file__).parent / "descriptions"
-    given = [file.resolve() for file in urdf.files[1:] if not file.resolve().is_relative_to(ours)]
-    top = Path(os.path.commonpath([file.parent for file in given])) if given else Path("/")
-
-    def place(file: Path) -> str:
-        file = file.resolve()
-        inside = Path("hand") / file.relative_to(ours) if file.is_relative_to(ours) else file.relative_to(top)
-        return (Path("files") / inside).as_posix()
-
-    tree = ElementTree.parse(urdf.path)
-    for entry in [*tree.iter("mesh"), *tree.iter("texture")]:
-        if found := urdf.meshes.get(entry.get("filename", "")):
-            entry.set("filename", place(found))
-    with complete_folder(folder, held=(name, "files", OWN)) as temporary:
-        for file in urdf.files[1:]:
-            copy = temporary / place(file)
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, copy)
-        ElementTree.indent(tree)
-        tree.write(temporary / name, encoding="utf-8", xml_declaration=True)
-        (temporary / OWN).write_text(commented_yaml(robot, draft, name), encoding="utf-8")
-
-
 @user_errors
 def main() -> None:
     quiet_warp()
     folder = adopt(tyro.cli(Args, description=__doc__))
-    print(f"{folder}: give this path to the other commands; {folder / OWN} says what was found and how to change it")
+    print(f"{folder}: give this path to the other commands; {folder / OWN} says how each entry was found and how to change it")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ After RoboTwin 2.0's beat_block_hammer.
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from xew.sim_warp import objects
 from xew.sim_warp.geometry import meshes
@@ -15,7 +14,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, pick
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, object_axis, pick
 
 HEAD_SIZE = (0.05, 0.05, 0.07)
 HANDLE_HEIGHT = 0.045
@@ -65,11 +64,9 @@ def plan(scene: Scene) -> Timeline:
 
 
 def success(scene: Scene, now: Moment) -> bool:
-    face = now.object_pose[scene.index("hammer"), :3]
-    top = np.array(scene.object("block").pose[:3]) + [0, 0, BLOCK]
-    tilt = Rotation.from_quat(now.object_pose[scene.index("hammer"), 3:]).apply([0, 0, 1])[2]
-    offset = np.abs(face - top)
-    return bool((offset[:2] < 0.02).all() and offset[2] < 0.006 and tilt > 0.9)
+    hammer = now.object_pose[scene.index("hammer")]
+    offset = np.abs(hammer[:3] - np.array(scene.object("block").pose[:3]) - [0, 0, BLOCK])
+    return bool((offset < [0.02, 0.02, 0.006]).all() and object_axis(hammer, [0, 0, 1])[2] > 0.9)
 
 
 TASK = Task("beat_block_hammer", "pick up the hammer and hit the {color} block", sample, plan, success)

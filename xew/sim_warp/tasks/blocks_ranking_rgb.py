@@ -7,9 +7,12 @@ Success: red left of green left of blue, neighbors within 130 mm in x and 30 mm 
 After RoboTwin 2.0's blocks_ranking_rgb.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from xew.sim_warp import objects
+from xew.sim_warp.geometry.poses import Pose
 from xew.sim_warp.plan import Timeline, tool
 from xew.sim_warp.scene import Point, Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
@@ -22,64 +25,71 @@ GRASP_BELOW_TOP = 0.014
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
     half = rng.uniform(0.015, 0.025)
-    targets = [(rng.uniform(low, high), 0.0) for low, high in ((-0.09, -0.08), (-0.01, 0.01), (0.08, 0.09))]
+    targets = [rng.uniform(low, high) for low, high in ((-0.09, -0.08), (-0.01, 0.01), (0.08, 0.09))]
     row = rng.uniform(-0.2, -0.1)
-    places: list[np.ndarray] = []
-    while not places or are_in_order(np.array(places)):
-        places = []
-        for _ in COLORS:
-            places.append(draw(rng, [-0.28, -0.08], [0.28, 0.05], lambda p: is_free(p, places)))  # noqa: B023
+    starts = draw_starts(rng, is_free)
     yaws = rng.uniform(-0.75, 0.75, 3)
     blocks = tuple(
-        SceneObject(
-            f"{color}_block",
-            objects.block((2 * half,) * 3, objects.PALETTE[color]),
-            upright(place_, TABLE_TOP, yaw),
-            mass=float(400 * (2 * half) ** 3),
-        )
-        for color, place_, yaw in zip(COLORS, places, yaws, strict=True)
+        cube(f"{color}_block", half, color, 400, upright(start, TABLE_TOP, yaw))
+        for color, start, yaw in zip(COLORS, starts, yaws, strict=True)
     )
-    row_places = {f"{color}_block": (float(x), float(row)) for color, (x, _) in zip(COLORS, targets, strict=True)}
-    return Scene("blocks_ranking_rgb", seed, blocks, targets=row_places)
+    row_targets = {block.name: (float(x), float(row)) for block, x in zip(blocks, targets, strict=True)}
+    return Scene("blocks_ranking_rgb", seed, blocks, targets=row_targets)
 
 
-def is_free(point: np.ndarray, places: list[np.ndarray]) -> bool:
-    """Can a block begin at `point` [2], clear of the row's middle and of the `places` of other blocks?"""
+def cube(name: str, half: float, color: str, density: float, pose: Pose) -> SceneObject:
+    """A block of half an edge `half` [m], a color's name and a density [kg/m^3]."""
+    return SceneObject(
+        name, objects.block((2 * half,) * 3, objects.PALETTE[color]), pose, mass=float(density * (2 * half) ** 3)
+    )
+
+
+def draw_starts(
+    rng: np.random.Generator, accept: Callable[[np.ndarray, list[np.ndarray]], bool], count: int = 3
+) -> list[np.ndarray]:
+    """Points [2] at which blocks begin, not in order yet; each is accepted with those before it."""
+    starts: list[np.ndarray] = []
+    while not starts or are_in_order(np.array(starts)):
+        starts = []
+        for _ in range(count):
+            starts.append(draw(rng, [-0.28, -0.08], [0.28, 0.05], lambda p: accept(p, starts)))  # noqa: B023
+    return starts
+
+
+def is_free(point: np.ndarray, others: list[np.ndarray]) -> bool:
+    """Can a block begin at `point` [2], clear of the row's middle and of the `others` [2]?"""
     x, y = point
     if abs(x) < 0.05 or (abs(x) < 0.15 and y > 0) or np.hypot(x, y + 0.1) < 0.1:
         return False
-    return all(np.hypot(*(point - other)) >= 0.1 for other in places)
+    return all(np.hypot(*(point - other)) >= 0.1 for other in others)
 
 
-def are_in_order(places: np.ndarray) -> bool:
+def are_in_order(positions: np.ndarray) -> bool:
     """Do blocks at [3 2] stand in a row in their order, each a little to the right of the one before?"""
-    step = np.diff(places, axis=0)
+    step = np.diff(positions, axis=0)
     return bool((step[:, 0] > 0).all() and (step[:, 0] < 0.13).all() and (np.abs(step[:, 1]) < 0.03).all())
 
 
 def plan(scene: Scene) -> Timeline:
     timeline = Timeline()
     for block in scene.objects:
-        arm = arm_for(block.pose[0])
-        move_block(timeline, arm, block, scene.targets[block.name])
+        move_block(timeline, block, scene.targets[block.name])
     return timeline
 
 
-def move_block(
-    timeline: Timeline, arm: int, block: SceneObject, target: Point, *, opening: float = 0.8, release: float = 0.7
-) -> None:
+def move_block(timeline: Timeline, block: SceneObject, target: Point, *, opening: float = 0.8, release: float = 0.7) -> None:
     """Put a block down at `target` [2], squarely; `opening` is the gripper's before the grasp, `release` the one after it."""
-    yaw = 2 * np.arctan2(block.pose[5], block.pose[6])
+    arm = arm_for(block.pose[0])
     height = TABLE_TOP + float(block.shape.mesh.vertices[:, 2].max()) - GRASP_BELOW_TOP
-    grasp = tool((*block.pose[:2], height), symmetric_yaw(arm, block.pose, yaw, np.pi / 2), STEEP_TILT)
+    grasp = tool((*block.pose[:2], height), symmetric_yaw(arm, block.pose, block.yaw, np.pi / 2), STEEP_TILT)
     goal = tool((*target, height + 0.002), symmetric_yaw(arm, target, 0.0, np.pi / 2), STEEP_TILT)
     pick(timeline, {arm: grasp}, lift=0.08, opening=opening)
     place(timeline, arm, block.name, goal, above=0.07, retreat=0.09, release=release)
 
 
 def success(scene: Scene, now: Moment) -> bool:
-    places = now.object_pose[[scene.index(f"{color}_block") for color in COLORS], :2]
-    return are_in_order(places) and now.both_open
+    """Do all objects of the scene, which are the blocks from left to right, stand in order?"""
+    return are_in_order(now.object_pose[:, :2]) and now.both_open
 
 
 TASK = Task(

@@ -12,10 +12,10 @@ import numpy as np
 
 from xew.sim_warp import objects
 from xew.sim_warp.plan import Timeline
-from xew.sim_warp.scene import Scene, SceneObject, draw, upright
+from xew.sim_warp.scene import Scene, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.blocks_ranking_rgb import are_in_order, is_free, move_block
-from xew.sim_warp.tasks.task import LET_GO, NARROWEST_HAND, Moment, Task, arm_for
+from xew.sim_warp.tasks.blocks_ranking_rgb import cube, draw_starts, is_free, move_block, success
+from xew.sim_warp.tasks.task import Task, opening_for
 
 SIZES = {"large": (0.028, 0.031), "medium": (0.023, 0.026), "small": (0.018, 0.021)}
 """Half edges [m], from the left end of the row to the right."""
@@ -27,29 +27,20 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     halves = [rng.uniform(low, high) for low, high in SIZES.values()]
     row = rng.uniform(-0.2, -0.1)
     targets = [np.array([rng.uniform(low, high), row]) for low, high in ROW]
-    places: list[np.ndarray] = []
-    while not places or are_in_order(np.array(places)):
-        places = []
-        for _ in SIZES:
-            places.append(draw(rng, [-0.28, -0.08], [0.28, 0.05], lambda p: _is_free(p, places, targets)))  # noqa: B023
+    starts = draw_starts(rng, lambda point, others: _is_free(point, others, targets))
     yaws = rng.uniform(-0.75, 0.75, 3)
     colors = [str(color) for color in rng.permutation(sorted(objects.PALETTE))]
     blocks = tuple(
-        SceneObject(
-            f"{size}_block",
-            objects.block((2 * half,) * 3, objects.PALETTE[color]),
-            upright(place, TABLE_TOP, yaw),
-            mass=float(700 * (2 * half) ** 3),
-        )
-        for size, half, color, place, yaw in zip(SIZES, halves, colors, places, yaws, strict=False)
+        cube(f"{size}_block", half, color, 700, upright(start, TABLE_TOP, yaw))
+        for size, half, color, start, yaw in zip(SIZES, halves, colors, starts, yaws, strict=False)
     )
-    row_places = {f"{size}_block": (float(x), float(y)) for size, (x, y) in zip(SIZES, targets, strict=True)}
-    return Scene("blocks_ranking_size", seed, blocks, words=dict(zip(SIZES, colors, strict=False)), targets=row_places)
+    row_targets = {block.name: (float(x), float(y)) for block, (x, y) in zip(blocks, targets, strict=True)}
+    return Scene("blocks_ranking_size", seed, blocks, words=dict(zip(SIZES, colors, strict=False)), targets=row_targets)
 
 
-def _is_free(point: np.ndarray, places: list[np.ndarray], targets: list[np.ndarray]) -> bool:
-    room = all(np.hypot(*(point - target)) >= 0.1 for target in targets)
-    return room and is_free(point, places) and all(np.hypot(*(point - other)) >= 0.12 for other in places)
+def _is_free(point: np.ndarray, others: list[np.ndarray], targets: list[np.ndarray]) -> bool:
+    off_row = all(np.hypot(*(point - target)) >= 0.1 for target in targets)
+    return off_row and is_free(point, others) and all(np.hypot(*(point - other)) >= 0.12 for other in others)
 
 
 def plan(scene: Scene) -> Timeline:
@@ -57,20 +48,9 @@ def plan(scene: Scene) -> Timeline:
     timeline = Timeline()
     for block in reversed(scene.objects):
         width = float(np.ptp(block.shape.mesh.vertices[:, 0]))
-        move_block(
-            timeline,
-            arm_for(block.pose[0]),
-            block,
-            scene.targets[block.name],
-            opening=min(1.0, (width + 0.020) / NARROWEST_HAND),
-            release=min(1.0, (width + LET_GO) / NARROWEST_HAND),
-        )
+        target = scene.targets[block.name]
+        move_block(timeline, block, target, opening=opening_for(width, 0.020), release=opening_for(width))
     return timeline
-
-
-def success(scene: Scene, now: Moment) -> bool:
-    places = now.object_pose[[scene.index(f"{size}_block") for size in SIZES], :2]
-    return are_in_order(places) and now.both_open
 
 
 TASK = Task(

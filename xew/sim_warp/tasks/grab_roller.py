@@ -30,7 +30,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 def plan(scene: Scene) -> Timeline:
     roller = scene.object("roller")
     x, y = roller.pose[:2]
-    yaw = 2 * np.arctan2(roller.pose[5], roller.pose[6])
+    yaw = roller.yaw
     points = roller.shape.hulls[0]
     reach, height = points[:, 0].max() - GRASP_FROM_END, points[:, 2].mean()
     along = np.array([np.cos(yaw), np.sin(yaw)])

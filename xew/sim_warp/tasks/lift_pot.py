@@ -6,13 +6,12 @@ After RoboTwin 2.0's lift_pot.
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from xew.sim_warp.assets import containers
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, pick
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, object_axis, pick
 
 WIDEST_TURN = np.radians(22.5)
 LIFT = 0.14
@@ -32,7 +31,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 def handles(scene: Scene, pose: np.ndarray) -> np.ndarray:
     """[2 3] the middles of the left and the right handle of the pot at `pose` [7], world [m]."""
-    return np.asarray(pose[:3]) + Rotation.from_quat(pose[3:]).apply(containers.handles(scene.object("pot").shape))
+    return np.asarray(pose[:3]) + object_axis(pose, containers.handles(scene.object("pot").shape))
 
 
 def plan(scene: Scene) -> Timeline:
@@ -49,9 +48,8 @@ def plan(scene: Scene) -> Timeline:
 
 def success(scene: Scene, now: Moment) -> bool:
     pose = now.object_pose[scene.index("pot")]
-    level = Rotation.from_quat(pose[3:]).apply([0, 0, 1])[2]
     apart = np.linalg.norm(now.tool_pose[:, :3] - handles(scene, pose), axis=-1)
-    return bool(pose[2] > HIGH_ENOUGH and level > UPRIGHT and (apart < NEAR).all())
+    return bool(pose[2] > HIGH_ENOUGH and object_axis(pose, [0, 0, 1])[2] > UPRIGHT and (apart < NEAR).all())
 
 
 TASK = Task("lift_pot", "lift the {color} pot with both arms", sample, plan, success)

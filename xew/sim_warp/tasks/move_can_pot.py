@@ -9,13 +9,12 @@ passes over its handle.
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from xew.sim_warp.assets import containers
 from xew.sim_warp.plan import Timeline
-from xew.sim_warp.scene import Scene, SceneObject, draw, upright
+from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, carry, radial_yaw, side_sign
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, carry, is_upright, radial_turn, side_sign
 
 BESIDE = 0.18
 """Distance of the can from the pot's axis [m]."""
@@ -23,7 +22,7 @@ BESIDE = 0.18
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
     side = rng.choice([-1.0, 1.0])
-    at = draw(rng, [0.20, 0.05], [0.30, 0.15], lambda p: True) * [side, 1]
+    at = rng.uniform([0.20, 0.05], [0.30, 0.15]) * [side, 1]
     pot, metal = containers.pot(rng, radius=(0.056, 0.064), height=(0.062, 0.074), reach=0.022)
     can, label = containers.can(rng)
     return Scene(
@@ -42,7 +41,7 @@ def plan(scene: Scene) -> Timeline:
     arm = arm_for(can.pose[0])
     goal = np.array(pot.pose[:3]) + [side_sign(arm) * BESIDE, 0, 0]
     timeline = Timeline()
-    carry(timeline, can, goal, radial_yaw(arm, goal) - radial_yaw(arm, can.pose), tilt=GRASP_TILT)
+    carry(timeline, can, goal, radial_turn(arm, can.pose, goal), tilt=GRASP_TILT)
     return timeline
 
 
@@ -50,8 +49,7 @@ def success(scene: Scene, now: Moment) -> bool:
     can, pot = now.object_pose[scene.index("can")], np.array(scene.object("pot").pose[:3])
     side = np.sign(scene.object("can").pose[0])
     x, y, z = (can[:3] - pot) * [side, 1, 1]
-    tilt = Rotation.from_quat(can[3:]).apply([0, 0, 1])[2]
-    return bool(0 < x < 0.2 and abs(y) < 0.035 and abs(z) < 0.005 and tilt > np.cos(np.radians(15)) and now.both_open)
+    return bool(0 < x < 0.2 and abs(y) < 0.035 and abs(z) < 0.005 and is_upright(can, 15) and now.both_open)
 
 
 TASK = Task("move_can_pot", "pick up the {can} can and put it beside the {pot} pot", sample, plan, success)

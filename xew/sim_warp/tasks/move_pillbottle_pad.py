@@ -7,13 +7,12 @@ After RoboTwin 2.0's move_pillbottle_pad, whose pads are all blue.
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from xew.sim_warp.assets import containers, household
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, carry, radial_yaw
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, carry, is_upright, point_above, radial_turn
 
 PAD = 0.08
 """Side of the pad [m]."""
@@ -21,7 +20,7 @@ PAD = 0.08
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
     side = rng.choice([-1.0, 1.0])
-    bottle = draw(rng, [0.05, -0.10], [0.25, 0.10], lambda p: True)
+    bottle = rng.uniform([0.05, -0.10], [0.25, 0.10])
     pad = draw(rng, [0.05, -0.20], [0.25, 0.10], lambda p: np.hypot(*(p - bottle)) >= 0.10)
     shape, _ = containers.pill_bottle(rng)
     color = str(rng.choice(sorted(household.MATS)))
@@ -38,18 +37,16 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 def plan(scene: Scene) -> Timeline:
     bottle, pad = scene.object("bottle"), scene.object("pad")
-    arm = arm_for(bottle.pose[0])
-    goal = np.array(pad.pose[:3]) + [0, 0, household.MAT_THICKNESS]
+    goal = point_above(pad, household.MAT_THICKNESS)
     timeline = Timeline()
-    carry(timeline, bottle, goal, radial_yaw(arm, goal) - radial_yaw(arm, bottle.pose), lift=0.06, tilt=GRASP_TILT)
+    carry(timeline, bottle, goal, radial_turn(arm_for(bottle.pose[0]), bottle.pose, goal), lift=0.06, tilt=GRASP_TILT)
     return timeline
 
 
 def success(scene: Scene, now: Moment) -> bool:
     bottle = now.object_pose[scene.index("bottle")]
     offset = np.abs(bottle[:3] - scene.object("pad").pose[:3] - [0, 0, household.MAT_THICKNESS])
-    standing = Rotation.from_quat(bottle[3:]).apply([0, 0, 1])[2] > np.cos(np.radians(15))
-    return bool((offset[:2] < 0.03).all() and offset[2] < 0.005 and standing and now.both_open)
+    return bool((offset < [0.03, 0.03, 0.005]).all() and is_upright(bottle, 15) and now.both_open)
 
 
 TASK = Task("move_pillbottle_pad", "place the pill bottle on the {color} pad", sample, plan, success)

@@ -9,13 +9,12 @@ After RoboTwin 2.0's move_stapler_pad, whose stapler lies at any yaw; here both 
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from xew.sim_warp.assets import household
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, arm_for, carry, graspable_yaw, symmetric_yaw
+from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, aligning_turn, carry, graspable_yaw, object_axis, point_above
 
 MAT = (0.11, 0.06)
 
@@ -23,7 +22,7 @@ MAT = (0.11, 0.06)
 def sample(rng: np.random.Generator, seed: int) -> Scene:
     side = rng.choice([-1.0, 1.0])
     stapler = household.stapler(rng)
-    goal = draw(rng, [0.05, -0.20], [0.16, -0.10], lambda p: True)
+    goal = rng.uniform([0.05, -0.20], [0.16, -0.10])
     at = draw(rng, [0.05, -0.20], [0.25, -0.03], lambda p: np.hypot(*(p - goal)) >= 0.12) * [side, 1]
     color = household.mat_color(rng, stapler.words)
     return Scene(
@@ -39,19 +38,17 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 def plan(scene: Scene) -> Timeline:
     stapler, mat = scene.object("stapler"), scene.object("mat")
-    arm = arm_for(stapler.pose[0])
-    goal = np.array(mat.pose[:3]) + [0, 0, household.MAT_THICKNESS]
-    start_yaw = symmetric_yaw(arm, stapler.pose, stapler.yaw, np.pi)
+    goal = point_above(mat, household.MAT_THICKNESS)
     timeline = Timeline()
-    carry(timeline, stapler, goal, symmetric_yaw(arm, goal, np.pi / 2, np.pi) - start_yaw, tilt=STEEP_TILT)
+    carry(timeline, stapler, goal, aligning_turn(stapler, goal, np.pi / 2), tilt=STEEP_TILT)
     return timeline
 
 
 def success(scene: Scene, now: Moment) -> bool:
     pose = now.object_pose[scene.index("stapler")]
     offset = np.abs(pose[:3] - np.array(scene.object("mat").pose[:3]) - [0, 0, household.MAT_THICKNESS])
-    along = np.abs(Rotation.from_quat(pose[3:]).apply([0, 1, 0])[0]) > np.cos(np.radians(10))
-    return bool((offset[:2] < 0.02).all() and offset[2] < 0.01 and along and now.both_open)
+    along = np.abs(object_axis(pose, [0, 1, 0])[0]) > np.cos(np.radians(10))
+    return bool((offset < [0.02, 0.02, 0.01]).all() and along and now.both_open)
 
 
 TASK = Task("move_stapler_pad", "move the {stapler} to the {color} mat", sample, plan, success)

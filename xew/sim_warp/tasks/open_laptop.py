@@ -7,14 +7,13 @@ After RoboTwin 2.0's open_laptop, whose front turns up to 60 degrees and whose e
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from xew.sim_warp import objects
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool, tool
 from xew.sim_warp.scene import Hinge, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, aside_poses, radial_yaw
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, aside_poses, hinge_of, lid_point, radial_yaw
 
 BASE_HEIGHT = 0.016
 LID_THICKNESS = 0.009
@@ -63,16 +62,15 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 def lid_edge(scene: Scene, fraction: float) -> np.ndarray:
     """[3] world position of the middle of the lid's free edge, inner side, at a fraction of the hinge's range."""
-    thing, hinge = scene.object("laptop"), _hinge(scene)
-    angle = hinge.lower + fraction * (hinge.upper - hinge.lower)
+    laptop = scene.object("laptop")
+    hinge = hinge_of(laptop)
     reach = hinge.anchor[1] - hinge.lid.hulls[0][:, 1].min()
-    local = np.array(hinge.anchor) + Rotation.from_euler("x", -angle).apply([0, -reach, -LID_THICKNESS / 2])
-    return np.array(thing.pose[:3]) + Rotation.from_euler("z", _yaw(thing)).apply(local)
+    return lid_point(laptop, [0, -reach, -LID_THICKNESS / 2], fraction)
 
 
 def _pushing_pose(scene: Scene, arm: int, fraction: float, short_by: float) -> Tool:
     """The closed hand whose far side touches the lid's edge, drawn back toward the laptop's front by `short_by` [m]."""
-    edge, yaw = lid_edge(scene, fraction), _yaw(scene.object("laptop"))
+    edge, yaw = lid_edge(scene, fraction), scene.object("laptop").yaw
     radial = radial_yaw(arm, edge)
     hand = tool(edge, radial + np.clip(yaw - radial, -WIDEST_TURN, WIDEST_TURN), GRASP_TILT)
     ahead = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
@@ -80,7 +78,7 @@ def _pushing_pose(scene: Scene, arm: int, fraction: float, short_by: float) -> T
 
 
 def plan(scene: Scene) -> Timeline:
-    arm = RIGHT if _yaw(scene.object("laptop")) > 0 else LEFT
+    arm = RIGHT if scene.object("laptop").yaw > 0 else LEFT
     timeline = Timeline()
     timeline.grip({arm: 0.0})
     before = _pushing_pose(scene, arm, START, RUN_UP)
@@ -95,18 +93,8 @@ def plan(scene: Scene) -> Timeline:
     return timeline
 
 
-def _hinge(scene: Scene) -> Hinge:
-    hinge = scene.object("laptop").hinge
-    assert hinge is not None
-    return hinge
-
-
-def _yaw(thing: SceneObject) -> float:
-    return float(2 * np.arctan2(thing.pose[5], thing.pose[6]))
-
-
 def success(scene: Scene, now: Moment) -> bool:
-    fraction = _hinge(scene).fraction(now.object_joint[scene.index("laptop")])
+    fraction = hinge_of(scene.object("laptop")).fraction(now.object_joint[scene.index("laptop")])
     near = np.linalg.norm(now.tool_pose[:, :3] - lid_edge(scene, fraction), axis=-1).min() < 0.1
     return bool(fraction > DONE and near)
 

@@ -15,7 +15,7 @@ from xew.sim_warp.assets import household
 from xew.sim_warp.assets.household import Thing
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw
-from xew.sim_warp.tasks.task import Moment, Task, carry, easy_turn, graspable_yaw
+from xew.sim_warp.tasks.task import Moment, Task, carry, easy_turn, grasp_of, graspable_yaw
 
 KINDS = (
     "bell", "bread", "coffee_box", "mouse", "phone", "playing_cards", "rubik_cube", "soap", "stapler", "tea_box", "toy_car",
@@ -45,8 +45,9 @@ def sample_beside(rng: np.random.Generator, task: str, seed: int, side: float) -
     mirror = np.array([half, 1, -side, 1])
     # B leaves room for A between itself and the end of the arm's reach.
     near, far = (0.18, 0.23) if half == -side else (-0.1, 0.1)
-    places = draw(rng, [0.02, -0.2, near, -0.2], [0.22, 0.0, far, 0.0], lambda p: _are_apart(p * mirror, first, second, side))
-    at, beside = np.split(places * mirror, 2)
+    low, high = [0.02, -0.2, near, -0.2], [0.22, 0.0, far, 0.0]
+    positions = draw(rng, low, high, lambda p: _are_apart(p * mirror, first, second, side))
+    at, beside = np.split(positions * mirror, 2)
     return Scene(
         task,
         seed,
@@ -55,9 +56,9 @@ def sample_beside(rng: np.random.Generator, task: str, seed: int, side: float) -
     )
 
 
-def _are_apart(places: np.ndarray, first: Thing, second: Thing, side: float) -> bool:
+def _are_apart(positions: np.ndarray, first: Thing, second: Thing, side: float) -> bool:
     """Are A and B, at [4] x y x y, free of each other, and is A not yet where it is to go?"""
-    offset = places[2:] - places[:2]
+    offset = positions[2:] - positions[:2]
     free = np.hypot(*offset) >= max(0.1, first.radius + second.radius + GAP) and abs(offset[1]) >= 0.1
     return bool(free and (np.hypot(*offset) > FARTHEST - 0.01 or side * offset[0] > 0))
 
@@ -74,10 +75,9 @@ def plan_beside(scene: Scene, side: float) -> Timeline:
 
 
 def _distance(first: SceneObject, second: SceneObject, yaw: float) -> float:
-    """How far from B to put A, turned to `yaw` [rad], so that neither A nor a finger nor the palm meets B [m]."""
-    assert first.grasp is not None
+    """Distance from B at which A, turned to `yaw` [rad], fingers and palm stay clear of B [m]."""
     beside = _half_extent(first, yaw) + _half_extent(second, second.yaw) + GAP
-    if second.shape.mesh.vertices[:, 2].max() > first.grasp.height + household.PALM:
+    if second.shape.mesh.vertices[:, 2].max() > grasp_of(first).height + household.PALM:
         beside = max(beside, PALM_HALF_WIDTH + _half_extent(second, second.yaw))
     return float(np.clip(beside, BESIDE, FARTHEST - MARGIN))
 

@@ -13,10 +13,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from xew.sim_warp import objects
-from xew.sim_warp.assets import household
+from xew.sim_warp.assets import containers, household
 from xew.sim_warp.assets.household import Thing
 from xew.sim_warp.geometry import meshes
 from xew.sim_warp.geometry.meshes import Color, Mesh
@@ -26,18 +25,19 @@ from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks.task import (
     HOVER,
-    LET_GO,
-    NARROWEST_HAND,
     STEEP_TILT,
     Moment,
     Task,
     arm_for,
     aside_poses,
     grasp_across,
+    grasp_of,
     graspable_yaw,
+    hand_yaw,
+    object_axis,
+    opening_for,
     pick,
     place,
-    symmetric_yaw,
 )
 
 BASKET = (0.0, -0.15)
@@ -69,8 +69,7 @@ def basket(form: str, color: Color) -> Shape:
         return Shape(meshes.merge(seen), body.hulls)
     x, y = HALF
     floor = objects.block((2 * x + WALL, 2 * y + WALL, FLOOR), shade)
-    walls = [objects.move(objects.block((2 * x + 2 * WALL, WALL, RIM), color), (0, s * (y + WALL / 2), 0)) for s in (-1, 1)]
-    walls += [objects.move(objects.block((WALL, 2 * y, RIM), color), (s * (x + WALL / 2), 0, 0)) for s in (-1, 1)]
+    walls = containers.walls((2 * x + 2 * WALL, 2 * y + 2 * WALL), WALL, RIM, color)
     along, deep = (np.linspace(-half + 0.01, half - 0.01, count) for half, count in ((x, 12), (y, 9)))
     spots = [(u, s * w, 0.0) for s in (-1, 1) for w in (y, y + WALL) for u in along]
     spots += [(s * w, v, np.pi / 2) for s in (-1, 1) for w in (x, x + WALL) for v in deep]
@@ -103,14 +102,14 @@ def _cloth() -> list[Mesh]:
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
     count = 1 + int(rng.random() < 0.75)
-    places: list[np.ndarray] = []
+    starts: list[np.ndarray] = []
     for _ in range(count):
-        places.append(draw(rng, [-0.28, -0.20], [0.28, 0.02], lambda p: _is_free(p, places)))
-    breads = [_bread(rng) for _ in places]
+        starts.append(draw(rng, [-0.28, -0.20], [0.28, 0.02], lambda p: _is_free(p, starts)))
+    breads = [_bread(rng) for _ in starts]
     form, color = str(rng.choice(["round", "square"])), WICKER[rng.integers(len(WICKER))]
     things = [
         bread.place_at(name, at, graspable_yaw(rng, at, WIDEST_TURN))
-        for name, bread, at in zip(("first_bread", "second_bread"), breads, sorted(places, key=lambda p: p[1]), strict=False)
+        for name, bread, at in zip(("first_bread", "second_bread"), breads, sorted(starts, key=lambda p: p[1]), strict=False)
     ]
     fixed = SceneObject("basket", basket(form, color), upright(BASKET, TABLE_TOP, rng.uniform(-0.25, 0.25)))
     words = {"bread": " and the ".join(bread.words for bread in breads), "form": form}
@@ -140,11 +139,11 @@ def plan(scene: Scene) -> Timeline:
     if len({arm_for(thing.pose[0]) for thing in things}) == 1:
         for thing in things:
             arm = arm_for(thing.pose[0])
-            pick(timeline, {arm: grasp_across(thing, arm, STEEP_TILT)}, LIFT)
+            pick(timeline, {arm: grasp_across(thing, STEEP_TILT)}, LIFT)
             _put_bread(timeline, arm, thing, goals[thing.name])
         return timeline
     left, right = sorted(things, key=lambda thing: thing.pose[0])
-    pick(timeline, {LEFT: grasp_across(left, LEFT, STEEP_TILT), RIGHT: grasp_across(right, RIGHT, STEEP_TILT)}, LIFT)
+    pick(timeline, {LEFT: grasp_across(left, STEEP_TILT), RIGHT: grasp_across(right, STEEP_TILT)}, LIFT)
     _put_bread(timeline, LEFT, left, goals[left.name])
     timeline.move(aside_poses([RIGHT]) | {RIGHT: goals[right.name].moved(z=LIFT)})
     _put_bread(timeline, RIGHT, right, goals[right.name])
@@ -154,13 +153,12 @@ def plan(scene: Scene) -> Timeline:
 def _goals(scene: Scene) -> dict[str, Tool]:
     """The hand as it lets go of each bread: one goes to the middle, two lie side by side."""
     fixed, things = scene.object("basket"), _sort_left_to_right(breads(scene))
-    sideways = Rotation.from_quat(fixed.pose[3:]).apply([1.0, 0, 0])
+    sideways = object_axis(fixed.pose, [1.0, 0, 0])
     goals = {}
     for thing, shift in zip(things, [0.0] if len(things) == 1 else [-SLOT, SLOT], strict=True):
-        arm = arm_for(thing.pose[0])
         goal = np.array(fixed.pose[:3]) + shift * sideways + [0, 0, FLOOR + HOVER]
-        turn = fixed.yaw - symmetric_yaw(arm, thing.pose, thing.yaw, np.pi)
-        goals[thing.name] = grasp_across(thing, arm, STEEP_TILT).carried(thing.pose[:3], goal, turn)
+        turn = fixed.yaw - hand_yaw(thing)
+        goals[thing.name] = grasp_across(thing, STEEP_TILT).carried(thing.pose[:3], goal, turn)
     return goals
 
 
@@ -173,15 +171,12 @@ def _sort_left_to_right(things: list[SceneObject]) -> list[SceneObject]:
 
 
 def _put_bread(timeline: Timeline, arm: int, thing: SceneObject, goal: Tool) -> None:
-    assert thing.grasp is not None
-    release = min(1.0, (thing.grasp.width + LET_GO) / NARROWEST_HAND)
-    place(timeline, arm, thing.name, goal, above=0.05, retreat=LIFT, release=release)
+    place(timeline, arm, thing.name, goal, above=0.05, retreat=LIFT, release=opening_for(grasp_of(thing).width))
 
 
 def success(scene: Scene, now: Moment) -> bool:
-    middle = scene.object("basket").pose
     for thing in breads(scene):
-        offset = now.object_pose[scene.index(thing.name), :3] - middle[:3]
+        offset = now.object_pose[scene.index(thing.name), :3] - scene.object("basket").pose[:3]
         if (np.abs(offset[:2]) >= 0.06).any() or not 0.0 < offset[2] < RIM:
             return False
     return now.both_open

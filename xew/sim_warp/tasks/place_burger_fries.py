@@ -10,13 +10,14 @@ After RoboTwin 2.0's place_burger_fries.
 import numpy as np
 
 from xew.sim_warp import objects
+from xew.sim_warp.assets import containers
 from xew.sim_warp.geometry import meshes
 from xew.sim_warp.geometry.meshes import Color, Mesh
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, aside_poses, pick, place, radial_yaw
+from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, aside_poses, pick, place, point_above, radial_turn, radial_yaw
 
 TRAY = (0.30, 0.19)
 """Outer size of the tray [m]."""
@@ -37,13 +38,7 @@ def tray(color: Color) -> Shape:
     """A low tray with a rim."""
     width, depth = TRAY
     floor = objects.block((width, depth, TRAY_FLOOR), color)
-    rim = objects.darken(color, 0.82)
-    edges = [
-        objects.move(objects.block((width, 0.006, 0.009), rim), (0, side * (depth / 2 - 0.003), TRAY_FLOOR)) for side in (-1, 1)
-    ] + [
-        objects.move(objects.block((0.006, depth - 0.012, 0.009), rim), (side * (width / 2 - 0.003), 0, TRAY_FLOOR))
-        for side in (-1, 1)
-    ]
+    edges = containers.walls(TRAY, 0.006, 0.009, objects.darken(color, 0.82), TRAY_FLOOR)
     paper = meshes.box((width * 0.86, depth * 0.8, 0.0006), (246, 243, 234)).transformed((0, 0, TRAY_FLOOR))
     return objects.merge(floor, *edges, Shape(paper))
 
@@ -73,10 +68,7 @@ def burger(rng: np.random.Generator) -> Shape:
 
 
 def _ring(radius: float, z: float) -> np.ndarray:
-    """[SIDES 3] corners of a polygon about z whose inscribed circle has `radius` [m]; a flat side faces +x."""
-    angle = (np.arange(SIDES) + 0.5) * 2 * np.pi / SIDES
-    outer = radius / np.cos(np.pi / SIDES)
-    return np.column_stack([outer * np.cos(angle), outer * np.sin(angle), np.full(SIDES, z)])
+    return containers.ring(radius, SIDES, z)
 
 
 def _layer(radius: float, low: float, high: float, color: Color) -> Mesh:
@@ -137,22 +129,21 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 def spots(scene: Scene) -> dict[str, np.ndarray]:
     """Where burger and fries go on the tray's floor, [3] world."""
-    middle = np.array(scene.object("tray").pose[:3]) + [0, 0, TRAY_FLOOR]
+    middle = point_above(scene.object("tray"), TRAY_FLOOR)
     return {"burger": middle - [SPOT, 0, 0], "fries": middle + [SPOT, 0, 0]}
 
 
 def plan(scene: Scene) -> Timeline:
     left, right = (np.array(scene.object(name).pose[:3]) for name in ("burger", "fries"))
-    yaw = radial_yaw(LEFT, left)
     along = np.array([0, CARTON_BACK + CARTON_LENGTH / 2, FRIES_GRASP])
     grasps = {
-        LEFT: tool(left + [0, 0, BURGER_GRASP], yaw, STEEP_TILT),
+        LEFT: tool(left + [0, 0, BURGER_GRASP], radial_yaw(LEFT, left), STEEP_TILT),
         RIGHT: tool(right + along, 0.0, STEEP_TILT),
     }
     goal = {name: spot + [0, 0, 0.002] for name, spot in spots(scene).items()}
-    turn = radial_yaw(LEFT, goal["burger"]) - yaw
+    turn = radial_turn(LEFT, left, goal["burger"])
     timeline = Timeline()
-    pick(timeline, grasps, lift=LIFT, opening=1.0)
+    pick(timeline, grasps, lift=LIFT)
     put_burger = grasps[LEFT].carried(left, goal["burger"], turn)
     place(timeline, LEFT, "burger", put_burger, above=0.07, retreat=LIFT, release=0.95)
     put_fries = grasps[RIGHT].carried(right, goal["fries"])

@@ -15,7 +15,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, pick, place, radial_yaw, rim_grasp, vessel_pose
+from xew.sim_warp.tasks.task import Moment, Task, carry_by_rim, point_above, vessel_pose
 
 WALL = 0.005
 RIM_DEPTH = 0.007
@@ -50,7 +50,7 @@ def plate(rng: np.random.Generator, color: Color) -> Shape:
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
     side = rng.choice([-1.0, 1.0])
-    at = draw(rng, [0.20, -0.10], [0.28, 0.05], lambda p: True)
+    at = rng.uniform([0.20, -0.10], [0.28, 0.05])
     dish = draw(rng, [0.02, -0.15], [0.08, -0.10], lambda p: np.hypot(*(p - at)) >= CLEAR)
     kind = ("bowl", "cup")[rng.integers(2)]
     color, trim = containers.draw_color_names(rng, 2)
@@ -67,19 +67,15 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 
 def plan(scene: Scene) -> Timeline:
-    container, dish = scene.object("container"), scene.object("plate")
-    arm, grasp = rim_grasp(container, WALL, RIM_DEPTH)
-    start, goal = container.pose[:3], np.array(dish.pose[:3]) + [0, 0, WALL + 0.002]
-    turn = radial_yaw(arm, goal) - radial_yaw(arm, start)
+    goal = point_above(scene.object("plate"), WALL + 0.002)
     timeline = Timeline()
-    pick(timeline, {arm: grasp}, lift=0.08, opening=0.5)
-    place(timeline, arm, "container", grasp.carried(start, goal, turn), above=0.05, retreat=0.08, release=0.4)
+    carry_by_rim(timeline, scene.object("container"), goal, WALL, RIM_DEPTH)
     return timeline
 
 
 def success(scene: Scene, now: Moment) -> bool:
     offset = np.abs(now.object_pose[scene.index("container"), :3] - scene.object("plate").pose[:3] - [0, 0, WALL])
-    return bool((offset[:2] < 0.05).all() and offset[2] < 0.01 and now.both_open)
+    return bool((offset < [0.05, 0.05, 0.01]).all() and now.both_open)
 
 
 TASK = Task("place_container_plate", "place the {color} {kind} on the plate", sample, plan, success)

@@ -16,13 +16,26 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xew.sim_warp import objects
+from xew.sim_warp.assets import containers
 from xew.sim_warp.geometry import meshes
 from xew.sim_warp.geometry.meshes import Color, Mesh
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool, tool
 from xew.sim_warp.scene import Grasp, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import HOVER, LET_GO, NARROWEST_HAND, Moment, Task, aside_poses, pick, place, side_sign
+from xew.sim_warp.tasks.task import (
+    HOVER,
+    Moment,
+    Task,
+    aside_poses,
+    grasp_of,
+    object_axis,
+    opening_for,
+    pick,
+    place,
+    point_above,
+    side_sign,
+)
 
 BOX = (0.0, -0.14)
 BOX_SIZE = (0.236, 0.214)
@@ -103,7 +116,7 @@ def _collar(grip: float, half: float, top: float, trim: Color) -> list[Mesh]:
 
 
 def _details(kind: str, grip: float, half: float, top: float, trim: Color) -> list[Mesh]:
-    """What tells a sneaker (laces, tongue, stripes, toe cap) from a loafer (strap, heel); all only seen."""
+    """Details of a sneaker (laces, tongue, stripes, toe cap) or a loafer (strap, heel); all only seen."""
     fall = 0.27 * top / (0.48 * half)
     lean = -float(np.arctan(fall))
 
@@ -133,13 +146,9 @@ def shoe_box(color: Color) -> Shape:
     """The lower part of a shoe box, with tissue paper on its floor."""
     width, depth = BOX_SIZE
     floor = objects.block((width - WALL, depth - WALL, FLOOR), objects.darken(color, 0.9))
-    walls = [objects.move(objects.block((width, WALL, RIM), color), (0, s * (depth - WALL) / 2, 0)) for s in (-1, 1)]
-    walls += [
-        objects.move(objects.block((WALL, depth - 2 * WALL, RIM), color), (s * (width - WALL) / 2, 0, 0)) for s in (-1, 1)
-    ]
     paper = meshes.box((width - 0.02, depth - 0.02, 0.0008), (246, 244, 240)).transformed((0, 0, FLOOR))
     label = meshes.box((0.07, 0.0012, 0.018), (246, 244, 240)).transformed((0, -depth / 2, RIM / 2))
-    return objects.merge(floor, *walls, Shape(meshes.merge([paper, label])))
+    return objects.merge(floor, *containers.walls(BOX_SIZE, WALL, RIM, color), Shape(meshes.merge([paper, label])))
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
@@ -156,9 +165,9 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     return Scene("place_dual_shoes", seed, (*shoes, fixed), words={"color": colors[0], "kind": kind})
 
 
-def places(scene: Scene) -> dict[str, np.ndarray]:
+def slots(scene: Scene) -> dict[str, np.ndarray]:
     """Where the shoes stand in the box, [3] world."""
-    middle = np.array(scene.object("box").pose[:3]) + [0, 0, FLOOR]
+    middle = point_above(scene.object("box"), FLOOR)
     return {"left_shoe": middle - [0, SLOT, 0], "right_shoe": middle + [0, SLOT, 0]}
 
 
@@ -174,12 +183,10 @@ def plan(scene: Scene) -> Timeline:
     names = {LEFT: "left_shoe", RIGHT: "right_shoe"}
     grasps, goals = {}, {}
     for arm, name in names.items():
-        thing, goal = scene.object(name), places(scene)[name] + [0, 0, HOVER]
+        thing, goal = scene.object(name), slots(scene)[name] + [0, 0, HOVER]
         grasps[arm], turn = _grasp(thing, arm)
         goals[arm] = grasps[arm].carried(thing.pose[:3], goal, turn)
-    grasp = scene.object("left_shoe").grasp
-    assert grasp is not None
-    release = min(1.0, (grasp.width + LET_GO) / NARROWEST_HAND)
+    release = opening_for(grasp_of(scene.object("left_shoe")).width)
     timeline = Timeline()
     pick(timeline, grasps, LIFT)
     place(timeline, LEFT, names[LEFT], goals[LEFT], above=LIFT, retreat=LIFT, release=release)
@@ -189,11 +196,10 @@ def plan(scene: Scene) -> Timeline:
 
 
 def success(scene: Scene, now: Moment) -> bool:
-    for name, goal in places(scene).items():
+    for name, goal in slots(scene).items():
         pose = now.object_pose[scene.index(name)]
         offset = np.abs(pose[:3] - goal)
-        tip = Rotation.from_quat(pose[3:]).apply([0, 1, 0])
-        if (offset >= [0.05, 0.05, 0.015]).any() or -tip[0] < np.cos(np.radians(15)):
+        if (offset >= [0.05, 0.05, 0.015]).any() or -object_axis(pose, [0, 1, 0])[0] < np.cos(np.radians(15)):
             return False
     return now.both_open
 

@@ -12,7 +12,7 @@ from xew.sim_warp import objects
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, pick, place, radial_yaw, rim_grasp, vessel_pose
+from xew.sim_warp.tasks.task import Moment, Task, carry_by_rim, point_above, vessel_pose
 
 COASTER_HEIGHT = 0.008
 WALL = 0.005
@@ -21,7 +21,7 @@ RIM_DEPTH = 0.008
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
     side = rng.choice([-1.0, 1.0])
-    cup = draw(rng, [0.15, -0.20], [0.30, 0.05], lambda p: True) * [side, 1]
+    cup = rng.uniform([0.15, -0.20], [0.30, 0.05]) * [side, 1]
     coaster = draw(rng, [-0.05, -0.20], [0.10, 0.05], lambda p: np.hypot(*(p * [side, 1] - cup)) >= 0.12) * [side, 1]
     height, radius = rng.uniform([0.078, 0.038], [0.092, 0.043])
     colors = rng.permutation(sorted(objects.PALETTE))
@@ -40,18 +40,14 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 
 def plan(scene: Scene) -> Timeline:
-    cup, coaster = scene.object("cup"), scene.object("coaster")
-    arm, grasp = rim_grasp(cup, WALL, RIM_DEPTH)
-    start, goal = cup.pose[:3], np.array(coaster.pose[:3]) + [0, 0, COASTER_HEIGHT + 0.002]
-    turn = radial_yaw(arm, goal) - radial_yaw(arm, start)
+    goal = point_above(scene.object("coaster"), COASTER_HEIGHT + 0.002)
     timeline = Timeline()
-    pick(timeline, {arm: grasp}, lift=0.08, opening=0.5)
-    place(timeline, arm, "cup", grasp.carried(start, goal, turn), above=0.05, retreat=0.08, release=0.4)
+    carry_by_rim(timeline, scene.object("cup"), goal, WALL, RIM_DEPTH)
     return timeline
 
 
 def success(scene: Scene, now: Moment) -> bool:
-    goal = np.array(scene.object("coaster").pose[:3]) + [0, 0, COASTER_HEIGHT]
+    goal = point_above(scene.object("coaster"), COASTER_HEIGHT)
     offset = now.object_pose[scene.index("cup"), :3] - goal
     return bool(np.hypot(*offset[:2]) < 0.035 and abs(offset[2]) < 0.015 and now.both_open)
 

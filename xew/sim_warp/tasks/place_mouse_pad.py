@@ -8,13 +8,12 @@ After RoboTwin 2.0's place_mouse_pad, whose mouse lies at any yaw and at least .
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from xew.sim_warp.assets import household
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, arm_for, carry, graspable_yaw, symmetric_yaw
+from xew.sim_warp.tasks.task import Moment, Task, aligning_turn, carry, graspable_yaw, object_axis, point_above
 
 MAT = (0.07, 0.13)
 
@@ -22,7 +21,7 @@ MAT = (0.07, 0.13)
 def sample(rng: np.random.Generator, seed: int) -> Scene:
     side = rng.choice([-1.0, 1.0])
     mouse = household.mouse(rng)
-    at = draw(rng, [0.05, -0.20], [0.25, 0.0], lambda p: True)
+    at = rng.uniform([0.05, -0.20], [0.25, 0.0])
     goal = draw(rng, [0.05, -0.20], [0.25, 0.0], lambda p: np.hypot(*(p - at)) >= 0.13) * [side, 1]
     at = at * [side, 1]
     color = household.mat_color(rng, mouse.words)
@@ -39,19 +38,17 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 def plan(scene: Scene) -> Timeline:
     mouse, mat = scene.object("mouse"), scene.object("mat")
-    arm = arm_for(mouse.pose[0])
-    goal = np.array(mat.pose[:3]) + [0, 0, household.MAT_THICKNESS]
-    start_yaw = symmetric_yaw(arm, mouse.pose, mouse.yaw, np.pi)
+    goal = point_above(mat, household.MAT_THICKNESS)
     timeline = Timeline()
-    carry(timeline, mouse, goal, symmetric_yaw(arm, goal, 0.0, np.pi) - start_yaw)
+    carry(timeline, mouse, goal, aligning_turn(mouse, goal, 0.0))
     return timeline
 
 
 def success(scene: Scene, now: Moment) -> bool:
     pose = now.object_pose[scene.index("mouse")]
     offset = np.abs(pose[:2] - scene.object("mat").pose[:2])
-    along = np.abs(Rotation.from_quat(pose[3:]).apply([0, 1, 0])[1]) > np.cos(np.radians(15))
-    return bool(offset[0] < 0.015 and offset[1] < 0.012 and along and now.both_open)
+    along = np.abs(object_axis(pose, [0, 1, 0])[1]) > np.cos(np.radians(15))
+    return bool((offset < [0.015, 0.012]).all() and along and now.both_open)
 
 
 TASK = Task("place_mouse_pad", "place the {mouse} on the {color} mat", sample, plan, success)

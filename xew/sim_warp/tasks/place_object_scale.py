@@ -15,9 +15,9 @@ from xew.sim_warp.assets.household import print_on, slab
 from xew.sim_warp.geometry import meshes
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline
-from xew.sim_warp.scene import Scene, SceneObject, draw, upright
+from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, carry, easy_turn, graspable_yaw
+from xew.sim_warp.tasks.task import Moment, Task, carry, draw_pair, easy_turn, graspable_yaw, point_above
 
 KINDS = ("mouse", "stapler", "bell")
 GAP = 0.02
@@ -51,9 +51,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     thing = household.draw_thing(rng, KINDS)
     color, shape = scale(rng)
     apart = thing.radius + household.footprint_radius(shape) + GAP
-    low, high = [0.04, -0.20, 0.04, -0.18], [0.25, 0.0, 0.25, 0.02]
-    places = draw(rng, low, high, lambda p: np.hypot(*(p[2:] - p[:2])) >= apart) * [side, 1, side, 1]
-    at, beneath = np.split(places, 2)
+    at, beneath = draw_pair(rng, [0.04, -0.20, 0.04, -0.18], [0.25, 0.0, 0.25, 0.02], apart, side)
     turn = rng.uniform(-1, 1) * np.radians(40)
     return Scene(
         "place_object_scale",
@@ -69,7 +67,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 def pan_center(scene: Scene) -> np.ndarray:
     """[3] the middle of the pan's upper face, world [m]."""
     scale = scene.object("scale")
-    return np.array(scale.pose[:3]) + [0, 0, scale.shape.mesh.vertices[:, 2].max()]
+    return point_above(scale, scale.shape.mesh.vertices[:, 2].max())
 
 
 def plan(scene: Scene) -> Timeline:

@@ -16,9 +16,9 @@ from xew.sim_warp.geometry import meshes
 from xew.sim_warp.geometry.meshes import Color, Mesh
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline
-from xew.sim_warp.scene import Scene, SceneObject, draw, upright
+from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, carry, easy_turn, graspable_yaw
+from xew.sim_warp.tasks.task import Moment, Task, carry, draw_pair, easy_turn, graspable_yaw, point_above
 
 KINDS = ("bell", "mouse", "remote", "rubik_cube", "stapler", "toy_car")
 COLORS = ("black", "gray", "teal", "purple", "blue", "green")
@@ -58,9 +58,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     thing = household.draw_thing(rng, KINDS)
     color, shape = stand(rng)
     apart = thing.radius + household.footprint_radius(shape) + GAP
-    low, high = [0.20, -0.05, 0.0, -0.15], [0.28, 0.05, 0.05, -0.10]
-    places = draw(rng, low, high, lambda p: np.hypot(*(p[2:] - p[:2])) >= apart) * [side, 1, side, 1]
-    at, beneath = np.split(places, 2)
+    at, beneath = draw_pair(rng, [0.20, -0.05, 0.0, -0.15], [0.28, 0.05, 0.05, -0.10], apart, side)
     turn = rng.uniform(-1, 1) * np.radians(30)
     return Scene(
         "place_object_stand",
@@ -79,7 +77,7 @@ def top_height(scene: Scene) -> float:
 
 
 def plan(scene: Scene) -> Timeline:
-    thing, goal = scene.object("thing"), np.array(scene.object("stand").pose[:3]) + [0, 0, top_height(scene)]
+    thing, goal = scene.object("thing"), point_above(scene.object("stand"), top_height(scene))
     timeline = Timeline()
     carry(timeline, thing, goal, easy_turn(thing, goal))
     return timeline
@@ -88,7 +86,7 @@ def plan(scene: Scene) -> Timeline:
 def success(scene: Scene, now: Moment) -> bool:
     thing, beneath = (now.object_pose[scene.index(name), :3] for name in ("thing", "stand"))
     offset = np.abs(thing - beneath - [0, 0, top_height(scene)])
-    return bool((offset[:2] < 0.03).all() and offset[2] < SEATED and now.both_open)
+    return bool((offset < [0.03, 0.03, SEATED]).all() and now.both_open)
 
 
 TASK = Task("place_object_stand", "place the {thing} on the {color} stand", sample, plan, success)

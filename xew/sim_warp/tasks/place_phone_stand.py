@@ -20,7 +20,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import LET_GO, NARROWEST_HAND, Moment, Task, arm_for, pick, place, radial_yaw
+from xew.sim_warp.tasks.task import Moment, Task, arm_for, grasp_of, object_axis, opening_for, pick, place, radial_yaw
 
 LEAN = np.radians(40)
 """Lean of the stand's rest from level [rad]."""
@@ -69,7 +69,7 @@ def _rest_box(size: tuple[float, float, float], center: tuple[float, float, floa
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
     side = np.array([rng.choice([-1.0, 1.0]), 1.0])
-    start = draw(rng, [0.05, -0.20], [0.25, -0.05], lambda p: True) * side
+    start = rng.uniform([0.05, -0.20], [0.25, -0.05]) * side
     place_ = draw(rng, [0.0, 0.02], [0.15, 0.12], lambda p: np.hypot(*(p * side - start)) >= 0.17) * side
     phone = household.phone(rng)
     colors = {name: household.COLORS[name] for name in ("black", "gray", "teal", "orange", "blue", "pink")} | {
@@ -97,12 +97,11 @@ def _lower_edge(thing: SceneObject) -> np.ndarray:
 def ledge(scene: Scene) -> np.ndarray:
     """[3] where that edge comes to rest, world."""
     thing = scene.object("stand")
-    return np.array(thing.pose[:3]) + Rotation.from_quat(thing.pose[3:]).apply(FOOT)
+    return np.array(thing.pose[:3]) + object_axis(thing.pose, FOOT)
 
 
 def plan(scene: Scene) -> Timeline:
     thing, support = scene.object("phone"), scene.object("stand")
-    assert thing.grasp is not None
     arm = arm_for(thing.pose[0])
     start = np.array(thing.pose[:3])
     grasp = tool(start + [0, 0, GRASP_HEIGHT], thing.yaw)
@@ -111,8 +110,7 @@ def plan(scene: Scene) -> Timeline:
     goal = tool(middle + leaning.apply([0, 0, GRASP_HEIGHT]), support.yaw, LEAN)
     timeline = Timeline()
     pick(timeline, {arm: grasp}, lift=0.06)
-    release = min(1.0, (thing.grasp.width + LET_GO) / NARROWEST_HAND)
-    place(timeline, arm, "phone", goal, above=0.05, retreat=0.07, release=release)
+    place(timeline, arm, "phone", goal, above=0.05, retreat=0.07, release=opening_for(grasp_of(thing).width))
     return timeline
 
 

@@ -8,14 +8,23 @@ After RoboTwin 2.0's press_stapler, whose stapler has no hinge and whose test as
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from xew.sim_warp.assets import household
 from xew.sim_warp.assets.household import StaplerParts
 from xew.sim_warp.plan import ASIDE_TIME, Timeline, Tool, tool
 from xew.sim_warp.scene import Hinge, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRIPPER_CLOSED, TURN_TILT, Moment, Task, arm_for, aside_poses, radial_yaw
+from xew.sim_warp.tasks.task import (
+    GRIPPER_CLOSED,
+    TURN_TILT,
+    Moment,
+    Task,
+    arm_for,
+    aside_poses,
+    hinge_of,
+    lid_point,
+    radial_yaw,
+)
 
 PRESS_AT = 0.28
 """Place to press along y, as a share of the stapler's length."""
@@ -69,12 +78,10 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 def press_point(scene: Scene, fraction: float) -> np.ndarray:
     """[3] the place to press on the upper face of the stapler's arm, at a fraction of its way down, world [m]."""
     thing = scene.object("stapler")
-    hinge = _hinge(scene)
-    arm = hinge.lid.hulls[0]
-    open_at = np.array([0.0, PRESS_AT * float(np.ptp(thing.shape.hulls[0][:, 1])), arm[:, 2].max() - 0.002])
-    angle = hinge.lower + fraction * (hinge.upper - hinge.lower)
-    local = hinge.anchor + Rotation.from_euler("x", -angle).apply(open_at - hinge.anchor)
-    return np.array(thing.pose[:3]) + Rotation.from_euler("z", thing.yaw).apply(local)
+    hinge = hinge_of(thing)
+    top = hinge.lid.hulls[0][:, 2].max()
+    open_at = np.array([0.0, PRESS_AT * float(np.ptp(thing.shape.hulls[0][:, 1])), top - 0.002])
+    return lid_point(thing, open_at - hinge.anchor, fraction)
 
 
 def _pressing_pose(scene: Scene, arm: int, fraction: float) -> Tool:
@@ -98,15 +105,9 @@ def plan(scene: Scene) -> Timeline:
     return timeline
 
 
-def _hinge(scene: Scene) -> Hinge:
-    hinge = scene.object("stapler").hinge
-    assert hinge is not None
-    return hinge
-
-
 def success(scene: Scene, now: Moment) -> bool:
     index = scene.index("stapler")
-    fraction = _hinge(scene).fraction(now.object_joint[index])
+    fraction = hinge_of(scene.object("stapler")).fraction(now.object_joint[index])
     near = np.linalg.norm(now.tool_pose[:, :3] - press_point(scene, fraction), axis=-1) < NEAR
     pressing = now.contact[:, index] & near & (now.gripper < GRIPPER_CLOSED)
     return bool(fraction > DONE and pressing.any())

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from xew.sim_warp.assets import containers
 from xew.sim_warp.plan import Timeline, Tool, tool
-from xew.sim_warp.scene import Scene, SceneObject, draw
+from xew.sim_warp.scene import Scene, SceneObject
 from xew.sim_warp.tasks.task import Moment, Task, arm_for, grasp_across, pick, radial_yaw, side_sign
 
 WIDEST_TURN = np.radians(45)
@@ -39,7 +39,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 def lying_bottle(task: str, rng: np.random.Generator, seed: int) -> Scene:
     """A bottle on its side, to be taken where it balances by the arm on its side."""
     side = rng.choice([-1.0, 1.0])
-    at = draw(rng, [0.10, -0.15], [0.15, -0.05], lambda p: True) * [side, 1]
+    at = rng.uniform([0.10, -0.15], [0.15, -0.05]) * [side, 1]
     yaw = radial_yaw(arm_for(side), at) + rng.uniform(-WIDEST_TURN, WIDEST_TURN)
     shape, color = containers.bottle(rng)
     return Scene(task, seed, (containers.place_lying("bottle", shape, at, yaw, mass=0.12),), words={"color": color})
@@ -59,7 +59,7 @@ def roll_hand(hand: Tool, angle: float) -> Tool:
 def raise_bottle(timeline: Timeline, bottle: SceneObject) -> int:
     """Take a lying bottle from straight above and bring it to `front_pose`; the arm on its side does it."""
     arm = arm_for(bottle.pose[0])
-    pick(timeline, {arm: grasp_across(bottle, arm, tilt=0.0)}, lift=LIFT)
+    pick(timeline, {arm: grasp_across(bottle, tilt=0.0)}, lift=LIFT)
     timeline.follow(arm, [front_pose(arm)], RAISING)
     return arm
 

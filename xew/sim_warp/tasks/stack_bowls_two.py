@@ -13,7 +13,7 @@ from xew.sim_warp import objects
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, pick, place, radial_yaw, rim_grasp, vessel_pose
+from xew.sim_warp.tasks.task import Moment, Task, carry_by_rim, vessel_pose
 
 STACK = (0.0, -0.1)
 WALL = 0.004
@@ -51,11 +51,8 @@ def _is_free(point: np.ndarray, others: list[np.ndarray]) -> bool:
 def plan(scene: Scene) -> Timeline:
     timeline = Timeline()
     for bowl, height in zip(scene.objects, (0.0, NESTING), strict=True):
-        arm, grasp = rim_grasp(bowl, WALL, RIM_DEPTH)
-        pick(timeline, {arm: grasp}, lift=0.10, opening=0.5)
-        start, goal = bowl.pose[:3], np.array([*STACK, TABLE_TOP + height + 0.003])
-        turn = radial_yaw(arm, goal) - radial_yaw(arm, start)
-        place(timeline, arm, bowl.name, grasp.carried(start, goal, turn), above=0.08, retreat=0.09, release=0.4)
+        goal = np.array([*STACK, TABLE_TOP + height + 0.003])
+        carry_by_rim(timeline, bowl, goal, WALL, RIM_DEPTH, lift=0.10, above=0.08, retreat=0.09)
     return timeline
 
 

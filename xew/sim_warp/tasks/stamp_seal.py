@@ -9,16 +9,16 @@ After RoboTwin 2.0's stamp_seal.
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from xew.sim_warp import objects
+from xew.sim_warp.assets import containers
 from xew.sim_warp.geometry import meshes
 from xew.sim_warp.geometry.meshes import Color
 from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, pick, place, radial_yaw
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, is_upright, pick, place, radial_turn, radial_yaw
 
 FACETS = 8
 """Number of flat sides of the knob, so that a pad lies on one."""
@@ -37,23 +37,17 @@ def seal(rng: np.random.Generator, ink: Color) -> Shape:
     pad = _prism(foot * 0.97, sides, 0.0, 0.005)
     base = _prism(foot, sides, 0.004, 0.016)
     neck = _prism(handle * 0.55, FACETS, 0.015, 0.036)
-    ring = _prism(handle * 0.7, 24, 0.016, 0.020)
+    band = _prism(handle * 0.7, 24, 0.016, 0.020)
     outline = [(0.55, 0.034), (1.0, 0.044), (1.0, height - 0.010), (0.72, height)]
-    knob = np.concatenate([_ring(share * handle, FACETS, z) for share, z in outline]).astype(np.float32)
-    pieces = [(pad, ink), (base, wood), (ring, BRASS), (neck, wood), (knob, wood)]
+    knob = np.concatenate([containers.ring(share * handle, FACETS, z) for share, z in outline]).astype(np.float32)
+    pieces = [(pad, ink), (base, wood), (band, BRASS), (neck, wood), (knob, wood)]
     mesh = meshes.merge([meshes.hull(points, color) for points, color in pieces])
     return Shape(mesh, (np.concatenate([pad, base]), neck, knob))
 
 
 def _prism(radius: float, sides: int, low: float, high: float) -> np.ndarray:
     """[k 3] corners of an upright prism; `radius` [m] is that of its inscribed circle, a flat side faces +x."""
-    return np.concatenate([_ring(radius, sides, low), _ring(radius, sides, high)]).astype(np.float32)
-
-
-def _ring(radius: float, sides: int, z: float) -> np.ndarray:
-    angle = (np.arange(sides) + 0.5) * 2 * np.pi / sides
-    outer = radius / np.cos(np.pi / sides)
-    return np.column_stack([outer * np.cos(angle), outer * np.sin(angle), np.full(sides, z)])
+    return np.concatenate([containers.ring(radius, sides, low), containers.ring(radius, sides, high)]).astype(np.float32)
 
 
 def square(color: Color) -> Shape:
@@ -65,7 +59,7 @@ def square(color: Color) -> Shape:
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
     side = np.array([rng.choice([-1.0, 1.0]), 1.0])
-    start = draw(rng, [0.05, -0.05], [0.25, 0.05], lambda p: True) * side
+    start = rng.uniform([0.05, -0.05], [0.25, 0.05]) * side
     target = draw(rng, [0.05, -0.05], [0.25, 0.05], lambda p: np.hypot(*(p * side - start)) >= 0.1) * side
     color = str(rng.choice(sorted(objects.PALETTE)))
     yaw = radial_yaw(arm_for(start[0]), start) + TURN * rng.integers(FACETS)
@@ -86,7 +80,7 @@ def plan(scene: Scene) -> Timeline:
     arm = arm_for(start[0])
     height = float(thing.shape.mesh.vertices[:, 2].max()) - GRASP_BELOW_TOP
     grasp = tool(start + [0, 0, height], radial_yaw(arm, start), GRASP_TILT)
-    turn = radial_yaw(arm, target) - radial_yaw(arm, start)
+    turn = radial_turn(arm, start, target)
     timeline = Timeline()
     pick(timeline, {arm: grasp}, lift=0.05, opening=0.7)
     place(timeline, arm, "seal", grasp.carried(start, target + [0, 0, 0.001], turn), above=0.05, retreat=0.09, release=0.7)
@@ -96,8 +90,7 @@ def plan(scene: Scene) -> Timeline:
 def success(scene: Scene, now: Moment) -> bool:
     pose = now.object_pose[scene.index("seal")]
     offset = np.abs(pose[:3] - scene.object("square").pose[:3])
-    stands = Rotation.from_quat(pose[3:]).apply([0, 0, 1])[2] > np.cos(np.radians(8))
-    return bool((offset < [0.01, 0.01, 0.005]).all() and stands and now.both_open)
+    return bool((offset < [0.01, 0.01, 0.005]).all() and is_upright(pose, 8) and now.both_open)
 
 
 TASK = Task("stamp_seal", "stamp the seal on the {color} square", sample, plan, success)

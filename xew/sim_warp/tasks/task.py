@@ -1,13 +1,14 @@
 """Tasks and the moves that they share: a task is a scene to sample, a plan that solves it, and a test of success."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from xew.sim_warp.geometry.poses import Pose
 from xew.sim_warp.plan import ASIDE, ASIDE_TIME, LEFT, RIGHT, Timeline, Tool, tool
-from xew.sim_warp.scene import Point, Scene, SceneObject, upright
+from xew.sim_warp.scene import Grasp, Hinge, Point, Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
 
 GRASP_TILT = np.radians(30)
@@ -15,7 +16,7 @@ GRASP_TILT = np.radians(30)
 STEEP_TILT = np.radians(10)
 """Lean for grasps low over the near part of the table, where a wrist of small range has it easier [rad]."""
 TURN_TILT = np.radians(20)
-"""Lean for grasps across things that may lie turned: the one with which all robots turn a hand up to `WIDEST_TURN`."""
+"""Lean for grasps across turned objects: the one with which all robots turn a hand up to `WIDEST_TURN`."""
 WIDEST_TURN = np.radians(55)
 """Largest turn of a hand from its radial yaw, over the near part of the table (y below .02) [rad]."""
 EASY_TURN = np.radians(35)
@@ -23,9 +24,9 @@ EASY_TURN = np.radians(35)
 PRE_GRASP = 0.09
 """Distance before a grasp from which the approach is straight [m]."""
 HOVER = 0.001
-"""Height above its place at which a thing is let go [m]."""
+"""Height above its place at which an object is released [m]."""
 LET_GO = 0.016
-"""Distance by which a hand opens wider than the thing in it, to be clear of it [m]."""
+"""Distance by which a hand opens wider than the held object, to be clear of it [m]."""
 NARROWEST_HAND = 0.08
 """Distance between the open pads of the narrowest gripper [m]."""
 GRIPPER_OPEN = 0.8
@@ -69,6 +70,21 @@ class Task:
     """Function (scene, moment) -> is the task done?"""
 
 
+def point_above(thing: SceneObject, height: float) -> np.ndarray:
+    """The point [3] m at `height` [m] over an object's origin."""
+    return np.array(thing.pose[:3]) + [0, 0, height]
+
+
+def object_axis(pose: np.ndarray | Pose, axis: Point) -> np.ndarray:
+    """An axis [3] of an object at a pose [7] in the world's frame [3]."""
+    return Rotation.from_quat(pose[3:]).apply(axis)
+
+
+def is_upright(pose: np.ndarray, lean: float) -> bool:
+    """Does the z axis of an object at a pose [7] lean by less than `lean` [deg]?"""
+    return bool(object_axis(pose, [0, 0, 1])[2] > np.cos(np.radians(lean)))
+
+
 def arm_for(x: float) -> int:
     """The arm on whose side x [m] lies."""
     return RIGHT if x > 0 else LEFT
@@ -105,26 +121,83 @@ def symmetric_yaw(arm: int, position: Point, yaw: float, symmetry: float) -> flo
     return float(yaw + symmetry * np.round((radial_yaw(arm, position) - yaw) / symmetry))
 
 
+def draw_pair(
+    rng: np.random.Generator, low: Sequence[float], high: Sequence[float], apart: float, side: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Two points [2] m on one side of the table, at least `apart` [m] from each other.
+
+    Args:
+        rng: random stream.
+        low, high: [4] bounds x y x y on the right side [m].
+        apart: least distance [m].
+        side: 1.0 for the right side, -1.0 for the left, where x is mirrored.
+    """
+    points = draw(rng, low, high, lambda p: np.hypot(*(p[2:] - p[:2])) >= apart) * [side, 1, side, 1]
+    return points[:2], points[2:]
+
+
 def graspable_yaw(rng: np.random.Generator, position: Point, widest: float = WIDEST_TURN) -> float:
-    """A yaw for a thing at `position`, either way round, at which the hand on its side takes it across its x axis [rad]."""
+    """A yaw for an object at `position`, either way round, at which the hand on its side takes it across its x axis [rad]."""
     return radial_yaw(arm_for(position[0]), position) + rng.uniform(-widest, widest) + np.pi * float(rng.integers(2))
 
 
-def grasp_across(thing: SceneObject, arm: int, tilt: float = TURN_TILT) -> Tool:
-    """The grasp from above that a thing asks for, with the hand turned as little as its symmetry allows."""
+def grasp_of(thing: SceneObject) -> Grasp:
+    """The grasp from above of an object that has one."""
     assert thing.grasp is not None, f"the {thing.name} has no grasp"
-    yaw = symmetric_yaw(arm, thing.pose, thing.yaw, thing.grasp.symmetry)
-    return tool(np.array(thing.pose[:3]) + [0, 0, thing.grasp.height], yaw, tilt)
+    return thing.grasp
+
+
+def hinge_of(thing: SceneObject) -> Hinge:
+    """The hinge of an object that has one."""
+    assert thing.hinge is not None, f"the {thing.name} has no hinge"
+    return thing.hinge
+
+
+def lid_point(thing: SceneObject, offset: Point, fraction: float) -> np.ndarray:
+    """World position [3] m of a point of an object's lid.
+
+    Args:
+        thing: upright, its lid hinged about an axis along its -x.
+        offset: [3] m from the hinge's anchor to the point at angle 0, in the object's frame.
+        fraction: how far open the lid is, 0 to 1.
+    """
+    hinge = hinge_of(thing)
+    angle = hinge.lower + fraction * (hinge.upper - hinge.lower)
+    local = np.array(hinge.anchor) + Rotation.from_euler("x", -angle).apply(offset)
+    return np.array(thing.pose[:3]) + Rotation.from_euler("z", thing.yaw).apply(local)
+
+
+def opening_for(width: float, clearance: float = LET_GO) -> float:
+    """The gripper command, 0 to 1, at which every hand clears an object of `width` [m] by `clearance` [m]."""
+    return min(1.0, (width + clearance) / NARROWEST_HAND)
+
+
+def hand_yaw(thing: SceneObject) -> float:
+    """Yaw of the hand in the grasp from above by the arm on the object's side [rad], turned as little as symmetry allows."""
+    return symmetric_yaw(arm_for(thing.pose[0]), thing.pose, thing.yaw, grasp_of(thing).symmetry)
+
+
+def grasp_across(thing: SceneObject, tilt: float = TURN_TILT) -> Tool:
+    """The grasp from above of an object by the arm on its side."""
+    return tool(point_above(thing, grasp_of(thing).height), hand_yaw(thing), tilt)
+
+
+def radial_turn(arm: int, start: Point, goal: Point) -> float:
+    """Turn of an object on its way from `start` to `goal` [2] or [3] m, at which the hand stays as radial as it is [rad]."""
+    return radial_yaw(arm, goal) - radial_yaw(arm, start)
 
 
 def easy_turn(thing: SceneObject, goal: Point) -> float:
-    """Turn of a thing on its way to a `goal` [2] or [3] m at which any yaw will do [rad]: the hand keeps its angle to the
-    radial yaw, or comes back to `EASY_TURN` where that is more."""
-    assert thing.grasp is not None, f"the {thing.name} has no grasp"
-    arm = arm_for(thing.pose[0])
-    start = symmetric_yaw(arm, thing.pose, thing.yaw, thing.grasp.symmetry)
+    """Turn of an object on its way to a `goal` [2] or [3] m where any yaw will do [rad]: the hand keeps its angle to the radial
+    yaw, limited to `EASY_TURN`."""
+    arm, start = arm_for(thing.pose[0]), hand_yaw(thing)
     offset = np.clip(start - radial_yaw(arm, thing.pose), -EASY_TURN, EASY_TURN)
     return float(radial_yaw(arm, goal) + offset - start)
+
+
+def aligning_turn(thing: SceneObject, goal: Point, yaw: float) -> float:
+    """Turn of an object on its way to `goal` [2] or [3] m that brings the hand to `yaw`, up to the object's symmetry [rad]."""
+    return symmetric_yaw(arm_for(thing.pose[0]), goal, yaw, grasp_of(thing).symmetry) - hand_yaw(thing)
 
 
 def carry(
@@ -137,17 +210,14 @@ def carry(
     above: float = 0.05,
     tilt: float = TURN_TILT,
 ) -> None:
-    """Take a thing from above with the arm on its side, set it down with its origin at `goal` [3] m, and draw back.
+    """Take an object from above with the arm on its side, set it down with its origin at `goal` [3] m, and draw back.
 
-    `turn` is the thing's about z on its way [rad]; `lift` and `above` are its heights over its old and its new place [m].
+    `turn` is the object's about z on its way [rad]; `lift` and `above` are its heights over its old and its new place [m].
     """
-    arm = arm_for(thing.pose[0])
-    grasp = grasp_across(thing, arm, tilt)
-    assert thing.grasp is not None
-    release = min(1.0, (thing.grasp.width + LET_GO) / NARROWEST_HAND)
+    arm, grasp = arm_for(thing.pose[0]), grasp_across(thing, tilt)
     pick(timeline, {arm: grasp}, lift)
     end = grasp.carried(thing.pose[:3], np.asarray(goal) + [0, 0, HOVER], turn)
-    place(timeline, arm, thing.name, end, above=above, retreat=PRE_GRASP, release=release)
+    place(timeline, arm, thing.name, end, above=above, retreat=PRE_GRASP, release=opening_for(grasp_of(thing).width))
 
 
 def across(position: Point, direction: float, arm: int) -> Tool:
@@ -180,6 +250,28 @@ def rim_grasp(vessel: SceneObject, wall: float, depth: float) -> tuple[int, Tool
     yaw = radial_yaw(arm, position)
     radial = side_sign(arm) * np.array([np.cos(yaw), np.sin(yaw), 0.0])
     return arm, tool(position + radius * radial + [0, 0, vertices[:, 2].max() - depth], yaw, GRASP_TILT)
+
+
+def carry_by_rim(
+    timeline: Timeline,
+    vessel: SceneObject,
+    goal: np.ndarray,
+    wall: float,
+    depth: float,
+    *,
+    lift: float = 0.08,
+    above: float = 0.05,
+    retreat: float = 0.08,
+) -> None:
+    """Take a vessel by its rim (`rim_grasp`), set it down with its origin at `goal` [3] m, and draw back by `retreat` [m].
+
+    `lift` and `above` are its heights over its old and its new place [m].
+    """
+    arm, grasp = rim_grasp(vessel, wall, depth)
+    start = vessel.pose[:3]
+    pick(timeline, {arm: grasp}, lift, opening=0.5)
+    end = grasp.carried(start, goal, radial_turn(arm, start, goal))
+    place(timeline, arm, vessel.name, end, above=above, retreat=retreat, release=0.4)
 
 
 def aside_poses(working: Collection[int]) -> dict[int, Tool]:

@@ -1,16 +1,13 @@
-"""Bodies by their number: `body:17` is a candidate of the catalog with its place and homes.
+"""Bodies by their number: `body:17` is a candidate of the catalog with its base poses and homes.
 
-Reads  catalog.json, which `python -m xew.sim_warp.bodies` writes: the candidates that pass its check, in order
-Writes URDFs and meshes of bodies that are asked for, once, to the user's cache folder, under a digest of the code that makes
-       them; a `RobotSpec` names the URDF there
+Reads  catalog.json: the candidates that follow the trial plans and succeed in physics, in order
+Writes the URDF and meshes of each requested body once, to the user's cache folder, under a digest of the code that makes them
 
-All but what the catalog holds is a function of the number.
+Everything that the catalog does not hold is a function of the number.
 """
 
 import hashlib
-import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -18,7 +15,7 @@ import numpy as np
 import scipy
 import trimesh
 
-from xew.config import ConfigError
+from xew.config import ConfigError, parse
 from xew.episode import complete_folder
 from xew.files import cache_folder, read_json
 from xew.protocol import BODY_NAME, body_key
@@ -27,11 +24,10 @@ from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import prepare
 from xew.sim_warp.geometry import meshes
 from xew.sim_warp.geometry.poses import Pose
-from xew.sim_warp.robots.procedural import design, shapes, urdf_files
+from xew.sim_warp.robots.procedural import design, shapes, solids, urdf_files
 from xew.sim_warp.robots.procedural.design import SPEED, BodyDesign, design_body
 from xew.sim_warp.robots.procedural.shapes import tool_offset
 from xew.sim_warp.robots.procedural.urdf_files import URDF, body_files
-from xew.sim_warp.robots.shapes import solids
 
 CATALOG = Path(__file__).parent / "catalog.json"
 AT_ORIGIN: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -48,10 +44,17 @@ class Entry:
     """Joint positions at rest [rad]."""
 
 
+@dataclass(frozen=True)
+class Catalog:
+    """The bodies that work, by number."""
+
+    bodies: tuple[Entry, ...]
+
+
 def body_number(name: str) -> int | None:
     """The number of a body by its name, body:17 or body_17; None for other names."""
-    found = BODY_NAME.fullmatch(name)
-    return int(found[1]) if found else None
+    match = BODY_NAME.fullmatch(name)
+    return int(match[1]) if match else None
 
 
 @cache
@@ -66,34 +69,14 @@ def load_body(number: int) -> RobotSpec:
     """
     entries = read_catalog()
     if number >= len(entries):
-        raise ConfigError(
-            f"there is no body:{number}; expected body:0 to body:{len(entries) - 1}. `python -m xew.sim_warp.bodies "
-            f"--count {number + 1}` extends the catalog."
-        )
+        raise ConfigError(f"there is no body:{number}; expected body:0 to body:{len(entries) - 1}.")
     return placed_body(entries[number], body_key(number), f"Body {number}")
 
 
 @cache
 def read_catalog(path: Path = CATALOG) -> tuple[Entry, ...]:
-    """The entries of a catalog, by number. Raises ConfigError if it cannot be read."""
-    try:
-        entries = read_json(path)["bodies"]
-        return tuple(
-            Entry(
-                entry["candidate"],
-                (tuple(entry["root_pose"][0]), tuple(entry["root_pose"][1])),
-                (tuple(entry["home"][0]), tuple(entry["home"][1])),
-            )
-            for entry in entries
-        )
-    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
-        raise ConfigError(f"{path} is no catalog of bodies ({error}); write it by `python -m xew.sim_warp.bodies`.") from error
-
-
-def catalog_text(entries: Sequence[Entry]) -> str:
-    """The content of a catalog, a line an entry."""
-    lines = ",\n".join(json.dumps(asdict(entry)) for entry in entries)
-    return f'{{"bodies": [\n{lines}\n]}}\n'
+    """The entries of a catalog, by number. Raises ConfigError if its content is no catalog."""
+    return parse(Catalog, read_json(path), str(path)).bodies
 
 
 def placed_body(entry: Entry, key: str, title: str) -> RobotSpec:
@@ -106,7 +89,7 @@ def placed_body(entry: Entry, key: str, title: str) -> RobotSpec:
 
 
 def unplaced_body(body: BodyDesign, key: str, title: str) -> RobotSpec:
-    """The robot of a design at the world's origin, with all joints at 0; its files are written if they are not there yet."""
+    """The robot of a design at the world's origin, with all joints at 0; missing files are written."""
     x, y, z = body.flange
     count, stroke = len(body.joints), body.hand.stroke
     arm = Arm(

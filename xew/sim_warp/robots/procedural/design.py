@@ -112,34 +112,27 @@ def design_body(number: int) -> BodyDesign:
     Args:
         number: from 0.
     """
-    if number >= WIDE:
-        return _wide_design(number)
+    is_wide = number >= WIDE
     rng = _stream(number, "arm")
     family = _choose(rng, tuple(FAMILIES))
     joints, flange = FAMILIES[family](rng)
-    mount = _choose(rng, MOUNTS)
-    column = _length(rng, 0.18, 0.35) if mount == "frame" else 0.0
-    lean = _rounded(rng.uniform(0.15, 0.5) * _choose(rng, (1, 1, -0.6))) if mount == "tilted" else 0.0
-    look, hand = _look(_stream(number, "look"), len(joints)), _hand(_stream(number, "hand"))
-    return BodyDesign(number, family, joints, flange, mount, column, lean, look, hand)
-
-
-def _wide_design(number: int) -> BodyDesign:
-    """A design of the wide family: half of them on stands; look and hand as in the first family, housings to the arm's size."""
-    rng = _stream(number, "arm")
-    family = _choose(rng, tuple(FAMILIES))
-    joints, flange = FAMILIES[family](rng)
-    size = float(rng.uniform(*WIDE_REACH)) / _reach(joints, flange)
-    joints, flange = _resize(joints, flange, size)
-    mount = _choose(rng, (*MOUNTS, *STANDS, "stand"))
+    size = float(rng.uniform(*WIDE_REACH)) / _reach(joints, flange) if is_wide else 1.0
+    mount = _choose(rng, (*MOUNTS, *STANDS, "stand") if is_wide else MOUNTS)
     column = _length(rng, 0.18, 0.35) if mount == "frame" else 0.0
     lean = _rounded(rng.uniform(0.15, 0.5) * _choose(rng, (1, 1, -0.6))) if mount == "tilted" else 0.0
     stand = _length(rng, *STANDS[mount]) if mount in STANDS else 0.0
-    x, y, z = joints[0].origin
-    joints = (replace(joints[0], origin=(x, y, _rounded(z + stand))), *joints[1:])
     look, hand = _look(_stream(number, "look"), len(joints)), _hand(_stream(number, "hand"))
-    look = replace(look, radii=tuple(_rounded(radius * min(max(size, 0.8), 1.2)) for radius in look.radii))
-    return BodyDesign(number, family, joints, flange, mount, column, lean, look, hand, stand)
+    body = BodyDesign(number, family, joints, flange, mount, column, lean, look, hand, stand)
+    return _widen(body, size) if is_wide else body
+
+
+def _widen(body: BodyDesign, size: float) -> BodyDesign:
+    """A body of the wide family: its arm times `size`, its foot on the stand, and housings to the arm's size."""
+    joints, flange = _resize(body.joints, body.flange, size)
+    x, y, z = joints[0].origin
+    joints = (replace(joints[0], origin=(x, y, _rounded(z + body.stand))), *joints[1:])
+    radii = tuple(_rounded(radius * min(max(size, 0.8), 1.2)) for radius in body.look.radii)
+    return replace(body, joints=joints, flange=flange, look=replace(body.look, radii=radii))
 
 
 def _reach(joints: tuple[JointDesign, ...], flange: Vector) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 
 from xew.sim_warp.robots.procedural.design import BodyDesign, HandDesign, Look, Vector
-from xew.sim_warp.robots.shapes.solids import (
+from xew.sim_warp.robots.procedural.solids import (
     PAD_HALF_WIDTH,
     PAD_THICKNESS,
     Box,

@@ -7,9 +7,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import trimesh
 
+from xew.sim_warp.geometry.meshes import Color
 from xew.sim_warp.robots.procedural.design import SPEED, BodyDesign, JointDesign, Vector
 from xew.sim_warp.robots.procedural.shapes import LinkShape, base_shape, finger_shape, link_shape, palm_shape
-from xew.sim_warp.robots.shapes.solids import Box
+from xew.sim_warp.robots.procedural.solids import Box
 
 URDF = "body.urdf"
 DENSITY = 420.0
@@ -24,8 +25,7 @@ def body_files(design: BodyDesign) -> dict[str, bytes]:
     look = design.look
     colors = {"body": look.body, "second": look.second, "housing": look.housing, "accent": look.accent, "rubber": RUBBER}
     for name, color in colors.items():
-        material = ElementTree.SubElement(root, "material", name=name)
-        ElementTree.SubElement(material, "color", rgba=_numbers([channel / 255 for channel in color] + [1]))
+        root.append(material_element(name, color))
     files: dict[str, bytes] = {}
     for name, shape in _links(design).items():
         root.append(_link(name, shape, files))
@@ -54,17 +54,35 @@ def _link(name: str, shape: LinkShape, files: dict[str, bytes]) -> ElementTree.E
     solids = defaultdict(list)
     for material, solid in shape.parts:
         solids[material].append(solid)
-    for material, found in solids.items():
+    for material, pieces in solids.items():
         path = f"meshes/{name}_{material}.stl"
-        files[path] = _mesh_bytes(trimesh.util.concatenate(found))
-        visual = ElementTree.SubElement(link, "visual")
-        ElementTree.SubElement(ElementTree.SubElement(visual, "geometry"), "mesh", filename=path)
-        ElementTree.SubElement(visual, "material", name=material)
-    for box in shape.boxes:
-        collision = ElementTree.SubElement(link, "collision", {"name": box.name} if box.name else {})
-        ElementTree.SubElement(collision, "origin", xyz=_numbers(box.center), rpy=_numbers(box.rpy))
-        ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), "box", size=_numbers(box.size))
+        files[path] = _mesh_bytes(trimesh.util.concatenate(pieces))
+        link.append(visual_element(path, material))
+    link.extend(collision_element(box) for box in shape.boxes)
     return link
+
+
+def material_element(name: str, color: Color) -> ElementTree.Element:
+    """A named color, sRGB 0 to 255."""
+    material = ElementTree.Element("material", name=name)
+    ElementTree.SubElement(material, "color", rgba=_numbers([channel / 255 for channel in color] + [1]))
+    return material
+
+
+def visual_element(mesh: str, material: str) -> ElementTree.Element:
+    """A visual that shows the mesh file `mesh`, a path relative to the URDF, in a named material."""
+    visual = ElementTree.Element("visual")
+    ElementTree.SubElement(ElementTree.SubElement(visual, "geometry"), "mesh", filename=mesh)
+    ElementTree.SubElement(visual, "material", name=material)
+    return visual
+
+
+def collision_element(box: Box) -> ElementTree.Element:
+    """The collision shape of a box."""
+    collision = ElementTree.Element("collision", {"name": box.name} if box.name else {})
+    ElementTree.SubElement(collision, "origin", xyz=_numbers(box.center), rpy=_numbers(box.rpy))
+    ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), "box", size=_numbers(box.size))
+    return collision
 
 
 def _mesh_bytes(solid: trimesh.Trimesh) -> bytes:
@@ -90,9 +108,7 @@ def _inertial(boxes: Sequence[Box]) -> ElementTree.Element:
 def _revolute(index: int, joint: JointDesign) -> ElementTree.Element:
     parent = "base_link" if index == 0 else f"link{index}"
     element = _joint(f"joint{index + 1}", "revolute", parent, f"link{index + 1}", joint.origin, joint.axis)
-    limits = {"lower": joint.lower, "upper": joint.upper, "velocity": SPEED[index], "effort": EFFORT}
-    ElementTree.SubElement(element, "limit", {name: _numbers([value]) for name, value in limits.items()})
-    return element
+    return _limited(element, joint.lower, joint.upper, SPEED[index], EFFORT)
 
 
 def _prismatic(design: BodyDesign, name: str, side: int) -> ElementTree.Element:
@@ -100,9 +116,14 @@ def _prismatic(design: BodyDesign, name: str, side: int) -> ElementTree.Element:
     origin = (round(x + design.hand.palm[0], 6), y, z)
     parent = f"link{len(design.joints)}"
     element = _joint(f"{name}_finger_joint", "prismatic", parent, f"{name}_finger", origin, (0.0, float(side), 0.0))
-    limits = {"lower": 0.0, "upper": design.hand.stroke, "velocity": FINGER_SPEED, "effort": FINGER_EFFORT}
-    ElementTree.SubElement(element, "limit", {key: _numbers([value]) for key, value in limits.items()})
-    return element
+    return _limited(element, 0.0, design.hand.stroke, FINGER_SPEED, FINGER_EFFORT)
+
+
+def _limited(joint: ElementTree.Element, lower: float, upper: float, velocity: float, effort: float) -> ElementTree.Element:
+    """The joint with limits."""
+    limits = {"lower": lower, "upper": upper, "velocity": velocity, "effort": effort}
+    ElementTree.SubElement(joint, "limit", {name: _numbers([value]) for name, value in limits.items()})
+    return joint
 
 
 def _joint(name: str, kind: str, parent: str, child: str, origin: Vector, axis: Vector) -> ElementTree.Element:

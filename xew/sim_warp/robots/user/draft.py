@@ -18,11 +18,13 @@ from xew.sim_warp.geometry.poses import Pose
 
 OWN, ROBOTWIN = "robot.yaml", "config.yml"
 """Names of the file that describes a robot in our own way, and in RoboTwin's."""
+Near = tuple[np.ndarray | None, np.ndarray | None]
+"""Postures [d] rad near which homes of the left and right arm are sought; None is near the joints' zero."""
 
 
 @dataclass(frozen=True)
 class ArmDraft:
-    """One arm, see `xew.sim_warp.robots.Arm`; None is found by `xew.sim_warp.robots.user.infer` or `placement`."""
+    """One arm, see `xew.sim_warp.robots.Arm`; `xew.sim_warp.robots.user.infer` or `placement` fill in what is None."""
 
     root_pose: Pose | None = None
     joints: tuple[str, ...] | None = None
@@ -60,7 +62,7 @@ class RobotDraft:
     """Distance between the bases of two equal arms [m], half to either side of `root_pose`; open: the first of
     `placement.DISTANCES` at which both arms reach home."""
     source: str | None = None
-    """SHA-256 of what a kept robot was made from; leave it out."""
+    """SHA-256 of the description that a robot in a data set comes from; leave it out."""
 
 
 def find_description(path: Path) -> Path:
@@ -79,8 +81,8 @@ def find_description(path: Path) -> Path:
     urdfs = sorted(path.glob("*.urdf"))
     if len(urdfs) == 1:
         return urdfs[0]
-    found = f"{len(urdfs)} URDFs" if urdfs else "no URDF"
-    raise ConfigError(f"{path} holds {found}, no {OWN} and no {ROBOTWIN}; name one URDF, or write a {OWN} that does.")
+    content = f"{len(urdfs)} URDFs" if urdfs else "no URDF"
+    raise ConfigError(f"{path} holds {content}, no {OWN} and no {ROBOTWIN}; name one URDF, or write a {OWN} that does.")
 
 
 def read_draft(description: Path) -> RobotDraft:

@@ -1,16 +1,17 @@
-"""Hands that are no two sliding fingers, made so: linked and turning fingers, and arms without a hand.
+"""Conversion of hands to two sliding fingers: linked and turning fingers, and arms without a hand.
 
 Reads  a URDF and its tree
 Writes the tree with two prismatic finger joints a hand
 
-Physics has one hand for all robots: two fingers that slide apart by the same way. `slide_fingers` puts whatever moves together
-by mimic joints onto two slides: at closed each link is where it is, and from there both fingers go as far as their tips do.
-How the links turn on the way is left out; it is nothing for grippers whose tips stay parallel. `graft_hand` puts the hand of
-one of the project's robots on an arm.
+Physics has one hand for all robots: two fingers that slide apart by the same distance. `slide_fingers` puts links that mimic
+joints move together onto two slides: closed, each link is where it was; both fingers open as far as their tips did. The turn
+of the links on the way is left out, which is nothing for parallel grippers. `graft_hand` puts the hand of one of the project's
+robots on an arm.
 """
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,8 @@ from xew.config import ConfigError
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import Joint, Urdf, load_urdf
 from xew.sim_warp.geometry.poses import matrix_from_pose
-from xew.sim_warp.kinematics.forward import joint_motion, link_matrices
+from xew.sim_warp.kinematics.forward import joint_motion
+from xew.sim_warp.robots.user.posed import moved_points, pose_links
 
 TIP = 0.02
 """Part of a finger from its farthest point on that counts as its tip [m]."""
@@ -29,6 +31,9 @@ LEAST_STROKE = 0.002
 ON_AXIS = np.cos(np.radians(5))
 FINGER_SPEED, FINGER_EFFORT = 0.3, 20.0
 """Limits of the slides [m/s], [N]; physics has its own."""
+HAND = "hand_"
+"""Beginning of the names of links and joints of a grafted hand."""
+OTHER_HAND = "expected two that open alike. Give the arm one of the project's hands: --hand ur5_wsg."
 
 
 @dataclass(frozen=True)
@@ -73,12 +78,12 @@ def find_linkages(urdf: Urdf) -> list[Linkage]:
             name, factor, offset = mimic[0], factor * mimic[1], factor * mimic[2] + offset
         if joint.kind != "fixed" and (name != joint.name or _is_driver(joint, urdf)):
             factors.setdefault(name, {})[joint.name] = (factor, offset)
-    found = []
+    linkages = []
     for name, driven in factors.items():
         joints = tuple(urdf.joints[joint] for joint in driven)
         if not (len(joints) == 2 and {j.kind for j in joints} == {"prismatic"} and len({j.parent for j in joints}) == 1):
-            found.append(Linkage(_common_link(urdf, joints), urdf.joints[name], joints, driven))
-    return found
+            linkages.append(Linkage(_common_link(urdf, joints), urdf.joints[name], joints, driven))
+    return linkages
 
 
 def _is_driver(joint: Joint, urdf: Urdf) -> bool:
@@ -96,13 +101,10 @@ def _slide(tree: ElementTree.Element, urdf: Urdf, linkage: Linkage, number: int)
     if not np.isfinite(driver.upper - driver.lower) or driver.upper - driver.lower < 1e-4:
         raise ConfigError(f"{urdf.path}: the finger joint {driver.name} has no limits between which it opens.")
     tops = _topmost(urdf, linkage)
-    ends = [{top.name: _points(urdf, linkage, top, end) for top in tops} for end in (driver.lower, driver.upper)]
+    ends = [_finger_points(urdf, linkage, tops, end) for end in (driver.lower, driver.upper)]
     fingers, approach = _choose_fingers(ends[0])
     if len(fingers) < 2:
-        raise ConfigError(
-            f"{urdf.path}: only one finger of the hand on {linkage.base} moves ({driver.name}); expected two that open alike. "
-            "Give the arm one of the project's hands: --hand ur5_wsg."
-        )
+        raise ConfigError(f"{urdf.path}: only one finger of the hand on {linkage.base} moves ({driver.name}); {OTHER_HAND}")
     gaps = [_tip(end[fingers[0]], approach) - _tip(end[fingers[1]], approach) for end in ends]
     shut = int(np.linalg.norm(gaps[1]) < np.linalg.norm(gaps[0]))
     closed = (driver.lower, driver.upper)[shut]
@@ -110,18 +112,17 @@ def _slide(tree: ElementTree.Element, urdf: Urdf, linkage: Linkage, number: int)
     opening = _on_axis(moves[0] - moves[1], approach)
     stroke = float((moves[0] - moves[1]) @ opening) / 2
     if min(moves[0] @ opening, -moves[1] @ opening) < LEAST_STROKE:
-        raise ConfigError(
-            f"{urdf.path}: the fingers of the hand on {linkage.base} do not both move apart; expected two that open alike. "
-            "Give the arm one of the project's hands: --hand ur5_wsg."
-        )
+        raise ConfigError(f"{urdf.path}: the fingers of the hand on {linkage.base} do not both move apart; {OTHER_HAND}")
     middle = (_tip(ends[shut][fingers[0]], approach) + _tip(ends[shut][fingers[1]], approach)) / 2
-    frames = _frames(urdf, linkage, closed)
-    for top in tops:
-        side = float((ends[shut][top.name].mean(0) - middle) @ opening)
-        first = top.name == fingers[0] or (top.name != fingers[1] and side > 0)
-        _hang(tree, top, f"{linkage.base}_slide_{number}{'ab'[not first]}", frames[linkage.base], frames[top.parent])
+    frames = pose_links(urdf, linkage.positions(closed))
     for joint in linkage.joints:
-        _fix(tree, joint, linkage.positions(closed)[joint.name])
+        origin = joint.origin
+        if joint in tops:
+            side = float((ends[shut][joint.name].mean(0) - middle) @ opening)
+            first = joint.name == fingers[0] or (joint.name != fingers[1] and side > 0)
+            _set_parent(tree, joint, f"{linkage.base}_slide_{number}{'ab'[not first]}")
+            origin = np.linalg.inv(frames[linkage.base]) @ frames[joint.parent] @ origin
+        _fix(tree, joint, origin @ joint_motion(joint, np.array([linkage.positions(closed)[joint.name]]))[0])
     for letter, sign in (("a", 1.0), ("b", -1.0)):
         _add_slide(tree, linkage.base, f"{linkage.base}_slide_{number}{letter}", sign * opening, stroke)
     turn = _turn(urdf, linkage, fingers[0])
@@ -137,23 +138,10 @@ def _topmost(urdf: Urdf, linkage: Linkage) -> list[Joint]:
     return [j for j in linkage.joints if not any(above.name in names for above in urdf.chain(j.parent))]
 
 
-def _frames(urdf: Urdf, linkage: Linkage, driven: float) -> dict[str, np.ndarray]:
-    """Poses [4 4] of all links in the root's frame."""
-    positions = linkage.positions(driven)
-    row = np.array([[positions.get(name, 0.0) for name in urdf.joint_names]])
-    return {name: frame[0] for name, frame in link_matrices(urdf, row).items()}
-
-
-def _points(urdf: Urdf, linkage: Linkage, top: Joint, driven: float) -> np.ndarray:
-    """Points [k 3] m of all that a joint of a linkage carries, in the frame of the linkage's base."""
-    frames = _frames(urdf, linkage, driven)
-    to_base, found = np.linalg.inv(frames[linkage.base]), []
-    for link in urdf.links.values():
-        if top in urdf.chain(link.name):
-            pose = to_base @ frames[link.name]
-            shapes = [shape.points for shape in link.collisions] or ([link.visual.vertices] if link.visual else [])
-            found += [shape @ pose[:3, :3].T + pose[:3, 3] for shape in shapes]
-    return np.concatenate(found) if found else (to_base @ frames[top.child])[None, :3, 3]
+def _finger_points(urdf: Urdf, linkage: Linkage, tops: list[Joint], driven: float) -> dict[str, np.ndarray]:
+    """Points [k 3] m of all that each of the topmost joints carries, in the frame of the linkage's base."""
+    poses = pose_links(urdf, linkage.positions(driven))
+    return {top.name: moved_points(urdf, top.name, poses, poses[linkage.base]) for top in tops}
 
 
 def _choose_fingers(points: Mapping[str, np.ndarray]) -> tuple[list[str], np.ndarray]:
@@ -182,7 +170,8 @@ def _on_axis(direction: np.ndarray, approach: np.ndarray) -> np.ndarray:
 def _turn(urdf: Urdf, linkage: Linkage, finger: str) -> float:
     """By how much the farthest link of a finger turns from end to end [deg]."""
     last = max(urdf.links, key=lambda link: len(urdf.chain(link)) * (urdf.joints[finger] in urdf.chain(link)))
-    ends = [_frames(urdf, linkage, end)[last][:3, :3] for end in (linkage.driver.lower, linkage.driver.upper)]
+    positions = [linkage.positions(end) for end in (linkage.driver.lower, linkage.driver.upper)]
+    ends = [pose_links(urdf, position)[last][:3, :3] for position in positions]
     return float(np.degrees(Rotation.from_matrix(ends[0].T @ ends[1]).magnitude()))
 
 
@@ -193,20 +182,15 @@ def _element(tree: ElementTree.Element, joint: Joint) -> ElementTree.Element:
     return next(entry for entry in tree.findall("joint") if entry.get("name") == joint.name)
 
 
-def _hang(tree: ElementTree.Element, joint: Joint, link: str, base: np.ndarray, parent: np.ndarray) -> None:
-    """Hang a joint on a slide's link, which lies in the base [4 4]; its parent's pose is that of the closed hand."""
-    entry = _element(tree, joint)
-    entry.find("parent").set("link", link)  # type: ignore[union-attr]
-    _set_origin(entry, np.linalg.inv(base) @ parent @ joint.origin)
+def _set_parent(tree: ElementTree.Element, joint: Joint, link: str) -> None:
+    _element(tree, joint).find("parent").set("link", link)  # type: ignore[union-attr]
 
 
-def _fix(tree: ElementTree.Element, joint: Joint, position: float) -> None:
-    """Make a joint a fixed one, at a position [rad or m]."""
+def _fix(tree: ElementTree.Element, joint: Joint, origin: np.ndarray) -> None:
+    """Make a joint a fixed one with an origin [4 4]."""
     entry = _element(tree, joint)
-    origin = entry.find("origin")
-    now = np.eye(4) if origin is None else _origin_matrix(origin)
     entry.set("type", "fixed")
-    _set_origin(entry, now @ joint_motion(joint, np.array([position]))[0])
+    _set_origin(entry, origin)
     for name in ("axis", "limit", "mimic", "dynamics", "safety_controller", "calibration"):
         for child in entry.findall(name):
             entry.remove(child)
@@ -220,13 +204,6 @@ def _add_slide(tree: ElementTree.Element, base: str, name: str, axis: np.ndarray
     ElementTree.SubElement(joint, "axis", xyz=_numbers(axis))
     limits = {"lower": 0.0, "upper": stroke, "velocity": FINGER_SPEED, "effort": FINGER_EFFORT}
     ElementTree.SubElement(joint, "limit", {key: f"{value:.6g}" for key, value in limits.items()})
-
-
-def _origin_matrix(origin: ElementTree.Element) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, 3] = [float(value) for value in origin.get("xyz", "0 0 0").split()]
-    pose[:3, :3] = Rotation.from_euler("xyz", [float(v) for v in origin.get("rpy", "0 0 0").split()]).as_matrix()
-    return pose
 
 
 def _set_origin(joint: ElementTree.Element, pose: np.ndarray) -> None:
@@ -272,30 +249,21 @@ def graft_hand(tree: ElementTree.Element, urdf: Urdf, robot: RobotSpec, last_joi
     flange, approach = _flange(urdf, last)
     theirs, arm = load_urdf(robot.urdf), robot.arms[0]
     hand = theirs.joints[arm.fingers[0]].parent
-    frames = {name: frame[0] for name, frame in link_matrices(theirs, np.zeros((1, len(theirs.joint_names)))).items()}
-    tool = np.linalg.inv(frames[hand]) @ frames[arm.tool_link] @ matrix_from_pose(arm.tool_pose)
+    poses = pose_links(theirs)
+    tool = np.linalg.inv(poses[hand]) @ poses[arm.tool_link] @ matrix_from_pose(arm.tool_pose)
     turn, _ = Rotation.align_vectors([approach], [tool[:3, 0]])
     pose = np.eye(4)
     pose[:3, :3] = turn.as_matrix()
     source = ElementTree.parse(theirs.path).getroot()
-    kept = {hand, *(link for link in theirs.links if any(joint.parent == hand for joint in theirs.chain(link)))}
-    for material in source.findall("material"):
-        tree.append(_renamed(material, ("name",)))
-    for link in source.findall("link"):
-        if link.get("name") in kept:
-            _add_link(tree, link, theirs)
-    for joint in source.findall("joint"):
-        if (child := joint.find("child")) is not None and child.get("link") in kept - {hand}:
-            tree.append(_renamed_joint(joint))
+    hand_links = {hand, *(link for link in theirs.links if any(joint.parent == hand for joint in theirs.chain(link)))}
+    tree.extend(_renamed(material) for material in source.findall("material"))
+    tree.extend(_renamed_link(link, theirs) for link in source.findall("link") if link.get("name") in hand_links)
+    tree.extend(_renamed_joint(joint) for joint in source.findall("joint") if _child(joint) in hand_links - {hand})
     mount = ElementTree.SubElement(tree, "joint", name=f"{HAND}mount", type="fixed")
     ElementTree.SubElement(mount, "parent", link=flange)
     ElementTree.SubElement(mount, "child", link=f"{HAND}{hand}")
     _set_origin(mount, pose)
     return f"the hand of {robot.title} is put on {flange}, pointing along {_numbers(approach)} of it"
-
-
-HAND = "hand_"
-"""Beginning of the names of links and joints of a grafted hand."""
 
 
 def _last_arm_joint(urdf: Urdf) -> Joint:
@@ -314,11 +282,11 @@ def _last_arm_joint(urdf: Urdf) -> Joint:
 
 def _next_moving(urdf: Urdf, link: str) -> list[Joint]:
     """The moving joints below a link that no other moving joint below it carries."""
-    found: list[Joint] = []
+    moving: list[Joint] = []
     for joint in urdf.joints.values():
         if joint.parent == link:
-            found += _next_moving(urdf, joint.child) if joint.kind == "fixed" else [joint]
-    return found
+            moving += _next_moving(urdf, joint.child) if joint.kind == "fixed" else [joint]
+    return moving
 
 
 def _cut_beyond(tree: ElementTree.Element, urdf: Urdf, last: Joint) -> None:
@@ -328,12 +296,15 @@ def _cut_beyond(tree: ElementTree.Element, urdf: Urdf, last: Joint) -> None:
         for link in urdf.links
         if last in (chain := urdf.chain(link)) and any(joint.kind != "fixed" for joint in chain[chain.index(last) + 1 :])
     }
-    for entry in tree.findall("link"):
-        if entry.get("name") in gone:
-            tree.remove(entry)
-    for entry in tree.findall("joint"):
-        if (child := entry.find("child")) is not None and child.get("link") in gone:
-            tree.remove(entry)
+    links = [entry for entry in tree.findall("link") if entry.get("name") in gone]
+    for entry in [*links, *(entry for entry in tree.findall("joint") if _child(entry) in gone)]:
+        tree.remove(entry)
+
+
+def _child(joint: ElementTree.Element) -> str | None:
+    """The name of the link that a joint carries."""
+    child = joint.find("child")
+    return None if child is None else child.get("link")
 
 
 def _flange(urdf: Urdf, last: Joint) -> tuple[str, np.ndarray]:
@@ -345,17 +316,17 @@ def _flange(urdf: Urdf, last: Joint) -> tuple[str, np.ndarray]:
     return last.child, last.axis * (-1.0 if ahead < -1e-3 else 1.0)
 
 
-def _add_link(tree: ElementTree.Element, link: ElementTree.Element, urdf: Urdf) -> None:
-    copy = _renamed(link, ("name",))
+def _renamed_link(link: ElementTree.Element, urdf: Urdf) -> ElementTree.Element:
+    copy = _renamed(link)
     for mesh in copy.iter("mesh"):
         mesh.set("filename", str(urdf.meshes[mesh.get("filename", "")].resolve()))
     for material in copy.iter("material"):
         material.set("name", f"{HAND}{material.get('name', '')}")
-    tree.append(copy)
+    return copy
 
 
 def _renamed_joint(joint: ElementTree.Element) -> ElementTree.Element:
-    copy = _renamed(joint, ("name",))
+    copy = _renamed(joint)
     for name in ("parent", "child"):
         entry = copy.find(name)
         assert entry is not None
@@ -365,9 +336,8 @@ def _renamed_joint(joint: ElementTree.Element) -> ElementTree.Element:
     return copy
 
 
-def _renamed(entry: ElementTree.Element, attributes: tuple[str, ...]) -> ElementTree.Element:
-    """A copy whose names begin with `HAND`."""
-    copy = ElementTree.fromstring(ElementTree.tostring(entry))
-    for attribute in attributes:
-        copy.set(attribute, f"{HAND}{copy.get(attribute, '')}")
+def _renamed(entry: ElementTree.Element) -> ElementTree.Element:
+    """A copy whose name begins with `HAND`."""
+    copy = deepcopy(entry)
+    copy.set("name", f"{HAND}{copy.get('name', '')}")
     return copy

@@ -1,8 +1,9 @@
-"""Inference from a URDF: its hands, the joints of its arms, its tool frame, which way its fingers close, its limits.
+"""Inference from a URDF: its hands, the joints of its arms, its tool frame, the closing direction of its fingers, its limits.
 
-Reads  a Urdf, and a RobotDraft
-Writes arms (`complete_arms`) and limits (`complete_limits`) of which nothing is open but where they stand
-Where the URDF leaves more than one reading, a ConfigError says which field of robot.yaml decides.
+Reads  a Urdf and a RobotDraft
+Writes arms (`complete_arms`) and limits (`complete_limits`); only bases and homes may stay open
+
+Where a URDF is ambiguous, a ConfigError says which field of robot.yaml decides.
 """
 
 import math
@@ -16,8 +17,8 @@ from xew.config import ConfigError
 from xew.sim_warp.embodiment.spec import Arm
 from xew.sim_warp.embodiment.urdf import Joint, Urdf
 from xew.sim_warp.geometry.poses import Pose
-from xew.sim_warp.kinematics.forward import link_matrices
 from xew.sim_warp.robots.user.draft import ArmDraft, RobotDraft
+from xew.sim_warp.robots.user.posed import moved_points, pose_links
 
 ARM_JOINTS = (6, 7)
 TIP_MARGIN = 0.015
@@ -37,10 +38,10 @@ STROKE_TOLERANCE = 1e-3
 def complete_arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]:
     """Left and right arm with nothing open but homes and bases."""
     drafts = fill_right_arm(draft.arms)
-    found = [] if all(arm.fingers for arm in drafts) else find_fingers(urdf)
+    hands = [] if all(arm.fingers for arm in drafts) else find_fingers(urdf)
     arms: list[Arm] = []
     for side, given in enumerate(drafts):
-        fingers = given.fingers or found[min(side, len(found) - 1)]
+        fingers = given.fingers or hands[min(side, len(hands) - 1)]
         _check_joints(urdf, fingers, source)
         joints = given.joints or arm_joints(urdf, fingers)
         _check_joints(urdf, joints, source)
@@ -118,9 +119,9 @@ def complete_limits(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Lower and upper position limits [d] rad and speed limits [d] rad/s that experts keep."""
     both = [joint_limits(urdf, arm.joints) for arm in arms]
-    found = (np.maximum(both[0][0], both[1][0]), np.minimum(both[0][1], both[1][1]), np.minimum(both[0][2], both[1][2]))
+    inferred = (np.maximum(both[0][0], both[1][0]), np.minimum(both[0][1], both[1][1]), np.minimum(both[0][2], both[1][2]))
     given = (draft.joint_lower, draft.joint_upper, draft.joint_velocity)
-    lower, upper, speed = (inferred if said is None else np.array(said) for inferred, said in zip(found, given, strict=True))
+    lower, upper, speed = (limit if own is None else np.array(own) for limit, own in zip(inferred, given, strict=True))
     if not len(lower) == len(upper) == len(speed) == len(arms[0].joints) or not (lower < upper).all() or not (speed > 0).all():
         raise ConfigError(
             f"{source}: joint_lower, joint_upper and joint_velocity need {len(arms[0].joints)} numbers each, lower below "
@@ -160,8 +161,8 @@ def find_fingers(urdf: Urdf) -> list[tuple[str, str]]:
             f"turning fingers become such a hand by python -m xew.sim_warp.robots.adopt {urdf.path.name}, and a bare arm takes "
             "one of ours by its --hand ur5_wsg; else name them in a robot.yaml as arms: [{fingers: [A, B]}, {fingers: [C, D]}]."
         )
-    frames = link_matrices(urdf, np.zeros((1, len(urdf.joint_names))))
-    ordered = sorted(hands, key=lambda hand: -frames[hand][0, 1, 3])
+    poses = pose_links(urdf)
+    ordered = sorted(hands, key=lambda hand: -poses[hand][1, 3])
     return [(hands[hand][0], hands[hand][1]) for hand in ordered]
 
 
@@ -211,17 +212,15 @@ def _middle_position(joint: Joint, urdf: Urdf) -> float:
 
 
 def _finger_points(urdf: Urdf, name: str, positions: dict[str, float]) -> np.ndarray:
-    """Points [k 3] m of all that a finger joint moves, in the frame of the hand; its origin if that has no shape."""
-    row = np.array([[positions.get(joint, 0.0) for joint in urdf.joint_names]])
-    frames = link_matrices(urdf, row)
-    hand = np.linalg.inv(frames[urdf.joints[name].parent][0])
-    points = [(hand @ frames[urdf.joints[name].child][0])[None, :3, 3]]
-    for link in urdf.links.values():
-        if urdf.joints[name] in urdf.chain(link.name):
-            pose = hand @ frames[link.name][0]
-            shapes = [shape.points for shape in link.collisions] or ([link.visual.vertices] if link.visual else [])
-            points += [shape @ pose[:3, :3].T + pose[:3, 3] for shape in shapes]
-    return np.concatenate(points[1:] or points)
+    """Points [k 3] m of all that a finger joint moves, in the frame of the hand."""
+    poses = pose_links(urdf, positions)
+    return moved_points(urdf, name, poses, poses[urdf.joints[name].parent])
+
+
+def _closed_hand_points(urdf: Urdf, fingers: tuple[str, str], closed: tuple[float, float]) -> np.ndarray:
+    """Points [k 3] m of both fingers of a closed hand, in the frame of the hand."""
+    positions = dict(zip(fingers, closed, strict=True))
+    return np.concatenate([_finger_points(urdf, name, positions) for name in fingers])
 
 
 def tool_frame(urdf: Urdf, joints: tuple[str, ...], fingers: tuple[str, str], closed: tuple[float, float]) -> Pose:
@@ -233,25 +232,23 @@ def tool_frame(urdf: Urdf, joints: tuple[str, ...], fingers: tuple[str, str], cl
     """
     hand = hand_link(urdf, fingers)
     opening = urdf.joints[fingers[0]].origin[:3, :3] @ urdf.joints[fingers[0]].axis
-    both = [_finger_points(urdf, name, dict(zip(fingers, closed, strict=True))) for name in fingers]
-    low, high = np.concatenate(both).min(0), np.concatenate(both).max(0)
-    frames = link_matrices(urdf, np.zeros((1, len(urdf.joint_names))))
-    wrist = np.linalg.inv(frames[hand][0]) @ frames[urdf.joints[joints[-1]].child][0]
+    points = _closed_hand_points(urdf, fingers, closed)
+    low, high = points.min(0), points.max(0)
+    poses = pose_links(urdf)
+    wrist = np.linalg.inv(poses[hand]) @ poses[urdf.joints[joints[-1]].child]
     approach = (low + high) / 2 - wrist[:3, 3]
     approach -= opening * (approach @ opening)
     if np.linalg.norm(approach) < 1e-3:
-        raise ConfigError(f"{urdf.path}: cannot tell which way {hand} points; give tool_pose in a robot.yaml.")
+        raise ConfigError(f"{urdf.path}: it is ambiguous which way {hand} points; give tool_pose in a robot.yaml.")
     approach = _snap_to_axis(approach / np.linalg.norm(approach), opening)
     return tool_at_tips(urdf, hand, np.stack([approach, opening, np.cross(approach, opening)], axis=1), fingers, closed)
 
 
 def tool_at_tips(urdf: Urdf, link: str, rotation: np.ndarray, fingers: tuple[str, str], closed: tuple[float, float]) -> Pose:
     """A tool frame in `link` of the orientation `rotation` [3 3], its origin between the fingers, behind their tips."""
-    row = np.zeros((1, len(urdf.joint_names)))
-    frames = link_matrices(urdf, row)
-    hand = np.linalg.inv(frames[link][0]) @ frames[hand_link(urdf, fingers)][0]
-    both = [_finger_points(urdf, name, dict(zip(fingers, closed, strict=True))) for name in fingers]
-    points = (np.concatenate(both) @ hand[:3, :3].T + hand[:3, 3]) @ rotation
+    poses = pose_links(urdf)
+    hand = np.linalg.inv(poses[link]) @ poses[hand_link(urdf, fingers)]
+    points = (_closed_hand_points(urdf, fingers, closed) @ hand[:3, :3].T + hand[:3, 3]) @ rotation
     center = np.array([points[:, 0].max() - TIP_MARGIN, *((points.min(0) + points.max(0)) / 2)[1:]])
     x, y, z = (rotation @ center).tolist()
     return (x, y, z, *Rotation.from_matrix(rotation).as_quat(canonical=True).tolist())
@@ -270,8 +267,8 @@ def joint_limits(urdf: Urdf, joints: tuple[str, ...]) -> tuple[np.ndarray, np.nd
     Raises:
         ConfigError: a joint does not turn, or has no limits.
     """
-    found = [urdf.joints[name] for name in joints]
-    for joint in found:
+    arm = [urdf.joints[name] for name in joints]
+    for joint in arm:
         if joint.kind not in ("revolute", "continuous"):
             raise ConfigError(f"{urdf.path}: the arm's joint {joint.name} is {joint.kind}; expected revolute or continuous.")
         if joint.kind == "revolute" and not joint.lower < joint.upper < math.inf:
@@ -279,7 +276,7 @@ def joint_limits(urdf: Urdf, joints: tuple[str, ...]) -> tuple[np.ndarray, np.nd
                 f"{urdf.path}: the arm's joint {joint.name} has no limits (from {joint.lower:g} to {joint.upper:g}); "
                 'give it <limit lower="…" upper="…" velocity="…" effort="…"/> in radians.'
             )
-    lower = np.maximum([joint.lower for joint in found], -LARGEST_ANGLE)
-    upper = np.minimum([joint.upper for joint in found], LARGEST_ANGLE)
-    speed = np.array([joint.velocity for joint in found])
+    lower = np.maximum([joint.lower for joint in arm], -LARGEST_ANGLE)
+    upper = np.minimum([joint.upper for joint in arm], LARGEST_ANGLE)
+    speed = np.array([joint.velocity for joint in arm])
     return lower, upper, np.where((speed > 0) & (speed <= LARGEST_SPEED), speed, DEFAULT_SPEED)

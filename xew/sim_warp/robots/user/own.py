@@ -1,7 +1,7 @@
-"""Robots of users: from a path to a `RobotSpec`, and kept beside the data that were made with them.
+"""Users' robots: from a path to a `RobotSpec`, and copies of them in the data sets that were generated with them.
 
-Reads  a URDF, a folder with robot.yaml, a RoboTwin embodiment folder, or a robot kept in a data set
-Writes <data>/robots/<key>/: robot.yaml with nothing left open, the URDF and all files that it names
+Reads  a URDF, a folder with robot.yaml, a RoboTwin embodiment folder, or a robot of a data set
+Writes <data>/robots/<key>/: a complete robot.yaml, the URDF and all files that it names
 
 Episodes name their robot by its key. Whoever reads them finds the robot in the data set of the episode, or in the folders that
 `XEW_ROBOTS` lists (as PATH does).
@@ -27,18 +27,26 @@ from xew.episode import complete_folder
 from xew.files import cache_folder, demand_regular, read_json, replacing
 from xew.names import EpisodeError, check_name, path_below
 from xew.protocol import BODY_NAME, PAINTED_NAME, ROBOT_NAMES, expand_robots
-from xew.sim_warp.embodiment.spec import Arm, RobotSpec
+from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
-from xew.sim_warp.robots.user.draft import OWN, ArmDraft, RobotDraft, find_description, read_draft
+from xew.sim_warp.robots.user.draft import OWN, ArmDraft, Near, RobotDraft, find_description, read_draft
 from xew.sim_warp.robots.user.infer import check_own_motion, complete_arms, complete_limits, fill_right_arm
 
 FOLDERS = "XEW_ROBOTS"
 """Name of the environment variable that lists folders of robots, separated as in PATH."""
 KEPT = "robots"
 """Name of the folder of a data set that holds its robots."""
+FILES = Path("files")
+"""Folder of a robot's folder with copies of all files that its URDF names."""
+DESCRIPTIONS = Path(__file__).resolve().parents[1] / "descriptions"
+"""Folder of the package's own URDFs and meshes."""
 SEARCH_CODE = ("robots/user", "kinematics", "tasks", "assets", "embodiment", "geometry")
-"""Packages of the room whose code, with the files at its root, decides where a robot is placed: a change of it makes the
-search begin anew."""
+"""Packages of sim_warp whose code, with the files at its root, decides where a robot is placed: a change of it invalidates
+cached places."""
+
+
+PLACE_FIELDS = ("root_pose", "home", "tool_pose")
+"""Fields of an arm that a search for its place decides."""
 
 
 def is_path(name: str) -> bool:
@@ -116,7 +124,7 @@ def _settle(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
     return placed
 
 
-def _find_place(draft: RobotDraft, robot: RobotSpec, near: tuple[np.ndarray | None, np.ndarray | None]) -> RobotSpec:
+def _find_place(draft: RobotDraft, robot: RobotSpec, near: Near) -> RobotSpec:
     """The robot with bases and homes, searched for near postures [d] rad."""
     from xew.sim_warp.robots.user import placement
 
@@ -133,20 +141,19 @@ def _find_place(draft: RobotDraft, robot: RobotSpec, near: tuple[np.ndarray | No
 def _place_digest(draft: RobotDraft, robot: RobotSpec) -> str:
     """SHA-256 over all that a place depends on: the draft, the files of the URDF, and the code that searches."""
     digest = hashlib.sha256(repr((draft, replace(robot, urdf=Path()))).encode())
-    room = Path(__file__).parents[2]
-    code = {*room.glob("*.py"), *(file for folder in SEARCH_CODE for file in (room / folder).rglob("*.py"))}
+    package = Path(__file__).parents[2]
+    code = {*package.glob("*.py"), *(file for folder in SEARCH_CODE for file in (package / folder).rglob("*.py"))}
     for file in [*load_urdf(robot.urdf).files, *sorted(code)]:
         digest.update(hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
 
 
 def _read_place(path: Path, robot: RobotSpec) -> RobotSpec | None:
-    """The robot with the bases, homes and tool frames that were found before; None if there are none."""
+    """The robot with the cached bases, homes and tool frames; None if there are none."""
     try:
-        kept = read_json(path)
         left, right = (
-            replace(arm, root_pose=tuple(found["root_pose"]), home=tuple(found["home"]), tool_pose=tuple(found["tool_pose"]))
-            for arm, found in zip(robot.arms, kept, strict=True)
+            replace(arm, **{name: tuple(place[name]) for name in PLACE_FIELDS})
+            for arm, place in zip(robot.arms, read_json(path), strict=True)
         )
     except (OSError, ValueError, TypeError, KeyError):
         return None
@@ -154,10 +161,10 @@ def _read_place(path: Path, robot: RobotSpec) -> RobotSpec | None:
 
 
 def _keep_place(robot: RobotSpec, path: Path) -> None:
-    """Keep what was found, where the cache folder can be written."""
-    found = [{name: getattr(arm, name) for name in ("root_pose", "home", "tool_pose")} for arm in robot.arms]
+    """Cache bases, homes and tool frames, where the cache folder can be written."""
+    places = [{name: getattr(arm, name) for name in PLACE_FIELDS} for arm in robot.arms]
     with contextlib.suppress(OSError), replacing(path) as temporary:
-        temporary.write_text(json.dumps(found), encoding="utf-8")
+        temporary.write_text(json.dumps(places), encoding="utf-8")
 
 
 def _posture(arm: ArmDraft, robot: RobotSpec, source: str) -> np.ndarray | None:
@@ -182,14 +189,14 @@ def adopt_robots(names: Sequence[str], data: Path) -> tuple[str, ...]:
 
 
 def kept_robot(key: str, data: Path | None = None) -> RobotSpec | None:
-    """The robot of a key that a data set keeps, or else a folder of `XEW_ROBOTS`; None where neither has it."""
-    if data is not None and (kept := Path(data) / KEPT / key / OWN).is_file():
+    """The robot of a key in a data set, or else in a folder of `XEW_ROBOTS`; None where neither has it."""
+    if data is not None and (description := Path(data) / KEPT / key / OWN).is_file():
         try:
             check_name(key, "robot")
-            _demand_own_files(kept, kept.stat().st_mtime_ns)
+            _demand_own_files(description, description.stat().st_mtime_ns)
         except EpisodeError as error:
             raise ConfigError(str(error)) from error
-        return load_robot(kept.parent)
+        return load_robot(description.parent)
     for folder in [Path(folder) for folder in os.environ.get(FOLDERS, "").split(os.pathsep) if folder]:
         if (folder / key / OWN).is_file():
             return load_robot(folder / key)
@@ -197,11 +204,11 @@ def kept_robot(key: str, data: Path | None = None) -> RobotSpec | None:
 
 
 @lru_cache(maxsize=256)
-def _demand_own_files(kept: Path, modified: int) -> None:
-    """Raise EpisodeError where a robot that data hold is read from files outside of its folder: data come from anybody."""
-    folder = kept.parent
+def _demand_own_files(description: Path, modified: int) -> None:
+    """Raise EpisodeError where a data set's robot is read from files outside of its folder: data sets may be anybody's."""
+    folder = description.parent
     path_below(folder.parent, folder.name)
-    urdf = path_below(folder, read_draft(path_below(folder, kept.name)).urdf)
+    urdf = path_below(folder, read_draft(path_below(folder, description.name)).urdf)
     try:
         named = [mesh.get("filename", "") for mesh in ElementTree.parse(demand_regular(urdf)).iter()]
     except (OSError, ElementTree.ParseError) as error:
@@ -210,21 +217,21 @@ def _demand_own_files(kept: Path, modified: int) -> None:
         path_below(folder, str(urdf.parent.relative_to(folder) / name))
     for file in load_urdf(urdf).files:  # what meshes name in turn
         if not file.resolve().is_relative_to(folder.resolve()):
-            raise EpisodeError(f"{kept} reads {file}, which is not below its folder; copy the data set again.")
+            raise EpisodeError(f"{description} reads {file}, which is not below its folder; copy the data set again.")
 
 
 def _adopt(path: Path, data: Path) -> str:
     description = find_description(path).resolve()
     key, digest = robot_key(description), _digest(description)
-    kept = data / KEPT / key / OWN
-    if kept.is_file():
-        if read_draft(kept).source != digest:
+    copy = data / KEPT / key / OWN
+    if copy.is_file():
+        if read_draft(copy).source != digest:
             raise ConfigError(
-                f"{kept.parent} holds another robot of that name than {path}, or that one before it changed; rename the "
+                f"{copy.parent} holds another robot of that name than {path}, or that one before it changed; rename the "
                 "folder or file, or choose another --out."
             )
         return key
-    print(f"robot {key}: what {description.name} leaves open is being looked for, and kept in {kept}")
+    print(f"robot {key}: completing {description.name}; the result is written to {copy}")
     keep_robot(load_robot(path), data, digest)
     return key
 
@@ -239,49 +246,59 @@ def _digest(description: Path) -> str:
 
 
 def keep_robot(robot: RobotSpec, data: Path, digest: str = "") -> RobotSpec:
-    """Keep a robot as it is in a data set, under its key, unless one is kept there already; returns what is kept.
+    """Copy a robot into a data set, under its key, unless there is one already; returns the data set's robot.
 
     Args:
-        digest: SHA-256 of what the robot was made from, by which it is known again.
+        digest: SHA-256 of the description that the robot comes from, by which it is recognized.
     """
     folder = path_below(data, KEPT, robot.key)
     if not (folder / OWN).is_file():
-        _write(robot, digest, folder)
+        write_robot(robot, folder, _robot_yaml(robot, digest))
     return load_robot(folder)
 
 
-def _write(robot: RobotSpec, digest: str, folder: Path) -> None:
-    """Write robot.yaml, the URDF and its files under a folder, as they lie to one another."""
-    urdf = load_urdf(robot.urdf)
-    top = Path(os.path.commonpath([file.resolve().parent for file in urdf.files]))
-    with complete_folder(folder) as temporary:
-        for file in urdf.files[1:]:
-            copy = temporary / file.resolve().relative_to(top)
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, copy)
-        inside = urdf.path.relative_to(top)
-        (temporary / inside).parent.mkdir(parents=True, exist_ok=True)
-        (temporary / inside).write_bytes(_with_relative_meshes(urdf))
-        content = _robot_yaml(robot, str(inside), digest)
-        (temporary / OWN).write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+def write_robot(robot: RobotSpec, folder: Path, description: str) -> None:
+    """Write a robot's folder: `description` as robot.yaml, the URDF as <key>.urdf, and all files that it names below files/.
 
-
-def _with_relative_meshes(urdf: Urdf) -> bytes:
-    """The URDF with every mesh named relative to it, so that it can be read wherever it is copied to."""
+    Raises:
+        EpisodeError: the folder holds something else.
+    """
+    urdf, name = load_urdf(robot.urdf), urdf_name(robot)
+    copies = _copy_names(urdf.files[1:])
     tree = ElementTree.parse(urdf.path)
-    for mesh in [*tree.iter("mesh"), *tree.iter("texture")]:
-        if found := urdf.meshes.get(mesh.get("filename", "")):
-            mesh.set("filename", os.path.relpath(found.resolve(), urdf.path.parent))
-    return ElementTree.tostring(tree.getroot(), encoding="utf-8", xml_declaration=True)
+    for entry in [*tree.iter("mesh"), *tree.iter("texture")]:
+        if file := urdf.meshes.get(entry.get("filename", "")):
+            entry.set("filename", copies[file.resolve()].as_posix())
+    ElementTree.indent(tree)
+    with complete_folder(folder, held=(name, FILES, OWN)) as temporary:
+        for file, copy in copies.items():
+            (temporary / copy).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, temporary / copy)
+        tree.write(temporary / name, encoding="utf-8", xml_declaration=True)
+        (temporary / OWN).write_text(description, encoding="utf-8")
 
 
-def _robot_yaml(robot: RobotSpec, urdf: str, digest: str) -> dict[str, object]:
+def urdf_name(robot: RobotSpec) -> str:
+    """Name of the URDF in a robot's folder."""
+    return f"{robot.key}.urdf"
+
+
+def _copy_names(files: Sequence[Path]) -> dict[Path, Path]:
+    """Path of each file's copy in a robot's folder; files keep their places relative to one another."""
+    own = [file.resolve() for file in files if not file.resolve().is_relative_to(DESCRIPTIONS)]
+    top = Path(os.path.commonpath([file.parent for file in own])) if own else Path("/")
+    copies = {file: FILES / file.relative_to(top) for file in own}
+    packaged = [file.resolve() for file in files if file.resolve() not in copies]
+    return copies | {file: FILES / "xew" / file.relative_to(DESCRIPTIONS) for file in packaged}
+
+
+def _robot_yaml(robot: RobotSpec, digest: str) -> str:
     """A robot.yaml that leaves nothing open."""
     limits = {
         name: list(getattr(robot, name)) for name in ("joint_lower", "joint_upper", "joint_velocity", "joint_acceleration")
     }
-    return {"urdf": urdf, "title": robot.title, "arms": [_plain_arm(arm) for arm in robot.arms], **limits, "source": digest}
-
-
-def _plain_arm(arm: Arm) -> dict[str, object]:
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(arm).items()}
+    arms = [
+        {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(arm).items()} for arm in robot.arms
+    ]
+    content = {"urdf": urdf_name(robot), "title": robot.title, "arms": arms, **limits, "source": digest}
+    return str(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))

@@ -19,6 +19,7 @@ from xew.config import ConfigError
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.kinematics.expert import joint_commands
 from xew.sim_warp.plan import HOME
+from xew.sim_warp.robots.user.draft import Near
 from xew.sim_warp.robots.user.trials import Postures, Trials, trial_plans
 
 DISTANCES = (0.6, 0.7, 0.8, 0.5, 0.4)
@@ -55,7 +56,7 @@ class Placed:
         return sum(problem is None for problem in self.problems) / len(self.problems)
 
 
-def place(candidates: Sequence[RobotSpec], near: tuple[np.ndarray | None, np.ndarray | None] = (None, None)) -> Placed:
+def place(candidates: Sequence[RobotSpec], near: Near = (None, None)) -> Placed:
     """The candidate that follows the most plans, with homes; of equals the first.
 
     Args:
@@ -89,7 +90,7 @@ def check_plans(robot: RobotSpec) -> Placed:
     return Placed(robot, tuple(commands.problem for commands in joint_commands(robot, list(trial_plans()))))
 
 
-def place_at(robot: RobotSpec, candidates: Sequence[RobotSpec], near: tuple[np.ndarray | None, np.ndarray | None]) -> Placed:
+def place_at(robot: RobotSpec, candidates: Sequence[RobotSpec], near: Near) -> Placed:
     """As `place`, for a robot whose user says where it stands; an error names a place that would do.
 
     Args:

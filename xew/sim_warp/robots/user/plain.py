@@ -1,7 +1,7 @@
-"""Descriptions of robots as they come, made plain: one URDF whose arms and hands are as the rest of the room takes them.
+"""Normalization of robot descriptions: a URDF or xacro becomes one URDF tree in the form that `infer` reads.
 
 Reads  a URDF or xacro with the folders of its packages and its arguments
-Writes the URDF's tree with every file named absolutely; `hands` and `mirrored_joints` change it further where that is needed
+Writes the URDF's tree with every file named absolutely; `hands` and `unfold_mirrored` change it further
 """
 
 import re
@@ -50,11 +50,12 @@ def _expand(path: Path, packages: Mapping[str, Path], arguments: Mapping[str, st
         raise ConfigError(f"{path} {NO_XACRO}") from error
     finder.update_package_cache({name: str(folder.resolve()) for name, folder in packages.items()})
     try:
-        found = XacroDoc.from_file(str(path), subargs=dict(arguments), resolve_packages=False)
-        return str(found.to_urdf_string())
+        document = XacroDoc.from_file(str(path), subargs=dict(arguments), resolve_packages=False)
+        return str(document.to_urdf_string())
     except Exception as error:  # xacro and xacrodoc have many of their own
-        told = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError(f"{path} cannot be expanded ({told}); --package NAME=DIR and --argument NAME=VALUE help.") from error
+        reason = " ".join(str(error).split()) or type(error).__name__
+        advice = "--package NAME=DIR and --argument NAME=VALUE help"
+        raise ConfigError(f"{path} cannot be expanded ({reason}); {advice}.") from error
 
 
 def _absolute(name: str, folder: Path, packages: Mapping[str, Path]) -> str:

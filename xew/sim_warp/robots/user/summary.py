@@ -1,7 +1,7 @@
-"""What was found of a user's robot, in words: what it is, what its arms can do where it stands, and what looks wrong.
+"""Summary of a completed robot: what its arms can do where it stands, and what looks wrong.
 
 Reads  a complete RobotSpec and the plans that it follows
-Writes lines for a terminal, and the robot.yaml that says of every entry whether it was given or found
+Writes lines for a terminal, and a robot.yaml that marks every entry as given or found
 """
 
 from collections.abc import Sequence
@@ -13,9 +13,9 @@ import yaml
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
 from xew.sim_warp.geometry.poses import matrix_from_pose
-from xew.sim_warp.kinematics.forward import link_matrices
 from xew.sim_warp.robots.user.draft import ArmDraft, RobotDraft
 from xew.sim_warp.robots.user.infer import fill_right_arm
+from xew.sim_warp.robots.user.posed import moved_points, pose_links
 
 TIP = 0.02
 """Length behind the tool frame's origin that counts as the fingers' tips [m]."""
@@ -77,46 +77,38 @@ def robot_lines(robot: RobotSpec, problems: Sequence[str | None], reach: Sequenc
 
 def warning_lines(robot: RobotSpec) -> list[str]:
     """What looks wrong, a sentence each."""
-    urdf, found = load_urdf(robot.urdf), list(load_urdf(robot.urdf).notes)
+    urdf = load_urdf(robot.urdf)
+    warnings = list(urdf.notes)
     if {urdf.joints[name].velocity for arm in robot.arms for name in arm.joints} == {PLACEHOLDER_SPEED}:
-        found.append(
+        warnings.append(
             "all joints have a speed limit of 1 rad/s, which looks like a placeholder: give joint_velocity in robot.yaml"
         )
     for side, arm in zip(("left", "right"), robot.arms, strict=True):
         if opening(arm) < SMALL_OPENING:
-            found.append(f"the {side} hand opens {1000 * opening(arm):.0f} mm; tasks hold things of up to 70 mm")
+            warnings.append(f"the {side} hand opens {1000 * opening(arm):.0f} mm; tasks hold things of up to 70 mm")
         if (gap := closed_gap(urdf, arm)) > LARGEST_GAP:
             apart = f"closed, the fingers of the {side} hand are {1000 * gap:.0f} mm apart"
-            found.append(f"{apart}: what is thinner cannot be held")
-        for name in arm.fingers:
-            moved = [link for link in urdf.links.values() if urdf.joints[name] in urdf.chain(link.name)]
-            if not any(link.collisions for link in moved):
-                found.append(f"nothing that {name} moves has a collision shape: the {side} hand can hold nothing")
-    frames = link_matrices(urdf, np.zeros((1, len(urdf.joint_names))))
-    for name, link in urdf.links.items():
-        if link.visual is not None:
-            center = frames[name][0, :3, :3] @ link.visual.vertices.mean(0) + frames[name][0, :3, 3]
+            warnings.append(f"{apart}: what is thinner cannot be held")
+        warnings += [
+            f"nothing that {name} moves has a collision shape: the {side} hand can hold nothing"
+            for name in arm.fingers
+            if not any(link.collisions for link in urdf.moved_links(name))
+        ]
+    for name, pose in pose_links(urdf).items():
+        if (visual := urdf.links[name].visual) is not None:
+            center = pose[:3, :3] @ visual.vertices.mean(0) + pose[:3, 3]
             if (away := float(np.linalg.norm(center))) > FAR_LINK:
-                found.append(f"link {name} is {away:.1f} m away from the root: look at its joint's origin and its mesh")
-    return list(dict.fromkeys(found))
+                warnings.append(f"link {name} is {away:.1f} m away from the root: look at its joint's origin and its mesh")
+    return list(dict.fromkeys(warnings))
 
 
 def closed_gap(urdf: Urdf, arm: Arm) -> float:
     """Distance of the fingers' tips along the axis on which they open, when they are closed [m]; below 0 where they overlap."""
-    row = np.zeros((1, len(urdf.joint_names)))
-    row[0, [urdf.joint_names.index(name) for name in arm.fingers]] = arm.finger_closed
-    frames = {name: frame[0] for name, frame in link_matrices(urdf, row).items()}
-    to_tool = np.linalg.inv(frames[arm.tool_link] @ matrix_from_pose(arm.tool_pose))
-    sides = []
-    for name in arm.fingers:
-        clouds = [np.empty((0, 3))]
-        for link in urdf.links.values():
-            if urdf.joints[name] in urdf.chain(link.name):
-                pose = to_tool @ frames[link.name]
-                clouds += [shape.points @ pose[:3, :3].T + pose[:3, 3] for shape in link.collisions]
-        points = np.concatenate(clouds)
-        sides.append(points[points[:, 0] > -TIP, 1])
-    first, second = sorted((side for side in sides if len(side)), key=np.mean) if all(map(len, sides)) else ([0.0], [0.0])
+    poses = pose_links(urdf, dict(zip(arm.fingers, arm.finger_closed, strict=True)))
+    tool = poses[arm.tool_link] @ matrix_from_pose(arm.tool_pose)
+    clouds = [moved_points(urdf, name, poses, tool) for name in arm.fingers]
+    sides = [points[points[:, 0] > -TIP, 1] for points in clouds]
+    first, second = sorted(sides, key=np.mean) if all(map(len, sides)) else ([0.0], [0.0])
     return float(np.min(second) - np.max(first))
 
 

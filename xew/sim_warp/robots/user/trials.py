@@ -22,6 +22,7 @@ from xew.sim_warp.kinematics.forward import link_matrices
 from xew.sim_warp.kinematics.inverse import ArmSolver, arm_bases
 from xew.sim_warp.kinematics.reachability import GRASP_TILT, radial_yaw
 from xew.sim_warp.plan import ASIDE, HOME, Tool, ToolPath, tool
+from xew.sim_warp.robots.user.draft import Near
 from xew.sim_warp.scene import scene_rng
 from xew.sim_warp.stage import TABLE_SIZE, TABLE_TOP
 from xew.sim_warp.tasks import TASKS
@@ -96,15 +97,16 @@ class Trials:
         where = (rows.candidate, rows.arm)
         frames = self._to_base[where][:, None] @ matrix_from_pose(pose) @ self._to_first_tool[where][:, None]
         targets = pose_from_matrix(frames.reshape(-1, 4, 4))
-        found = self.solver.solve_in_base(rows.arm.repeat(each), targets, seed.reshape(count * each, -1))
+        solution = self.solver.solve_in_base(rows.arm.repeat(each), targets, seed.reshape(count * each, -1))
         shape = (count, each)
-        return found.joint_pos.reshape(*shape, -1), found.position_error.reshape(shape), found.rotation_error.reshape(shape)
+        errors = solution.position_error.reshape(shape), solution.rotation_error.reshape(shape)
+        return solution.joint_pos.reshape(*shape, -1), *errors
 
-    def find_homes(self, near: tuple[np.ndarray | None, np.ndarray | None], seeds: int, most: int) -> Postures:
+    def find_homes(self, near: Near, seeds: int, most: int) -> Postures:
         """Postures that bring the tools home, at most so many an arm of a candidate, the nearest to `near` first.
 
         Args:
-            near: posture [d] rad that each arm would like to be near; None is near the joints' zero.
+            near: preferred postures.
             seeds: number of postures from which the search begins.
             most: number of postures that are kept.
         """
@@ -112,7 +114,7 @@ class Trials:
         rows = rows[_are_home(position, rotation)]
         return self._choose(rows[self._is_clear(rows)], near, most)
 
-    def find_miss(self, near: tuple[np.ndarray | None, np.ndarray | None], seeds: int) -> str:
+    def find_miss(self, near: Near, seeds: int) -> str:
         """Why the candidates have no home, in words that follow a colon; `near` are postures [d] rad as in `find_homes`."""
         rows, position, rotation = self._search_homes(near, seeds)
         for arm in (0, 1):
@@ -123,9 +125,7 @@ class Trials:
                 return f"the nearest of the {('left', 'right')[arm]} arm is {off}"
         return "a link would stand in the table or on the other arm's side"
 
-    def _search_homes(
-        self, near: tuple[np.ndarray | None, np.ndarray | None], seeds: int
-    ) -> tuple[Postures, np.ndarray, np.ndarray]:
+    def _search_homes(self, near: Near, seeds: int) -> tuple[Postures, np.ndarray, np.ndarray]:
         """Postures from all starts of both arms of all candidates, and how far from home [e] m and rad they leave the tool."""
         starts = [_start_postures(self.candidates[0], wanted, seeds) for wanted in near]
         pairs = np.array(list(product(range(len(self.candidates)), (0, 1))))
@@ -135,19 +135,19 @@ class Trials:
         every = Postures(rows.candidate.repeat(seeds), rows.arm.repeat(seeds), joint_pos.reshape(-1, joint_pos.shape[-1]))
         return every, position.ravel(), rotation.ravel()
 
-    def _choose(self, rows: Postures, near: tuple[np.ndarray | None, np.ndarray | None], most: int) -> Postures:
+    def _choose(self, rows: Postures, near: Near, most: int) -> Postures:
         """The postures of each arm that differ by more than 0.1 rad, with room to the limits where there are such."""
         lower, upper = self.solver.lower, self.solver.upper
         wanted = [np.zeros(len(lower)) if posture is None else posture for posture in near]
         far = np.linalg.norm(rows.joint_pos - np.array(wanted)[rows.arm], axis=1)
         tight = np.minimum(rows.joint_pos - lower, upper - rows.joint_pos).min(1) <= LIMIT_ROOM
-        kept: dict[tuple[int, int], list[int]] = {}
+        chosen: dict[tuple[int, int], list[int]] = {}
         for row in np.lexsort((far, tight)):
-            mine = kept.setdefault((int(rows.candidate[row]), int(rows.arm[row])), [])
+            mine = chosen.setdefault((int(rows.candidate[row]), int(rows.arm[row])), [])
             differs = all(np.abs(rows.joint_pos[row] - rows.joint_pos[other]).max() > 0.1 for other in mine)
             if len(mine) < most and differs and not (tight[row] and mine and not tight[mine[0]]):
                 mine.append(int(row))
-        return rows[np.array([row for mine in kept.values() for row in mine], int)]
+        return rows[np.array([row for mine in chosen.values() for row in mine], int)]
 
     def _is_clear(self, rows: Postures) -> np.ndarray:
         """[e] bool: do all links that an arm's second joint and those after it move stay off the table and on their side?"""
@@ -243,11 +243,15 @@ def _tool_pose(at: Tool) -> np.ndarray:
 def _link_points(robot: RobotSpec) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """For each arm, outermost points [k 3] m of the links that its second joint and those after it move."""
     urdf = load_urdf(robot.urdf)
-    found: list[dict[str, np.ndarray]] = []
-    for arm in robot.arms:
-        moved = {name: link.visual for name, link in urdf.links.items() if urdf.joints[arm.joints[1]] in urdf.chain(name)}
-        found.append({name: outermost_points(mesh.vertices, HULL_POINTS) for name, mesh in moved.items() if mesh is not None})
-    return found[0], found[1]
+    left, right = (
+        {
+            link.name: outermost_points(link.visual.vertices, HULL_POINTS)
+            for link in urdf.moved_links(arm.joints[1])
+            if link.visual is not None
+        }
+        for arm in robot.arms
+    )
+    return left, right
 
 
 def _start_postures(robot: RobotSpec, near: np.ndarray | None, count: int) -> np.ndarray:

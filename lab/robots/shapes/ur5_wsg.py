@@ -1,17 +1,16 @@
 """Shapes of the UR5 with WSG-50: light gray tubes, blue caps, a silver gripper, after the link sizes of the vendors' meshes."""
 
-from xew.sim_warp.robots.shapes.solids import (
+from lab.robots.shapes.parts import camera, point_between
+from xew.sim_warp.robots.procedural.solids import (
     PAD_HALF_WIDTH,
     PAD_THICKNESS,
     Box,
     Part,
     Vector,
     box_solid,
-    camera,
     cylinder,
     dome,
     hull,
-    point_between,
     rounded_box,
 )
 

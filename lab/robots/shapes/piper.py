@@ -1,12 +1,12 @@
 """Shapes of the AgileX PiPER: a dark, slender arm with red marks, after the link sizes of the vendor's meshes."""
 
-from xew.sim_warp.robots.shapes.solids import (
+from lab.robots.shapes.parts import camera
+from xew.sim_warp.robots.procedural.solids import (
     PAD_HALF_WIDTH,
     PAD_THICKNESS,
     Box,
     Part,
     box_solid,
-    camera,
     cylinder,
     hull,
     loft,

@@ -1,4 +1,4 @@
-"""Which tool poses the robots reach: `python -m xew.sim_warp.robots.reach` prints the study as Markdown.
+"""Which tool poses the robots reach: `python -m lab.robots.reach` prints the study as Markdown.
 
 Base poses, homes and the experts' grasp tilt rest on it. A pose counts as reached when the arm gets there from home
 along a straight path of its tool, inside the limits that experts keep, to 2 mm and 0.02 rad.
@@ -14,14 +14,13 @@ from xew.config import user_errors
 from xew.protocol import expand_robots
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.kinematics.inverse import ArmSolver
-from xew.sim_warp.kinematics.reachability import GRASP_TILT, WORK_X, WORK_Y, WORK_Z, radial_yaw, reaches
+from xew.sim_warp.kinematics.reachability import reaches, work_reach
 from xew.sim_warp.robots import ROBOTS, RobotSpec, get_robot
 
 X, Y, Z = np.linspace(-0.32, 0.10, 6), np.linspace(-0.25, 0.15, 5), np.array([0.76, 0.85, 0.95])
 """Grid over the work volume of the left arm [m]; the right arm's is its mirror image."""
 TILTS, YAWS = (0, 15, 30, 45, 60), (-90, -60, -30, 0, 30, 60, 90)
 """Leans and turns of the left hand [deg]; a negative yaw turns it inward. The right arm is given the mirrored yaw."""
-RADIAL_OFFSETS = (-45, -22.5, 0, 22.5, 45)
 
 
 def reach_table(robot: RobotSpec) -> np.ndarray:
@@ -31,19 +30,6 @@ def reach_table(robot: RobotSpec) -> np.ndarray:
     tilts, yaws, positions = (np.array(column, float) for column in zip(*cells, strict=True))
     both = [reaches(solver, arm, positions, tilts, yaws).reshape(len(TILTS), len(YAWS), -1).mean(-1) for arm in (0, 1)]
     return np.minimum(*both)
-
-
-def work_reach(robot: RobotSpec, arm: int) -> np.ndarray:
-    """Whether an arm reaches the grasps that tasks ask for: tilt 30 degrees, yaw up to 45 degrees off the radial one.
-
-    Returns:
-        [offsets x y z] bool over `RADIAL_OFFSETS`, `WORK_X`, `WORK_Y` and `WORK_Z`.
-    """
-    cells = list(product(RADIAL_OFFSETS, product(WORK_X, WORK_Y, WORK_Z)))
-    positions = np.array([position for _, position in cells])
-    yaws = np.array([radial_yaw(np.array(position)) + offset for offset, position in cells])
-    found = reaches(ArmSolver(robot), arm, positions, np.full(len(cells), GRASP_TILT), yaws)
-    return found.reshape(len(RADIAL_OFFSETS), len(WORK_X), len(WORK_Y), len(WORK_Z))
 
 
 def format_tables(robots: list[RobotSpec]) -> str:

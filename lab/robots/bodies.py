@@ -1,4 +1,4 @@
-"""The command that finds out which procedural bodies work, and where they stand: the catalog behind `body:17`.
+"""Search for procedural bodies that work and for their places: the catalog behind `body:17`.
 
 Reads  the designs of candidates, in numeric order
 Writes the catalog: for every body the number of its candidate, base poses and homes, so that loading one searches for nothing
@@ -8,19 +8,20 @@ seeds each (`trials.trial_plans`) within the limits and speeds of its joints; at
 succeeds in physics on two further seeds of each task. A seed of paired data counts only where all robots succeed, so that one
 body that never does would cost all others theirs.
 
-Numbers that are known keep their bodies: a longer catalog begins like a shorter one. Bodies are written as they are found; the
-command goes on from there unless it is told to begin anew. With --recheck known bodies are checked in physics again, and those
+Known bodies keep their numbers, so a longer catalog begins like a shorter one. Each body is written when it is accepted, and
+the command resumes from the file unless --anew is given. With --recheck known bodies are checked in physics again, and those
 that fail are replaced by further candidates.
 
 With --digest it prints SHA-256 digests of the URDF and meshes of each body of the catalog, and of all: two machines that print
 the same make the same bodies.
 
-Command: python -m xew.sim_warp.bodies [--count 104 --anew --recheck --workers 2 --out FILE | --count 104 --digest]
+Command: python -m lab.robots.bodies [--count 104 --anew --recheck --workers 2 --out FILE | --count 104 --digest]
 """
 
 import hashlib
+import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import count as count_from
 from itertools import islice, product
 from pathlib import Path
@@ -42,7 +43,7 @@ from xew.sim_warp.kinematics.forward import link_poses
 from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
 from xew.sim_warp.production.warm_up import compile_on_devices
 from xew.sim_warp.rendering.streams import home_action
-from xew.sim_warp.robots.procedural.bodies import CATALOG, Entry, catalog_text, placed_body, read_catalog, unplaced_body
+from xew.sim_warp.robots.procedural.bodies import CATALOG, Entry, placed_body, read_catalog, unplaced_body
 from xew.sim_warp.robots.procedural.design import WIDE, BodyDesign, design_body
 from xew.sim_warp.robots.procedural.urdf_files import body_files
 from xew.sim_warp.robots.user.placement import YAW_90, move_apart, move_to, place
@@ -128,15 +129,15 @@ def find_bodies(known: tuple[Entry, ...], count: int, workers: int) -> Iterator[
 
     The first `FIRST_FAMILY` bodies are of the first family of designs, all others of the wide one.
     """
-    found = len(known)
+    body_count = len(known)
     for first, end in ((0, min(FIRST_FAMILY, count)), (WIDE, count)):
-        if found >= end:
+        if body_count >= end:
             continue
         begin = max([first, *(entry.candidate + 1 for entry in known)])
         for result in _try_in_order(count_from(begin), workers):
             yield result
-            found += isinstance(result[1], Entry)
-            if found == end:
+            body_count += isinstance(result[1], Entry)
+            if body_count == end:
                 break
 
 
@@ -171,6 +172,12 @@ def _try_in_order(numbers: Iterator[int], workers: int) -> Iterator[tuple[int, E
         compile_for_checks(pool)
         while True:
             yield from sorted(pool.run(try_candidate, list(islice(numbers, 2 * workers))), key=lambda result: result[0])
+
+
+def catalog_text(entries: Sequence[Entry]) -> str:
+    """The content of a catalog, a line an entry."""
+    lines = ",\n".join(json.dumps(asdict(entry)) for entry in entries)
+    return f'{{"bodies": [\n{lines}\n]}}\n'
 
 
 def digest_lines(entries: Sequence[Entry]) -> Iterator[str]:

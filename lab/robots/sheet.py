@@ -1,8 +1,8 @@
 """Pictures of the robots: each from nine sides and all in one, and their reference renders as files.
 
-    python -m xew.sim_warp.robots.sheet --out docs/img
-    python -m xew.sim_warp.robots.sheet --robots piper --references references
-    python -m xew.sim_warp.robots.sheet --robots body:0-63 --grid docs/img/bodies.png
+    python -m lab.robots.sheet --out docs/img
+    python -m lab.robots.sheet --robots piper --references references
+    python -m lab.robots.sheet --robots body:0-63 --grid docs/img/bodies.png
 
 Reference renders do not depend on a task: for every robot <references>/<key>/ holds front.png (the canonical front view),
 view_000.png to view_320.png (nine azimuths in degrees), clip.mkv (17 frames that sweep every joint, lossless) with clip.png
@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from xew.config import user_errors
-from xew.episode import EpisodeError, encode_png, write_video
+from xew.episode import encode_png, write_video
 from xew.files import hold_lock, replacing, write_bytes
 from xew.protocol import expand_robots
 from xew.sim_warp.devices.workers import quiet_warp
@@ -37,16 +37,12 @@ from xew.sim_warp.rendering.streams import (
     side_view,
 )
 from xew.sim_warp.robots import ROBOTS, RobotSpec, get_robot
+from xew.sim_warp.robots.adopt import view_sheet
 
 GRID_COLUMNS, GRID_WIDTH, GRID_HEIGHT = 8, 240, 180
 """Numbers of robots in a row of a grid, and of pixels of each."""
 GRID_AZIMUTH = 25.0
 """Azimuth from which a grid shows its robots [deg]: nearly from the front, a little towards the robot's left hand."""
-
-
-def sheet(views: np.ndarray) -> np.ndarray:
-    """Nine images [9 h w 3] as three rows of three, [3h 3w 3]."""
-    return np.vstack([np.hstack(list(views[row : row + 3])) for row in (0, 3, 6)])
 
 
 def overview(robots: Sequence[RobotSpec], views: Sequence[np.ndarray], head: Sequence[np.ndarray]) -> np.ndarray:
@@ -78,60 +74,37 @@ def grid(robots: Sequence[RobotSpec]) -> np.ndarray:
     return np.vstack([np.hstack(tiles[row : row + GRID_COLUMNS]) for row in range(0, len(tiles), GRID_COLUMNS)])
 
 
-def write_grid(robots: Sequence[RobotSpec], path: Path) -> None:
-    """Draw `grid` as a PNG. Raises EpisodeError if it cannot be written."""
-    picture = grid(robots)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise EpisodeError(f"cannot write to {path.parent}: {error.strerror}. Choose another file with --grid.") from error
-    save(path, picture)
-
-
 def head_view(robot: RobotSpec, renderer: Renderer) -> np.ndarray:
     """The robot at home over the empty table, as the head camera sees it, [h w 3] uint8."""
     return renderer.render(robot_bodies(robot), robot_pose(robot, home_action(robot)[None]), HEAD_CAMERA).rgb[0]
 
 
 def write_references(robot: RobotSpec, folder: Path) -> Path:
-    """Write the reference renders of a robot into <folder>/<key>/, see the head of this file; returns that folder.
-
-    Raises:
-        EpisodeError: they cannot be written.
-    """
+    """Write the reference renders of a robot into <folder>/<key>/, see the head of this file; returns that folder."""
     own = folder / robot.key
-    try:
-        own.mkdir(parents=True, exist_ok=True)
-        save(own / "front.png", reference_image(robot))
-        for index, image in enumerate(nine_views(robot)):
-            save(own / f"view_{index * 360 // VIEW_COUNT:03d}.png", image)
-        clip = articulation_clip(robot)
-        with replacing(own / "clip.mkv") as temporary:
-            write_video(temporary, clip)
-        save(own / "clip.png", np.hstack([*clip]))
-        save(own / "ray_map.png", np.hstack([*ray_map(robot, articulation_action(robot)[::4])]))
-    except OSError as error:
-        raise EpisodeError(f"cannot write to {own}: {error.strerror}. Choose another folder with --references.") from error
+    own.mkdir(parents=True, exist_ok=True)
+    save(own / "front.png", reference_image(robot))
+    for index, image in enumerate(nine_views(robot)):
+        save(own / f"view_{index * 360 // VIEW_COUNT:03d}.png", image)
+    clip = articulation_clip(robot)
+    with replacing(own / "clip.mkv") as temporary:
+        write_video(temporary, clip)
+    save(own / "clip.png", np.hstack([*clip]))
+    save(own / "ray_map.png", np.hstack([*ray_map(robot, articulation_action(robot)[::4])]))
     return own
 
 
 def save(path: Path, image: np.ndarray) -> None:
     """Write a PNG of [h w 3] uint8."""
-    try:
-        write_bytes(path, encode_png(image))
-    except OSError as error:
-        raise EpisodeError(f"{path} cannot be written ({error.strerror}); choose another folder.") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, encode_png(image))
 
 
 def write_sheets(robots: Sequence[RobotSpec], folder: Path) -> list[Path]:
     """Draw robot_<key>.png of every robot and robots.png of all; the files."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise EpisodeError(f"cannot write to {folder}: {error.strerror}. Choose another folder with --out.") from error
     renderer = Renderer()
     views = [nine_views(robot) for robot in robots]
-    pictures = {f"robot_{robot.key}": sheet(images) for robot, images in zip(robots, views, strict=True)}
+    pictures = {f"robot_{robot.key}": view_sheet(images) for robot, images in zip(robots, views, strict=True)}
     pictures["robots"] = overview(robots, views, [head_view(robot, renderer) for robot in robots])
     for name, picture in pictures.items():
         save(folder / f"{name}.png", picture)
@@ -159,7 +132,7 @@ def main() -> None:
     robots = [get_robot(name) for name in expand_robots(args.robots)]
     with hold_lock(args.grid or args.references or args.out):
         if args.grid is not None:
-            write_grid(robots, args.grid)
+            save(args.grid, grid(robots))
             print(args.grid)
             return
         if args.references is None:

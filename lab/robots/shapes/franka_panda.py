@@ -1,18 +1,17 @@
 """Shapes of the Franka Emika Panda with its hand: rounded white shells, dark joints, after the vendor's mesh sizes."""
 
-from xew.sim_warp.robots.shapes.solids import (
+from lab.robots.shapes.parts import camera, point_between
+from xew.sim_warp.robots.procedural.solids import (
     PAD_HALF_WIDTH,
     PAD_THICKNESS,
     Box,
     Part,
     Vector,
     box_solid,
-    camera,
     cylinder,
     dome,
     hull,
     loft,
-    point_between,
     rounded_box,
 )
 

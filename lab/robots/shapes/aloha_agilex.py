@@ -1,7 +1,8 @@
 """Shapes of the ALOHA-AgileX: black arms of the X5 family on an aluminum frame over a mobile base."""
 
-from xew.sim_warp.robots.shapes import arx_x5
-from xew.sim_warp.robots.shapes.solids import Box, Part, Vector, box_solid, camera, cylinder, hull, rounded_box
+from lab.robots.shapes import arx_x5
+from lab.robots.shapes.parts import camera
+from xew.sim_warp.robots.procedural.solids import Box, Part, Vector, box_solid, cylinder, hull, rounded_box
 
 MATERIALS = {
     "black": (46, 46, 50),

@@ -5,14 +5,14 @@ The functions give one link each, in its frame, so that the ALOHA's arms, which 
 
 from functools import partial
 
-from xew.sim_warp.robots.shapes import solids
-from xew.sim_warp.robots.shapes.solids import (
+from lab.robots.shapes.parts import camera
+from xew.sim_warp.robots.procedural import solids
+from xew.sim_warp.robots.procedural.solids import (
     PAD_HALF_WIDTH,
     PAD_THICKNESS,
     Box,
     Part,
     box_solid,
-    camera,
     hull,
     loft,
     rounded_box,

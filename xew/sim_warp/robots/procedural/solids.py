@@ -35,12 +35,6 @@ class Box:
         return Rotation.from_euler("xyz", self.rpy).apply(np.add(self.low, self.high) / 2)
 
 
-def point_between(start: Vector, end: Vector, share: float) -> Vector:
-    """The point that lies `share` of the way from start to end."""
-    x, y, z = (a + share * (b - a) for a, b in zip(start, end, strict=True))
-    return x, y, z
-
-
 def transform(xyz: Sequence[float] | np.ndarray = (0, 0, 0), rpy: Sequence[float] = (0, 0, 0)) -> np.ndarray:
     """[4 4], URDF's order: turn by roll, pitch, yaw, then move."""
     matrix = np.eye(4)
@@ -135,13 +129,3 @@ def _move(solid: trimesh.Trimesh, rotation: np.ndarray, xyz: Sequence[float]) ->
     matrix[:3, 3] = xyz
     solid.apply_transform(matrix)
     return solid
-
-
-def camera(low: Vector, high: Vector, bracket: tuple[Vector, Vector]) -> list[Part]:
-    """A camera of the D435's size, a light bar with a dark face that looks along x, and the bracket that holds it."""
-    face = (high[0] - 0.002, low[1] + 0.006, low[2] + 0.004), (high[0] + 0.001, high[1] - 0.006, high[2] - 0.004)
-    return [
-        ("lens", rounded_box(*face, 0.001)),
-        ("case", rounded_box(low, high, 0.004)),
-        ("case", rounded_box(*bracket, 0.001)),
-    ]

@@ -1,11 +1,11 @@
 """Procedural bodies measured: how often they succeed, how far they lie apart, how fast they are generated and loaded.
 
-    python benchmarks/bodies.py yields [--bodies 32 --seeds 4]      # experts in physics, beside the five robots'
-    python benchmarks/bodies.py plans [--bodies 96 --seeds 2]       # the same without physics: which plans the arms follow
-    python benchmarks/bodies.py distances [--bodies 64 --wide 64 --plot docs/img/body_distances.png]
-    python benchmarks/bodies.py rate [--bodies 64 --seeds 2]        # frames a second of generate, beside the five robots'
-    python benchmarks/bodies.py loading [--bodies 16]               # CPU time to load a body whose files are in the cache
-    python benchmarks/bodies.py everything --out OUT                # all of these, and the digests of all bodies
+    python -m lab.robots.measure_bodies yields [--bodies 32 --seeds 4]  # successes in physics, of bodies and the five robots
+    python -m lab.robots.measure_bodies plans [--bodies 96 --seeds 2]  # the same without physics: which plans are followed
+    python -m lab.robots.measure_bodies distances [--bodies 64 --wide 64 --plot docs/img/body_distances.png]
+    python -m lab.robots.measure_bodies rate [--bodies 64 --seeds 2]  # frames a second of generate and of the five robots
+    python -m lab.robots.measure_bodies loading [--bodies 16]  # CPU time to load a body whose files are in the cache
+    python -m lab.robots.measure_bodies everything --out OUT  # all of these, and the digests of all bodies
 
 `yields` and `rate` take minutes on a GPU with 16 cores, hours on a laptop. `yields` exits with 1 where fewer than 80 % of the
 cells of bodies succeed, `rate` where bodies are generated at less than 0.8 of the five robots' rate.
@@ -155,8 +155,8 @@ def _format(successes: Sequence[bool]) -> str:
 
 def compare_distances(args: Distances) -> int:
     """Print quantiles of both distances by kind of pair, and plot them."""
+    from lab.robots.bodies import FIRST_FAMILY
     from xew.analysis.distance import appearance_matrix, measure
-    from xew.sim_warp.bodies import FIRST_FAMILY
     from xew.sim_warp.rendering.streams import nine_views
     from xew.sim_warp.robots import get_robot
 
@@ -262,10 +262,10 @@ def time_loading(args: Loading) -> int:
 def run_everything(args: Everything) -> int:
     """Print what each command prints and keep it; the number of commands that failed."""
     args.out.mkdir(parents=True, exist_ok=True)
-    this = [sys.executable, str(Path(__file__))]
+    this = [sys.executable, "-m", "lab.robots.measure_bodies"]
     failed = 0
     for name, command in {
-        "digest": [sys.executable, "-m", "xew.sim_warp.bodies", "--digest"],
+        "digest": [sys.executable, "-m", "lab.robots.bodies", "--digest"],
         "loading": [*this, "loading"],
         "yields": [*this, "yields"],
         "rate": [*this, "rate"],
