@@ -20,7 +20,7 @@ import os
 import platform
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 
 import numpy as np
@@ -30,7 +30,7 @@ import warp as wp
 from xew.sim_warp.physics import simulate
 from xew.sim_warp.physics.gpu import Batch
 from xew.sim_warp.physics.worlds import STEPS_PER_FRAME, Motion, World
-from xew.sim_warp.production.cells import Cell, Job, plan_cells
+from xew.sim_warp.production.cells import Cell, Job, plan_cells, with_motion
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.tasks import TASKS, get_task
 
@@ -64,7 +64,7 @@ def cells_for(count: int, tasks: Sequence[str] = tuple(TASKS)) -> list[Cell]:
 
 def find_successes(cells: Sequence[Cell], motions: Sequence[Motion]) -> np.ndarray:
     """[n] bool, whether each cell with this motion ends in success."""
-    return np.array([replace(cell, motion=motion).failure is None for cell, motion in zip(cells, motions, strict=True)])
+    return np.array([with_motion(cell, motion).failure is None for cell, motion in zip(cells, motions, strict=True)])
 
 
 def check(cells: list[Cell], motions: list[Motion], whole: bool) -> float:

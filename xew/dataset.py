@@ -13,7 +13,7 @@ from functools import cached_property
 from pathlib import Path
 
 from xew.episode import TEMPORARY, EpisodeError, Record, read_record
-from xew.protocol import MIXED_MOTION, MOTIONS, seed_split
+from xew.protocol import MOTIONS, seed_split
 
 Episode = tuple[Path, Record]
 """Folder and header of one cell."""
@@ -143,23 +143,19 @@ def find_accepted(data: Path) -> list[Episode]:
 def demand_motion(data: Path, records: Iterable[Record], motion: str) -> None:
     """Raise EpisodeError where episodes of a data set are not of the kind of motion that a split names (`Split.motion`)."""
     found = count_motions(records)
-    if motion != MIXED_MOTION and set(found) - {motion}:
+    if set(found) - {motion}:
         raise EpisodeError(
             f"{data} has {_list_motions(found)} to be read, and the split is of {motion} motion; choose a split of the other"
-            " kind (--split fixed, fixed_own), or one that ends in _mixed to mix them on purpose."
+            " kind (--split fixed, fixed_own)."
         )
 
 
-def demand_one_motion(data: Path, records: Iterable[Record], mixed: bool) -> str:
-    """The kind of motion of a data set's episodes, one of `MOTIONS`; MIXED_MOTION if they have both and may.
-
-    Raises:
-        EpisodeError: they have both, and `mixed` does not allow it.
-    """
+def demand_one_motion(data: Path, records: Iterable[Record]) -> str:
+    """The kind of motion of a data set's episodes, one of `MOTIONS`. Raises EpisodeError if they have both."""
     found = count_motions(records)
-    if len(found) > 1 and not mixed:
-        raise EpisodeError(f"{data} has {_list_motions(found)}, which do not compare; mix them on purpose by --mixed-motion.")
-    return MIXED_MOTION if len(found) > 1 else next(iter(found), MOTIONS[0])
+    if len(found) > 1:
+        raise EpisodeError(f"{data} has {_list_motions(found)}, which do not compare; keep them in data sets of their own.")
+    return next(iter(found), MOTIONS[0])
 
 
 def count_motions(records: Iterable[Record]) -> dict[str, int]:

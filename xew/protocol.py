@@ -16,8 +16,6 @@ HELD_OUT_ROBOTS = ("franka_panda", "piper")
 BODY_NAME = re.compile(r"body[:_](\d+)")
 BODY_RANGE = re.compile(r"body:(\d+)-(\d+)")
 """Forms of the names of one procedural body and of several in a row, as users write them."""
-PAINTED_NAME = re.compile(r"(\w[\w.+-]*)_paint_(\d+)")
-"""Form of the key of a robot in other colors: arx_x5_paint_3."""
 
 ACTION_DIM = 16
 """Length of a command: left arm 7 joints [rad], left gripper, right arm 7 joints [rad], right gripper. Grippers go from 0,
@@ -38,8 +36,6 @@ SHARED_MOTION, OWN_MOTION = "shared", "own"
 MOTIONS = (SHARED_MOTION, OWN_MOTION)
 """Kinds of motion that episodes may have: all robots of a scene follow one tool path on one clock, so that the body alone
 differs; or each goes between the task's waypoints by a path, in a time and from a rest posture of its own."""
-MIXED_MOTION = "mixed"
-"""Both kinds of motion, where a split, a table or a report has them on purpose."""
 
 FRAME_RATE = 1000 / 60
 """Number of stored frames per second [Hz]: one every 15 physics steps of 4 ms."""
@@ -78,17 +74,6 @@ def expand_robots(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(keys)
 
 
-def painted_key(robot: str, paint: int) -> str:
-    """The key of a robot in the colors of a number, from 1 (`xew.sim_warp.embodiment.paint`)."""
-    return f"{robot}_paint_{paint}"
-
-
-def unpainted_key(robot: str) -> str:
-    """The key of the same robot in its own colors."""
-    found = PAINTED_NAME.fullmatch(robot)
-    return found[1] if found else robot
-
-
 @dataclass(frozen=True)
 class Split:
     """Robots that a model trains on, and robots that it must render unseen."""
@@ -96,7 +81,7 @@ class Split:
     train_robots: tuple[str, ...]
     held_out_robots: tuple[str, ...]
     motion: str = SHARED_MOTION
-    """Kind of motion of its episodes: one of MOTIONS, or MIXED_MOTION."""
+    """Kind of motion of its episodes: one of MOTIONS."""
 
 
 FIXED = Split(SEEN_ROBOTS, HELD_OUT_ROBOTS)
@@ -130,13 +115,6 @@ HALVES = {
 }
 """The protocol of halves: every body is rendered by a model that trained on it and by one that did not, as in the folds of
 LOEO, but with 32 bodies in place of five robots. Keys say which half trains, by the bodies' numbers."""
-PAINT_COUNT = 40
-"""Number of paints that training robots are shown in: one for each training seed of a small study."""
-PAINTED = Split(
-    (*SEEN_ROBOTS, *(painted_key(robot, paint) for robot in SEEN_ROBOTS for paint in range(1, PAINT_COUNT + 1))),
-    HELD_OUT_ROBOTS,
-)
-"""The fixed split, with its training robots also in other colors."""
 VALIDATION = Split(SEEN_ROBOTS, VALIDATION_BODIES)
 """The fixed split's training robots, with the bodies by which choices are made in place of the held-out robots."""
 
@@ -147,23 +125,15 @@ def validation_split(split: Split) -> Split:
 
 
 def split_key(split: str, motion: str) -> str:
-    """The key of a split in a kind of motion: fixed, fixed_own, fixed_mixed."""
+    """The key of a split in a kind of motion: fixed, fixed_own."""
     return split if motion == SHARED_MOTION else f"{split}_{motion}"
 
 
 _SHARED_SPLITS = (
-    {"fixed": FIXED}
-    | {f"loeo_{robot}": split for robot, split in LOEO.items()}
-    | SCALING
-    | HALVES
-    | {"painted": PAINTED, "validation": VALIDATION}
+    {"fixed": FIXED} | {f"loeo_{robot}": split for robot, split in LOEO.items()} | SCALING | HALVES | {"validation": VALIDATION}
 )
-SPLITS = {
-    split_key(key, motion): replace(split, motion=motion)
-    for motion in (*MOTIONS, MIXED_MOTION)
-    for key, split in _SHARED_SPLITS.items()
-}
-"""All splits by key. A plain key is of shared motion, `_own` behind it of own motion, and `_mixed` of both on purpose."""
+SPLITS = {split_key(key, motion): replace(split, motion=motion) for motion in MOTIONS for key, split in _SHARED_SPLITS.items()}
+"""All splits by key. A plain key is of shared motion; keys of own motion end in `_own`."""
 
 SHOTS = (1, 2, 3)
 """Numbers of training episodes of each task that a model is adapted with (M); they are of the first accepted seeds."""

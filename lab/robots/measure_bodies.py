@@ -95,7 +95,7 @@ class Everything:
 
 def count_yields(args: Yields) -> int:
     """Print a table of successes of each body and task; 1 if too few of the bodies' cells succeed."""
-    from xew.sim_warp.yields import Args, attempt_seeds
+    from lab.seeds.yields import Args, attempt_seeds
 
     bodies = tuple(body_key(number) for number in range(args.bodies))
     flags = Args(args.tasks, (*ROBOT_NAMES, *bodies), args.seeds, args.first_seed, args.batch, args.workers)

@@ -34,7 +34,9 @@ from xew.model.runs.begin import claim_run
 from xew.model.runs.folder import load_run_config
 from xew.names import check_name, path_below
 from xew.rollout import RolloutError, find_rollouts, read_rollout, write_rollout
-from xew.sim_warp.inspect import draw_pictures, find_problem, read_headers
+from xew.sim_warp.inspect import read_headers
+from xew.sim_warp.inspection.checks import find_problem
+from xew.sim_warp.inspection.pictures import draw_pictures
 from xew.sim_warp.manifest import read_manifest
 from xew.sim_warp.production.surfaces import read_surfaces
 from xew.sim_warp.robots import recorded_robot

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.sim_warp.small import TASK
+from tests.sim_warp.small import TASK, produce
 from tests.synthetic import write_synthetic_data
 from xew.config import ConfigError
 from xew.dataset import find_accepted
@@ -42,7 +42,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An episode of the simulation, twelve frames."""
     from xew.sim_warp.production.cells import Job
-    from xew.sim_warp.production.produce import produce
     from xew.sim_warp.rendering.render import Renderer
 
     root = tmp_path_factory.mktemp("simulated")

@@ -5,17 +5,22 @@ Both are reached from outside the registries, as a user's own would be: TASK and
 
 import resource
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
+from xew.episode import Record
 from xew.sim_warp import objects
 from xew.sim_warp.plan import HOME, LEFT, RIGHT, Timeline
-from xew.sim_warp.robots import ROBOTS
+from xew.sim_warp.production.cells import Job
+from xew.sim_warp.production.produce import Production, simulate_jobs, write_scene
+from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.robots import ROBOTS, RobotSpec
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks.task import Moment, Task
@@ -49,8 +54,17 @@ CLOSE = Task("close", "close both hands", sample, plan, success)
 SLOW_PIPER = replace(ROBOTS["piper"], joint_velocity=(0.02,) * 6)
 WITH_SLOW = ROBOTS | {SLOW: SLOW_PIPER}
 """Robots of the registry and the slow one, by the names that jobs give."""
-WITH_WORKERS = ("devices.workers", "generate", "yields")
-"""Modules of the room that name Workers: where commands find them, and those that have imported them already."""
+WITH_WORKERS = ("xew.sim_warp.devices.workers", "xew.sim_warp.generate", "xew.sim_warp.inspection.checks", "lab.seeds.yields")
+"""Modules that name Workers: where commands find them, and those that have imported them already."""
+
+
+def produce(
+    jobs: Sequence[Job], out: Path, renderer: Renderer, *, videos: bool = True, robots: Mapping[str, RobotSpec] = ROBOTS
+) -> list[list[Record]]:
+    """Make some scenes in this process, with physics on the CPU; the headers of each job in the order of its robots."""
+    production = Production(out, robots, videos=videos)
+    scenes = zip(jobs, simulate_jobs(jobs, production), strict=True)
+    return [write_scene(cells, out, renderer, rejected=job.rejected, videos=videos) for job, cells in scenes]
 
 
 class InlineWorkers:
@@ -74,7 +88,7 @@ class InlineWorkers:
 def work_inline(patch: "pytest.MonkeyPatch") -> None:
     """Let commands that are called in this process start no workers."""
     for module in WITH_WORKERS:
-        patch.setattr(f"xew.sim_warp.{module}.Workers", InlineWorkers)
+        patch.setattr(f"{module}.Workers", InlineWorkers)
 
 
 def fill_disk(_: object = None) -> None:

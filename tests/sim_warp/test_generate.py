@@ -16,7 +16,7 @@ from typing import Any, Literal, cast
 import pytest
 import warp as wp
 
-from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, fill_disk, work_inline
+from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, fill_disk, produce, work_inline
 from tests.sim_warp.worker_jobs import half, name_of_own_device
 from xew.config import ConfigError
 from xew.dataset import find_accepted, find_records
@@ -25,20 +25,13 @@ from xew.protocol import SEED_STARTS, TEST_SEED_START, VALIDATION_SEED_START, se
 from xew.sim_warp import generate as command
 from xew.sim_warp.devices import workers
 from xew.sim_warp.devices.workers import Workers
-from xew.sim_warp.generate import (
-    MOST_UNPAIRED,
-    SEEDS_OF_ROBOT,
-    Args,
-    Family,
-    generate,
-    main,
-    plan_families,
-    yield_table,
-)
-from xew.sim_warp.inspect import find_problem
+from xew.sim_warp.generate import Args, generate, main, plan_seeds
+from xew.sim_warp.inspection.checks import find_problem
 from xew.sim_warp.manifest import Manifest
 from xew.sim_warp.production.cells import Job
-from xew.sim_warp.production.produce import produce
+from xew.sim_warp.production.produce import Production
+from xew.sim_warp.production.seeds import MOST_UNPAIRED, SEEDS_OF_ROBOT, Family
+from xew.sim_warp.production.summary import yield_table
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import RobotSpec
 
@@ -78,10 +71,10 @@ def test_seeds_are_tried_until_enough_are_accepted(undisturbed: Path) -> None:
         assert verify_episode(folder) == record and set(record.hashes) == {"states", "rgb", "robot"}
 
 
-def test_motion_of_its_own_is_on_record_and_mixed_on_purpose_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_own_motion_is_on_record_and_never_mixed_with_shared_motion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     work_inline(monkeypatch)
     out = tmp_path / "own"
-    asked = Args((TASK,), ("franka_panda",), None, 1, 0, out=out, device="cpu", motion="own", states_only=True)
+    asked = Args((TASK,), ("franka_panda",), 1, 0, out=out, device="cpu", motion="own", states_only=True)
     generate(asked)
     ((folder, record),) = find_records(out)
     assert record.motion == "own" and find_problem(folder) == "", "its holds are known again in its own time"
@@ -89,14 +82,9 @@ def test_motion_of_its_own_is_on_record_and_mixed_on_purpose_only(tmp_path: Path
         EpisodeError, match="holds episodes of own motion, and shared motion is asked for; choose another --out"
     ):
         generate(replace(asked, motion="shared"))
-    generate(replace(asked, robots=("franka_panda", "piper"), motion="shared", mixed_motion=True))
-    records = [record for _, record in find_records(out)]
-    assert {record.robot: record.motion for record in records} == {"franka_panda": "own", "piper": "shared"}
-    assert yield_table(records).splitlines()[-1] == "motion: shared 1, own 1"
+    assert yield_table([record]).splitlines()[-1] == "motion: own 1"
     header = folder / "episode.json"
     fields = json.loads(header.read_text())
-    header.write_text(json.dumps({name: value for name, value in fields.items() if name != "motion"}))
-    assert read_record(folder).motion == "shared", "headers of earlier versions do not say it"
     header.write_text(json.dumps(fields | {"motion": "fast"}))
     with pytest.raises(EpisodeError, match="its motion is 'fast', expected shared or own"):
         read_record(folder)
@@ -281,15 +269,15 @@ AB = dict.fromkeys(SEED_STARTS, ("a", "b"))
 
 def test_validation_seeds_are_a_family_of_their_own_that_is_made_when_asked_for() -> None:
     args = Args(tasks=("grab_roller",), robots=("a", "b"), train_seeds=2, test_seeds=1, validation_seeds=3)
-    families = plan_families(args, AB, Manifest())
+    families = plan_seeds(args, AB, Manifest())
     assert [(f.first_seed, f.wanted) for f in families] == [(0, 2), (VALIDATION_SEED_START, 3), (TEST_SEED_START, 1)]
     assert {seed_split(seed) for seed in families[1].tries} == {"validation"}
-    assert len(plan_families(replace(args, validation_seeds=0), AB, Manifest())) == 2
+    assert len(plan_seeds(replace(args, validation_seeds=0), AB, Manifest())) == 2
 
 
 def test_test_seeds_may_be_of_other_robots() -> None:
     args = Args(tasks=("grab_roller",), train_seeds=2, test_seeds=1)
-    families = plan_families(args, AB | {"test": ("b", "c")}, Manifest())
+    families = plan_seeds(args, AB | {"test": ("b", "c")}, Manifest())
     assert [(family.first_seed, family.robots) for family in families] == [(0, ("a", "b")), (TEST_SEED_START, ("b", "c"))]
 
 
@@ -297,24 +285,19 @@ def test_test_seeds_may_be_of_other_robots() -> None:
 def test_physics_on_the_cpu_leaves_the_gpu_to_the_pictures(
     physics: Literal["cpu"] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Five scenes of two robots on a GPU that steps eight worlds together: batches, devices of the jobs, compiled kernels."""
+    """Devices of the jobs and of the compiled kernels."""
     compiled: dict[str, str] = {}
-    stepped: list[int] = []
-    shared: list[dict[str, Any]] = []
+    productions: list[Production] = []
     gpus = [SimpleNamespace(is_cuda=True, alias=f"cuda:{number}", total_memory=1e12) for number in range(2)]
     monkeypatch.setattr(command, "find_devices", lambda name: gpus)
     monkeypatch.setattr(command, "compile_on_devices", lambda pool, devices, batch: compiled.update(devices))
-    monkeypatch.setattr(command, "_make", lambda jobs, **_: stepped.append(len(jobs)) or [])
-    monkeypatch.setattr(command, "make_by_robot", lambda *arguments: shared.extend(p.keywords for p in arguments[3:]) or [])
+    monkeypatch.setattr(command, "make_scenes", lambda pool, jobs, production: productions.append(production) or [])
     work_inline(monkeypatch)
     args = Args((TASK,), ("a", "b"), out=tmp_path, batch=8, physics=physics)
     with command.start_workers(args, dict.fromkeys("ab", WITH_SLOW[SLOW])) as make:
         assert list(make([Job(TASK, seed, ("a", "b")) for seed in range(5)])) == []
-    if physics is None:
-        assert stepped == [4, 1] and not shared, "scenes together, as many as the GPU steps worlds of"
-    else:
-        simulate, write = shared
-        assert not stepped and simulate["physics"] == "cpu" and write["painter"], "on the CPU, robot by robot"
+    (production,) = productions
+    assert production.gpu_physics == (physics is None) and production.batch == 8
     device = physics or "cuda:0"
     assert compiled == {"physics": device, "kinematics": device, "rendering": "cuda:0"}
 
@@ -322,7 +305,7 @@ def test_physics_on_the_cpu_leaves_the_gpu_to_the_pictures(
 def test_unpaired_robots_share_no_seed(tmp_path: Path) -> None:
     """Each robot's seeds are its own however many are tried, and it waits for no other."""
     args = Args(tasks=("grab_roller",), robots=("a", "b"), train_seeds=MOST_UNPAIRED, test_seeds=1, unpaired=True)
-    families = plan_families(args, AB, Manifest())
+    families = plan_seeds(args, AB, Manifest())
     assert [(f.robots, f.wanted) for f in families] == [
         (("a",), MOST_UNPAIRED),
         (("b",), MOST_UNPAIRED),
@@ -332,7 +315,7 @@ def test_unpaired_robots_share_no_seed(tmp_path: Path) -> None:
     tried = [set(f.tries) for f in families]
     assert len(set.union(*tried)) == sum(map(len, tried))
     assert families[1].first_seed == SEEDS_OF_ROBOT and families[3].first_seed == TEST_SEED_START + SEEDS_OF_ROBOT
-    paired = plan_families(replace(args, unpaired=False), AB, Manifest())
+    paired = plan_seeds(replace(args, unpaired=False), AB, Manifest())
     assert [(f.robots, f.first_seed) for f in paired] == [(("a", "b"), 0), (("a", "b"), TEST_SEED_START)]
 
 

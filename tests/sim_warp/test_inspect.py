@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.sim_warp.small import SLOW, TASK, WITH_SLOW
+from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, produce
 from xew.episode import States, episode_folder, read_record, read_states, read_video, write_episode
 from xew.names import folder_name
-from xew.sim_warp.inspect import (
+from xew.sim_warp.inspect import main, read_headers
+from xew.sim_warp.inspection.pictures import (
     GAP,
     LABEL_HEIGHT,
     LABEL_WIDTH,
@@ -23,14 +24,11 @@ from xew.sim_warp.inspect import (
     busy_instants,
     contact_sheet,
     grid,
-    main,
-    read_headers,
     strip,
     tile,
 )
 from xew.sim_warp.inspection.visibility import visibility_section
 from xew.sim_warp.production.cells import Job
-from xew.sim_warp.production.produce import produce
 from xew.sim_warp.production.surfaces import Seen, Visibility, count_visible, read_surfaces
 from xew.sim_warp.rendering.render import Renderer
 
@@ -201,15 +199,12 @@ def test_nothing_there_is_told_with_the_way_to_make_it(made: Path, data: Path, t
     assert code == 2 and "Choose another folder with --grid." in told
 
 
-def test_visibility_is_counted_by_task_and_robot(data: Path, tmp_path: Path, inspect: Inspect) -> None:
+def test_visibility_is_counted_by_task_and_robot(data: Path, inspect: Inspect) -> None:
     """The block of the small task never moves; so only the robot's points are asked for."""
-    page = tmp_path / "page.md"
-    code, out, _ = inspect(data, "--visibility", "--visibility-page", page)
+    code, out, _ = inspect(data, "--visibility")
     (row,) = [line for line in out.splitlines() if line.startswith(f"| `{TASK}`")]
     assert code == 0 and row == f"| `{TASK}` | 100 / 100 | 100 / 100 | nothing moves |"
-    assert "Below the aims" not in out and out.rstrip().endswith(page.read_text().rpartition("`. ")[2].rstrip())
-    code, _, told = inspect(data, "--visibility-page", tmp_path)
-    assert code == 2 and "Choose another file with --visibility-page" in told
+    assert "Below the aims" not in out
 
 
 def test_shapes_that_are_not_known_cannot_be_counted(data: Path, inspect: Inspect) -> None:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from xew.episode import EpisodeError, Record
-from xew.sim_warp import inspect
-from xew.sim_warp.inspect import GAP, LABEL_HEIGHT, LABEL_WIDTH, save_png, seeds_by_task, tile
+from xew.sim_warp.inspection import pictures as inspect
+from xew.sim_warp.inspection.pictures import GAP, LABEL_HEIGHT, LABEL_WIDTH, save_png, seeds_by_task, tile
 
 
 def dark_columns(image: np.ndarray) -> np.ndarray:

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from lab.seeds.manifest import main, manifest_of, to_json
 from xew.episode import EpisodeError, Record, write_episode
 from xew.protocol import TEST_SEED_START
 from xew.sim_warp.generate import Family
-from xew.sim_warp.manifest import PACKAGED, Manifest, main, manifest_of, read_manifest, to_json
+from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 
 ROBOTS = ("piper", "ur5_wsg")
 
@@ -155,9 +156,9 @@ def test_tasks_stand_in_order_of_their_names_whatever_was_made_first() -> None:
         ({"train": [True]}, "found True, expected a whole number"),
     ],
 )
-def test_the_line_says_what_is_wrong_and_how_to_make_another(changes: dict[str, object], told: str, tmp_path: Path) -> None:
+def test_the_line_says_what_is_wrong_and_what_to_do(changes: dict[str, object], told: str, tmp_path: Path) -> None:
     path = tmp_path / "seeds.json"
     path.write_text(broken(**changes))
     with pytest.raises(EpisodeError) as error:
         read_manifest(path)
-    assert told in str(error.value) and str(error.value).endswith(f"python -m xew.sim_warp.manifest DATA --out {path}")
+    assert told in str(error.value) and "name another file by --manifest" in str(error.value)

@@ -18,7 +18,7 @@ import pandas as pd
 from xew.config import IMPORT_PATH, ConfigError, parse
 from xew.files import demand_regular, replacing
 from xew.names import EpisodeError, check_label, check_name
-from xew.protocol import BASELINES, BODY_NAME, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES, SHARED_MOTION, unpainted_key
+from xew.protocol import BASELINES, BODY_NAME, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES, SHARED_MOTION
 from xew.statistics import find_power
 
 VARIANT = "variant"
@@ -181,7 +181,7 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
     metrics = _read_metric_infos(path, rows.attrs["metrics"])
     names = rows["robot"].unique()
     known = {*ROBOT_NAMES, *rows.attrs.get("robots", ()), *own_robots}
-    known |= {robot for robot in names if _is_named_by_form(unpainted_key(str(robot))) or unpainted_key(str(robot)) in known}
+    known |= {robot for robot in names if _is_named_by_form(str(robot))}
     wrong = _find_wrong_rows(rows, metrics, known)
     if wrong:
         raise ConfigError(f"{path} cannot be averaged over:\n{_format_wrong_rows(wrong)}\nGrade anew: {command} --overwrite")

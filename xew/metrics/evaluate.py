@@ -117,8 +117,6 @@ class Args:
     """Grade nothing: check that a bundle is consistent, and, where rollouts are named, that it was made from them."""
     regrade: int = 0
     """With --check: grade so many of its videos anew and compare."""
-    mixed_motion: bool = False
-    """Grade episodes of shared and of own motion into one table."""
     trust: tuple[str, ...] = ()
     """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
@@ -154,7 +152,7 @@ def grade_tables(args: Args) -> None:
             attributes |= {"codecs": {model: [codec.key] for model, codec in sorted(codecs.items())}}
         jobs = find_jobs(args, tuple(BASELINES) if args.baselines else (), errors if args.keep_going else None, codecs)
         records = map(read_record, dict.fromkeys(job.episode for job in jobs))
-        attributes["motion"] = demand_one_motion(args.data, records, args.mixed_motion)
+        attributes["motion"] = demand_one_motion(args.data, records)
         total = len(jobs) + len(errors)
         errors += grade_all(jobs, (*metrics, *diagnostics), args, store, grade_groups)
         cells = [job.cell for job in jobs]

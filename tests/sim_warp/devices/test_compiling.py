@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.sim_warp.small import TASK, InlineWorkers, launched_modules
+from tests.sim_warp.small import TASK, InlineWorkers, launched_modules, produce
 from xew.sim_warp.devices.kernels import Variant, compile_for, compile_together, noted_launches, watched_launches
 from xew.sim_warp.physics.kernels import set_targets
 from xew.sim_warp.production import warm_up
 from xew.sim_warp.production.cells import Job
-from xew.sim_warp.production.produce import produce
 from xew.sim_warp.rendering.render import Renderer
 
 

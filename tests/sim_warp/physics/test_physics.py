@@ -31,7 +31,7 @@ from xew.sim_warp.physics.worlds import (
     template_joints,
 )
 from xew.sim_warp.plan import HOME, LEFT, RIGHT, Timeline
-from xew.sim_warp.production.cells import Cell, Job, plan_cells
+from xew.sim_warp.production.cells import Cell, Job, plan_cells, with_motion
 from xew.sim_warp.production.outcome import DEEPEST_IN_TABLE
 from xew.sim_warp.production.warm_up import stand_at_home
 from xew.sim_warp.robots import ROBOTS
@@ -138,7 +138,7 @@ def driven(robot: RobotSpec, timeline: Timeline) -> Cell:
     scene, path = scene_of("grab_roller"), timeline.path()
     commands = replace(joint_commands(robot, [path])[0], problem=None)
     motion = simulate([World(robot, scene, commands.action)], "cpu")[0]
-    return Cell("grab_roller", TASKS["grab_roller"], scene, path, robot.key, robot, commands, motion)
+    return with_motion(Cell("grab_roller", scene, path, robot.key, robot, commands), motion)
 
 
 def test_a_hand_driven_into_the_table_is_seen() -> None:

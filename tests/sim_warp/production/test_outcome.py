@@ -11,6 +11,7 @@ from xew.sim_warp import objects
 from xew.sim_warp.kinematics.expert import Commands
 from xew.sim_warp.physics import Motion
 from xew.sim_warp.plan import LEFT, RIGHT, Hold, Timeline, ToolPath
+from xew.sim_warp.production import cells
 from xew.sim_warp.production.cells import Cell, measured_tools
 from xew.sim_warp.production.outcome import DEEPEST_IN_ARM, DEEPEST_IN_TABLE, moment
 from xew.sim_warp.production.warm_up import stand_at_home
@@ -38,7 +39,7 @@ TASK = Task("lift", "lift the cube", sample, lambda scene: Timeline(), is_lifted
 
 
 @pytest.fixture
-def cell() -> Cell:
+def cell(task_of_this_file: None) -> Cell:
     """The left hand lifts a cube, without a robot that moves: both tools stay home, the cube rises and is touched."""
     scene = sample(np.random.default_rng(0), 0)
     pose = np.tile(np.array([thing.pose for thing in scene.objects], np.float32), (FRAMES, 1, 1))
@@ -49,20 +50,28 @@ def cell() -> Cell:
     nothing = np.zeros((FRAMES, 2), np.float32)
     motion = Motion(action, np.zeros_like(action), pose, nothing, contact, nothing, 0.0, 0.0, False)
     path = ToolPath(np.zeros((FRAMES, 2, 7)), np.ones((FRAMES, 2)), ())
-    return Cell("lift", TASK, scene, path, "piper", ROBOT, Commands(action, None), motion)
+    return cells.with_motion(Cell("lift", scene, path, "piper", ROBOT, Commands(action, None)), motion)
+
+
+@pytest.fixture(autouse=True)
+def task_of_this_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cells' task is the one of this file, whatever its name."""
+    monkeypatch.setattr(cells, "get_task", lambda name: TASK)
 
 
 def with_motion(cell: Cell, **changes: object) -> Cell:
-    return replace(cell, motion=replace(cell.known_motion, **changes))  # type: ignore[arg-type]
+    return cells.with_motion(cell, replace(cell.known_motion, **changes))  # type: ignore[arg-type]
 
 
 def test_a_motion_that_ends_in_success_has_no_failure(cell: Cell) -> None:
     assert cell.failure is None
 
 
-def test_a_robot_that_cannot_follow_fails_in_its_plan(cell: Cell) -> None:
-    stuck = replace(cell, motion=None, commands=Commands(cell.commands.action, "left arm cannot reach"))
-    assert stuck.failure == ("plan", "left arm cannot reach")
+def test_a_robot_that_cannot_follow_fails_in_its_plan(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = Commands(cell.commands.action, "left arm cannot reach")
+    monkeypatch.setattr(cells, "joint_commands", lambda robot, paths, device: [problem] * len(paths))
+    ((stuck,),) = cells.simulate_cells(cells.plan_cells([cells.Job("lift", 0, ("piper",))]), "cpu")
+    assert stuck.failure == ("plan", "left arm cannot reach") and stuck.motion is None
 
 
 def test_a_cell_without_a_motion_has_none_to_give(cell: Cell) -> None:

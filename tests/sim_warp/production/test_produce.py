@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from tests.sim_warp.small import SLOW, TASK, WITH_SLOW
+from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, produce
 from xew.config import ConfigError
 from xew.dataset import find_accepted
 from xew.episode import (
@@ -30,7 +29,6 @@ from xew.sim_warp.production import surfaces as surfaces_module
 from xew.sim_warp.production.cells import Cell, Job
 from xew.sim_warp.production.episodes import fill_instruction
 from xew.sim_warp.production.kept_tracks import load_tracks, save_tracks, tracks_key, tracks_path
-from xew.sim_warp.production.produce import produce
 from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
 from xew.sim_warp.production.surfaces import read_surfaces
 from xew.sim_warp.rendering.render import Renderer
@@ -71,11 +69,10 @@ def test_headers_are_those_on_disk(data: Path, renderer: Renderer, tmp_path: Pat
     assert set(first.versions) == {"xew", "newton", "mujoco", "mujoco-warp", "warp-lang"}
 
 
-def test_the_same_bytes_alone_among_others_and_in_groups(
+def test_the_same_bytes_alone_and_among_others(
     data: Path, renderer: Renderer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     others = [Job("grab_roller", 1, ("piper",)), *reversed(JOBS)]
-    monkeypatch.setattr(produce_module, "FRAMES_AT_ONCE", 1)  # every seed is a group of its own
     monkeypatch.setattr(produce_module, "plan_cells", shorten_plans(produce_module.plan_cells))
     produce(others, tmp_path / "among", renderer, robots=WITH_SLOW)
     for job in JOBS:
@@ -86,19 +83,10 @@ def test_the_same_bytes_alone_among_others_and_in_groups(
             assert record_of(tmp_path / "alone", job.seed, robot) == expected
 
 
-def test_physics_is_stepped_where_pictures_are_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    devices: list[tuple[str, str]] = []
-    monkeypatch.setattr(produce_module, "plan_cells", lambda jobs, robots, device: devices.append(("plan", device)) or [])
-    monkeypatch.setattr(produce_module, "simulate_cells", lambda cells, device, batch: devices.append(("step", device)) or [])
-    renderer = SimpleNamespace(device=SimpleNamespace(alias="cuda:0"))
-    assert produce([], tmp_path, renderer) == []  # type: ignore[arg-type]
-    assert devices == [("plan", "cuda:0"), ("step", "cuda:0")]
-
-
 def shorten_plans(plan_cells: object) -> object:
     """Planning of which only the first frames are kept: company for the others, no whole episode."""
 
-    def first_frames(jobs: list[Job], robots: Mapping[str, RobotSpec], device: str) -> list[list[Cell]]:
+    def first_frames(jobs: list[Job], robots: Mapping[str, RobotSpec], device: str | None) -> list[list[Cell]]:
         return [[cut(cell) for cell in cells] for cells in plan_cells(jobs, robots, device)]  # type: ignore[operator]
 
     def cut(cell: Cell) -> Cell:

@@ -8,7 +8,7 @@ import pytest
 
 from tests.sim_warp.robots.own_robot import write_urdf
 from tests.sim_warp.robots.test_own_robots import at_home
-from tests.sim_warp.small import TASK
+from tests.sim_warp.small import TASK, produce
 from xew.analysis.distance import find_robots
 from xew.config import ConfigError
 from xew.dataset import read_dataset
@@ -17,7 +17,6 @@ from xew.protocol import body_key, expand_robots
 from xew.sim_warp.embodiment import prepared
 from xew.sim_warp.kinematics.expert import joint_commands
 from xew.sim_warp.production.cells import Job
-from xew.sim_warp.production.produce import produce
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import adopt_robots, get_robot, load_robot, load_urdf
 from xew.sim_warp.robots.procedural import design_body

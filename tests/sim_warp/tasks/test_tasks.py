@@ -7,17 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.sim_warp.small import SLOW, TASK, WITH_SLOW
 from xew.config import ConfigError
-from xew.episode import FAILURES, EpisodeError, Record
+from xew.episode import FAILURES
 from xew.sim_warp.plan import LEFT, RIGHT
-from xew.sim_warp.production.cells import Cell, Job, plan_cells, simulate_cells
+from xew.sim_warp.production import cells
+from xew.sim_warp.production.cells import Cell, Job, plan_cells, simulate_cells, with_motion
 from xew.sim_warp.production.outcome import moment
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.scene import Scene, scene_rng
 from xew.sim_warp.tasks import TASKS, get_task
 from xew.sim_warp.tasks.task import Moment
-from xew.sim_warp.yields import PARAGRAPHS, Args, attempt_batch, attempt_seeds, describe_task, markdown, page, task_section
 
 PAGE = Path(__file__).parents[3] / "docs" / "tasks.md"
 SOLVERS = dict(zip(sorted(TASKS), cycle(ROBOTS), strict=False))
@@ -29,8 +28,8 @@ SEED = 2
 def solved() -> dict[str, Cell]:
     """A whole episode of every task, in physics."""
     assert set(SOLVERS.values()) == set(ROBOTS)
-    cells = simulate_cells(plan_cells([Job(task, SEED, (robot,)) for task, robot in SOLVERS.items()]), "cpu")
-    return {seed[0].task_name: seed[0] for seed in cells}
+    solved = simulate_cells(plan_cells([Job(task, SEED, (robot,)) for task, robot in SOLVERS.items()]), "cpu")
+    return {seed[0].task_name: seed[0] for seed in solved}
 
 
 def at(cell: Cell, frame: int) -> Moment:
@@ -63,7 +62,7 @@ def test_an_expert_that_closes_no_hand_is_told_so(name: str, solved: dict[str, C
         field: np.repeat(getattr(cell.known_motion, field)[:1], cell.path.frame_count, 0)
         for field in ("object_pose", "object_joint")
     }
-    idle = replace(cell, motion=replace(cell.known_motion, **still, contact=np.zeros_like(cell.known_motion.contact)))
+    idle = with_motion(cell, replace(cell.known_motion, **still, contact=np.zeros_like(cell.known_motion.contact)))
     reason, words = idle.failure or ("", "")
     assert reason == "grasp" and reason in FAILURES and "never touched" in words
 
@@ -74,17 +73,19 @@ def test_what_is_lost_on_the_way_is_a_slip(solved: dict[str, Cell]) -> None:
     contact = cell.known_motion.contact.copy()
     contact[int(hold.end * cell.path.frame_rate) - 12 :] = False
     pose = np.repeat(cell.known_motion.object_pose[:1], cell.path.frame_count, 0)
-    lost = replace(cell, motion=replace(cell.known_motion, contact=contact, object_pose=pose))
+    lost = with_motion(cell, replace(cell.known_motion, contact=contact, object_pose=pose))
     word, told = lost.failure or ("", "")
     assert word == "slip" and told.startswith(f"the {('left', 'right')[hold.arm]} hand lost the cup at ")
 
 
-def test_an_overflow_and_an_early_success_are_told(solved: dict[str, Cell]) -> None:
+def test_an_overflow_and_an_early_success_are_failures(solved: dict[str, Cell], monkeypatch: pytest.MonkeyPatch) -> None:
     cell = solved["grab_roller"]
-    assert (replace(cell, motion=replace(cell.known_motion, overflow=True)).failure or ("",))[0] == "overflow"
-    early = replace(cell, task=replace(cell.task, success=lambda scene, now: True))
+    assert (with_motion(cell, replace(cell.known_motion, overflow=True)).failure or ("",))[0] == "overflow"
+    monkeypatch.setattr(cells, "get_task", lambda name: replace(TASKS[name], success=lambda scene, now: True))
+    early = with_motion(cell, cell.known_motion)
     assert early.failure == ("plan", "the scene is solved before it begins")
-    late = replace(cell, task=replace(cell.task, success=lambda scene, now: False))
+    monkeypatch.setattr(cells, "get_task", lambda name: replace(TASKS[name], success=lambda scene, now: False))
+    late = with_motion(cell, cell.known_motion)
     assert (late.failure or ("",))[0] == "timeout"
 
 
@@ -164,64 +165,3 @@ def test_unknown_tasks_are_told_with_the_nearest_name() -> None:
         get_task("nowhere.to.be:FOUND")
     with pytest.raises(ConfigError, match="is a str; expected a Task"):
         get_task("tests.sim_warp.small:TASK")
-
-
-# --- The page and the table of yields.
-
-
-@pytest.mark.parametrize("name", TASKS)
-def test_the_page_tells_what_the_docstrings_tell(name: str) -> None:
-    assert all(describe_task(TASKS[name]).get(part) for part in PARAGRAPHS)
-    assert task_section(TASKS[name]) in PAGE.read_text(), (
-        "write docs/tasks.md anew: python -m xew.sim_warp.yields --seeds 50 --page docs/tasks.md"
-    )
-
-
-def test_the_page_shows_at_least_80_percent_everywhere() -> None:
-    rows = [line.split("|")[2:-2] for line in PAGE.read_text().splitlines() if line.startswith("| `") and "/50 (" in line]
-    counts = [int(cell.split("/")[0]) for row in rows for cell in row]
-    assert len(counts) == len(TASKS) * len(ROBOTS) and min(counts) >= 40
-
-
-def test_the_table_of_yields_counts_right() -> None:
-    def record(seed: int, robot: str, failure: str | None = None) -> Record:
-        return Record("grab_roller", seed, robot, failure is None, failure, "because" if failure else "")
-
-    records = [
-        record(0, "piper"),
-        record(1, "piper", "slip"),
-        record(0, "arx_x5"),
-        record(1, "arx_x5"),
-        record(2, "arx_x5", "plan"),
-    ]
-    lines = markdown(records).splitlines()
-    assert lines[0] == "| task | `arx_x5` | `piper` | all robots on the same seed |"
-    assert lines[2] == "| `grab_roller` | 2/3 (67 %) | 1/2 (50 %) | 1/3 (33 %) |"
-    assert lines[-1] == "- `grab_roller`, `piper`, seed 1: slip (because)"
-
-
-def test_yields_try_every_robot_and_write_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    jobs = [Job(TASK, seed, ("ur5_wsg", SLOW)) for seed in (0, 1)]
-    records = [record for seed in attempt_batch(jobs, 1, WITH_SLOW) for record in seed]
-    assert [(record.robot, record.success) for record in records] == [
-        ("ur5_wsg", True), (SLOW, True), ("ur5_wsg", True), (SLOW, False),
-    ]  # fmt: skip
-    text = page(records, Args(tasks=(TASK,), robots=("ur5_wsg", SLOW), seeds=2))
-    assert (
-        f"| `{TASK}` | 2/2 (100 %) | 1/2 (50 %) | 1/2 (50 %) |" in text
-        and "2 seeds from 0 of each task, in physics, on CPU:" in text
-        and "python -m xew.sim_warp.yields --seeds 2 --page docs/tasks.md`" in text
-    )
-    assert not list(tmp_path.iterdir())
-
-
-def test_yields_of_nothing_or_of_the_unknown_are_refused() -> None:
-    with pytest.raises(EpisodeError, match="nothing to try"):
-        next(attempt_seeds(Args(seeds=0)))
-    with pytest.raises(ConfigError, match="unknown robot 'ur5'"):
-        next(attempt_seeds(Args(robots=("ur5",))))
-    with pytest.raises(EpisodeError, match="1 robots and 20 seeds from -1; name"):
-        next(attempt_seeds(Args(robots=("piper",), first_seed=-1)))
-    with pytest.raises(ConfigError, match="--device cuda:99: not on this machine, which has cpu"):
-        next(attempt_seeds(Args(device="cuda:99")))

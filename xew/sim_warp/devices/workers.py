@@ -29,9 +29,9 @@ IMPORTED = ("xew.sim_warp.production.preloaded",)
 """Modules that workers are forked with."""
 MEMORY_PER_WORKER = 9e9
 """Memory of a GPU that a worker takes [bytes]: a batch of 256 worlds, 512 frames in flight and what CUDA itself takes."""
-FRAMES_OF_A_PAINTER = 192
+FRAMES_OF_A_RENDERING_WORKER = 192
 """Number of frames in flight of a worker that steps physics on the CPU and has the GPU draw them."""
-MEMORY_PER_PAINTER = 3e9
+MEMORY_PER_RENDERING_WORKER = 3e9
 """Memory of a GPU that such a worker takes [bytes]; 14 of them were seen with 1.8e9 each on an H100."""
 
 
@@ -63,8 +63,8 @@ def worker_count(devices: Sequence[warp.Device], physics: warp.Device | None = N
     cores = usable_cores()
     if not devices[0].is_cuda:
         return cores
-    paints = physics is not None and not physics.is_cuda
-    wanted, memory = (cores, MEMORY_PER_PAINTER) if paints else (cores // 2, MEMORY_PER_WORKER)
+    only_render = physics is not None and not physics.is_cuda
+    wanted, memory = (cores, MEMORY_PER_RENDERING_WORKER) if only_render else (cores // 2, MEMORY_PER_WORKER)
     return max(1, min(wanted, sum(int(device.total_memory // memory) for device in devices)))
 
 

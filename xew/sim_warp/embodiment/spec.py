@@ -54,8 +54,6 @@ class RobotSpec:
     """Acceleration limits that motion of its own keeps [rad/s²]; `USUAL_ACCELERATION` where left out."""
     label: str = ""
     """Short name in columns and legends; the title where it is left out."""
-    paint: int = 0
-    """Number of the colors that it is seen in (`xew.sim_warp.embodiment.paint`); 0 for those of its URDF."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "label", self.label or self.title)

@@ -1,4 +1,4 @@
-"""How much of robots and of what moves the camera sees, as a section of a Markdown page.
+"""How much of robots and of moving objects the camera sees, as Markdown.
 
 It is a table of all tasks and robots, and one of what is below the aims.
 """
@@ -11,8 +11,6 @@ import numpy as np
 from xew.sim_warp.production.surfaces import Seen, Visibility
 from xew.sim_warp.robots import ROBOTS
 
-HEADING = "## How much of robots and objects is seen"
-"""Heading of the section on the page of the tasks."""
 NEEDED_OF_ROBOT, NEEDED_OF_THING = 8, 4
 """Numbers of visible points of a robot, and of an object that moves, that are aimed at."""
 ROBOT_SHARE, THING_SHARE = 0.95, 0.90

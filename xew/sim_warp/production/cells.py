@@ -6,8 +6,6 @@ Writes `Cell`s: first with scene, plan and joint commands (`plan_cells`), then w
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -45,7 +43,6 @@ class Cell:
 
     task_name: str
     """Key of the registry or module:NAME, as asked for."""
-    task: Task
     scene: Scene
     path: ToolPath
     """Path of both tools: all robots' of the scene, or the robot's own."""
@@ -56,31 +53,21 @@ class Cell:
     """Motion that physics made of the commands; None before, and where the robot cannot follow the plan."""
     motion_kind: str = SHARED_MOTION
     """Kind of motion that the commands are of, one of `xew.protocol.MOTIONS`."""
+    tool_pose: np.ndarray | None = None
+    """[t 2 7] float32 measured tool poses, xyz [m] and quaternion xyzw, world; None without motion."""
+    failure: tuple[str, str] | None = None
+    """Why the cell does not count: one of `episode.FAILURES` and a sentence; None of a simulated cell that succeeded."""
 
-    def __getstate__(self) -> dict[str, Any]:
-        """What travels to another process: all but the task, whose functions may be lambdas and are found there by name."""
-        return {name: value for name, value in self.__dict__.items() if name != "task"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, task=get_task(state["task_name"]))
+    @property
+    def task(self) -> Task:
+        """The task itself. It stays out of what travels to another process, since its functions may be lambdas."""
+        return get_task(self.task_name)
 
     @property
     def known_motion(self) -> Motion:
         """The motion of a cell that is known to have one."""
         assert self.motion is not None, f"{self.robot.key} cannot follow the plan of {self.scene.task}/{self.scene.seed}"
         return self.motion
-
-    @cached_property
-    def tool_pose(self) -> np.ndarray:
-        """[t 2 7] float32 measured tool poses, xyz [m] and quaternion xyzw, world."""
-        return measured_tools(self.robot, self.known_motion.joint_pos)
-
-    @cached_property
-    def failure(self) -> tuple[str, str] | None:
-        """Why the cell does not count: one of `episode.FAILURES` and a sentence; None if it succeeded."""
-        if self.commands.problem is not None:
-            return "plan", self.commands.problem
-        return find_failure(self.task, self.scene, self.path, self.commands.action, self.known_motion, self.tool_pose)
 
     @property
     def recording(self) -> Recording:
@@ -106,8 +93,9 @@ def plan_cells(jobs: Sequence[Job], robots: Mapping[str, RobotSpec] = ROBOTS, de
         robot = robots[name]
         planned = plan_motion(robot, [plans[index] for index in mine], kind, device)
         for index, (path, commands) in zip(mine, planned, strict=True):
-            place = jobs[index].task, tasks[index], scenes[index]
-            seeds[index].append(Cell(*place, path, name, robot, commands, motion_kind=kind))
+            failure = None if commands.problem is None else ("plan", commands.problem)
+            cell = Cell(jobs[index].task, scenes[index], path, name, robot, commands, motion_kind=kind, failure=failure)
+            seeds[index].append(cell)
     return seeds
 
 
@@ -136,8 +124,17 @@ def simulate_cells(seeds: list[list[Cell]], device: str | None = None, batch: in
     """
     cells = [cell for cells in seeds for cell in cells if cell.commands.problem is None]
     worlds = [World(cell.robot, cell.scene, cell.commands.action) for cell in cells]
-    motions = {id(cell): motion for cell, motion in zip(cells, simulate(worlds, device, batch), strict=True)}
-    return [[replace(cell, motion=motions.get(id(cell))) for cell in cells] for cells in seeds]
+    simulated = {
+        id(cell): with_motion(cell, motion) for cell, motion in zip(cells, simulate(worlds, device, batch), strict=True)
+    }
+    return [[simulated.get(id(cell), cell) for cell in cells] for cells in seeds]
+
+
+def with_motion(cell: Cell, motion: Motion) -> Cell:
+    """A planned cell with the motion that physics made of its commands, and why that does not count, if it does not."""
+    tools = measured_tools(cell.robot, motion.joint_pos)
+    failure = find_failure(cell.task, cell.scene, cell.path, cell.commands.action, motion, tools)
+    return replace(cell, motion=motion, tool_pose=tools, failure=failure)
 
 
 def measured_tools(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:

@@ -1,103 +1,159 @@
-"""The making of episodes for a batch of seeds: plan, simulate, render, write.
+"""Scenes made in worker processes: simulated in shares, then rendered and written one scene at a time.
 
 Reads  `Job`s: (task, seed) and the robots that still lack it
 Writes episodes and, for what did not succeed, their headers with the reason
 
-A seed counts only when all of its robots succeed, and only then it is rendered: so all of them are simulated first.
+A scene counts only when all of its robots succeed, and only then it is rendered. So all of its robots are simulated first; when
+the last of them is done the scene is written, ahead of all that has not begun. Physics on a CPU takes a core for each robot, so
+a share is one robot of one scene there. A GPU steps many worlds together, so a share is a batch of whole scenes there.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from pathlib import Path
+
+import warp as wp
 
 from xew.concurrency import usable_cores
 from xew.episode import Record
+from xew.sim_warp.devices.workers import FRAMES_OF_A_RENDERING_WORKER, Workers
 from xew.sim_warp.production.cells import Cell, Job, plan_cells, simulate_cells
 from xew.sim_warp.production.episodes import render_cells, write_cell
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS, RobotSpec
 
-FRAMES_AT_ONCE = 4096
-"""Number of frames in one group of seeds: about half a megabyte of pixels each."""
+
+@dataclass(frozen=True)
+class Production:
+    """How and where scenes are made; what every worker needs."""
+
+    out: Path
+    """Folder of the data set."""
+    robots: Mapping[str, RobotSpec] = field(default_factory=lambda: ROBOTS)
+    """All robots of the jobs by name."""
+    gpu_physics: bool = False
+    """Whether each worker's own GPU plans and steps physics, and not the CPU."""
+    batch: int = 256
+    """Number of worlds that a GPU steps together."""
+    videos: bool = True
+    """Store videos; without, an episode has all states and hashes, and `rerender.add_videos` makes its videos."""
+
+    @property
+    def physics(self) -> str | None:
+        """Warp's name of the device that plans and steps physics; None for a worker's own."""
+        return None if self.gpu_physics else "cpu"
+
+    def shares(self, jobs: Sequence[Job]) -> list[list[Job]]:
+        """The jobs cut into what one worker simulates at a time."""
+        if not self.gpu_physics:
+            return [[replace(job, robots=(robot,))] for job in jobs for robot in job.robots]
+        shares: list[list[Job]] = []
+        worlds = self.batch
+        for job in jobs:
+            if worlds + len(job.robots) > self.batch:
+                shares.append([])
+                worlds = 0
+            shares[-1].append(job)
+            worlds += len(job.robots)
+        return shares
 
 
-def produce(
-    jobs: Sequence[Job],
-    out: Path,
-    renderer: Renderer,
-    batch: int | None = None,
-    videos: bool = True,
-    robots: Mapping[str, RobotSpec] = ROBOTS,
-) -> list[list[Record]]:
-    """Make all episodes of some seeds and write them under `out`; the headers of each job in the order of its robots.
+@dataclass
+class _Scene:
+    """A job, and how far it is."""
 
-    All is done on the renderer's device. Seeds are rendered a group at a time while the group before is being written: that
-    bounds the pixels in memory.
+    job: Job
+    cells: list[Cell] = field(default_factory=list)
+    seconds: float = 0.0
+
+    @property
+    def is_simulated(self) -> bool:
+        return len(self.cells) == len(self.job.robots)
+
+    @property
+    def ordered_cells(self) -> list[Cell]:
+        """The cells in the order of the job's robots."""
+        by_robot = {cell.robot_name: cell for cell in self.cells}
+        return [by_robot[robot] for robot in self.job.robots]
+
+
+Outcome = tuple[list[list[Cell]] | list[Record], float]
+"""Simulated cells of each job of a share, or the headers of a written scene; and the seconds spent on it."""
+
+
+def make_scenes(workers: Workers, jobs: Sequence[Job], production: Production) -> Iterator[tuple[list[Record], float]]:
+    """Make some scenes; the headers of each job in the order of its robots, and the seconds that workers spent on it.
 
     Args:
-        jobs: the seeds, and which robots do each.
+        workers: processes to which shares and simulated cells travel by pickle.
+        jobs: no two of them of the same task and seed.
+        production: how they are made.
+    """
+    scenes = {(job.task, job.seed): _Scene(job) for job in jobs}
+    work: deque[Callable[[], Outcome]] = deque(partial(_simulate, share, production) for share in production.shares(jobs))
+    for made, seconds in workers.run(_call, work):
+        if made and isinstance(made[0], Record):
+            records = [record for record in made if isinstance(record, Record)]
+            yield records, scenes[records[0].task, records[0].seed].seconds + seconds
+            continue
+        cells = [cell for group in made if isinstance(group, list) for cell in group]
+        for cell in cells:
+            scene = scenes[cell.task_name, cell.scene.seed]
+            scene.cells.append(cell)
+            scene.seconds += seconds / len(cells)
+            if scene.is_simulated:
+                work.appendleft(partial(_write, scene.ordered_cells, scene.job.rejected, production))
+
+
+def _call(unit: Callable[[], Outcome]) -> Outcome:
+    return unit()
+
+
+def _simulate(share: Sequence[Job], production: Production) -> Outcome:
+    """Plan and simulate a share, in a worker process."""
+    begin = time.perf_counter()
+    cells = simulate_jobs(share, production)
+    return cells, time.perf_counter() - begin
+
+
+def _write(cells: Sequence[Cell], rejected: bool, production: Production) -> Outcome:
+    """Render and write a scene, in a worker process, on its own device."""
+    begin = time.perf_counter()
+    records = write_scene(cells, production.out, _renderer(production.gpu_physics), rejected=rejected, videos=production.videos)
+    return records, time.perf_counter() - begin
+
+
+@cache
+def _renderer(gpu_physics: bool) -> Renderer:
+    """The renderer of a worker process on its own device, made once; smaller where many workers share a GPU."""
+    only_renders = wp.get_device().is_cuda and not gpu_physics
+    return Renderer(frames_per_chunk=FRAMES_OF_A_RENDERING_WORKER if only_renders else None)
+
+
+def simulate_jobs(jobs: Sequence[Job], production: Production) -> list[list[Cell]]:
+    """The cells of each job with the motion that physics made of their plans."""
+    cells = plan_cells(jobs, production.robots, production.physics)
+    return simulate_cells(cells, production.physics, production.batch)
+
+
+def write_scene(
+    cells: Sequence[Cell], out: Path, renderer: Renderer, *, rejected: bool = False, videos: bool = True
+) -> list[Record]:
+    """Render and write the simulated cells of one scene; their headers, in the same order.
+
+    Args:
+        cells: of all robots that the scene still lacked.
         out: folder of the data set.
         renderer: draws the pictures.
-        batch: worlds that a GPU steps together, None for all.
-        videos: store them; without, an episode has all states and hashes, and `rerender.add_videos` makes its videos.
-        robots: the robots of the jobs by name.
+        rejected: whether a robot has failed that is not among the cells; then nothing is rendered.
+        videos: as of `Production`.
     """
-    seeds = simulate_jobs(jobs, renderer.device.alias, batch, robots)
-    return write_seeds(seeds, {(job.task, job.seed) for job in jobs if job.rejected}, out, renderer, videos)
-
-
-def simulate_jobs(
-    jobs: Sequence[Job], physics: str, batch: int | None = None, robots: Mapping[str, RobotSpec] = ROBOTS
-) -> list[list[Cell]]:
-    """The cells of each job with the motion that physics made of their plans.
-
-    Args:
-        jobs, batch, robots: as for `produce`.
-        physics: Warp's name of the device that plans and steps physics.
-    """
-    return simulate_cells(plan_cells(jobs, robots, physics), physics, batch)
-
-
-def write_seeds(
-    seeds: Sequence[Sequence[Cell]],
-    rejected: Collection[tuple[str, int]],
-    out: Path,
-    renderer: Renderer,
-    videos: bool = True,
-) -> list[list[Record]]:
-    """Render and write simulated cells; their headers, in the same order.
-
-    Args:
-        seeds: the cells of each seed, or some of them.
-        rejected: tasks and seeds on which a robot has failed that is not among the cells; then nothing is rendered.
-        out, renderer, videos: as for `produce`.
-    """
-    records: list[list[Record]] = []
-    writing: list[list[Future[Record]]] = []
+    accepted = not rejected and not any(cell.failure for cell in cells)
+    pixels = render_cells(cells, renderer) if accepted else [None] * len(cells)
     with ThreadPoolExecutor(usable_cores()) as pool:  # codecs, zlib and hashes let go of the interpreter's lock
-        for group in _group_seeds(seeds):
-            accepted = [cell for cells in group if _is_accepted(cells, rejected) for cell in cells]
-            pixels = dict(zip(map(id, accepted), render_cells(accepted, renderer), strict=True))
-            records += [[future.result() for future in cells] for cells in writing]
-            writing = [
-                [pool.submit(write_cell, cell, pixels.get(id(cell)), out, renderer.device, videos) for cell in cells]
-                for cells in group
-            ]
-        return records + [[future.result() for future in cells] for cells in writing]
-
-
-def _group_seeds(seeds: Sequence[Sequence[Cell]]) -> Iterator[list[Sequence[Cell]]]:
-    """The seeds in order, about `FRAMES_AT_ONCE` frames at a time."""
-    group: list[Sequence[Cell]] = []
-    for cells in seeds:
-        group.append(cells)
-        if sum(cell.path.frame_count for others in group for cell in others) >= FRAMES_AT_ONCE:
-            yield group
-            group = []
-    if group:
-        yield group
-
-
-def _is_accepted(cells: Sequence[Cell], rejected: Collection[tuple[str, int]]) -> bool:
-    """Whether all robots of a seed have succeeded, those that were made before included."""
-    return not any((cell.task_name, cell.scene.seed) in rejected or cell.failure for cell in cells)
+        writing = [pool.submit(write_cell, *pair, out, renderer.device, videos) for pair in zip(cells, pixels, strict=True)]
+        return [future.result() for future in writing]

@@ -1,11 +1,9 @@
 """Episodes on disk, made again: their pixels from recorded states, their videos on demand, and a check of their motion.
 
 Reads  <data>/<task>/<seed>/<robot>/
-Writes pixels whose hashes agree with the recorded ones and, where asked, the videos of an episode without any, or the same
-       episode with its robot in other colors
+Writes pixels whose hashes agree with the recorded ones and, where asked, the videos of an episode without any
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +12,6 @@ import numpy as np
 from xew.episode import (
     EpisodeError,
     Record,
-    States,
     array_hash,
     data_folder,
     demand_known,
@@ -23,14 +20,13 @@ from xew.episode import (
     states_hash,
     write_episode,
 )
-from xew.protocol import OWN_MOTION, painted_key
-from xew.sim_warp.embodiment.spec import RobotSpec
+from xew.protocol import OWN_MOTION
 from xew.sim_warp.kinematics.own_motion import own_commands
 from xew.sim_warp.physics.plausibility import find_implausible
 from xew.sim_warp.rendering.observe import observe, scene_recording
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import command_renders
-from xew.sim_warp.robots import paint_robot, recorded_robot
+from xew.sim_warp.robots import recorded_robot
 from xew.sim_warp.scene import Scene, scene_hash, scene_rng
 from xew.sim_warp.tasks import recorded_task
 
@@ -46,52 +42,20 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
     """
     record = read_record(folder)
     robot = recorded_robot(record.robot, data_folder(folder))
-    states, rgb, render, scene = _render_states(folder, record, robot, renderer)
-    found = {"states": states_hash(states), "rgb": array_hash(rgb), "robot": array_hash(render), "scene": scene}
-    _demand_equal(folder, record, record.hashes | {"scene": record.scene_hash}, found, renderer)
-    return rgb, render
-
-
-def paint_again(folder: Path, paint: int, renderer: Renderer) -> Path:
-    """Write an episode once more with its robot in the colors of a paint: all else is the same, to the bit.
-
-    Returns:
-        The folder of the episode of the painted robot, in the same data set.
-
-    Raises:
-        EpisodeError: the scene, or anything but colors, differs from what is recorded.
-    """
-    record = read_record(folder)
-    robot = paint_robot(recorded_robot(record.robot, data_folder(folder)), paint)
-    states, rgb, render, scene = _render_states(folder, record, robot, renderer)
-    expected = {"states": record.hashes["states"], "scene": record.scene_hash}
-    _demand_equal(folder, record, expected, {"states": states_hash(states), "scene": scene}, renderer)
-    painted = replace(record, robot=painted_key(record.robot, paint))
-    return write_episode(data_folder(folder), painted, states, rgb, render, videos=record.videos)
-
-
-def _render_states(
-    folder: Path, record: Record, robot: RobotSpec, renderer: Renderer
-) -> tuple[States, np.ndarray, np.ndarray, str]:
-    """The states of an episode with what is rendered of them anew, the two videos [t h w 3] uint8, and the scene's hash."""
     demand_known(folder, "joint_pos", "object_pose")
     states, scene = read_states(folder), _sample_again(folder, record)
     view = observe(renderer, [scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)])[0]
     render = command_renders([(robot, states.action)], renderer=renderer)[0]
     again = replace(states, keypoints=view.keypoints, keypoint_visible=view.keypoint_visible, robot_mask=view.robot_mask)
-    return again, view.rgb, render, scene_hash(scene)
-
-
-def _demand_equal(
-    folder: Path, record: Record, expected: Mapping[str, str], found: Mapping[str, str], renderer: Renderer
-) -> None:
-    """Raise EpisodeError at the first hash of what was made anew that is not the recorded one."""
-    for name, hash_ in expected.items():
-        if found[name] != hash_:
+    hashes = {"states": states_hash(again), "rgb": array_hash(view.rgb), "robot": array_hash(render)}
+    hashes["scene"] = scene_hash(scene)
+    for name, recorded in (record.hashes | {"scene": record.scene_hash}).items():
+        if hashes[name] != recorded:
             raise EpisodeError(
-                f"{folder}: rendered again on {renderer.device.name}, {name} has hash {found[name][:12]}, recorded on "
-                f"{record.device} was {hash_[:12]}; with the same device and versions they must agree."
+                f"{folder}: rendered again on {renderer.device.name}, {name} has hash {hashes[name][:12]}, recorded on "
+                f"{record.device} was {recorded[:12]}; with the same device and versions they must agree."
             )
+    return view.rgb, render
 
 
 def add_videos(folder: Path, renderer: Renderer) -> None:

@@ -7,11 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from xew.protocol import unpainted_key
-from xew.sim_warp.embodiment.paint import paint_meshes
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
-from xew.sim_warp.geometry.meshes import Mesh
 from xew.sim_warp.kinematics.forward import link_poses
 from xew.sim_warp.rendering.packing import Body
 
@@ -20,20 +17,9 @@ SIDES = ("left", "right")
 
 def robot_bodies(spec: RobotSpec) -> list[Body]:
     """The robot's visible links, as many and in the order of `robot_pose`. The meshes are shared between calls."""
-    meshes = _painted_meshes(spec) if spec.paint else _own_meshes(spec)
+    links = load_urdf(spec.urdf).links
+    meshes = {name: link.visual for name, link in links.items() if link.visual is not None}
     return [Body(meshes[name], is_robot=True) for _, name in _visible_links(spec)]
-
-
-def _own_meshes(spec: RobotSpec) -> dict[str, Mesh]:
-    """The meshes of the visible links by name, in the colors of the URDF."""
-    return {name: link.visual for name, link in load_urdf(spec.urdf).links.items() if link.visual is not None}
-
-
-@lru_cache(maxsize=256)
-def _painted_meshes(spec: RobotSpec) -> dict[str, Mesh]:
-    """The same in the colors of the robot's paint."""
-    meshes = _own_meshes(spec)
-    return dict(zip(meshes, paint_meshes(meshes.values(), unpainted_key(spec.key), spec.paint), strict=True))
 
 
 def robot_pose(spec: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:

@@ -3,15 +3,13 @@
 `body:17` names a procedural body, `body:0-63` a range of them (docs/bodies.md); their keys are `body_17`. To add a robot, write
 a file with `SPEC = RobotSpec(...)` here and add its line to `ROBOTS`; outside the repository write it anywhere importable and
 name it `module:SPEC` wherever a robot is asked for, or name the path of a URDF or of a RoboTwin embodiment
-(docs/add_a_robot.md). `arx_x5_paint_3` is a robot in other colors.
+(docs/add_a_robot.md).
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 from xew.config import ConfigError, demand_admitted, pick
 from xew.names import EpisodeError, check_name
-from xew.protocol import PAINTED_NAME, painted_key
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, UrdfError, load_urdf
 from xew.sim_warp.robots import aloha_agilex, arx_x5, franka_panda, piper, ur5_wsg
@@ -30,7 +28,6 @@ __all__ = [
     "keep_robot",
     "load_robot",
     "load_urdf",
-    "paint_robot",
     "recorded_robot",
 ]
 
@@ -59,8 +56,6 @@ def get_robot(name: str | RobotSpec, data: Path | None = None) -> RobotSpec:
         return load_body(number)
     if name not in ROBOTS and is_path(name):
         return load_robot(name)
-    if painted := PAINTED_NAME.fullmatch(name):
-        return paint_robot(get_robot(painted[1], data), int(painted[2]))
     try:
         return pick(ROBOTS, name, "robot")
     except ConfigError as error:
@@ -70,14 +65,6 @@ def get_robot(name: str | RobotSpec, data: Path | None = None) -> RobotSpec:
             raise
         hint = f"A robot at a path is named with a /; a data set keeps its own in <data>/robots, list that in {FOLDERS}."
         raise ConfigError(f"{error} {hint}") from None
-
-
-def paint_robot(robot: RobotSpec, paint: int) -> RobotSpec:
-    """The same robot in the colors of a number. Raises ConfigError for a number that is none of a paint."""
-    if paint < 1:
-        raise ConfigError(f"there is no paint {paint} of {robot.key}; they count from 1, and the robot itself has none.")
-    key = painted_key(robot.key, paint)
-    return replace(robot, key=key, title=f"{robot.title}, paint {paint}", label=f"{robot.label} {paint}", paint=paint)
 
 
 def recorded_robot(name: str, data: Path | None = None) -> RobotSpec:

@@ -19,12 +19,12 @@ from xew.config import ConfigError, parse
 from xew.episode import complete_folder
 from xew.files import cache_folder, read_json
 from xew.protocol import BODY_NAME, body_key
-from xew.sim_warp.embodiment import mesh_files, paint, prepared, urdf
+from xew.sim_warp.embodiment import mesh_files, prepared, urdf
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import prepare
 from xew.sim_warp.geometry import meshes
 from xew.sim_warp.geometry.poses import Pose
-from xew.sim_warp.robots.procedural import design, shapes, solids, urdf_files
+from xew.sim_warp.robots.procedural import colors, design, shapes, solids, urdf_files
 from xew.sim_warp.robots.procedural.design import SPEED, BodyDesign, design_body
 from xew.sim_warp.robots.procedural.shapes import tool_offset
 from xew.sim_warp.robots.procedural.urdf_files import URDF, body_files
@@ -141,6 +141,6 @@ def keep_files(body: BodyDesign) -> Path:
 def content_version() -> str:
     """Digest of all that decides a body's bytes and arrays: the code that makes and reads them, and the libraries it calls."""
     digest = hashlib.sha256(f"{np.__version__} {scipy.__version__} {trimesh.__version__}".encode())
-    for module in (design, paint, shapes, urdf_files, solids, mesh_files, meshes, prepared, urdf):
+    for module in (design, colors, shapes, urdf_files, solids, mesh_files, meshes, prepared, urdf):
         digest.update(Path(str(module.__file__)).read_bytes())
     return digest.hexdigest()[:12]

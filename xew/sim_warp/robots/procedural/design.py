@@ -14,7 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from xew.sim_warp.embodiment.paint import draw_color
+from xew.sim_warp.robots.procedural.colors import draw_color
 
 Vector = tuple[float, float, float]
 Option = TypeVar("Option")

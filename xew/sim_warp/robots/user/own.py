@@ -26,7 +26,7 @@ from xew.config import ConfigError
 from xew.episode import complete_folder
 from xew.files import cache_folder, demand_regular, read_json, replacing
 from xew.names import EpisodeError, check_name, path_below
-from xew.protocol import BODY_NAME, PAINTED_NAME, ROBOT_NAMES, expand_robots
+from xew.protocol import BODY_NAME, ROBOT_NAMES, expand_robots
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
 from xew.sim_warp.robots.user.draft import OWN, ArmDraft, Near, RobotDraft, find_description, read_draft
@@ -74,12 +74,12 @@ def _load(description: Path, modified: int) -> RobotSpec:
 
 
 def robot_key(description: Path) -> str:
-    """A name for folders, of a URDF file or else the folder; `_own` sets it apart from ours, painted or not, and bodies."""
+    """A name for folders, of a URDF file or else the folder; `_own` distinguishes it from the robots and bodies of xew."""
     name = description.stem if description.suffix == ".urdf" else description.parent.name
     key = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_-")
     if not key:
         raise ConfigError(f"{description}: the name {name!r} gives no key for the robot; give the folder a name of letters.")
-    taken = key in ROBOT_NAMES or BODY_NAME.fullmatch(key) or PAINTED_NAME.fullmatch(key)
+    taken = key in ROBOT_NAMES or BODY_NAME.fullmatch(key)
     return f"{key}_own" if taken else key
 
 

@@ -7,7 +7,7 @@ It looks at the commands alone, without physics. Paths are compared at equal pha
 instant of its own clock: a robot that takes longer on the same way is at distance 0. Scenes whose plan some robot cannot
 follow in either kind of motion are left out.
 
-Command: python -m xew.sim_warp.motions [--tasks … --robots … --seeds 4 --first-seed 0]
+Command: python -m lab.seeds.motions [--tasks … --robots … --seeds 4 --first-seed 0]
 """
 
 from collections.abc import Mapping, Sequence

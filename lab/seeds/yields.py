@@ -5,7 +5,7 @@ Writes a Markdown table to the terminal and, with --page, docs/tasks.md: the tas
 
 Unlike generate this tries every seed on every robot and stores no episode.
 
-Command: python -m xew.sim_warp.yields [--tasks … --robots … --seeds 20 --first-seed 0 --page docs/tasks.md]
+Command: python -m lab.seeds.yields [--tasks … --robots … --seeds 20 --first-seed 0 --page docs/tasks.md]
 """
 
 import contextlib
@@ -36,7 +36,7 @@ from xew.sim_warp.tasks import TASKS, Task, get_task
 
 PARAGRAPHS = ("Task", "Randomization", "Success", "After")
 """Words with which the paragraphs of a task's module docstring begin."""
-COMMAND = "python -m xew.sim_warp.yields"
+COMMAND = "python -m lab.seeds.yields"
 YIELDS = "## How often the experts succeed"
 """Heading of the last section that this command writes. It keeps those that follow: `inspect --visibility-page` and
 `xew.metrics.evaluate --power-page` write them."""

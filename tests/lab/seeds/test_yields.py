@@ -7,13 +7,13 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from lab.seeds.yields import YIELDS, Args, describe_task, find_kept, markdown, page, task_section, write_page
 from tests.sim_warp.small import CLOSE, TASK, plan, success
 from xew.episode import EpisodeError, Record
 from xew.metrics.grading.power import HEADING as POWER
 from xew.sim_warp.inspection.visibility import HEADING as SEEN
 from xew.sim_warp.scene import Scene
 from xew.sim_warp.tasks import Task
-from xew.sim_warp.yields import YIELDS, Args, describe_task, find_kept, markdown, page, task_section, write_page
 
 
 def record(seed: int, robot: str, failure: str | None = None, task: str = "grab_roller") -> Record:
@@ -93,7 +93,7 @@ def test_failures_are_listed_by_task_robot_and_seed() -> None:
 def test_the_page_says_by_which_command_it_is_made() -> None:
     args = Args(tasks=(TASK,), robots=("piper",), seeds=7, first_seed=30)
     text = page([record(30, "piper", task=TASK)], args)
-    assert "`python -m xew.sim_warp.yields --seeds 7 --first-seed 30 --page docs/tasks.md`" in text
+    assert "`python -m lab.seeds.yields --seeds 7 --first-seed 30 --page docs/tasks.md`" in text
     assert "7 seeds from 30 of each task, in physics, on CPU:" in text
     assert text.index("### `close`") < text.index("## How often the experts succeed") < text.index("| **all tasks**")
 

@@ -1,0 +1,73 @@
+"""Scenes made in workers: simulated in shares, then written, and nothing rendered of a scene that one has failed."""
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from tests.sim_warp.small import CLOSE, SLOW, TASK, WITH_SLOW, InlineWorkers
+from xew.episode import Record
+from xew.sim_warp.production import cells as cells_module
+from xew.sim_warp.production import produce
+from xew.sim_warp.production.cells import Cell, Job
+from xew.sim_warp.production.produce import Production, make_scenes, simulate_jobs
+
+ROBOTS = ("franka_panda", SLOW)
+PRODUCTION = Production(Path("nowhere"), WITH_SLOW)
+
+
+def make(jobs: list[Job], monkeypatch: pytest.MonkeyPatch) -> tuple[list[tuple[list[Record], float]], list[tuple[Any, ...]]]:
+    """What comes of some jobs, and the units of work in the order in which they were done; each takes a second."""
+    done: list[tuple[Any, ...]] = []
+
+    def simulate(share: list[Job], production: Production) -> tuple[list[list[Cell]], float]:
+        done.extend(("simulate", job.seed, job.robots) for job in share)
+        return simulate_jobs(share, production), 1.0
+
+    def write(cells: list[Cell], rejected: bool, production: Production) -> tuple[list[Record], float]:
+        rejected = rejected or any(cell.failure for cell in cells)
+        done.append(("write", cells[0].scene.seed, tuple(cell.robot_name for cell in cells), rejected))
+        return [Record(cell.task_name, cell.scene.seed, cell.robot_name, cell.failure is None) for cell in cells], 1.0
+
+    monkeypatch.setattr(produce, "_simulate", simulate)
+    monkeypatch.setattr(produce, "_write", write)
+    return list(make_scenes(cast(Any, InlineWorkers(1)), jobs, PRODUCTION)), done
+
+
+def test_a_scene_is_written_as_soon_as_all_robots_are_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The slow robot cannot do the odd seed, which is then rejected for the other one too."""
+    made, done = make([Job(TASK, 0, ROBOTS), Job(TASK, 1, ROBOTS)], monkeypatch)
+    assert [step[:2] for step in done] == [(kind, seed) for seed in (0, 1) for kind in ("simulate", "simulate", "write")]
+    assert {step[2:] for step in done if step[0] == "simulate"} == {((robot,),) for robot in ROBOTS}
+    assert [step[1:] for step in done if step[0] == "write"] == [(seed, ROBOTS, seed == 1) for seed in (0, 1)]
+    assert [[(r.seed, r.robot, r.success) for r in records] for records, _ in made] == [
+        [(0, "franka_panda", True), (0, SLOW, True)],
+        [(1, "franka_panda", True), (1, SLOW, False)],
+    ]
+    assert [seconds for _, seconds in made] == [3, 3]
+
+
+def test_what_a_robot_of_an_earlier_run_has_failed_stays_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, done = make([Job(TASK, 0, ROBOTS[:1], rejected=True)], monkeypatch)
+    assert done[-1] == ("write", 0, ROBOTS[:1], True)
+
+
+def test_a_gpu_gets_as_many_whole_scenes_as_it_steps_worlds() -> None:
+    jobs = [Job(TASK, seed, ROBOTS) for seed in range(5)]
+    batches = replace(PRODUCTION, gpu_physics=True, batch=8).shares(jobs)
+    assert [[job.seed for job in share] for share in batches] == [[0, 1, 2, 3], [4]]
+    assert [job.robots for share in PRODUCTION.shares(jobs[:1]) for job in share] == [(robot,) for robot in ROBOTS]
+    assert (replace(PRODUCTION, gpu_physics=True).physics, PRODUCTION.physics) == (None, "cpu")
+
+
+def test_a_cell_travels_without_its_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A user's task may be of lambdas, which cannot be pickled; its name finds it on the other side."""
+    with_lambda = replace(CLOSE, success=lambda scene, now: CLOSE.success(scene, now))
+    monkeypatch.setattr(cells_module, "get_task", lambda name: with_lambda)
+    ((cell,),) = simulate_jobs([Job(TASK, 0, ROBOTS[:1])], PRODUCTION)
+    assert cell.failure is None
+    again = pickle.loads(pickle.dumps(cell))
+    assert again.task is with_lambda and again.failure is None
+    assert (again.known_motion.joint_pos == cell.known_motion.joint_pos).all() and again.scene.names == cell.scene.names

@@ -1,0 +1,169 @@
+"""Pictures of a data set: contact sheets and strips of its first seeds, and a grid of all tasks and robots."""
+
+import math
+from collections import defaultdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+from tqdm import tqdm
+
+from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, encode_png, read_record, read_states, read_video
+from xew.files import replacing, write_bytes
+from xew.names import folder_name, path_below
+from xew.sim_warp.robots import ROBOTS
+
+STRIP_FRAMES = 8
+SHEET_TIMES = (0.0, 0.5, 1.0)
+"""Instants that a contact sheet shows, as shares of the episode."""
+BLANK = np.full((HEIGHT // 2, WIDTH // 2, 3), 255, np.uint8)
+GAP = 4
+"""Width of the white between pictures [pixels]."""
+AT_WORK = 0.6
+"""Share of an episode after which the hands are at work."""
+LABEL_WIDTH, LABEL_HEIGHT, TEXT_SCALE = 96, 24, 0.42
+"""Size of the names in a grid or sheet [pixels], and the scale of their letters."""
+
+
+def draw_pictures(cells: list[tuple[Path, Record]], out: Path, seeds: int) -> None:
+    """Draw sheets and strips of the first seeds of each task, as PNG."""
+    by_task = seeds_by_task(cells)
+    _make_folder(out, "--pictures")
+    for task, of_task in tqdm(by_task.items(), desc="drawing", unit="task"):
+        for seed in sorted(of_task)[:seeds]:
+            save_png(path_below(out, f"{folder_name(task)}_{seed}.png"), contact_sheet(of_task[seed]))
+            for folder, record in of_task[seed]:
+                save_png(path_below(out, f"{folder_name(task)}_{seed}_{folder_name(record.robot)}.png"), strip(folder))
+
+
+def seeds_by_task(cells: list[tuple[Path, Record]]) -> dict[str, dict[int, list[tuple[Path, Record]]]]:
+    """Cells in order, by task and seed."""
+    by_task: dict[str, dict[int, list[tuple[Path, Record]]]] = defaultdict(lambda: defaultdict(list))
+    for folder, record in cells:
+        by_task[record.task][record.seed].append((folder, record))
+    return by_task
+
+
+def _make_folder(folder: Path, option: str) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise EpisodeError(f"cannot write to {folder}: {error.strerror}. Choose another folder with {option}.") from error
+
+
+def draw_grid(cells: list[tuple[Path, Record]], path: Path) -> None:
+    """Write `grid` of the first seed of each task as a PNG; 25 tasks and five robots take 1.1 MB."""
+    _make_folder(path.parent, "--grid")
+    picture = grid([of_task[min(of_task)] for of_task in seeds_by_task(cells).values()])
+    try:
+        with replacing(path) as temporary:
+            Image.fromarray(picture).save(temporary, format="PNG", optimize=True)
+    except OSError as error:
+        raise EpisodeError(f"cannot write {path}: {error.strerror}. Choose another file with --grid.") from error
+    print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
+
+
+def grid(seeds: list[list[tuple[Path, Record]]]) -> np.ndarray:
+    """One seed of every task, a column each under its name, and a robot a row, at half size: [h w 3] uint8.
+
+    In a column all robots are shown at the same instant, see `busy_instants`. Columns stand in bands of equal length, one
+    under the other, about as many as make the picture as wide as high.
+    """
+    present = {record.robot for cells in seeds for _, record in cells}
+    robots = [robot for robot in ROBOTS if robot in present] + sorted(present - set(ROBOTS))
+    columns = [_column(cells, robots) for cells in seeds]
+    bands = math.ceil(len(columns) ** 0.5 / 2)
+    length = -(-len(columns) // bands)
+    names = np.concatenate([_label("", LABEL_WIDTH), *(_label(robot, LABEL_WIDTH, HEIGHT // 2 + GAP) for robot in robots)])
+    blank = np.full_like(columns[0], 255)
+    drawn = []
+    for first in range(0, len(columns), length):
+        band = columns[first : first + length]
+        drawn.append(np.concatenate([names, *band, *[blank] * (length - len(band))], 1))
+    return np.concatenate(drawn)
+
+
+def _column(cells: list[tuple[Path, Record]], robots: list[str]) -> np.ndarray:
+    """A task's name over one picture a robot: [h w 3] uint8."""
+    folders = {record.robot: folder for folder, record in cells}
+    instants = dict(zip(folders, busy_instants([read_states(folder).contact for folder in folders.values()]), strict=True))
+    images = [
+        _halve(read_video(folders[robot] / "rgb.mkv")[instants[robot]]) if robot in folders else BLANK for robot in robots
+    ]
+    name = cells[0][1].task.rsplit(":", 1)[-1]
+    return np.concatenate([_label(name, WIDTH // 2 + GAP), tile([[image] for image in images])])
+
+
+def busy_instants(contacts: list[np.ndarray]) -> list[int]:
+    """For every robot the frame nearest to 60 % of the episodes at which all of them touch something, or that at 60 %.
+
+    It is one frame for all, but for episodes of different lengths, as imported ones are: those share no clock.
+
+    Args:
+        contacts: [t 2 o] bool of every robot, whether its left, right fingers touch each object.
+    """
+    if len({len(contact) for contact in contacts}) > 1:
+        return [instant for contact in contacts for instant in busy_instants([contact])]
+    wanted = round(AT_WORK * (len(contacts[0]) - 1))
+    touching = np.flatnonzero(np.logical_and.reduce([contact.any((1, 2)) for contact in contacts]))
+    return [int(touching[np.abs(touching - wanted).argmin()]) if touching.size else wanted] * len(contacts)
+
+
+def _label(text: str, width: int, height: int = LABEL_HEIGHT) -> np.ndarray:
+    """Text on white [h w 3] uint8, smaller where it would not fit."""
+    image = np.full((height, width, 3), 255, np.uint8)
+    (wide, high), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 1)
+    scale = min(TEXT_SCALE, (width - 8) / max(1, wide))
+    place = round((width - GAP - scale * wide) / 2), round((height - GAP + scale * high) / 2)
+    return cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (40, 40, 40), 1, cv2.LINE_AA)
+
+
+def _halve(image: np.ndarray) -> np.ndarray:
+    return cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
+
+
+def contact_sheet(cells: list[tuple[Path, Record]]) -> np.ndarray:
+    """A seed's robots one under the other by name, each at its start, middle and end, under the instruction: [h w 3] uint8."""
+    rows = []
+    for folder, _ in cells:
+        video = read_video(folder / "rgb.mkv")
+        rows.append([video[round(time * (len(video) - 1))] for time in SHEET_TIMES])
+    names = np.concatenate([_label(record.robot, LABEL_WIDTH, HEIGHT + GAP) for _, record in cells])
+    pictures = np.concatenate([names, tile(rows)], 1)
+    record = cells[0][1]
+    title = f"{record.task}, seed {record.seed}: {record.instruction}"
+    return np.concatenate([_label(title, pictures.shape[1]), pictures])
+
+
+def strip(folder: Path) -> np.ndarray:
+    """Eight evenly spaced frames of an episode, with keypoints, over the robot alone: [h w 3] uint8."""
+    rgb, states = read_video(folder / "rgb.mkv"), read_states(folder)
+    is_known = "robot" in read_record(folder).hashes  # an imported episode may be without
+    robot = read_video(folder / "robot.mkv") if is_known else np.full_like(rgb, 255)
+    frames = np.linspace(0, len(rgb) - 1, STRIP_FRAMES).round().astype(int)
+    marked = [_mark_robot(rgb[t], states.keypoints[t][states.keypoint_visible[t]], states.robot_mask[t]) for t in frames]
+    return tile([marked, [robot[t] for t in frames]])
+
+
+def _mark_robot(image: np.ndarray, keypoints: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The image [h w 3] with the outline of the robot's mask [h w] and its visible keypoints [k 2] pixels."""
+    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    image = cv2.drawContours(image.copy(), outlines, -1, (255, 120, 0), 1)
+    for x, y in keypoints:
+        cv2.circle(image, (round(float(x)), round(float(y))), 2, (0, 160, 255), -1, cv2.LINE_AA)
+    return image
+
+
+def tile(rows: list[list[np.ndarray]]) -> np.ndarray:
+    """Rows of equal pictures [h w 3] uint8 as one, white between them."""
+    padded = [[np.pad(image, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for image in row] for row in rows]
+    return np.concatenate([np.concatenate(row, 1) for row in padded])
+
+
+def save_png(path: Path, image: np.ndarray) -> None:
+    """Write an image [h w 3] uint8 RGB. Raises EpisodeError where it cannot be written."""
+    try:
+        write_bytes(path, encode_png(image))
+    except OSError as error:
+        raise EpisodeError(f"cannot write {path}: {error.strerror}. Choose another folder with --pictures.") from error
