@@ -292,7 +292,7 @@ COMMANDS = {
 
 
 def main() -> int:
-    chosen: Any = tyro.cli(Yields | Plans | Distances | Rate | Loading | Everything)  # type: ignore[arg-type]
+    chosen: Any = tyro.cli(Yields | Plans | Distances | Rate | Loading | Everything)
     command: Callable[[Any], int] = COMMANDS[type(chosen)]  # type: ignore[assignment]
     return command(chosen)
 
