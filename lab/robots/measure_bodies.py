@@ -17,9 +17,10 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -98,7 +99,8 @@ def count_yields(args: Yields) -> int:
     from lab.seeds.yields import Args, attempt_seeds
 
     bodies = tuple(body_key(number) for number in range(args.bodies))
-    flags = Args(args.tasks, (*ROBOT_NAMES, *bodies), args.seeds, args.first_seed, args.batch, args.workers)
+    robots = (*ROBOT_NAMES, *bodies)
+    flags = Args(args.tasks, robots, args.seeds, args.first_seed, batch=args.batch, workers=args.workers)
     cells: dict[tuple[str, str], list[bool]] = defaultdict(list)
     failures: dict[str, int] = defaultdict(int)
     for seed in tqdm(attempt_seeds(flags), total=args.seeds * len(args.tasks), desc="seeds"):
@@ -290,8 +292,9 @@ COMMANDS = {
 
 
 def main() -> int:
-    chosen = tyro.cli(Yields | Plans | Distances | Rate | Loading | Everything)  # type: ignore[call-overload]
-    return COMMANDS[type(chosen)](chosen)
+    chosen: Any = tyro.cli(Yields | Plans | Distances | Rate | Loading | Everything)
+    command: Callable[[Any], int] = COMMANDS[type(chosen)]  # type: ignore[assignment]
+    return command(chosen)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Shapes of the ARX X5: black, its forearm white, after the link sizes of the vendor's meshes.
+"""Shapes of the ARX-X5: black, its forearm white, after the link sizes of the vendor's meshes.
 
 The functions give one link each, in its frame, so that the ALOHA's arms, which are of this family, share them.
 """

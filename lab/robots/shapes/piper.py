@@ -1,4 +1,4 @@
-"""Shapes of the AgileX PiPER: a dark, slender arm with red marks, after the link sizes of the vendor's meshes."""
+"""Shapes of the AgileX Piper: a dark, slender arm with red marks, after the link sizes of the vendor's meshes."""
 
 from lab.robots.shapes.parts import camera
 from xew.sim_warp.robots.procedural.solids import (

@@ -265,6 +265,7 @@ def test_a_robot_is_worked_out_once(
         "note: the hand on link6, driven by outer_a",
     ):
         assert told in printed, told
+    adopt.main()  # again: what it wrote is replaced
     folder = (tmp_path / "lab" / "arm").rename(tmp_path / "gone") and tmp_path / "robots" / "arm"
     monkeypatch.setattr("xew.sim_warp.robots.user.own._find_place", lambda *_: pytest.fail("a place is searched for"))
     robot = load_robot(folder)

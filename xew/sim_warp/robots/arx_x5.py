@@ -1,4 +1,4 @@
-"""ARX X5: two black-and-white table-top arms of six joints.
+"""ARX-X5: two black-and-white table-top arms of six joints.
 
 Limits that experts keep: real-stanford/arx5-sdk, configuration X5.
 """

@@ -1,4 +1,4 @@
-"""AgileX PiPER: two dark, light-weight table-top arms of six joints.
+"""AgileX Piper: two dark, light-weight table-top arms of six joints.
 
 Limits that experts keep: agilexrobotics/piper_sdk, and for joint 3 the URDF.
 The arms stand leaning back by 10 degrees, which its short wrist range asks for.
@@ -30,7 +30,6 @@ RIGHT = replace(
 SPEC = RobotSpec(
     key="piper",
     title="Piper",
-    label="Piper",
     urdf=Path(__file__).parent / "descriptions" / "piper.urdf",
     arms=(LEFT, RIGHT),
     joint_lower=(-2.6179, 0.0, -2.697, -1.745, -1.22, -2.09439),

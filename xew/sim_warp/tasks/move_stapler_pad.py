@@ -5,7 +5,7 @@ Randomization: stapler at |x| in [.05, .25], y in [-.20, -.03], its long side wi
     [-.20, -.10], at least .12 away; size and color of the stapler, one of eight colors of the mat, not its own.
 Success: stapler within 20 mm of the mat's center in x and y and standing on it (10 mm), its long side within 10 degrees of x,
     both grippers open.
-After RoboTwin 2.0's move_stapler_pad, whose stapler lies at any yaw; here both lie where a PiPER turns its hand crosswise.
+After RoboTwin 2.0's move_stapler_pad, whose stapler lies at any yaw; here both lie where a Piper turns its hand crosswise.
 """
 
 import numpy as np

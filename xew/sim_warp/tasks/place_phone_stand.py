@@ -6,7 +6,7 @@ Randomization: phone at |x| in [.05, .25], y in [-.20, -.05], yaw within 40 degr
 Success: the middle of the phone's lower edge within 45, 40 and 40 mm of its place on the stand's ledge, in x, y and z; the
     phone leans 30 to 50 degrees from lying flat; both grippers open.
 After RoboTwin 2.0's place_phone_stand, which does not test the lean, and whose stand holds the phone 27 degrees from
-    upright; ours holds it 40 degrees from lying flat, as far as the PiPER's wrist turns a hand that takes it from the table.
+    upright; ours holds it 40 degrees from lying flat, as far as the Piper's wrist turns a hand that takes it from the table.
 """
 
 import numpy as np

@@ -159,7 +159,7 @@ def _stream(number: int, part: str) -> np.random.Generator:
 
 
 def _roll_wrist(rng: np.random.Generator) -> tuple[tuple[JointDesign, ...], Vector]:
-    """Six joints; the wrist turns about the forearm, bends, and turns again (as PiPER's)."""
+    """Six joints; the wrist turns about the forearm, bends, and turns again (as Piper's)."""
     upper, fore = _length(rng, 0.24, 0.4), _length(rng, 0.22, 0.36)
     roll = _share(rng, fore, 0.45, 0.75)
     drop = _length(rng, 0.0, 0.06)
@@ -174,7 +174,7 @@ def _roll_wrist(rng: np.random.Generator) -> tuple[tuple[JointDesign, ...], Vect
 
 
 def _yaw_wrist(rng: np.random.Generator) -> tuple[tuple[JointDesign, ...], Vector]:
-    """Six joints; the wrist bends, swings aside and turns (as ARX X5's)."""
+    """Six joints; the wrist bends, swings aside and turns (as ARX-X5's)."""
     upper, fore = _length(rng, 0.24, 0.38), _length(rng, 0.22, 0.34)
     joints = (
         *_shoulder(rng, 0.0, _length(rng, 0.0, 0.04)),

@@ -36,17 +36,13 @@ FOLDERS = "XEW_ROBOTS"
 """Name of the environment variable that lists folders of robots, separated as in PATH."""
 KEPT = "robots"
 """Name of the folder of a data set that holds its robots."""
-FILES = Path("files")
+FILES = "files"
 """Folder of a robot's folder with copies of all files that its URDF names."""
 DESCRIPTIONS = Path(__file__).resolve().parents[1] / "descriptions"
 """Folder of the package's own URDFs and meshes."""
 SEARCH_CODE = ("robots/user", "kinematics", "tasks", "assets", "embodiment", "geometry")
 """Packages of sim_warp whose code, with the files at its root, decides where a robot is placed: a change of it invalidates
 cached places."""
-
-
-PLACE_FIELDS = ("root_pose", "home", "tool_pose")
-"""Fields of an arm that a search for its place decides."""
 
 
 def is_path(name: str) -> bool:
@@ -152,7 +148,7 @@ def _read_place(path: Path, robot: RobotSpec) -> RobotSpec | None:
     """The robot with the cached bases, homes and tool frames; None if there are none."""
     try:
         left, right = (
-            replace(arm, **{name: tuple(place[name]) for name in PLACE_FIELDS})
+            replace(arm, root_pose=tuple(place["root_pose"]), home=tuple(place["home"]), tool_pose=tuple(place["tool_pose"]))
             for arm, place in zip(robot.arms, read_json(path), strict=True)
         )
     except (OSError, ValueError, TypeError, KeyError):
@@ -162,7 +158,7 @@ def _read_place(path: Path, robot: RobotSpec) -> RobotSpec | None:
 
 def _keep_place(robot: RobotSpec, path: Path) -> None:
     """Cache bases, homes and tool frames, where the cache folder can be written."""
-    places = [{name: getattr(arm, name) for name in PLACE_FIELDS} for arm in robot.arms]
+    places = [{name: getattr(arm, name) for name in ("root_pose", "home", "tool_pose")} for arm in robot.arms]
     with contextlib.suppress(OSError), replacing(path) as temporary:
         temporary.write_text(json.dumps(places), encoding="utf-8")
 
@@ -287,9 +283,9 @@ def _copy_names(files: Sequence[Path]) -> dict[Path, Path]:
     """Path of each file's copy in a robot's folder; files keep their places relative to one another."""
     own = [file.resolve() for file in files if not file.resolve().is_relative_to(DESCRIPTIONS)]
     top = Path(os.path.commonpath([file.parent for file in own])) if own else Path("/")
-    copies = {file: FILES / file.relative_to(top) for file in own}
+    copies = {file: Path(FILES) / file.relative_to(top) for file in own}
     packaged = [file.resolve() for file in files if file.resolve() not in copies]
-    return copies | {file: FILES / "xew" / file.relative_to(DESCRIPTIONS) for file in packaged}
+    return copies | {file: Path(FILES) / "xew" / file.relative_to(DESCRIPTIONS) for file in packaged}
 
 
 def _robot_yaml(robot: RobotSpec, digest: str) -> str:
