@@ -33,9 +33,12 @@ FRAMES = 12
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}
 codec: {spatial_factor: 8, channels: 4}
-model: {size: tiny, action: joints, embodiment: robot_render}
-train: {steps: 4, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, ema_decay: 0.5}
-rollout: {steps: 2, batch: 3}
+model: {size: tiny, action: joints, embodiment: robot_render,
+  history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none}
+train: {steps: 4, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, ema: 0.25, sample_every: 1000,
+  optimizer: adamw, warmup_steps: 0, decay_to: 1, motion_loss_weight: 0}
+rollout: {steps: 2, batch: 3,
+  sampler: euler}
 """
 
 

@@ -21,7 +21,8 @@ from xew.model import latents, rollout
 from xew.model.cache.codecs import load_codec
 from xew.model.codecs.contract import encode_pictures
 from xew.model.episodes.choice import training_episodes
-from xew.model.experiment import Experiment, create_model, load_experiment
+from xew.model.experiment import Experiment, load_experiment
+from xew.model.network.dit import WorldModel
 from xew.model.network.dit_layouts import save_dit
 from xew.model.rollout import RolloutWriter
 from xew.model.sampling.predict import ChunkInputs, Predictor, guided_velocity
@@ -34,9 +35,12 @@ data: {root}/data
 out: {root}/run
 clip: {{frames: 5, height: 64, width: 80}}
 codec: {{spatial_factor: 8, channels: 4}}
-model: {{size: tiny, action: joints, embodiment: robot_render, history: [-4]}}
-train: {{steps: 1, batch: 2}}
-rollout: {{steps: 2, batch: 3}}
+model: {{size: tiny, action: joints, embodiment: robot_render, history: [-4],
+  reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none}}
+train: {{steps: 1, batch: 2,
+  optimizer: adamw, warmup_steps: 0, decay_to: 1, ema: 0, motion_loss_weight: 0}}
+rollout: {{steps: 2, batch: 3,
+  sampler: euler}}
 """
 
 
@@ -57,7 +61,7 @@ def predictor(world: Path) -> Predictor:
 def make_predictor(experiment: Experiment) -> Predictor:
     """A network whose output depends on all that it is given: nothing of it is zero."""
     codec = load_codec(experiment.encoding, training_episodes(read_dataset(experiment.data), experiment.choice))
-    graph, params = nnx.split(create_model(experiment), nnx.Param)
+    graph, params = nnx.split(WorldModel(experiment.network), nnx.Param)
     keys = iter(jax.random.split(jax.random.key(3), 200))
     noisy = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(next(keys), leaf.shape, leaf.dtype), params)
     return Predictor(experiment.inputs, experiment.instructions, experiment.sampling, codec, graph, noisy)
@@ -201,7 +205,7 @@ def published(world: Path) -> Path:
     """A config with published weights, and no run."""
     experiment = load_experiment(world / "config.yaml")
     save_dit(
-        create_model(replace(experiment, model=replace(experiment.model, text="learned"))),
+        WorldModel(replace(experiment, model=replace(experiment.model, text="learned")).network),
         world / "dit.safetensors",
         "official",
     )

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from xew.config import ConfigError
-from xew.files import RUN_MARK, is_run
 from xew.model.codecs.patches import PatchCodec
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.begin import prepare_run
 from xew.model.settings.settings import AdaptSettings
+from xew.run import RUN_MARK, is_run
 
 
 @pytest.fixture(scope="module")

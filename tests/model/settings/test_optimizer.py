@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from xew.model.settings.optimizer import RMS_OF_ADAM, find_matrices, make_optimizer, tell_stale_average
+from xew.model.settings.checks import LONGEST_AVERAGE
+from xew.model.settings.optimizer import RMS_OF_ADAM, average_decay, find_matrices, make_optimizer
 from xew.model.settings.settings import TrainSettings
 
 SHAPES = {
@@ -59,11 +60,12 @@ def test_muon_computes_in_the_type_of_its_moments(params: dict) -> None:
     assert 0 < np.linalg.norm(found - true) < 0.1 * np.linalg.norm(true)
 
 
-def test_an_average_that_holds_the_start_is_told() -> None:
-    """.999 to the power of 2,000 is .135; of 7,500 it is 5e-4."""
-    short = TrainSettings(batch=1, steps=2000, ema_decay=0.999)
-    said = tell_stale_average(short)
-    assert said == "train.ema_decay 0.999 leaves 14 % of the start in the average of 2000 steps; 0.9977 would leave 1 %"
-    assert tell_stale_average(replace(short, ema_decay=0.9977)) is None
-    assert tell_stale_average(replace(short, steps=7500)) is None
-    assert tell_stale_average(replace(short, ema_decay=0.0)) is None
+@pytest.mark.parametrize("steps", [4, 200, 7500])
+@pytest.mark.parametrize("ema", [0.1, LONGEST_AVERAGE])
+def test_an_average_forgets_the_random_start(steps: int, ema: float) -> None:
+    """However short the run: what is left of the start at its end is at most exp(-1 / ema)."""
+    assert average_decay(TrainSettings(steps=steps, ema=ema)) ** steps <= np.exp(-1 / ema) < 0.02
+
+
+def test_an_average_reaches_over_its_fraction_of_the_run() -> None:
+    assert average_decay(TrainSettings(steps=7500, ema=0.1)) == pytest.approx(1 - 1 / 750)
