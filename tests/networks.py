@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -33,6 +34,10 @@ def world_model(
     settings |= {"dtype": jnp.dtype(settings["dtype"]).name} if "dtype" in settings else {}
     spec = Network(size, channels, tuple(streams), guess, words, seed, replace(WAN, **settings), unrolled=False)
     return WorldModel(spec)
+
+
+TINY_CODEC = Path(__file__).parent / "model" / "tiny_codec.safetensors"
+"""Weights of a tiny codec: eight channels for 8x8 pixels and four frames. It was trained for a minute on synthetic episodes."""
 
 
 def normal(seed: int, *shape: int) -> jax.Array:

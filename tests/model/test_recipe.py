@@ -47,8 +47,6 @@ DIFFERS: dict[str, set[str]] = {
     "wan5b/fewshot": WAN5B - {"model.weights", "train.sample_every"} | {"adapt.start_from", "adapt.robots"},
 }
 """Settings in which each variant differs from configs/fixed.yaml."""
-OF_CODECS = {"codec.spatial_factor", "codec.channels"}
-"""Settings of a codec that follow from its weights."""
 
 
 def flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -60,7 +58,7 @@ def flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 def differences(first: Experiment, second: Experiment) -> set[str]:
     """Names of the settings in which two experiments differ."""
     values = dict(flatten(second))
-    return {name for name, value in flatten(first) if value != values[name]} - OF_CODECS
+    return {name for name, value in flatten(first) if value != values[name]}
 
 
 def shipped() -> dict[str, Path]:
@@ -73,7 +71,7 @@ def shipped() -> dict[str, Path]:
 
 def test_the_defaults_are_the_recommended_recipe() -> None:
     recipe = load_experiment(ROOT / "configs/fixed.yaml")
-    assert differences(recipe, Experiment(data=Path("data"), out=Path("runs/fixed"))) <= {"codec.name"}
+    assert differences(recipe, Experiment(data=Path("data"), out=Path("runs/fixed"))) == set()
 
 
 def test_every_shipped_config_is_compared() -> None:

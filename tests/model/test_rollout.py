@@ -15,12 +15,12 @@ from flax import nnx
 
 from tests import synthetic
 from tests.commands import on_devices
+from tests.networks import TINY_CODEC
 from xew.dataset import Episode, read_dataset
 from xew.episode import EpisodeError, read_video
 from xew.model import latents, rollout
 from xew.model.cache.codecs import load_codec
 from xew.model.codecs.contract import encode_pictures
-from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.network.dit import WorldModel
 from xew.model.network.dit_layouts import save_dit
@@ -34,14 +34,14 @@ CONFIG = """
 data: {root}/data
 out: {root}/run
 clip: {{frames: 5, height: 64, width: 80}}
-codec: {{spatial_factor: 8, channels: 4}}
+codec: {{weights: TINY_CODEC}}
 model: {{size: tiny, action: joints, embodiment: robot_render, history: [-4],
   reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none}}
 train: {{steps: 1, batch: 2,
   optimizer: adamw, warmup_steps: 0, decay_to: 1, ema: 0, motion_loss_weight: 0}}
 rollout: {{steps: 2, batch: 3,
   sampler: euler}}
-"""
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def predictor(world: Path) -> Predictor:
 
 def make_predictor(experiment: Experiment) -> Predictor:
     """A network whose output depends on all that it is given: nothing of it is zero."""
-    codec = load_codec(experiment.encoding, training_episodes(read_dataset(experiment.data), experiment.choice))
+    codec = load_codec(experiment.encoding)
     graph, params = nnx.split(WorldModel(experiment.network), nnx.Param)
     keys = iter(jax.random.split(jax.random.key(3), 200))
     noisy = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(next(keys), leaf.shape, leaf.dtype), params)
@@ -163,10 +163,10 @@ def test_sampler_and_grid_are_chosen_by_name(predictor: Predictor, world: Path) 
 
 
 def test_a_codec_may_come_from_outside(world: Path) -> None:
-    config = [str(world / "config.yaml"), "--codec.name", "xew.model.codecs.codec:PatchCodec"]
+    config = [str(world / "config.yaml"), "--codec.name", "xew.model.codecs.codec:ConvAutoencoderCodec"]
     latents.main(config)
     experiment = load_experiment(config[0], config[1:])
-    assert load_codec(experiment.encoding, training_episodes(read_dataset(experiment.data), experiment.choice)).channels == 4
+    assert load_codec(experiment.encoding).channels == 8
 
 
 DEVICES = """

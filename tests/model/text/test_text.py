@@ -9,6 +9,7 @@ import pytest
 import tokenizers
 from flax import nnx
 
+from tests.networks import TINY_CODEC
 from xew.config import ConfigError
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.network.dit import WorldModel
@@ -21,12 +22,12 @@ CONFIG = """
 data: {root}/data
 out: {root}/run
 clip: {{frames: 5, height: 64, width: 80}}
-codec: {{channels: 4}}
+codec: {{weights: TINY_CODEC}}
 model: {{size: tiny, history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none,
   {model}}}
 train: {{steps: 1, batch: 1,
   optimizer: adamw, warmup_steps: 0, decay_to: 1, ema: 0, motion_loss_weight: 0}}
-"""
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 def experiment(root: Path, model: str) -> Experiment:
