@@ -26,7 +26,7 @@ from xew.model.experiment import Experiment, load_experiment
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs import checkpoint
 from xew.model.runs.checkpoint import TrainState, restore_sum
-from xew.model.runs.lineage import trace_start
+from xew.model.runs.folder import trace_start
 from xew.model.settings.optimizer import learning_rate, set_steps
 from xew.model.training import data, memory
 from xew.model.training.data import Batch, ClipSource, fake_batch
@@ -563,7 +563,7 @@ def test_run_with_corrections_resumes_and_is_read(world: Path, tmp_path: Path, c
     elsewhere = (tmp_path / "run").rename(tmp_path / "elsewhere")
     jax.tree.map(np.testing.assert_array_equal, network(elsewhere)[0], after)
     shutil.rmtree(base / "checkpoints" / "2")
-    with pytest.raises(ConfigError, match="not there any more or was trained anew"):
+    with pytest.raises(ConfigError, match="not there any more or was trained again"):
         network(elsewhere)
     (elsewhere / "start.json").unlink()
     with pytest.raises(ConfigError, match="does not tell from which checkpoint"):

@@ -60,7 +60,7 @@ def training_pair(key: Key[Array, ""], latents: Float[Array, "b t h w c"], shift
 
 
 def motion_weights(latents: Float[Array, "b t h w c"], strength: float) -> Float[Array, "b t h w"]:
-    """Weights [b t h w] of places in the loss: what moves weighs up to 1 + `strength` times what stands still; mean 1.
+    """Weights [b t h w] of places in the loss: a moving place weighs up to 1 + `strength` times a still one; mean 1.
 
     Args:
         latents: [b t h w c], clean and of variance 1; a place moves as far as it differs from the first frame.

@@ -169,6 +169,6 @@ def _check_history(settings: ModelSettings, conditions: Sequence[Condition], sou
     framed = [name for name in streams if name in MECHANISMS and MECHANISMS[name].enters == "frame"]
     if settings.visibility == "one_way" and framed and settings.history:
         raise ConfigError(
-            f"{source}: model.visibility one_way computes earlier frames without the poses that action {settings.action} tells "
+            f"{source}: model.visibility one_way computes earlier frames without the poses that action {settings.action} gives "
             "them; use joint, or leave model.history out."
         )

@@ -48,7 +48,7 @@ class ClipSource:
         text: instructions as the network takes them, [l e] float32 or [l] int32.
         scales: of conditions that are numbers.
         episodes: those to learn from.
-        replay: episodes of which every batch has a part beside them.
+        replay: episodes that every batch has a part of besides them.
     """
 
     def __init__(
