@@ -50,7 +50,7 @@ def test_causal(codec: ConvAutoencoderCodec) -> None:
     before, after = codec.encode(video), codec.encode(changed)
     np.testing.assert_array_equal(before[:2], after[:2])
     assert not np.allclose(before[2], after[2])
-    np.testing.assert_array_equal(codec.encode(video[:1])[0], before[0])
+    np.testing.assert_allclose(codec.encode(video[:1])[0], before[0], atol=1e-5)
 
 
 def test_a_batch_is_its_clips(codec: ConvAutoencoderCodec) -> None:
