@@ -39,6 +39,7 @@ from xew.model.network.dit import cast_params, network_graph
 from xew.model.network.dit_layouts import load_dit_params
 from xew.model.runs.checkpoint import load_params
 from xew.model.runs.folder import load_run_codec, load_run_config
+from xew.model.runs.layout import checkpoint_time
 from xew.model.sampling.predict import Prediction, Predictor, make_predictor
 from xew.model.settings.checks import check_experiment
 from xew.model.settings.settings import RolloutSettings
@@ -46,7 +47,6 @@ from xew.model.training.step import make_trainer
 from xew.model.video.frames import to_camera_size
 from xew.protocol import MIXED_MOTION
 from xew.rollout import write_rollout
-from xew.run import checkpoint_time
 
 Item = tuple[Episode, dict[str, Any]]
 """An episode to predict and the header that its rollout will have."""

@@ -279,7 +279,7 @@ def test_earlier_frames_are_rgb_at_their_own_times() -> None:
     embedded = model.patch_embedding(patches) + model.stream_embeddings["history"][...][None, None]
     np.testing.assert_allclose(tokens[:, 18:30], embedded, atol=1e-5)
     assert levels[18:30].tolist() == [0] * 12
-    angles = dit.rotary_angles((2, 2, 3), 16, times=EARLIER)
+    angles = dit.rotary_angles((2, 2, 3), 16, times=[frame / 4 for frame in EARLIER])
     np.testing.assert_allclose(cos[18:30], np.cos(angles), atol=1e-6)
     assert not np.allclose(cos[18:24], cos[:6])
     assert "history" not in model.stream_inputs
@@ -379,4 +379,4 @@ def test_the_page_s_condition_from_outside_works(tmp_path: Path, monkeypatch: py
     system = load_experiment(
         ROOT / "configs" / "fixed.yaml", ["--model.action", "my_conditions:SYSTEM", "--model.embodiment", "none"]
     )
-    assert set(system.conditions) == {"embodiment", "joints"}
+    assert set(system.conditions) == {"embodiment", "joints", "history"}

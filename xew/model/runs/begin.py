@@ -25,8 +25,8 @@ from xew.model.experiment import Experiment, load_recorded
 from xew.model.network.dit import WorldModel
 from xew.model.network.dit_layouts import check_dit
 from xew.model.runs.folder import START, StartNote, load_run_config
+from xew.model.runs.layout import RUN_MARK, checkpoint_time, is_run, list_steps, remove_run
 from xew.model.weights.reading import read_tensors
-from xew.run import RUN_MARK, checkpoint_time, is_run, list_steps, remove_run
 
 T = TypeVar("T")
 

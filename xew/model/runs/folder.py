@@ -19,8 +19,8 @@ from xew.files import read_json
 from xew.model.codecs.codec import RUN_CODEC, RUN_REMEDY, codec_class, load_kept_codec
 from xew.model.codecs.contract import Codec, CodecSettings
 from xew.model.experiment import Experiment, load_recorded
+from xew.model.runs.layout import checkpoint_time
 from xew.model.settings.settings import AdaptSettings
-from xew.run import checkpoint_time
 
 START = "start.json"
 """Name of the file that says, in an adapted run, which checkpoint of which run it started from."""
