@@ -68,9 +68,9 @@ class ClipSource:
     def open(
         cls, encoding: Encoding, instructions: Instructions, episodes: Sequence[Episode], replay: Sequence[Episode] = ()
     ) -> "ClipSource":
-        """Open the cache of these episodes. Raises ConfigError if codec or scales were never fitted on them."""
+        """Open the cache of these episodes. Raises ConfigError if scales were never fitted on them."""
         text = instructions.encode(record.instruction for _, record in (*episodes, *replay))
-        return cls(open_cache(encoding, episodes), text, load_scales(encoding, episodes), episodes, replay)
+        return cls(open_cache(encoding), text, load_scales(encoding, episodes), episodes, replay)
 
     def _list_samples(self, record: Record) -> list[tuple[Record, tuple[int, ...]]]:
         inputs = self.cache.encoding.inputs
