@@ -1,4 +1,4 @@
-"""What the configs of `train_codec` hold, and the checks of it."""
+"""The settings of `python -m lab.codec`, and their checks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

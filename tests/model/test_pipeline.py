@@ -136,7 +136,7 @@ def test_other_data_makes_the_cache_stale(world: Path, tmp_path: Path, capsys: p
     said = refusal(
         train.main, [str(world / "config.yaml"), "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")], capsys
     )
-    assert "no codec fitted on" in said and "python -m xew.model.latents" in said
+    assert "was encoded from other data" in said and "python -m xew.model.latents" in said
 
 
 def test_stale_stream_is_an_error(
