@@ -24,8 +24,10 @@ from xew.model.video.pixels import stored_pixels
 CONFIG = """
 clip: {frames: 9, height: 64, width: 80}
 codec: {weights: TINY_CODEC}
-model: {size: tiny, action: optical_flow, embodiment: robot_render}
-train: {steps: 1, batch: 1}
+model: {size: tiny, action: optical_flow, embodiment: robot_render,
+  history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none}
+train: {steps: 1, batch: 1,
+  optimizer: adamw, warmup_steps: 0, decay_to: 1, ema: 0, motion_loss_weight: 0}
 """.replace("TINY_CODEC", str(TINY_CODEC))
 
 

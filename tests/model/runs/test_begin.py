@@ -8,10 +8,10 @@ import pytest
 
 from tests.networks import TINY_CODEC
 from xew.config import ConfigError
-from xew.files import RUN_MARK, is_run
 from xew.model.codecs.autoencoders import ConvAutoencoderCodec
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.begin import prepare_run
+from xew.model.runs.layout import RUN_MARK, is_run
 from xew.model.settings.settings import AdaptSettings
 
 

@@ -32,21 +32,7 @@ PACKAGED_WEIGHTS = Path(__file__).with_name("conv_autoencoder.safetensors")
 """Weights of conv_autoencoder that come with the package."""
 
 
-class OfSize:
-    """What is read off the size of an autoencoder."""
-
-    size: Any
-
-    @property
-    def spatial_factor(self) -> int:
-        return self.size.spatial_factor
-
-    @property
-    def channels(self) -> int:
-        return self.size.channels
-
-
-class AutoencoderCodec(OfSize, BatchCodec, ABC):  # type: ignore[override]
+class AutoencoderCodec(BatchCodec, ABC):
     """What the codecs of autoencoders share: the network, and that its weights are written once."""
 
     file: ClassVar[str]
@@ -54,8 +40,19 @@ class AutoencoderCodec(OfSize, BatchCodec, ABC):  # type: ignore[override]
 
     params: Any
     graph: nnx.GraphDef
+    size: Any
     dtype: str
     hash: str
+
+    @property
+    def spatial_factor(self) -> int:  # type: ignore[override]
+        """Number of pixels a side of a latent."""
+        return self.size.spatial_factor
+
+    @property
+    def channels(self) -> int:
+        """Number of channels of the latents."""
+        return self.size.channels
 
     @property
     def autoencoder(self) -> Any:

@@ -1,4 +1,4 @@
-"""Videos to tokens and back, and the numbers that tell tokens their place and their noise level.
+"""Videos to tokens and back, and the features of their place and noise level.
 
 Reads  latents [b t h w c], timesteps
 Writes tokens' features [b s c*ph*pw], rotation angles [s head_dim/2], time features [... 256]
@@ -14,6 +14,8 @@ from jaxtyping import Float
 
 Patch = tuple[int, int, int]
 """Latent frames, rows and columns of a token."""
+TokenGrid = tuple[int, int, int]
+"""Number of tokens in time, height and width."""
 WAN_PATCH: Patch = (1, 2, 2)
 WAVELENGTH_BASE = 10_000.0
 TIME_FREQUENCIES = 256

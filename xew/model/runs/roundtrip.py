@@ -1,4 +1,4 @@
-"""Video through a run's codec and back: what is left of true frames, for whoever measures it."""
+"""Video through a run's codec and back: the most that a model with this codec can reach."""
 
 from dataclasses import dataclass
 from pathlib import Path
