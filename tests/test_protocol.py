@@ -13,7 +13,6 @@ from xew.protocol import (
     HALVES,
     HELD_OUT_ROBOTS,
     LOEO,
-    MIXED_MOTION,
     MOTIONS,
     PAPER_PARTS,
     PARTS,
@@ -102,13 +101,13 @@ def test_the_model_knows_every_action_conditioning_and_split() -> None:
         assert variant.action in ACTIONS and variant.embodiment in CONDITIONS and variant.split in SPLITS
         assert variant.start is None or variant.start in VARIANTS.values()
     loeo = {f"loeo_{robot}" for robot in LOEO}
-    shared = {"fixed", "painted", "validation", *loeo, *SCALING, *HALVES}
-    assert set(SPLITS) == {key + ending for key in shared for ending in ("", "_own", "_mixed")}
+    shared = {"fixed", "validation", *loeo, *SCALING, *HALVES}
+    assert set(SPLITS) == {key + ending for key in shared for ending in ("", "_own")}
 
 
 def test_the_key_of_a_split_says_the_motion_of_its_episodes() -> None:
-    assert [SPLITS[key].motion for key in ("fixed", "loeo_piper_own", "scaling_seen_mixed")] == ["shared", "own", "mixed"]
-    for motion in (*MOTIONS, MIXED_MOTION):
+    assert [SPLITS[key].motion for key in ("fixed", "loeo_piper_own")] == ["shared", "own"]
+    for motion in MOTIONS:
         split = SPLITS[split_key("fixed", motion)]
         assert replace(split, motion="shared") == FIXED
         assert validation_split(split).motion == motion

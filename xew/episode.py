@@ -119,7 +119,7 @@ class Record:
     videos: bool = True
     """Are rgb and robot stored? Where not, `python -m xew.sim_warp.inspect --render` makes them from the states."""
     motion: str = SHARED_MOTION
-    """Kind of motion, one of `xew.protocol.MOTIONS`; headers that were written before there were two are of the first."""
+    """Kind of motion, one of `xew.protocol.MOTIONS`."""
 
 
 def episode_folder(data: Path, task: str, seed: int, robot: str) -> Path:

@@ -217,13 +217,8 @@ def edit(study: Study, out: Path, change: object) -> Path:
     return out / "scores.parquet"
 
 
-def test_kinds_of_motion_are_reported_together_on_purpose_only(
-    study: Study, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    for motion, data, word in (
-        ("mixed", None, "has scores of shared and of own motion, which do not compare"),
-        ("own", study.data, "has episodes of shared motion"),
-    ):
+def test_kinds_of_motion_are_not_reported_together(study: Study, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    for motion, data, word in (("own", study.data, "has episodes of shared motion"),):
         path = edit(study, tmp_path, lambda rows: rows)
         rows = pd.read_parquet(path)
         rows.attrs["motion"] = motion

@@ -128,14 +128,6 @@ def test_robots_of_ones_own_are_told(tmp_path: Path) -> None:
     assert len(read_scores(written(path, rows, robots=["my_robot"])).rows) == len(rows)
 
 
-def test_painted_robots_are_known_where_the_robot_is(tmp_path: Path) -> None:
-    robots = ("piper_paint_3", "body_17_paint_1")
-    path = written(tmp_path / "scores.parquet", graded(robots=robots))
-    assert set(read_scores(path).rows["robot"]) == set(robots)
-    with pytest.raises(ConfigError, match=r"the robot is unknown, .* my_robot_paint_3"):
-        read_scores(written(tmp_path / "scores.parquet", graded(robots=("piper", "my_robot_paint_3"))))
-
-
 def test_robots_with_an_import_path_need_no_word(tmp_path: Path) -> None:
     rows = graded(robots=("piper", "my_lab.robots:SPEC"))
     assert set(read_scores(written(tmp_path / "s.parquet", rows)).rows["robot"]) == {"piper", "my_lab.robots:SPEC"}

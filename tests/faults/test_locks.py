@@ -134,7 +134,7 @@ def test_a_rollout_into_a_folder_that_another_writes_ends_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     data, out = tmp_path / "data", tmp_path / "out"
-    flags = SimpleNamespace(data=data, out=out, checkpoint=None, mixed_motion=True, split="test", robots=())
+    flags = SimpleNamespace(data=data, out=out, checkpoint=None, split="test", robots=())
     experiment = SimpleNamespace(instructions=SimpleNamespace(encode=list))
     monkeypatch.setattr(rollout, "parse_rollout", lambda _: (tmp_path / "run", flags, experiment))
     monkeypatch.setattr(rollout, "load_predictor", lambda *_: (None, None))

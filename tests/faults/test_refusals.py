@@ -26,7 +26,7 @@ from xew.sim_warp import generate, yields
 REPOSITORY = Path(__file__).parents[2]
 
 
-def test_both_kinds_of_motion_are_mixed_on_purpose_only(
+def test_both_kinds_of_motion_are_never_mixed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.syspath_prepend(str(REPOSITORY))
@@ -44,10 +44,7 @@ def test_both_kinds_of_motion_are_mixed_on_purpose_only(
     ):
         with pytest.raises(SystemExit, match="2"):
             refused()
-        assert "mix them on purpose by --mixed-motion" in capsys.readouterr().err and not out.exists()
-    assert len(select_episodes(data, "train", mixed_motion=True)) == 2
-    outside.main([*predicting, "--mixed-motion"])
-    assert len(list(out.rglob("rollout.json"))) == 2
+        assert "keep them in data sets of their own" in capsys.readouterr().err and not out.exists()
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EIO, errno.EDQUOT])

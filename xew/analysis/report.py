@@ -53,7 +53,7 @@ from xew.dataset import count_motions, demand_one_motion, find_records
 from xew.episode import Record, episode_folder, read_video
 from xew.files import hold_lock, write_bytes, write_text
 from xew.names import csv_text, path_below, plain_markdown
-from xew.protocol import BASELINES, HELD_OUT_ROBOTS, MIXED_MOTION, ROBOT_NAMES, seed_split
+from xew.protocol import BASELINES, HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
 from xew.statistics import MIN_SCENES, find_parting, strict_metrics
 
@@ -95,8 +95,6 @@ class Args:
     """Folder that python -m xew.analysis.distance wrote, for a study; without it the paper's distances are used."""
     other_motion: Path | None = None
     """Score table of the same study in the other kind of motion: action representations of both stand side by side."""
-    mixed_motion: bool = False
-    """Report on scores of episodes of shared and of own motion together."""
     explorer: bool = False
     """Write <out>/explorer too, a page that plays the scenes of the strips, for the report of one run."""
     paper: bool = False
@@ -129,14 +127,10 @@ def main(args: Args) -> None:
 
 
 def _check_motion(args: Args, scores: Scores) -> None:
-    """Raise ConfigError or EpisodeError where scores or data are of both kinds of motion, unless they may, or of different."""
-    if scores.motion == MIXED_MOTION and not args.mixed_motion:
-        raise ConfigError(
-            f"{args.scores} has scores of shared and of own motion, which do not compare; report on them by --mixed-motion."
-        )
+    """Raise ConfigError or EpisodeError where the data are of another kind of motion than the scores, or of both."""
     records = [record for _, record in find_records(args.data)] if args.data else []
-    motion = demand_one_motion(args.data, records, args.mixed_motion) if args.data and records else scores.motion
-    if motion != scores.motion and not args.mixed_motion:
+    motion = demand_one_motion(args.data, records) if args.data and records else scores.motion
+    if motion != scores.motion:
         raise ConfigError(
             f"{args.data} has episodes of {motion} motion, {args.scores} has scores of {scores.motion} motion; name the data"
             " that was graded."

@@ -123,7 +123,7 @@ class Scores:
 
     @property
     def motion(self) -> str:
-        """Kind of motion of the graded episodes (`xew.protocol.MOTIONS`), or MIXED_MOTION."""
+        """Kind of motion of the graded episodes (`xew.protocol.MOTIONS`)."""
         return self.attributes.get("motion", EARLIER["motion"])
 
     @property
@@ -335,7 +335,7 @@ class _Attributes:
     robots: tuple[str, ...] = ()
     study: dict[str, Any] = field(default_factory=dict)
     codecs: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    motion: Literal["shared", "own", "mixed"] = "shared"
+    motion: Literal["shared", "own"] = "shared"
 
 
 def _check_attributes(path: Path, attributes: Mapping[Hashable, Any]) -> None:

@@ -86,8 +86,6 @@ class Args:
     """Names of the metrics of the predictors' table."""
     cases: tuple[str, ...] = tuple(PREDICTORS)
     """Names of the predictors that are graded."""
-    mixed_motion: bool = False
-    """Calibrate on episodes of shared and of own motion together."""
     trust: tuple[str, ...] = ()
     """Modules of your own, such as my_lab.tasks, that the run and the data may name."""
 
@@ -114,7 +112,7 @@ def main(args: Args) -> None:
     estimators = Estimators(open_masker(args.masks, args.masks_checkpoint), open_tracker(args.tracks, args.tracks_checkpoint))
     through_codec = None if args.codec is None else open_codec(args.codec, args.codec_opener)
     episodes = find_accepted(args.data)
-    demand_one_motion(args.data, (record for _, record in episodes), args.mixed_motion)
+    demand_one_motion(args.data, (record for _, record in episodes))
     with hold_lock(args.out):
         if args.predictors:
             print(grade_matrix(episodes, args, estimators))

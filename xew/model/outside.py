@@ -171,8 +171,6 @@ class Args:
     """Name of what the model is conditioned on, for the tables."""
     out: Path | None = None
     """Folder to write to; rollouts/NAME where left out."""
-    mixed_motion: bool = False
-    """Predict episodes of shared and of own motion into one folder."""
     trust: tuple[str, ...] = ()
     """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
 
@@ -187,7 +185,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     name = args.model.rpartition(":")[2]
     out = args.out or Path("rollouts") / name
     check_out(out, args.data)
-    episodes = select_episodes(args.data, args.split, args.robots or None, args.mixed_motion)
+    episodes = select_episodes(args.data, args.split, args.robots or None)
     items = [(e, common_header(name, args.condition, e[1], args.max_frames) | {"outside": args.model}) for e in episodes]
     pending = [item for item in items if not is_done(out, *item)]
     model = load_model(args.model)

@@ -45,7 +45,6 @@ from xew.model.settings.checks import check_experiment
 from xew.model.settings.settings import RolloutSettings
 from xew.model.training.step import make_trainer
 from xew.model.video.frames import to_camera_size
-from xew.protocol import MIXED_MOTION
 from xew.rollout import write_rollout
 
 Item = tuple[Episode, dict[str, Any]]
@@ -241,8 +240,6 @@ class Flags:
     """Robots to predict; all of the data where left out."""
     out: Path | None = None
     """Folder to write to; rollouts/<name of the run> where left out."""
-    mixed_motion: bool = False
-    """Predict episodes of shared and of own motion into one folder, as runs do whose split ends in _mixed."""
     trust: tuple[str, ...] = ()
     """Modules of your own, such as my_lab.tasks, that the run and the data may name."""
 
@@ -262,8 +259,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     predictor, step = load_predictor(run, experiment, flags.checkpoint)
     data, out = flags.data or experiment.data, flags.out or Path("rollouts") / default_name(run)
     check_out(out, data)
-    mixed = flags.mixed_motion or experiment.choice.motion == MIXED_MOTION
-    episodes = select_episodes(data, flags.split, flags.robots or None, mixed)
+    episodes = select_episodes(data, flags.split, flags.robots or None)
     saved = None if step is None else checkpoint_time(run, step)
     headers = [(episode, rollout_header(experiment, step, saved, episode)) for episode in episodes]
     pending = [item for item in headers if not is_done(out, *item)]

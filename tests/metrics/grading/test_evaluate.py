@@ -374,7 +374,7 @@ def test_missing_episodes_trees_and_metrics_are_named(
     assert "xew.model.rollout" in capsys.readouterr().err
 
 
-def test_kinds_of_motion_are_graded_together_on_purpose_only(
+def test_kinds_of_motion_are_not_graded_together(
     rollouts: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     mixed = tmp_path / "mixed"
@@ -384,9 +384,7 @@ def test_kinds_of_motion_are_graded_together_on_purpose_only(
     with pytest.raises(SystemExit):
         grade(rollouts, mixed, metrics=("psnr",))
     message = capsys.readouterr().err
-    assert "episodes of shared motion (1) and of own motion (1)" in message and "--mixed-motion" in message
-    scores = grade(rollouts, mixed, metrics=("psnr",), mixed_motion=True)
-    assert scores.attrs["motion"] == "mixed"
+    assert "episodes of shared motion (1) and of own motion (1)" in message
     assert grade(rollouts, data, metrics=("psnr",)).attrs["motion"] == "shared"
 
 

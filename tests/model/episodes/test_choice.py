@@ -57,8 +57,8 @@ def test_nothing_is_trained_on_validation_or_test_seeds() -> None:
     assert {seed_split(record.seed) for _, record in episodes} == {"train"}
 
 
-def test_motion_is_mixed_on_purpose_only() -> None:
-    """The split names the kind of motion; a data set of both is read by a split that ends in _mixed."""
+def test_motion_is_never_mixed() -> None:
+    """The split names the kind of motion."""
     shared = dataset("train")
     own = tuple((folder, replace(record, motion="own")) for folder, record in shared.cells if record.seed == 1)
     mixed = Dataset(shared.root, tuple(cell for cell in shared.cells if cell[1].seed == 0) + own)
@@ -67,9 +67,9 @@ def test_motion_is_mixed_on_purpose_only() -> None:
     def read(data: Dataset, split: str, **settings: Any) -> int:
         return len(training_episodes(data, EpisodeChoice(robots, motion=SPLITS[split].motion, **settings)))
 
-    assert read(shared, "fixed") == read(Dataset(shared.root, own * 2), "fixed_own") == read(mixed, "fixed_mixed") == 6
+    assert read(shared, "fixed") == read(Dataset(shared.root, own * 2), "fixed_own") == 6
     for split in ("fixed", "fixed_own"):
-        with pytest.raises(EpisodeError, match=r"episodes of shared motion \(3\) and of own motion \(3\) .*ends in _mixed"):
+        with pytest.raises(EpisodeError, match=r"episodes of shared motion \(3\) and of own motion \(3\) "):
             read(mixed, split)
     with pytest.raises(EpisodeError, match=r"episodes of shared motion \(6\) to be read, and the split is of own motion"):
         read(shared, "fixed_own")
@@ -77,9 +77,8 @@ def test_motion_is_mixed_on_purpose_only() -> None:
     with pytest.raises(EpisodeError, match="own motion"):
         choose_episodes(mixed, replayed)
     records = [record for _, record in mixed.cells]
-    assert demand_one_motion(mixed.root, records, mixed=True) == "mixed"
-    with pytest.raises(EpisodeError, match="do not compare; mix them on purpose by --mixed-motion"):
-        demand_one_motion(mixed.root, records, mixed=False)
+    with pytest.raises(EpisodeError, match="do not compare; keep them in data sets of their own"):
+        demand_one_motion(mixed.root, records)
 
 
 @pytest.mark.parametrize("families", [("train", "validation", "test"), ("train", "test")])

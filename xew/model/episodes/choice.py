@@ -98,11 +98,11 @@ def sample_episodes(dataset: Dataset, roles: Mapping[str, str], motion: str | No
     return {f"{roles[robot]}/{robot}": first[robot] for robot in roles if robot in first}
 
 
-def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None, mixed_motion: bool = False) -> list[Episode]:
+def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None) -> list[Episode]:
     """Accepted episodes of a seed family and of the given robots, or of all.
 
     Raises:
-        ConfigError, EpisodeError: there is none, or they are of both kinds of motion and `mixed_motion` does not allow it.
+        ConfigError, EpisodeError: there is none, or they are of both kinds of motion.
     """
     dataset = read_dataset(data)
     robots = expand_robots(robots or ()) or None
@@ -114,7 +114,7 @@ def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None,
         asked = f"{split} episode of {', '.join(robots)}" if robots else f"{split} episode"
         seeds = " --validation-seeds 4" if split == "validation" else ""
         raise EpisodeError(f"{data} has no {asked}; run python -m xew.sim_warp.generate --out {data}{seeds}")
-    demand_one_motion(data, (record for _, record in chosen), mixed_motion)
+    demand_one_motion(data, (record for _, record in chosen))
     return chosen
 
 

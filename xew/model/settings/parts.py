@@ -82,7 +82,7 @@ class EpisodeChoice:
     samples: Mapping[str, str] = field(default_factory=dict)
     """Roles of the robots that sample videos are drawn of: seen, unseen or target."""
     motion: str = SHARED_MOTION
-    """Kind of motion of the episodes, or MIXED_MOTION, as the split names it."""
+    """Kind of motion of the episodes, as the split names it."""
 
 
 @dataclass(frozen=True)
