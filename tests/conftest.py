@@ -29,7 +29,6 @@ SLOW = (
     "tests/analysis/studies/test_study_debug.py",
     "tests/analysis/test_null.py::test_equal_variants_are_rarely_told_apart",
     "tests/analysis/test_report.py",
-    "tests/legacy/",
     "tests/metrics/calibration/",
     "tests/metrics/estimators/test_sam2.py",
     "tests/metrics/grading/test_evaluate.py",

@@ -242,7 +242,6 @@ def test_folders_of_tests_mirror_those_of_the_source() -> None:
     tests = ROOT.parent / "tests"
     folders = {path.parent.relative_to(tests) for path in tests.rglob("test_*.py")} - {
         Path("."),
-        Path("legacy"),
         Path("faults"),
     }
     assert not sorted(str(folder) for folder in folders if not (ROOT / folder).is_dir())
