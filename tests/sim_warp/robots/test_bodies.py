@@ -237,7 +237,6 @@ def test_workers_begin_when_the_kernels_of_their_checks_are_compiled(monkeypatch
     assert begun == [{"physics", "kinematics"}]
 
 
-@pytest.mark.slow
 def test_two_processes_write_the_same_bytes() -> None:
     """This one, and one with another locale, hash seed and number of threads."""
     environment = os.environ | {"PYTHONHASHSEED": "77", "OMP_NUM_THREADS": "2", "LC_ALL": "C"}

@@ -1,23 +1,20 @@
-"""Reference implementations, where the extra `reference` is installed."""
+"""The package `lpips` with the weights that xew reads; needs the extra `reference`."""
 
-import importlib.util
+import functools
 import sys
 import types
 from collections.abc import Callable
 
 import numpy as np
-import pytest
 
 from xew.metrics.networks.alexnet import read_alexnet
 
 
-@pytest.fixture(scope="session")
+@functools.cache
 def reference_lpips() -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """The real `lpips` network on uint8 videos [t h w 3], its trunk filled from our file (no download)."""
-    # Looked for and not imported: `import lpips` needs torchvision, for which there is a stand-in below.
-    if not all(importlib.util.find_spec(name) for name in ("torch", "lpips")):
-        pytest.skip("parity with lpips needs the extra: pip install -e '.[reference]'")
-    torch = importlib.import_module("torch")
+    import torch
+
     network = _lpips_without_torchvision(torch)
     _fill(torch, network, read_alexnet())
 
