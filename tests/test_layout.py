@@ -238,13 +238,26 @@ def test_the_house_is_in_order(check: Callable[[Sources], list[str]]) -> None:
     assert not failures, f"{len(failures)} failures:\n" + "\n".join(failures)
 
 
+LAB = read_sources(ROOT.parent / "lab")
+
+
+@pytest.mark.parametrize(
+    "check", (circle_failures, folder_failures, annotation_failures), ids=lambda check: check.__name__.removesuffix("_failures")
+)
+def test_the_laboratory_is_in_order(check: Callable[[Sources], list[str]]) -> None:
+    failures = check(LAB)
+    assert not failures, f"{len(failures)} failures:\n" + "\n".join(failures)
+
+
+def test_xew_imports_nothing_of_the_laboratory() -> None:
+    assert not [source.name for source in SOURCES if touches(source.imports(), "lab")]
+
+
 def test_folders_of_tests_mirror_those_of_the_source() -> None:
     tests = ROOT.parent / "tests"
-    folders = {path.parent.relative_to(tests) for path in tests.rglob("test_*.py")} - {
-        Path("."),
-        Path("faults"),
-    }
-    assert not sorted(str(folder) for folder in folders if not (ROOT / folder).is_dir())
+    folders = {path.parent.relative_to(tests) for path in tests.rglob("test_*.py")} - {Path("."), Path("faults")}
+    missing = [folder for folder in folders if not (ROOT / folder).is_dir() and not (ROOT.parent / folder).is_dir()]
+    assert not missing, "folders of tests without a folder of xew, or of lab for those in tests/lab"
 
 
 Files = dict[str, str]
