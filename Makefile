@@ -1,12 +1,11 @@
 # The ground floor. A newcomer needs python3 (3.11 to 3.13) with venv, and make; everything else is set up here.
 #   make demo    the whole system at debug size, from a seed to a report page
-#   make test    every room's tests, with PyTorch, diffusers and transformers beside to compare with
-#   make test-fast   in three to five minutes, for the edit loop: no trainings, simulations or whole commands, no parity with others'
-#                    networks (SLOW in tests/conftest.py lists what is left out); make test-fast TESTS=tests/metrics for one room
+#   make test    the tests of xew; parity with other libraries by stored arrays. make test TESTS=tests/metrics for one package
+#   make test-lab   what make test leaves out: lab/, live parity with PyTorch, diffusers and transformers, long tests
 #   make test-faults   hostile and broken inputs, kills, full disks: all of tests/faults, with the counts of what was tried
 #   make docs    the site of the documentation, site/index.html
 #   make test-fresh   the README's quickstart with the wheel and the newest releases of everything, in a fresh environment of each Python that
-#                     is there; make test does it by one Python at the versions of requirements/test.txt
+#                     is there; make test-lab does it by one Python at the versions of requirements/test.txt
 #   make lint    ruff and mypy
 #   make setup   only the environment (.venv, at the versions of requirements/test.txt)
 
@@ -18,7 +17,7 @@ STAMP := .venv/.installed
 REFERENCE := .venv/.reference
 DOCS := .venv/.docs
 
-.PHONY: setup demo test test-lab test-fast test-faults test-fresh docs lint clean
+.PHONY: setup demo test test-lab test-faults test-fresh docs lint clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
@@ -40,14 +39,11 @@ $(REFERENCE): $(STAMP)
 TESTS ?=
 PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-test: $(REFERENCE)
+test: $(STAMP)
 	$(PYTEST) -m "not lab" $(TESTS)
 
 test-lab: $(REFERENCE)
-	$(PYTEST) -m lab $(TESTS)
-
-test-fast: $(STAMP)
-	$(PYTEST) -m "not slow and not lab" $(TESTS)
+	XEW_GOLDEN=live $(PYTEST) -m "lab or parity" $(TESTS)
 
 test-faults: $(STAMP)
 	XEW_ALL_FAULTS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/faults

@@ -6,7 +6,7 @@ For each Python: a new virtual environment, the wheel of this repository with wh
 releases, or those of --constraints), and then, in an empty folder that is not in the clone, the commands of the README's
 section "Quickstart" as they stand there, but for its `pip install`, which is that of the wheel; and what else the README shows
 of the package: functions of the metrics, a config's --help, the plan of a study. Prints a line for each Python with the
-versions that matter; exit status 1 where one fails. `make test` does it by one Python at the versions of
+versions that matter; exit status 1 where one fails. `make test-lab` does it by one Python at the versions of
 requirements/test.txt, `make test-fresh` by all at the newest.
 """
 

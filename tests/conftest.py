@@ -8,6 +8,7 @@ import os
 import threading
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -23,51 +24,25 @@ CHECK_SHAPES = os.environ.get("XEW_CHECK_SHAPES", "1") != "0"
 """Whether shapes and types of arrays are checked at every call; benchmarks of tests turn it off by XEW_CHECK_SHAPES=0."""
 LOOSE = (("loose_types", "jax_numpy_dtype_promotion", "standard"), ("loose_ranks", "jax_numpy_rank_promotion", "allow"))
 """Mark, option of JAX, and its value under the mark."""
-SLOW = (
-    "tests/analysis/reports/",
-    "tests/analysis/studies/test_machines.py::test_cells_run_as_tasks_on_a_ray_cluster",
-    "tests/analysis/studies/test_study_debug.py",
-    "tests/analysis/test_null.py::test_equal_variants_are_rarely_told_apart",
-    "tests/analysis/test_report.py",
-    "tests/legacy/",
-    "tests/metrics/calibration/",
-    "tests/metrics/estimators/test_sam2.py",
-    "tests/metrics/grading/test_evaluate.py",
-    "tests/metrics/grading/test_outside_videos.py",
-    "tests/metrics/grading/test_resume.py",
-    "tests/metrics/test_calibrate.py",
-    "tests/metrics/test_page.py::test_examples_print_what_they_say",
-    "tests/metrics/test_perceptual.py",
-    "tests/metrics/test_states.py",
-    "tests/metrics/test_transforms.py::test_bfloat16_is_computed_with_in_float32",
-    "tests/metrics/test_transforms.py::test_nan_goes_through",
-    "tests/model/codecs/",
-    "tests/model/devices/test_many_devices.py",
-    "tests/model/network/test_dit.py",
-    "tests/model/network/test_dit_parity.py",
-    "tests/model/network/test_mechanisms.py",
-    "tests/model/test_export.py",
-    "tests/model/test_latents.py::test_latents_from_states_are_those_from_video",
-    "tests/model/test_latents.py::test_only_what_is_needed_is_read",
+LONG_FILES = (
+    "tests/lab/",
+    "tests/test_adding.py",
+    "tests/test_docs.py",
+    "tests/test_wheel.py",
+    "tests/model/training/test_training.py",
     "tests/model/test_pipeline.py",
     "tests/model/test_rollout.py",
-    "tests/model/test_systems.py",
-    "tests/model/text/",
-    "tests/model/training/test_training.py",
-    "tests/sim_warp/assets/",
-    "tests/sim_warp/production/test_produce.py",
-    "tests/sim_warp/robots/test_own_robots.py::test_data_keep_their_robot",
+    "tests/model/devices/",
+    "tests/model/network/test_dit.py",
+    "tests/model/network/test_mechanisms.py",
+    "tests/metrics/grading/",
+    "tests/metrics/estimators/test_sam2.py",
     "tests/sim_warp/tasks/",
-    "tests/sim_warp/test_benchmarks.py",
     "tests/sim_warp/test_generate.py",
-    "tests/sim_warp/test_kill.py::test_kills_change_no_byte",
-    "tests/sim_warp/test_scene.py",
-    "tests/test_adding.py",
-    "tests/test_docs.py::test_a_page_does_what_it_says",
-    "tests/test_wheel.py",
+    "tests/analysis/",
+    "tests/faults/",
 )
-"""Beginnings of the names of tests that make test-fast leaves out: whole commands, trainings, simulations, and parity with
-other people's networks. Taken from --durations; a test is slow, too, when it bears the mark."""
+"""Files and folders that are run first, so no worker begins a long file when the other has finished."""
 XLA_FLAGS = (
     "--xla_cpu_use_fusion_emitters=false",
     "--xla_backend_optimization_level=0",
@@ -115,15 +90,16 @@ def remove_old_files(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the slow tests; files that have some go first, so that no worker is left with a long file at the end."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the tests of lab/, deselect those whose package is not installed, and put long files first."""
     for item in items:
-        if item.nodeid.startswith(SLOW):
-            item.add_marker(pytest.mark.slow)
         if item.nodeid.startswith("tests/lab/"):
             item.add_marker(pytest.mark.lab)
-    slow_files = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow_files)
+    missing = [item for item in items if any(not find_spec(mark.args[0]) for mark in item.iter_markers("needs"))]
+    if missing:
+        config.hook.pytest_deselected(items=missing)
+        items[:] = [item for item in items if item not in missing]
+    items.sort(key=lambda item: not item.nodeid.startswith(LONG_FILES))
 
 
 @pytest.fixture(scope="session", autouse=True)

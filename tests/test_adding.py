@@ -18,7 +18,6 @@ from xew.dataset import find_records
 from xew.metrics import METRICS
 
 pytestmark = [
-    pytest.mark.slow,
     pytest.mark.loose_types("Optax raises its decays to an int32 count of steps"),
 ]
 

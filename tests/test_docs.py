@@ -74,7 +74,6 @@ def run_block(language: str, text: str, folder: Path, patch: pytest.MonkeyPatch)
         assert " 0 (0 %)" not in said, f"a page shows what works:\n{said}"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("page", WALKED)
 def test_a_page_does_what_it_says(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

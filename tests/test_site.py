@@ -172,13 +172,11 @@ def pictures(cells: list[dict[str, Any]]) -> int:
     return sum("image/jpeg" in output.get("data", {}) for cell in cells for output in cell.get("outputs", ()))
 
 
-@pytest.mark.slow
 def test_the_notebook_that_grades_a_video_runs(tmp_path: Path) -> None:
     (episode,) = write_synthetic_data(tmp_path, seeds=(1_000_000,), robots=("piper",), frames=5)
     assert pictures(run("grade_a_video", {"EPISODE": episode, "FRAMES": 3})) == 3
 
 
-@pytest.mark.slow
 def test_the_notebook_of_a_scene_runs() -> None:
     cells = run("a_scene_and_its_robots", {"TASK": small.TASK, "ROBOTS": ("piper",)})
     printed = [text for cell in cells for output in cell.get("outputs", ()) for text in output.get("text", ())]

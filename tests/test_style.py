@@ -214,7 +214,7 @@ def spelling_failures(paths: Iterable[Path]) -> list[str]:
         "--ignore-words-list",
         words,
         "--skip",
-        "*.json,*.tsv,*.urdf,*.png,*.jpg,*.npz,*.svg",
+        "*.json,*.tsv,*.urdf,*.png,*.jpg,*.webp,*.npz,*.svg,*.safetensors,*.parquet",
     ]
     command = [sys.executable, "-m", "codespell_lib", *options, *map(str, paths)]
     done = subprocess.run(command, capture_output=True, text=True)

@@ -17,7 +17,7 @@ import yaml
 import xew
 
 ROOT = Path(__file__).parents[1]
-SOURCES = ("xew", "configs", "docs", "examples", "benchmarks", "requirements", "tests")
+SOURCES = ("xew", "configs", "docs", "examples", "benchmarks", "requirements", "lab", "tests")
 FILES = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "Makefile")
 BUILD = "import setuptools.build_meta as build; build.build_sdist('dist'); build.build_wheel('dist')"
 
@@ -68,6 +68,7 @@ def test_the_version_is_one_and_is_known_without_an_installation() -> None:
     assert not asked, "a source tree that is not installed has no metadata"
 
 
+@pytest.mark.lab
 def test_the_quickstart_of_the_readme_passes_in_an_empty_environment(distributions: Path, tmp_path: Path) -> None:
     """The wheel and what it needs, at the versions that are tested; packages come from the index, or from pip's cache."""
     (wheel,) = distributions.glob("*.whl")

@@ -199,10 +199,11 @@ def test_nothing_half_written_remains(data: Path, tmp_path: Path, monkeypatch: p
 # --- With LeRobot itself.
 
 
+@pytest.mark.needs("lerobot")
 def test_lerobot_reads_it(data: Path, exported: Path) -> None:
-    reason = "LeRobot 0.4 or newer reads v3.0; it is not a dependency (pip install lerobot, Python 3.10 or newer)"
-    module = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason=reason)
-    dataset = module.LeRobotDataset("xew/test", root=exported)
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("xew/test", root=exported)
     start = 0
     for number, (record, states, rgb) in enumerate(episodes(data)):
         for frame in (0, states.frame_count // 2, states.frame_count - 1):

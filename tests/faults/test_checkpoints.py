@@ -71,15 +71,16 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.mark.parametrize("sums", ["with sums", "without sums"])
-@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize(
+    ("damage", "sums"),
+    [(damage, "with sums") for damage in DAMAGES]
+    + [(damage, "without sums") for damage in DAMAGES if damage != "a flipped bit"],  # only sums show it
+)
 def test_damage_is_told_and_the_last_good_step_is_offered(damage: str, sums: str, whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     shutil.copytree(whole, out)
     DAMAGES[damage](out / "checkpoints/2")
     if sums == "without sums":
-        if damage == "a flipped bit":
-            pytest.skip("only sums tell it")
         (out / "sums/2.json").unlink()
     with open_checkpoints(out, keep=5) as checkpoints, pytest.raises(ConfigError) as error:
         restore_state(checkpoints, state(0))

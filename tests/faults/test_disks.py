@@ -16,7 +16,6 @@ CAUSES = {"full": "No space left on device", "read-only": "Read-only file system
 """What is said, by disk."""
 
 
-@pytest.mark.slow
 def test_what_a_disk_refuses_is_one_line_and_nothing_is_lost(record_property: Any) -> None:
     with tempfile.TemporaryDirectory(prefix="xew-disk-") as folder:  # where another user gets, too
         try:

@@ -19,10 +19,8 @@ from tests.faults.kills import Death, Server
 ALL = bool(os.environ.get("XEW_ALL_FAULTS"))
 """Whether every kill is tried, as `make test-faults` does; else one of SHARE."""
 SHARE = 9
-TRIED = tuple(STAGES) if ALL else ("latents", "lerobot", "study")
-"""Commands that are killed: without ALL those that take a second."""
-
-pytestmark = pytest.mark.slow
+TRIED = tuple(STAGES) if ALL else ("latents", *(pytest.param(stage, marks=pytest.mark.lab) for stage in ("lerobot", "study")))
+"""Commands that are killed: without ALL those that take a second, and one in make test."""
 
 
 @dataclass

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.golden import golden
+from tests.metrics.reference_lpips import reference_lpips
 from xew.config import ConfigError
 from xew.metrics import (
     lpips,
@@ -69,12 +71,13 @@ def test_missing_weights_are_told_of_metrics_that_need_them(monkeypatch: pytest.
             check_weights(("psnr", name))
 
 
+@pytest.mark.lab
 def test_torchs_files_hold_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The trunk as torchvision saves it (written here from ours), the heads as the package `lpips` has them."""
-    torch = pytest.importorskip("torch")
+    import torch
+
     heads = _package_file("lpips", "v0.1/alex.pth")
-    if heads is None:
-        pytest.skip("needs the package lpips")
+    assert heads is not None, "the package lpips"
     ours, layers = read_alexnet(), {}
     for i, layer in enumerate((0, 3, 6, 8, 10)):
         layers[f"features.{layer}.weight"] = torch.from_numpy(ours[f"conv{i}_kernel"].transpose(3, 2, 0, 1).copy())
@@ -91,10 +94,12 @@ def test_torchs_files_hold_the_same_weights(tmp_path: Path, monkeypatch: pytest.
         np.testing.assert_array_equal(found[name], ours[name])
 
 
+@pytest.mark.parity
 @pytest.mark.parametrize("size", [(31, 31), (35, 35), (64, 64), (57, 91)])
-def test_it_equals_the_reference_package(size: tuple[int, int], reference_lpips: object) -> None:
-    prediction, target = noise(2, *size), noise(2, *size)
-    np.testing.assert_allclose(lpips(prediction, target), reference_lpips(prediction, target), atol=1e-6)
+def test_it_equals_the_reference_package(size: tuple[int, int]) -> None:
+    videos = np.random.default_rng(sum(size)).integers(0, 256, (2, 2, *size, 3), np.uint8)
+    expected = golden(f"lpips_{size[0]}x{size[1]}", lambda: {"distance": reference_lpips()(*videos)})["distance"]
+    np.testing.assert_allclose(lpips(*videos), expected, atol=1e-6)
 
 
 def test_identity_is_zero_and_noise_is_monotone() -> None:

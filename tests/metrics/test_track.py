@@ -62,8 +62,10 @@ def test_ndtw_equals_the_whole_table(t: int) -> None:
     assert ndtw(prediction, target, valid) == pytest.approx(brute_ndtw(prediction, target, valid), rel=1e-5)
 
 
+@pytest.mark.lab
 def test_ndtw_equals_the_exact_reference_of_fastdtw() -> None:
-    fastdtw = pytest.importorskip("fastdtw")
+    import fastdtw
+
     prediction, target, valid = tracks(40, 3)
     valid[:] = True
     scale = brute_diagonal(target, valid).mean()

@@ -102,9 +102,8 @@ MEANINGLESS = {("mask", traced_grad): "masks are bool", ("mask", traced_bfloat16
 def cells() -> Iterator[object]:
     for mode in MODES:
         for name in ALONE:
-            reason = MEANINGLESS.get((METRICS[name].inputs, mode))
-            marks = [] if reason is None else [pytest.mark.skip(reason=reason)]
-            yield pytest.param(name, mode, marks=marks, id=f"{name}-{mode.__name__.removeprefix('traced_')}")
+            if (METRICS[name].inputs, mode) not in MEANINGLESS:
+                yield pytest.param(name, mode, id=f"{name}-{mode.__name__.removeprefix('traced_')}")
 
 
 @pytest.mark.filterwarnings("ignore:jax.pmap:DeprecationWarning")

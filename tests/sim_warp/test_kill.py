@@ -7,11 +7,14 @@ import random
 import threading
 from pathlib import Path
 
+import pytest
+
 from tests.sim_warp.kill import complete, contents, kill_at_random, make_undisturbed, read_beside
 from xew.dataset import find_records
 from xew.episode import Record, complete_folder, episode_folder, write_episode
 
 
+@pytest.mark.lab
 def test_kills_change_no_byte(tmp_path: Path) -> None:
     expected, out, rng = make_undisturbed(tmp_path / "undisturbed"), tmp_path / "killed", random.Random(0)
     with read_beside(out) as reader:

@@ -10,6 +10,11 @@ from playwright.sync_api import sync_playwright
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (apt-get install chromium)")
 
+FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+)
+"""Options of Chromium: no network of its own, and no sandbox, which root may not have."""
 WIDTHS = {"phone": 390, "desk": 1280}
 SCHEMES = ("light", "dark")
 LOOK = """() => {
@@ -76,7 +81,7 @@ def look_at(page: Path, shots: Path | None = None) -> dict[tuple[str, str], Sigh
     """Open a page by itself (file://, offline) at every width and scheme; `shots` is a folder for screenshots."""
     found = {}
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS])
         for name, width in WIDTHS.items():
             for scheme in SCHEMES:
                 context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme, offline=True)

@@ -19,6 +19,7 @@ from xew.metrics.estimators.adapters import query_frames
 from xew.metrics.estimators.cotracker import open_cotracker
 
 torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.lab
 
 
 class StandIn(torch.nn.Module):
@@ -121,9 +122,11 @@ def test_query_frames_are_the_papers_where_the_paper_has_one() -> None:
     assert query_frames(visible).tolist() == [2, 2, 2, -1]
 
 
+@pytest.mark.needs("cotracker")
 def test_the_real_network(tmp_path: Path) -> None:
     """Random weights of the published architecture, saved as published."""
-    build = pytest.importorskip("cotracker.models.build_cotracker", reason="needs the sources of facebookresearch/co-tracker")
+    from cotracker.models import build_cotracker as build
+
     torch.manual_seed(0)
     torch.save(build.build_cotracker(None, offline=True, v2=False, window_len=60).state_dict(), tmp_path / "scaled_offline.pth")
     video, points, visible = squares()

@@ -81,6 +81,7 @@ def raft_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.lab
 def test_raft_is_torchvisions_network_on_our_frames(raft_file: Path) -> None:
     """One call of the network on images in [-1, 1] gives the same; several pairs do not touch each other."""
     import torch
@@ -98,12 +99,14 @@ def test_raft_is_torchvisions_network_on_our_frames(raft_file: Path) -> None:
     np.testing.assert_allclose(flow[1:2], expected, atol=1e-3)
 
 
+@pytest.mark.lab
 def test_raft_takes_frames_of_any_size(raft_file: Path) -> None:
     pair = np.random.default_rng(1).integers(0, 255, (2, 1, 61, 75, 3), dtype=np.uint8)
     flow = open_raft(raft_file)(*pair)
     assert flow.shape == (1, 61, 75, 2) and np.isfinite(flow).all()
 
 
+@pytest.mark.lab
 def test_raft_tells_its_large_network_by_its_tensors(tmp_path: Path) -> None:
     make_torchvision_importable()
     import torch
@@ -114,6 +117,7 @@ def test_raft_tells_its_large_network_by_its_tensors(tmp_path: Path) -> None:
     assert open_raft(path)(*np.zeros((2, 1, 16, 16, 3), np.uint8)).shape == (1, 16, 16, 2)
 
 
+@pytest.mark.lab
 def test_raft_refuses_another_checkpoint(raft_file: Path, tmp_path: Path) -> None:
     import torch
 

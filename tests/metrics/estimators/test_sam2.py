@@ -24,6 +24,7 @@ PROMPTED = 1
 operators = make_torchvision_importable()
 torch = pytest.importorskip("torch")
 transformers = pytest.importorskip("transformers")
+pytestmark = pytest.mark.lab
 
 
 def tiny_network() -> Any:

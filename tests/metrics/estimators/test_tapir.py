@@ -136,11 +136,12 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.loose_ranks("TAPIR lets arrays of different rank meet")
+@pytest.mark.needs("tapnet")
 def test_the_real_network(tmp_path: Path) -> None:
     """Random weights of the published architecture, saved as published."""
-    model = pytest.importorskip("tapnet.models.tapir_model", reason="needs the sources of google-deepmind/tapnet")
     import haiku
     import jax
+    from tapnet.models import tapir_model as model
 
     def forward(video: Any, queries: Any) -> Any:
         network = model.TAPIR(bilinear_interp_with_depthwise_conv=False, pyramid_level=0)

@@ -1,24 +1,23 @@
 """The autoencoder beside diffusers' AutoencoderKLWan: the same numbers from the same weights, by both kinds of file."""
 
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
 
+from tests.golden import golden
 from tests.torch_ops import make_torchvision_importable
 from xew.config import ConfigError
 from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae
 from xew.model.codecs.vae_layouts import diffusers_layout, load_vae, official_layout
 from xew.model.weights.layout import checkpoint_shapes
 from xew.model.weights.writing import save_weights
-
-torch = pytest.importorskip("torch")
-operators = make_torchvision_importable()
-diffusers = pytest.importorskip("diffusers")
 
 REFERENCE = Path(__file__).parents[1] / "reference"
 SIZE = VaeSize(4, encoder_dim=16, decoder_dim=16, multipliers=(1, 2, 4, 4), halve_time=(False, True, True), blocks=1)
@@ -27,13 +26,48 @@ TOLERANCE = 1e-5
 
 @pytest.fixture(scope="module", autouse=True)
 def exact() -> Iterator[None]:
-    with jax.default_matmul_precision("highest"), torch.no_grad():
+    with jax.default_matmul_precision("highest"):
         yield
 
 
+def draw(size: VaeSize) -> VideoVae:
+    """Random weights that leave no layer without effect."""
+    vae = abstract_vae(size)
+    rng = np.random.default_rng(0)
+    for path, leaf in nnx.to_flat_state(nnx.state(vae, nnx.Param)):
+        values = rng.standard_normal(leaf.shape, np.float32)
+        if path[-1] == "gamma":
+            values = rng.uniform(0.5, 1.5, leaf.shape).astype(np.float32)
+        elif path[-1] == "bias":
+            values *= 0.1
+        else:
+            values /= np.prod(leaf.shape[:-1]) ** 0.5
+        leaf.set_value(jnp.asarray(values))
+    return vae
+
+
 @pytest.fixture(scope="module")
-def theirs() -> Any:
-    """AutoencoderKLWan at a tiny size with weights that leave no layer without effect."""
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """diffusion_pytorch_model.safetensors under diffusers' names."""
+    folder = tmp_path_factory.mktemp("vae")
+    save_weights(draw(SIZE), folder / "diffusion_pytorch_model.safetensors", diffusers_layout(abstract_vae(SIZE)))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def ours(folder: Path) -> VideoVae:
+    vae = abstract_vae(SIZE)
+    load_vae(vae, folder)
+    return vae
+
+
+@functools.cache
+def load_theirs(folder: Path) -> Any:
+    """AutoencoderKLWan with the weights of the folder, strictly loaded."""
+    operators = make_torchvision_importable()
+    import diffusers
+    from safetensors.torch import load_file
+
     model = diffusers.AutoencoderKLWan(
         base_dim=SIZE.encoder_dim,
         decoder_base_dim=SIZE.decoder_dim,
@@ -50,26 +84,9 @@ def theirs() -> Any:
         latents_mean=[0.0] * SIZE.channels,
         latents_std=[1.0] * SIZE.channels,
     )
-    generator = torch.Generator().manual_seed(0)
-    for name, parameter in model.named_parameters():
-        noise = torch.randn(parameter.shape, generator=generator)
-        if name.endswith("gamma"):
-            parameter.copy_(torch.rand(parameter.shape, generator=generator) + 0.5)
-        elif name.endswith("bias"):
-            parameter.copy_(0.1 * noise)
-        else:
-            parameter.copy_(noise / parameter[0].numel() ** 0.5)
-    return model.eval()
-
-
-@pytest.fixture(scope="module")
-def ours(theirs: Any, tmp_path_factory: pytest.TempPathFactory) -> VideoVae:
-    """Our module with their weights, by the file that they write."""
-    folder = tmp_path_factory.mktemp("theirs")
-    theirs.save_pretrained(folder)
-    vae = abstract_vae(SIZE)
-    load_vae(vae, folder)
-    return vae
+    model.load_state_dict(load_file(folder / "diffusion_pytorch_model.safetensors"), strict=True)
+    model.registered_operators = operators
+    return model.eval().requires_grad_(False)
 
 
 def noise(*shape: int) -> np.ndarray:
@@ -82,6 +99,8 @@ jitted_decode = jax.jit(lambda vae, latents: vae.decode(latents))
 
 def to_torch(video: np.ndarray) -> Any:
     """[b t h w c] -> [b c t h w]."""
+    import torch
+
     return torch.from_numpy(np.moveaxis(video, -1, 1).copy())
 
 
@@ -92,31 +111,43 @@ def from_torch(video: Any) -> np.ndarray:
 CLIPS = [(1, 32, 48), (5, 48, 16), (9, 32, 32), (13, 16, 48)]
 
 
+@pytest.mark.parity
 @pytest.mark.parametrize(("frames", "height", "width"), CLIPS)
-def test_encoder(ours: VideoVae, theirs: Any, frames: int, height: int, width: int) -> None:
+def test_encoder(ours: VideoVae, folder: Path, frames: int, height: int, width: int) -> None:
     video = noise(2, frames, height, width, 3)
-    distribution = theirs.encode(to_torch(video)).latent_dist
+
+    def encode() -> dict[str, np.ndarray]:
+        latents = load_theirs(folder).encode(to_torch(video)).latent_dist
+        return {"mean": from_torch(latents.mode()), "log_variance": from_torch(latents.logvar)}
+
+    expected = golden(f"vae_encoder_{frames}", encode)
     mean, log_variance = jitted_encode(ours, video)
     assert np.abs(mean).max() > 0.5
-    np.testing.assert_allclose(mean, from_torch(distribution.mode()), atol=TOLERANCE)
-    np.testing.assert_allclose(log_variance, from_torch(distribution.logvar), atol=TOLERANCE)
+    np.testing.assert_allclose(mean, expected["mean"], atol=TOLERANCE)
+    np.testing.assert_allclose(log_variance, expected["log_variance"], atol=TOLERANCE)
 
 
+@pytest.mark.parity
 @pytest.mark.parametrize(("frames", "height", "width"), CLIPS)
-def test_decoder(ours: VideoVae, theirs: Any, frames: int, height: int, width: int) -> None:
+def test_decoder(ours: VideoVae, folder: Path, frames: int, height: int, width: int) -> None:
     latents = noise(2, (frames - 1) // 4 + 1, height // 16, width // 16, SIZE.channels)
     decoded = jitted_decode(ours, latents)
     assert decoded.shape == (2, frames, height, width, 3)
     assert np.std(decoded) > 0.1
-    np.testing.assert_allclose(decoded, from_torch(theirs.decode(to_torch(latents)).sample), atol=TOLERANCE)
+
+    def decode() -> dict[str, np.ndarray]:
+        return {"video": from_torch(load_theirs(folder).decode(to_torch(latents)).sample)}
+
+    np.testing.assert_allclose(decoded, golden(f"vae_decoder_{frames}", decode)["video"], atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("suffix", ["vae.safetensors", "Wan2.2_VAE.pth"])
+@pytest.mark.parametrize("suffix", ["vae.safetensors", pytest.param("Wan2.2_VAE.pth", marks=pytest.mark.lab)])
 def test_official_file(ours: VideoVae, tmp_path: Path, suffix: str) -> None:
     """Written under Wan2.2's names, as safetensors and as the .pth that is published, and read back without a change."""
     path = tmp_path / suffix
     save_weights(ours, path.with_suffix(".safetensors"), official_layout(ours))
     if path.suffix == ".pth":
+        import torch
         from safetensors.torch import load_file
 
         torch.save(load_file(path.with_suffix(".safetensors")), path)
@@ -126,7 +157,12 @@ def test_official_file(ours: VideoVae, tmp_path: Path, suffix: str) -> None:
         np.testing.assert_array_equal(mine, read)
 
 
-def test_diffusers_reads_what_is_written(ours: VideoVae, theirs: Any, tmp_path: Path) -> None:
+@pytest.mark.lab
+def test_diffusers_reads_what_is_written(ours: VideoVae, folder: Path, tmp_path: Path) -> None:
+    theirs = load_theirs(folder)
+    import diffusers
+    import torch
+
     theirs.save_config(tmp_path)
     save_weights(ours, tmp_path / "diffusion_pytorch_model.safetensors", diffusers_layout(ours))
     read = diffusers.AutoencoderKLWan.from_pretrained(tmp_path)
@@ -149,8 +185,14 @@ def test_a_wrong_file_says_what_differs(ours: VideoVae, tmp_path: Path) -> None:
     larger = VaeSize(4, encoder_dim=16, decoder_dim=32, multipliers=(1, 2, 4, 4), halve_time=(False, True, True), blocks=1)
     with pytest.raises(ConfigError, match=r"decoder\.conv_in\.bias is \[64\], .*decoder\.conv_in\.bias needs \[128\]"):
         load_vae(abstract_vae(larger), tmp_path / "vae.safetensors")
+    with pytest.raises(ConfigError, match="no weights at"):
+        load_vae(abstract_vae(SIZE), tmp_path / "nowhere.pth")
+
+
+@pytest.mark.lab
+def test_another_torch_file_is_refused(tmp_path: Path) -> None:
+    import torch
+
     torch.save({"weight": torch.zeros(3)}, tmp_path / "other.pth")
     with pytest.raises(ConfigError, match=r"no autoencoder of Wan2\.2: it holds weight"):
         load_vae(abstract_vae(SIZE), tmp_path / "other.pth")
-    with pytest.raises(ConfigError, match="no weights at"):
-        load_vae(abstract_vae(SIZE), tmp_path / "nowhere.pth")

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.golden import golden
 from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES, NoiseSchedule
 
 SHAPE = (2, 3, 2, 2, 4)
@@ -51,9 +52,10 @@ def sample(
     return np.asarray(jax.jit(lambda: SAMPLERS[name](velocity, noise[:, :1] * 0.5, noise, schedule))())
 
 
-def run_scheduler(scheduler: object, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def run_scheduler(scheduler: object, steps: int) -> dict[str, np.ndarray]:
     """Sigmas, timesteps and the sample of a diffusers scheduler on the same toy, with the same frame put back."""
-    torch = pytest.importorskip("torch")
+    import torch
+
     scheduler.set_timesteps(steps)
     noise = np.asarray(jax.random.normal(jax.random.key(0), SHAPE, jnp.float32))
     reference = noise[:, :1] * 0.5
@@ -63,30 +65,38 @@ def run_scheduler(scheduler: object, steps: int) -> tuple[np.ndarray, np.ndarray
         velocity = np.array(toy_velocity(jnp.asarray(latents), levels))
         latents = scheduler.step(torch.from_numpy(velocity), timestep, torch.from_numpy(latents)).prev_sample.numpy()
         latents = np.concatenate([reference, latents[:, 1:]], axis=1)
-    return scheduler.sigmas.numpy(), scheduler.timesteps.numpy() / 1000, latents
+    return {"sigmas": scheduler.sigmas.numpy(), "levels": scheduler.timesteps.numpy() / 1000, "latents": latents}
 
 
+@pytest.mark.parity
 @pytest.mark.parametrize(("steps", "shift"), [(50, 5.0), (7, 3.0), (2, 5.0), (1, 5.0)])
 def test_unipc_is_that_of_diffusers(steps: int, shift: float) -> None:
-    diffusers = pytest.importorskip("diffusers")
-    scheduler = diffusers.UniPCMultistepScheduler(
-        prediction_type="flow_prediction", use_flow_sigmas=True, flow_shift=shift, num_train_timesteps=1000
-    )
-    sigmas, levels, expected = run_scheduler(scheduler, steps)
+    def run_unipc() -> dict[str, np.ndarray]:
+        from diffusers import UniPCMultistepScheduler
+
+        kind = {"prediction_type": "flow_prediction", "use_flow_sigmas": True, "num_train_timesteps": 1000}
+        return run_scheduler(UniPCMultistepScheduler(flow_shift=shift, **kind), steps)
+
+    expected = golden(f"unipc_{steps}", run_unipc)
     schedule = SCHEDULES["diffusers_unipc"](steps, shift)
-    np.testing.assert_allclose(schedule.sigmas, sigmas, atol=1e-7)
-    np.testing.assert_allclose(schedule.input_levels, levels, atol=1e-7)
-    np.testing.assert_allclose(sample("unipc", schedule), expected, atol=5e-5)
+    np.testing.assert_allclose(schedule.sigmas, expected["sigmas"], atol=1e-7)
+    np.testing.assert_allclose(schedule.input_levels, expected["levels"], atol=1e-7)
+    np.testing.assert_allclose(sample("unipc", schedule), expected["latents"], atol=5e-5)
 
 
+@pytest.mark.parity
 @pytest.mark.parametrize(("steps", "shift"), [(50, 5.0), (7, 3.0), (1, 5.0)])
 def test_euler_is_that_of_diffusers(steps: int, shift: float) -> None:
-    diffusers = pytest.importorskip("diffusers")
-    sigmas, levels, expected = run_scheduler(diffusers.FlowMatchEulerDiscreteScheduler(shift=shift), steps)
+    def run_euler() -> dict[str, np.ndarray]:
+        from diffusers import FlowMatchEulerDiscreteScheduler
+
+        return run_scheduler(FlowMatchEulerDiscreteScheduler(shift=shift), steps)
+
+    expected = golden(f"euler_{steps}", run_euler)
     schedule = SCHEDULES["diffusers_euler"](steps, shift)
-    np.testing.assert_allclose(schedule.sigmas, sigmas, atol=1e-6)
-    np.testing.assert_allclose(schedule.input_levels, levels, atol=1e-6)
-    np.testing.assert_allclose(sample("euler", schedule), expected, atol=2e-5)
+    np.testing.assert_allclose(schedule.sigmas, expected["sigmas"], atol=1e-6)
+    np.testing.assert_allclose(schedule.input_levels, expected["levels"], atol=1e-6)
+    np.testing.assert_allclose(sample("euler", schedule), expected["latents"], atol=2e-5)
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)

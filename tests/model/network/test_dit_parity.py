@@ -1,27 +1,20 @@
-"""The network against diffusers' WanTransformer3DModel on the CPU, random weights passed through our own loading."""
+"""The network against diffusers' WanTransformer3DModel on the CPU, random weights passed through our own saving and loading."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import nnx
 
+from tests.golden import golden
+from tests.networks import draw_network, world_model
 from tests.torch_ops import make_torchvision_importable
-
-torch = pytest.importorskip("torch")
-operators = make_torchvision_importable()
-diffusers = pytest.importorskip("diffusers")
-
-from safetensors.torch import load_file, save_file  # noqa: E402
-
-from tests.networks import world_model  # noqa: E402
-from xew.model.network import dit  # noqa: E402
-from xew.model.network.dit import ModelSize, WorldModel  # noqa: E402
-from xew.model.network.dit_layouts import diffusers_config, load_dit, save_dit  # noqa: E402
-from xew.model.network.spec import Visibility  # noqa: E402
+from xew.model.network import dit
+from xew.model.network.dit import ModelSize, WorldModel
+from xew.model.network.dit_layouts import load_dit, save_dit
 
 CHANNELS, TEXT, WORDS = 8, 24, 5
 TOLERANCE = 1e-4
@@ -43,28 +36,40 @@ def size_of(head_dim: int) -> ModelSize:
     return ModelSize(dim=2 * head_dim, depth=2, heads=2, ffn_dim=48, text_dim=TEXT, text_tokens=WORDS, epsilon=1e-2)
 
 
-def reference(size: ModelSize, seed: int = 0) -> torch.nn.Module:
-    """Diffusers' network with every parameter N(0, 0.2): its own start leaves modulations too small to matter."""
-    arguments = diffusers_config(nnx.eval_shape(lambda: world_model(size, CHANNELS)))
-    model = diffusers.WanTransformer3DModel(**{key: value for key, value in arguments.items() if key[0] != "_"}).eval()
-    torch.manual_seed(seed)
-    for parameter in model.parameters():
-        torch.nn.init.normal_(parameter, std=0.2)
-    return model.requires_grad_(False)
+def save_random(size: ModelSize, folder: Path) -> Path:
+    """A folder in diffusers' format with all parameters N(0, 0.2); the network's own start leaves modulations near zero."""
+    save_dit(draw_network(lambda: world_model(size, CHANNELS)), folder)
+    return folder
 
 
-class Float64Features(torch.nn.Module):
-    """Time features as in Wan's own code."""
+def load_theirs(folder: Path) -> Any:
+    """Diffusers' network, built from the config.json in a folder and strictly loaded."""
+    operators = make_torchvision_importable()
+    import diffusers
+    from safetensors.torch import load_file
 
-    def forward(self, timestep: torch.Tensor) -> torch.Tensor:
-        angles = torch.outer(timestep.to(torch.float64), 10_000 ** (-torch.arange(128, dtype=torch.float64) / 128))
-        return torch.cat([angles.cos(), angles.sin()], dim=1).to(torch.float32)
+    model = diffusers.WanTransformer3DModel.from_config(diffusers.WanTransformer3DModel.load_config(folder))
+    (file,) = folder.glob("*.safetensors")
+    model.load_state_dict(load_file(file), strict=True)
+    model.registered_operators = operators
+    return model.eval().requires_grad_(False)
 
 
-def ours(theirs: torch.nn.Module, size: ModelSize, path: Path, *streams: str, **options: object) -> WorldModel:
-    save_file({key: value.contiguous() for key, value in theirs.state_dict().items()}, path)
+def use_float64_features(model: Any) -> None:
+    """Give diffusers' network the time features of Wan's own code."""
+    import torch
+
+    class Float64Features(torch.nn.Module):
+        def forward(self, timestep: torch.Tensor) -> torch.Tensor:
+            angles = torch.outer(timestep.to(torch.float64), 10_000 ** (-torch.arange(128, dtype=torch.float64) / 128))
+            return torch.cat([angles.cos(), angles.sin()], dim=1).to(torch.float32)
+
+    model.condition_embedder.timesteps_proj = Float64Features()
+
+
+def load_ours(folder: Path, size: ModelSize, *streams: str, **options: Any) -> WorldModel:
     model = world_model(size, CHANNELS, streams, seed=1, **options)
-    load_dit(model, path)
+    load_dit(model, folder)
     return model
 
 
@@ -72,7 +77,9 @@ def normal(seed: int, *shape: int) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal(shape, np.float32)
 
 
-def channels_first(latents: np.ndarray) -> torch.Tensor:
+def channels_first(latents: np.ndarray) -> Any:
+    import torch
+
     return torch.tensor(np.ascontiguousarray(latents.transpose(0, 4, 1, 2, 3)))
 
 
@@ -83,48 +90,55 @@ def padded_text() -> np.ndarray:
     return text
 
 
+@pytest.mark.parity
 @pytest.mark.parametrize(("head_dim", "grid"), [(12, (3, 4, 6)), (16, (1, 2, 2)), (16, (5, 6, 2)), (24, (2, 10, 6))])
 @pytest.mark.parametrize("exact", [False, True])
 def test_whole_network(exact: bool, head_dim: int, grid: tuple[int, int, int], tmp_path: Path) -> None:
-    """Frame 0 is told t = 0 and the others their sample's (expand_timesteps of diffusers' pipelines)."""
+    """Frame 0 is given t = 0 and the others their sample's (expand_timesteps of diffusers' pipelines)."""
     size, latents, text = size_of(head_dim), normal(2, 2, *grid, CHANNELS), padded_text()
-    theirs = reference(size)
-    model = ours(theirs, size, tmp_path / "weights.safetensors")
+    folder = save_random(size, tmp_path / "folder")
     levels = LEVELS if exact else LOW_LEVELS
-    if exact:
-        theirs.condition_embedder.timesteps_proj = Float64Features()
-    moving = np.repeat(np.arange(grid[0]) > 0, grid[1] * grid[2] // 4)
-    timesteps = np.where(moving[None], np.float32(1000) * levels[:, None], np.float32(0))
-    with torch.no_grad():
-        expected = theirs(
-            hidden_states=channels_first(latents),
-            timestep=torch.tensor(timesteps),
-            encoder_hidden_states=torch.tensor(text),
-            return_dict=False,
-        )[0]
-    expected = expected.numpy().transpose(0, 2, 3, 4, 1)
+
+    def run_theirs() -> dict[str, np.ndarray]:
+        theirs = load_theirs(folder)
+        import torch
+
+        if exact:
+            use_float64_features(theirs)
+        moving = np.repeat(np.arange(grid[0]) > 0, grid[1] * grid[2] // 4)
+        timesteps = np.where(moving[None], np.float32(1000) * levels[:, None], np.float32(0))
+        inputs = {"timestep": torch.tensor(timesteps), "encoder_hidden_states": torch.tensor(text)}
+        velocity = theirs(hidden_states=channels_first(latents), **inputs, return_dict=False)[0]
+        return {"velocity": velocity.numpy().transpose(0, 2, 3, 4, 1)}
+
+    expected = golden(f"dit_{head_dim}_{'x'.join(map(str, grid))}{'_exact' * exact}", run_theirs)["velocity"]
     assert np.abs(expected).max() > 2
+    model = load_ours(folder, size)
     found = jax.jit(lambda *inputs: model(inputs[0], {}, *inputs[1:]))(latents, levels, text)
     np.testing.assert_allclose(found, expected, atol=EXACT_TOLERANCE if exact else TOLERANCE)
 
 
+@pytest.mark.parity
 @pytest.mark.parametrize("streams", [("action",), ("action", "embodiment")])
 @pytest.mark.parametrize("visibility", ["joint", "one_way"])
 def test_streams_are_plain_blocks_on_concatenated_tokens(
-    streams: tuple[str, ...], visibility: Visibility, tmp_path: Path
+    streams: tuple[str, ...], visibility: dit.Visibility, tmp_path: Path
 ) -> None:
     """Two and three streams, by diffusers' own blocks; seen one way, with a mask that forbids looking back at RGB."""
     size, grid, text = size_of(16), (3, 4, 6), padded_text()
-    theirs = reference(size)
-    theirs.condition_embedder.timesteps_proj = Float64Features()
-    model = ours(theirs, size, tmp_path / "weights.safetensors", *streams, visibility=visibility)
+    folder = save_random(size, tmp_path / "folder")
+    model = load_ours(folder, size, *streams, visibility=visibility)
     latents = jnp.asarray(normal(2, 2, *grid, CHANNELS))
     conditions = {name: jnp.asarray(normal(4 + n, 2, *grid, CHANNELS)) for n, name in enumerate(streams)}
     tokens, levels, (cos, sin) = model.embed_streams(latents, conditions)
     rgb = tokens.shape[1] // (1 + len(streams))
 
-    # Diffusers, from the same tokens: its own positions for one stream, laid end to end.
-    with torch.no_grad():
+    def run_their_blocks() -> dict[str, np.ndarray]:
+        """From the same tokens, with diffusers' own positions for one stream, laid end to end."""
+        theirs = load_theirs(folder)
+        import torch
+
+        use_float64_features(theirs)
         rotary = theirs.rope(channels_first(np.asarray(latents)))
         rotary = tuple(torch.cat([table] * (1 + len(streams)), dim=1) for table in rotary)
         timesteps = torch.tensor(np.where(levels[None] == 0, np.float32(0), np.float32(1000) * LEVELS[:, None]))
@@ -138,6 +152,7 @@ def test_streams_are_plain_blocks_on_concatenated_tokens(
                 mask[rgb:, :rgb] = False
                 block.attn1.forward = masked(block.attn1, torch.tensor(mask))
             hidden = block(hidden, context, projected, rotary)
+        return {"hidden": hidden.numpy()}
 
     found = model.apply_blocks(
         tokens,
@@ -147,33 +162,40 @@ def test_streams_are_plain_blocks_on_concatenated_tokens(
         model.context(jnp.asarray(text)),
         rgb,
     )
-    assert np.abs(hidden.numpy()).max() > 2
-    np.testing.assert_allclose(found, hidden.numpy(), atol=EXACT_TOLERANCE)
+    expected = golden(f"dit_blocks_{len(streams)}_{visibility}", run_their_blocks)["hidden"]
+    assert np.abs(expected).max() > 2
+    np.testing.assert_allclose(found, expected, atol=EXACT_TOLERANCE)
 
 
-def masked(attention: torch.nn.Module, mask: torch.Tensor) -> object:
+def masked(attention: Any, mask: Any) -> Callable[..., Any]:
     """The forward of a diffusers attention with a mask that it is not given by its block."""
     plain = type(attention).forward
 
-    def forward(hidden: torch.Tensor, context: object, _: object, rotary: object) -> torch.Tensor:
+    def forward(hidden: Any, context: Any, _: Any, rotary: Any) -> Any:
         return plain(attention, hidden, context, mask[None, None], rotary)
 
     return forward
 
 
+@pytest.mark.lab
 def test_saved_folder_is_that_of_diffusers(tmp_path: Path) -> None:
-    """Written by us, built from the config.json beside it and strictly loaded: the same network again."""
+    """Written by diffusers, loaded and saved by us: the same tensors."""
+    from safetensors.torch import load_file, save_file
+
     size = size_of(16)
-    theirs = reference(size)
-    save_dit(ours(theirs, size, tmp_path / "weights.safetensors"), tmp_path / "folder")
-    again = diffusers.WanTransformer3DModel.from_config(diffusers.WanTransformer3DModel.load_config(tmp_path / "folder"))
+    theirs = load_theirs(save_random(size, tmp_path / "drawn")).state_dict()
+    save_file({key: value.contiguous() for key, value in theirs.items()}, tmp_path / "weights.safetensors")
+    save_dit(load_ours(tmp_path / "weights.safetensors", size), tmp_path / "folder")
     (file,) = (tmp_path / "folder").glob("*.safetensors")
-    again.load_state_dict(load_file(file), strict=True)
-    assert all(torch.equal(again.state_dict()[key], value) for key, value in theirs.state_dict().items())
+    again = load_file(file)
+    assert again.keys() == theirs.keys() and all(again[key].equal(value) for key, value in theirs.items())
 
 
+@pytest.mark.lab
 def test_rounded_time_is_that_of_float64() -> None:
     """All 50 levels of FlowWAM's sampler and all levels of training: bfloat16 of the float64 sinusoid of bfloat16 of t."""
+    import torch
+
     shifted = [5 * u / (1 + 4 * u) for steps in (50, 1000) for u in np.linspace(1, 0, steps + 1)[:-1]]
     timesteps = torch.tensor(1000 * np.array(shifted, np.float32)).to(torch.bfloat16)
     frequencies = torch.pow(10000, -torch.arange(128, dtype=torch.float64).div(128))

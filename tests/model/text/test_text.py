@@ -9,6 +9,7 @@ import pytest
 import tokenizers
 from flax import nnx
 
+from tests.golden import golden
 from tests.networks import TINY_CODEC
 from xew.config import ConfigError
 from xew.model.experiment import Experiment, load_experiment
@@ -64,14 +65,20 @@ def test_cleaning_is_wans() -> None:
     assert clean("the robotâ€™s arm") == "the robot's arm"
 
 
+@pytest.mark.parity
 @pytest.mark.parametrize("tokens", [512, 6])
 def test_tokens_are_those_of_transformers(files: Path, tokens: int) -> None:
-    transformers = pytest.importorskip("transformers")
-    theirs = transformers.T5TokenizerFast(tokenizer_file=str(files / "tokenizer.json"), extra_ids=0)
-    tokenizer = load_tokenizer(files)
-    for text in TEXTS:
-        expected = theirs(clean(text), truncation=True, max_length=tokens, add_special_tokens=True).input_ids
-        assert token_ids(tokenizer, text, tokens).tolist() == expected
+
+    def tokenize() -> dict[str, np.ndarray]:
+        import transformers
+
+        theirs = transformers.T5TokenizerFast(tokenizer_file=str(files / "tokenizer.json"), extra_ids=0)
+        options = {"truncation": True, "max_length": tokens, "add_special_tokens": True}
+        return {f"text{n}": np.array(theirs(clean(text), **options).input_ids) for n, text in enumerate(TEXTS)}
+
+    expected, tokenizer = golden(f"tokens_{tokens}", tokenize), load_tokenizer(files)
+    for n, text in enumerate(TEXTS):
+        assert token_ids(tokenizer, text, tokens).tolist() == expected[f"text{n}"].tolist()
 
 
 def test_embeddings_are_the_encoders_and_zero_past_the_end(files: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 from flax import nnx
 from safetensors.numpy import save_file
 
+from tests.golden import golden
 from tests.torch_ops import make_torchvision_importable
 from xew.config import ConfigError
 from xew.model.network.dit import parameter_count
@@ -48,7 +49,8 @@ def test_names_and_shapes_at_full_size() -> None:
 def transformers_output(tensors: Path, ids: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """What transformers' encoder makes of a checkpoint in its names."""
     make_torchvision_importable()
-    torch, transformers = pytest.importorskip("torch"), pytest.importorskip("transformers")
+    import torch
+    import transformers
     from safetensors.torch import load_file
 
     config = transformers.UMT5Config(
@@ -64,6 +66,7 @@ def transformers_output(tensors: Path, ids: np.ndarray, lengths: np.ndarray) -> 
         return model(torch.from_numpy(ids.astype(np.int64)), attention_mask=mask).last_hidden_state.numpy()
 
 
+@pytest.mark.parity
 @pytest.mark.parametrize("length", [1, 12, 300], ids=["one", "short", "long"])
 def test_parity_with_transformers(length: int, tmp_path: Path) -> None:
     encoder = random_encoder()
@@ -71,7 +74,8 @@ def test_parity_with_transformers(length: int, tmp_path: Path) -> None:
     rng = np.random.default_rng(length)
     ids = rng.integers(0, TINY.vocabulary, (3, length)).astype(np.int32)
     lengths = np.array([length, max(1, length // 2), max(1, length - 5)])
-    expected = transformers_output(tmp_path / "hf.safetensors", ids, lengths)
+    weights = tmp_path / "hf.safetensors"
+    expected = golden(f"umt5_{length}", lambda: {"hidden": transformers_output(weights, ids, lengths)})["hidden"]
     with jax.default_matmul_precision("highest"):
         found = np.asarray(load_umt5(tmp_path / "hf.safetensors", TINY, jnp.float32)(jnp.asarray(ids), jnp.asarray(lengths)))
     assert np.abs(expected).max() > 1
@@ -80,16 +84,27 @@ def test_parity_with_transformers(length: int, tmp_path: Path) -> None:
         assert not found[row, n:].any()
 
 
-def test_buckets_of_all_distances_are_those_of_transformers() -> None:
+def transformers_buckets() -> dict[str, np.ndarray]:
+    """The bucket of each pair of 512 positions [512 512] in transformers."""
     make_torchvision_importable()
-    torch, umt5 = pytest.importorskip("torch"), pytest.importorskip("transformers.models.umt5.modeling_umt5")
-    config = pytest.importorskip("transformers").UMT5Config(d_model=8, d_kv=4, num_heads=2)
-    attention = umt5.UMT5Attention(config, has_relative_attention_bias=True)
+    import torch
+    from transformers import UMT5Config
+    from transformers.models.umt5.modeling_umt5 import UMT5Attention
+
+    attention = UMT5Attention(UMT5Config(d_model=8, d_kv=4, num_heads=2), has_relative_attention_bias=True)
     relative = torch.arange(512)[None] - torch.arange(512)[:, None]
-    np.testing.assert_array_equal(relative_buckets(512, 32, 128), attention._relative_position_bucket(relative).numpy())
+    return {"buckets": attention._relative_position_bucket(relative).numpy().astype(np.int16)}
 
 
-@pytest.mark.parametrize("name", ["official.safetensors", "hf.safetensors", "hf_twice", "hf_other", "official.pth"])
+@pytest.mark.parity
+def test_buckets_of_all_distances_are_those_of_transformers() -> None:
+    np.testing.assert_array_equal(relative_buckets(512, 32, 128), golden("umt5_buckets", transformers_buckets)["buckets"])
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["official.safetensors", "hf.safetensors", "hf_twice", "hf_other", pytest.param("official.pth", marks=pytest.mark.lab)],
+)
 def test_every_published_format_loads(name: str, tmp_path: Path) -> None:
     encoder = random_encoder(1)
     path = tmp_path / name
@@ -99,7 +114,7 @@ def test_every_published_format_loads(name: str, tmp_path: Path) -> None:
         path = path.with_suffix(".safetensors")
         save_weights(encoder, path, hf_layout(TINY))
     if path.suffix == ".pth":
-        torch = pytest.importorskip("torch")
+        import torch
         from safetensors.torch import load_file
 
         torch.save(load_file(tmp_path / "official.safetensors"), path)

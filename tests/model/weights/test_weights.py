@@ -3,6 +3,7 @@
 import ast
 import json
 import pickle
+import zipfile
 from pathlib import Path
 
 import jax
@@ -13,6 +14,7 @@ import pytest
 from flax import nnx
 from safetensors.numpy import load_file, save_file
 
+from tests.golden import golden, golden_file
 from tests.networks import world_model
 from xew.config import ConfigError
 from xew.model.network.dit import MODELS, WorldModel
@@ -117,11 +119,18 @@ def test_every_layout_goes_in_and_out(arrays: Arrays, tmp_path: Path) -> None:
         np.testing.assert_array_equal(written[key], array if key != "embed" else array.astype(ml_dtypes.bfloat16))
 
 
+@pytest.mark.parity
 def test_patches_are_the_convolution(arrays: Arrays) -> None:
     """A matrix over flattened patches does what the strided convolution does."""
-    torch = pytest.importorskip("torch")
     video = np.random.default_rng(1).standard_normal((1, 2, 3, 4, 6), np.float32)
-    expected = torch.nn.functional.conv3d(torch.tensor(video), torch.tensor(arrays["patch"]), stride=(1, 2, 2)).numpy()
+
+    def convolve() -> dict[str, np.ndarray]:
+        import torch
+
+        found = torch.nn.functional.conv3d(torch.tensor(video), torch.tensor(arrays["patch"]), stride=(1, 2, 2))
+        return {"video": found.numpy()}
+
+    expected = golden("patch_convolution", convolve)["video"]
     patches = video.reshape(1, 2, 3, 2, 2, 3, 2).transpose(0, 2, 3, 5, 1, 4, 6).reshape(1, 3, 2, 3, 8)
     np.testing.assert_allclose(patches @ arrays["patch"].reshape(3, 8).T, expected.transpose(0, 2, 3, 4, 1), atol=1e-5)
 
@@ -221,32 +230,42 @@ def test_a_cut_file_is_told(arrays: Arrays, tmp_path: Path) -> None:
     assert "is no whole safetensors file" in refusal(path)
 
 
-@pytest.mark.parametrize("wrap", [lambda state: state, lambda state: {"state_dict": state, "epoch": 3}])
+@pytest.mark.parity
+@pytest.mark.parametrize("wrapped", [False, True])
 @pytest.mark.parametrize("zipped", [True, False])
-def test_torch_files(wrap: object, zipped: bool, arrays: Arrays, tmp_path: Path) -> None:
-    torch = pytest.importorskip("torch")
-    state = {f"model.{key}": torch.tensor(array).to(torch.bfloat16) for key, array in arrays.items()}
-    torch.save(wrap(state), tmp_path / "in.pth", _use_new_zipfile_serialization=zipped)
-    tensors = read_tensors(tmp_path / "in.pth")
+def test_torch_files(wrapped: bool, zipped: bool, arrays: Arrays, tmp_path: Path) -> None:
+    def save(path: Path) -> None:
+        import torch
+
+        state = {f"model.{key}": torch.tensor(array).to(torch.bfloat16) for key, array in arrays.items()}
+        torch.save({"state_dict": state, "epoch": 3} if wrapped else state, path, _use_new_zipfile_serialization=zipped)
+
+    tensors = read_tensors(golden_file(f"torch{'_wrapped' * wrapped}{'_zip' * zipped}.pth", save, tmp_path))
     for key, array in arrays.items():
         np.testing.assert_array_equal(tensors[key], array.astype(ml_dtypes.bfloat16))
 
 
+def save_like_torch(content: object, path: Path) -> None:
+    """What torch.save writes of objects without tensors: a pickle in a zip archive."""
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("archive/data.pkl", pickle.dumps(content, protocol=2))
+        archive.writestr("archive/version", "3\n")
+
+
 def test_nothing_is_unpickled(tmp_path: Path) -> None:
     """A pickle that would write a file when opened does not get to."""
-    torch = pytest.importorskip("torch")
     touched = tmp_path / "touched"
 
     class Bad:
         def __reduce__(self) -> tuple[object, ...]:
             return Path.touch, (touched,)
 
-    torch.save({"a.weight": Bad()}, tmp_path / "bad.pth")
+    save_like_torch({"a.weight": Bad()}, tmp_path / "bad.pth")
     assert "holds more than tensors" in refusal(tmp_path / "bad.pth")
     (tmp_path / "raw.pth").write_bytes(pickle.dumps({"a.weight": Bad()}, protocol=2))
     assert "holds more than tensors" in refusal(tmp_path / "raw.pth")
     assert not touched.exists()
-    torch.save({"epoch": 3}, tmp_path / "none.pth")
+    save_like_torch({"epoch": 3}, tmp_path / "none.pth")
     assert "holds no tensors by name" in refusal(tmp_path / "none.pth")
 
 
@@ -344,7 +363,7 @@ def test_models_that_no_other_project_has_go_out_and_in(tmp_path: Path) -> None:
         np.testing.assert_array_equal(leaf[...], written[path][...], err_msg=path)
 
 
-@pytest.mark.parametrize("form", ["file", "shards", "pth"])
+@pytest.mark.parametrize("form", ["file", "shards", pytest.param("pth", marks=pytest.mark.lab)])
 def test_official_checkpoint_to_diffusers_and_back(form: str, tmp_path: Path) -> None:
     """Byte for byte the same tensors, through every format, at every step."""
     official, renamed = wan_arrays(), wan_arrays("diffusers")
@@ -355,7 +374,8 @@ def test_official_checkpoint_to_diffusers_and_back(form: str, tmp_path: Path) ->
     elif form == "shards":
         path = sharded(official, path)
     else:
-        torch = pytest.importorskip("torch")
+        import torch
+
         path = path.with_suffix(".pth")
         torch.save({key: torch.tensor(array) for key, array in official.items()}, path)
     model = nnx.eval_shape(wan)

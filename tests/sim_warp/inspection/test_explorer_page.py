@@ -20,7 +20,7 @@ from xew.rollout import write_rollout
 from xew.sim_warp.inspection.explorer import Page, choose_scenes, find_predictions, write_page
 from xew.sim_warp.rendering import streams
 
-pytestmark = [needs_chromium, pytest.mark.slow]
+pytestmark = needs_chromium
 
 FRAMES = 18
 TASK = "place_empty_cup"
