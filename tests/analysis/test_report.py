@@ -17,9 +17,9 @@ from tests.analysis.conftest import FRAMES, SEEDS, TASKS, Study
 from tests.analysis.reports.browser import find_faults, needs_chromium
 from xew.analysis.report import Args, Picture, _strip_section, _write_explorer, main, run_table
 from xew.analysis.reports import charts, pictures
+from xew.analysis.reports.run_tables import Interval, RobotTable, Row
 from xew.analysis.reports.study_charts import run_chart
 from xew.analysis.scores import MetricInfo, read_scores
-from xew.analysis.statistics.summary import Interval, RobotTable, Row
 from xew.config import ConfigError
 from xew.episode import write_video
 from xew.metrics import evaluate

@@ -33,11 +33,12 @@ from xew.analysis.reports import page, pictures
 from xew.analysis.reports import paper as paper_report
 from xew.analysis.reports import study as report_study
 from xew.analysis.reports.charts import Chart, chart_files
+from xew.analysis.reports.run_tables import RobotTable, Row, finding, flat_summary, robot_table
 from xew.analysis.reports.study_charts import run_chart
 from xew.analysis.reports.study_text import missing_note
 from xew.analysis.scores import TRUTH, MetricInfo, Scores, find_missing_scores, read_scores
-from xew.analysis.statistics.summary import RobotTable, Row, finding, flat_summary, robot_table, robot_title
 from xew.analysis.tables import formats
+from xew.analysis.tables.labels import robot_title
 from xew.analysis.tables.table import (
     Table,
     TableCell,

@@ -19,7 +19,6 @@ from xew.config import IMPORT_PATH, ConfigError, parse
 from xew.files import demand_regular, replacing
 from xew.names import EpisodeError, check_label, check_name
 from xew.protocol import BASELINES, BODY_NAME, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES, SHARED_MOTION, unpainted_key
-from xew.statistics import find_power
 
 VARIANT = "variant"
 TRAINING = "training"
@@ -249,11 +248,6 @@ def write_scores(scores: Scores, path: Path) -> None:
                 frame.to_parquet(temporary, index=False)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error}. Free some space or choose another place.") from error
-
-
-def measure_power(rows: pd.DataFrame, metrics: Sequence[MetricInfo]) -> pd.DataFrame:
-    """The power of each task for each metric whose mean tasks may leave (`xew.statistics.find_power`)."""
-    return find_power(rows, {m.name: m.best for m in metrics if m.leaves_tasks and m.best is not None})
 
 
 def find_missing_scores(rows: pd.DataFrame) -> pd.DataFrame:

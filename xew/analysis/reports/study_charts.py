@@ -15,10 +15,9 @@ from xew.analysis.reports import charts
 from xew.analysis.reports.charts import SERIES, SOFT, Chart, Panel, Series
 from xew.analysis.scores import COPY, TRUTH, VARIANT, MetricInfo
 from xew.analysis.statistics.grades import Grades, PaperGrades, find_variant, relative_gain
-from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables.builder import Builder, interval_ends
 from xew.analysis.tables.distances import AXIS_TITLES, Distances, unseen_gaps
-from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, SHORT_ROBOTS
+from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, ROBOT_TITLES, SHORT_ROBOTS
 from xew.analysis.tables.table import metric_title
 from xew.protocol import BASELINES, FORGETTING_ROBOT, HELD_OUT_ROBOTS, PASTED_RENDER, ROBOT_NAMES, SHOTS
 from xew.statistics import Mean
