@@ -29,26 +29,6 @@ KINDS = {stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a dev
 """Names of what a path may lead to that is neither a file nor a folder, by the type in its mode."""
 
 
-RUN_MARK = ".xew-run"
-"""Name of the file that marks the folder of a run; runs of earlier versions have none."""
-RUN_FILES = (
-    RUN_MARK,
-    "config.yaml",
-    "codec/*",
-    "scales.json",
-    "checkpoints/*",
-    "sums/*.json",
-    "start.json",
-    "metrics.jsonl",
-    "events.out.tfevents.*",
-    "autoencoder.*",
-    "vae.*",
-    "report.md",
-    "pictures/*.png",
-)
-"""Patterns of the paths of what trainings write into the folder of a run."""
-
-
 def demand_regular(path: Path) -> Path:
     """The path itself, where it is that of a regular file. Reading another kind may block forever or never end.
 
@@ -193,15 +173,6 @@ def remove_written(folder: Path, patterns: Sequence[str]) -> list[Path]:
     return left
 
 
-def is_run(folder: Path) -> bool:
-    """Whether a training has made a folder, by its mark; in earlier versions by a config beside what trainings write."""
-    if (folder / RUN_MARK).is_file():
-        return True
-    return (folder / "config.yaml").is_file() and any(
-        (folder / name).exists() for name in ("codec", "checkpoints", "metrics.jsonl")
-    )
-
-
 @contextmanager
 def hold_lock(path: Path, *, wait: bool = False) -> Iterator[None]:
     """Hold the lock of a folder or file that a command writes, until the block or the process ends.
@@ -286,14 +257,6 @@ def digest_tree(path: Path) -> str:
     files = sorted(file for file in path.rglob("*") if file.is_file())
     lines = [f"{file_digest(file)} {file.relative_to(path).as_posix()}" for file in files]
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
-
-
-def checkpoint_time(run: Path, step: int) -> int | None:
-    """When a run's checkpoint was begun [ns], which tells it from another of the same step; None if there is none."""
-    try:
-        return read_json(run / "checkpoints" / str(step) / "_CHECKPOINT_METADATA")["init_timestamp_nsecs"]
-    except (OSError, ValueError, KeyError):
-        return None
 
 
 def cache_folder(name: str) -> Path:

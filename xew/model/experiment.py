@@ -1,7 +1,7 @@
 """The config of a world-model experiment: what configs/*.yaml hold, and the parts that it is resolved into.
 
-Fields without a default must be given. Functions elsewhere take the part that they need (`Experiment.network`, `.inputs`,
-`.instructions`, `.encoding`, `.choice`, `.learning`, `.sampling`) and not the whole experiment.
+The defaults are the recommended recipe, that of configs/fixed.yaml. Functions elsewhere take the part that they need
+(`Experiment.network`, `.inputs`, `.instructions`, `.encoding`, `.choice`, `.spec`) and not the whole experiment.
 """
 
 import functools
@@ -17,18 +17,14 @@ from xew.model.codecs.contract import CodecSettings, latent_frames
 from xew.model.codecs.vae import VAES
 from xew.model.conditions import Condition
 from xew.model.devices.sharding import MeshSettings
-from xew.model.network.dit import (
-    MODELS,
-    ModelSize,
-    WorldModel,
-)
+from xew.model.diffusion.samplers import SCHEDULES, NoiseSchedule
+from xew.model.network.dit import MODELS, ModelSize
 from xew.model.network.mechanisms import MECHANISMS
+from xew.model.network.spec import Network
 from xew.model.settings.checks import check_experiment
-from xew.model.settings.network import Network
-from xew.model.settings.optimizer import make_optimizer
-from xew.model.settings.parts import ClipInputs, Encoding, EpisodeChoice, Instructions, Learning, pick_conditions, sample_roles
+from xew.model.settings.parts import ClipInputs, Encoding, EpisodeChoice, TrainSpec, pick_conditions, sample_roles
 from xew.model.settings.settings import AdaptSettings, Clip, ModelSettings, RolloutSettings, TrainSettings
-from xew.model.text.instructions import TEXT_ENCODERS, VOCABULARY, TextEncoder, TextSource
+from xew.model.text.instructions import TEXT_ENCODERS, VOCABULARY, Instructions, TextEncoder, TextSource
 from xew.protocol import ACTION_DIM, SPLITS, Split, expand_robots
 
 F = TypeVar("F")
@@ -40,17 +36,17 @@ class Experiment:
     """Episodes, made by `python -m xew.sim_warp.generate`."""
     out: Path
     """The run: config, checkpoints, TensorBoard, samples."""
-    clip: Clip
-    model: ModelSettings
-    train: TrainSettings
     split: str = "fixed"
     """One of protocol.SPLITS: which robots train."""
+    clip: Clip = field(default_factory=Clip)
     codec: CodecSettings = field(default_factory=CodecSettings)
+    model: ModelSettings = field(default_factory=ModelSettings)
+    train: TrainSettings = field(default_factory=TrainSettings)
     mesh: MeshSettings = field(default_factory=MeshSettings)
     adapt: AdaptSettings = field(default_factory=AdaptSettings)
     rollout: RolloutSettings = field(default_factory=RolloutSettings)
     cache: Path | None = None
-    """Encoded streams; beside the data where left out."""
+    """Encoded streams; next to the data where left out."""
 
     @property
     def cache_folder(self) -> Path:
@@ -82,12 +78,6 @@ class Experiment:
         guess = next((name for name, condition in self.conditions.items() if condition.is_guess), "")
         streams = (*self.conditions, *own)
         return Network(self.size, self.codec.channels, streams, guess, words, self.train.seed, self.model)
-
-    @property
-    def sampling_network(self) -> Network:
-        """The network as rollouts and samples compile it; its parameters are those of `network`."""
-        unroll = self.rollout.unroll or self.model.unroll
-        return replace(self.network, settings=replace(self.model, unroll=unroll))
 
     @property
     def inputs(self) -> ClipInputs:
@@ -122,13 +112,15 @@ class Experiment:
         return EpisodeChoice(targets, adapt.episodes, replay, samples, self.robots.motion)
 
     @property
-    def learning(self) -> Learning:
-        return Learning(self.network, self.train, make_optimizer(self.train), self.adapt.lora_rank)
+    def spec(self) -> TrainSpec:
+        """What is trained and how; a run whose length is in epochs gets its steps from `TrainSpec.with_steps`."""
+        return TrainSpec(self.network, self.inputs, self.train, self.adapt.replay, self.adapt.lora_rank)
 
     @property
-    def sampling(self) -> RolloutSettings:
-        """How rollouts are sampled, with the shift of training where none of its own is given."""
-        return replace(self.rollout, shift=self.rollout.shift or self.train.shift)
+    def schedule(self) -> NoiseSchedule:
+        """Noise levels through which rollouts are sampled."""
+        make = pick(SCHEDULES, self.rollout.noise_schedule, "noise schedule")
+        return make(self.rollout.steps, self.train.shift)
 
 
 def _latent_shape(clip: Clip, codec: CodecSettings) -> tuple[int, ...]:
@@ -185,8 +177,3 @@ def parse_experiment(flags: type[F], arguments: Sequence[str] | None, prog: str,
     admit(getattr(command.flags, "trust", ()))
     check_experiment(command.config, str(command.path))
     return command.flags, command.config
-
-
-def create_model(experiment: Experiment) -> WorldModel:
-    """Make the network of an experiment at its random start; wrap in `nnx.eval_shape` for shapes only."""
-    return experiment.network.create()

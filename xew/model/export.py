@@ -18,7 +18,7 @@ from flax import nnx
 
 from xew.config import ConfigError, admit, user_errors
 from xew.files import hold_lock
-from xew.model.network.dit import parameter_count
+from xew.model.network.dit import network_graph, parameter_count
 from xew.model.network.dit_layouts import Naming, save_dit, wan_layout
 from xew.model.network.tokens import WAVELENGTH_BASE
 from xew.model.runs.checkpoint import load_params
@@ -36,7 +36,7 @@ def export(run: Path, out: Path, naming: Naming = "diffusers", dtype: str = "flo
     if out.exists() and (out.is_file() or any(out.iterdir())):
         raise ConfigError(f"{out} exists already; choose another --out.")
     params, step = load_params(run, experiment.network, step)
-    model = nnx.merge(experiment.network.structure, jax.tree.map(lambda leaf: leaf.astype(jnp.dtype(dtype)), params))
+    model = nnx.merge(network_graph(experiment.network), jax.tree.map(lambda leaf: leaf.astype(jnp.dtype(dtype)), params))
     save_dit(model, out, naming)
     total = parameter_count(model)
     added = total - sum(math.prod(shape) for shape in checkpoint_shapes(model, wan_layout(model, naming)).values())

@@ -25,27 +25,28 @@ from tqdm import tqdm
 from xew.command_line import find_path, parse_command
 from xew.compilation import keep_compiled_programs
 from xew.concurrency import usable_cores
-from xew.config import CONVERTER, ConfigError, admit, find_config, is_packaged, parse, user_errors
+from xew.config import CONVERTER, ConfigError, admit, find_config, is_packaged, user_errors
 from xew.dataset import Episode
 from xew.episode import Record, episode_folder, remove_left_overs
-from xew.files import checkpoint_time, hold_lock, read_json
+from xew.files import hold_lock, read_json
 from xew.model.cache.scales import Scale, load_run_scales
 from xew.model.codecs.contract import Codec
 from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
 from xew.model.episodes.choice import select_episodes
 from xew.model.experiment import Experiment, parse_experiment
-from xew.model.network.dit import cast_params
+from xew.model.network.dit import cast_params, network_graph
 from xew.model.network.dit_layouts import load_dit_params
 from xew.model.runs.checkpoint import load_params
 from xew.model.runs.folder import load_run_codec, load_run_config
 from xew.model.runs.roundtrip import load_untrained_codec
-from xew.model.sampling.predict import Prediction, Predictor
+from xew.model.sampling.predict import Prediction, Predictor, make_predictor
 from xew.model.settings.checks import check_experiment
 from xew.model.settings.settings import RolloutSettings
-from xew.model.training.step import make_learner
+from xew.model.training.step import make_trainer
 from xew.model.video.frames import to_camera_size
 from xew.protocol import MIXED_MOTION
 from xew.rollout import write_rollout
+from xew.run import checkpoint_time
 
 Item = tuple[Episode, dict[str, Any]]
 """An episode to predict and the header that its rollout will have."""
@@ -71,14 +72,13 @@ def load_predictor(run: Path, experiment: Experiment, step: int | None = None) -
     mesh, codec = make_mesh(MeshSettings()), load_run_codec(run, experiment.codec)
     params, step = load_params(run, experiment.network, step, replicated_sharding(mesh))
     scales = load_run_scales(experiment.conditions, run)
-    return _make_predictor(experiment, codec, params, mesh, scales), step
+    return _place_predictor(experiment, codec, params, mesh, scales), step
 
 
-def _make_predictor(experiment: Experiment, codec: Codec, params: Any, mesh: Mesh, scales: Mapping[str, Scale]) -> Predictor:
-    graph = experiment.sampling_network.structure
-    params = jax.jit(cast_params, static_argnums=0)(graph, params)
-    codec = jax.device_put(codec, replicated_sharding(mesh))
-    return Predictor(experiment.inputs, experiment.instructions, experiment.sampling, codec, graph, params, scales)
+def _place_predictor(experiment: Experiment, codec: Codec, params: Any, mesh: Mesh, scales: Mapping[str, Scale]) -> Predictor:
+    """The model with its parameters in the types of its products, and a copy of the codec on each device."""
+    params = jax.jit(cast_params, static_argnums=0)(network_graph(experiment.network.for_sampling), params)
+    return make_predictor(experiment, jax.device_put(codec, replicated_sharding(mesh)), params, scales)
 
 
 def is_config(run: Path) -> bool:
@@ -104,9 +104,9 @@ def load_published(experiment: Experiment, source: Path) -> Predictor:
     if scaled:
         raise ConfigError(f"{source}: {', '.join(scaled)} is scaled by training episodes; train a run and roll that out.")
     mesh = make_mesh(MeshSettings())
-    graph, params = make_learner(experiment.learning, mesh).random_network()
+    graph, params = make_trainer(experiment.spec, mesh).random_network()
     params = load_dit_params(graph, params, experiment.model.weights)
-    return _make_predictor(experiment, load_untrained_codec(experiment), params, mesh, {})
+    return _place_predictor(experiment, load_untrained_codec(experiment), params, mesh, {})
 
 
 def check_out(out: Path, data: Path) -> None:
@@ -119,8 +119,8 @@ def rollout_header(experiment: Experiment, step: int | None, saved: int | None, 
     """rollout.json: what was predicted, from what, with what. How many were predicted at once is no part of it.
 
     Args:
-        step, saved: of the checkpoint and when it was saved (`checkpoint_time`), which tells it from that of another
-            training of the same config; None of published weights.
+        step, saved: of the checkpoint and when it was saved (`checkpoint_time`), which distinguishes it from the checkpoint of
+            another run of the same config; None for published weights.
     """
     _, record = episode
     action, embodiment = experiment.model.action, experiment.model.embodiment
@@ -135,7 +135,7 @@ def rollout_header(experiment: Experiment, step: int | None, saved: int | None, 
 
 
 def _drop_speed(experiment: Experiment) -> Experiment:
-    return replace(experiment, rollout=replace(experiment.rollout, batch=0, unroll=0))
+    return replace(experiment, rollout=replace(experiment.rollout, batch=0))
 
 
 def common_header(model: str, condition: str, record: Record, max_frames: int = 0) -> dict[str, Any]:
@@ -149,20 +149,9 @@ def is_done(out: Path, episode: Episode, header: dict[str, Any]) -> bool:
     _, record = episode
     folder = episode_folder(out, record.task, record.seed, record.robot)
     try:
-        return _read_header(folder) == header and (folder / "rgb.mkv").exists()
-    except (OSError, ValueError, ConfigError):
+        return read_json(folder / "rollout.json") == header and (folder / "rgb.mkv").exists()
+    except (OSError, ValueError):
         return False
-
-
-def _read_header(folder: Path) -> dict[str, Any]:
-    """A rollout's header; settings that came after it was written have their defaults."""
-    path = folder / "rollout.json"
-    header: dict[str, Any] = read_json(path)
-    if not isinstance(header, dict):
-        raise ConfigError(f"{path} holds {type(header).__name__}, expected an object.")
-    if "config" in header:
-        header["config"] = CONVERTER.unstructure(parse(Experiment, header["config"], str(path)))
-    return header
 
 
 def group_by_length(pending: Sequence[Item], size: int) -> Iterator[list[Item]]:
@@ -259,8 +248,8 @@ class Flags:
 
 
 @dataclass(frozen=True)
-class Sampling:
-    """All that can be chosen anew of a trained run."""
+class RunChoices:
+    """Settings of a trained run that its rollouts can change."""
 
     rollout: RolloutSettings = field(default_factory=RolloutSettings)
 
@@ -313,8 +302,8 @@ def parse_rollout(arguments: Sequence[str] | None) -> tuple[Path, Flags, Experim
     admit(_find_trusted(words))  # the run's config is read before the options are parsed
     command = parse_command(
         Flags,
-        Sampling,
-        lambda run: Sampling(load_run_config(run).rollout),
+        RunChoices,
+        lambda run: RunChoices(load_run_config(run).rollout),
         words,
         prog=prog,
         description=description,

@@ -10,7 +10,7 @@ import contextlib
 import itertools
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import numpy as np
@@ -20,14 +20,12 @@ from xew.compilation import keep_compiled_programs
 from xew.config import ConfigError, user_errors
 from xew.dataset import read_dataset
 from xew.files import hold_lock
-from xew.model.cache.scales import load_run_scales
 from xew.model.devices.sharding import (
     AXES,
     check_batch,
     make_mesh,
     mesh_shape,
     place_batch,
-    place_shapes,
     process_samples,
     start_processes,
 )
@@ -36,9 +34,8 @@ from xew.model.experiment import Experiment, parse_experiment
 from xew.model.runs.begin import begin_run, check_one_of, check_start
 from xew.model.runs.checkpoint import TrainState
 from xew.model.runs.session import open_session
-from xew.model.sampling.predict import Predictor
-from xew.model.settings.network import check_network
-from xew.model.settings.optimizer import learning_rate, make_optimizer, set_steps, tell_stale_average
+from xew.model.sampling.predict import make_predictor
+from xew.model.settings.optimizer import learning_rate
 from xew.model.training.data import ClipSource
 from xew.model.training.flops import flops_of_step
 from xew.model.training.loop import STOPPED, Meter, Timetable, run_steps
@@ -46,10 +43,10 @@ from xew.model.training.memory import check_memory, estimate_memory
 from xew.model.training.order import make_dataset
 from xew.model.training.samples import log_samples
 from xew.model.training.start import begin_state
-from xew.model.training.step import StepResult, abstract_state, make_learner
+from xew.model.training.step import StepResult, make_trainer
 
 NOISE_LEVEL_EDGES = (0.0, 0.5, 0.8, 0.95, 1.0)
-"""Bins of the noise level in which the loss is shown apart."""
+"""Bins of the noise level for each of which the mean loss is logged."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +93,7 @@ def print_estimate(experiment: Experiment, devices: int, memory_gb: float | None
         raise ConfigError(f"--devices is {devices}; expected at least one.")
     mesh = AbstractMesh(mesh_shape(experiment.mesh, devices), AXES)
     check_batch(experiment.train.batch, experiment.train.accumulate, devices)
-    shapes = place_shapes(abstract_state(experiment.learning)[1], mesh)
-    memory = estimate_memory(experiment.learning, shapes, experiment.encoding, mesh)
+    memory = estimate_memory(make_trainer(experiment.spec, mesh), experiment.encoding)
     print(memory.table())
     if memory_gb:
         print(f"{'fits' if memory.total < memory_gb * 1e9 else 'does not fit'} in {memory_gb:g} GB a device")
@@ -105,46 +101,35 @@ def print_estimate(experiment: Experiment, devices: int, memory_gb: float | None
 
 def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = False, ignore_memory: bool = False) -> bool:
     """Train an experiment to its last step, from the start or from its latest checkpoint; returns whether it came there."""
-    # Everything that can be missing or too small is found before a run folder is made.
-    settings = experiment.train
-    adapt = experiment.adapt
-    encoding = experiment.encoding
-    out = experiment.out
+    # Everything that can be missing or too small is an error before a run folder is made.
     mesh = make_mesh(experiment.mesh)
-    check_batch(settings.batch, settings.accumulate, mesh.size)
-    own = process_samples(mesh, settings.batch)
-    check_network(experiment.network)
+    check_batch(experiment.train.batch, experiment.train.accumulate, mesh.size)
+    own = process_samples(mesh, experiment.train.batch)
     check_start(experiment)
     episodes = choose_episodes(read_dataset(experiment.data), experiment.choice)
-    source = ClipSource.open(encoding, experiment.instructions, episodes.fresh, episodes.replay)
+    source = ClipSource.open(experiment.encoding, experiment.instructions, episodes.fresh, episodes.replay)
     source.check()
-    dataset = make_dataset(source, settings.batch, settings.seed, adapt.replay, own)
-    settings = set_steps(settings, source.fresh, adapt.replay)
-    if (told := tell_stale_average(settings)) and jax.process_index() == 0:
-        print(told, file=sys.stderr)
-    rates = learning_rate(settings)
-    learning = replace(experiment.learning, settings=settings, optimizer=make_optimizer(settings))
-    learner = make_learner(learning, mesh)
-    flops = flops_of_step(learning, encoding.inputs)
-    check_memory(estimate_memory(learning, learner.shapes, encoding, mesh), ignore=ignore_memory)
+    spec = experiment.spec.with_steps(source.fresh)
+    settings = spec.settings
+    codec = source.cache.codec
+    batches = iter(make_dataset(source, settings.batch, settings.seed, spec.replay, own))
+    trainer = make_trainer(spec, mesh, codec)
+    check_memory(estimate_memory(trainer, experiment.encoding), ignore=ignore_memory)
 
-    begin_run(experiment, source.cache.codec, source.scales, resume=resume, overwrite=overwrite)
-    source.scales = load_run_scales(encoding.inputs.conditions, out)
-    graph, codec = experiment.sampling_network.structure, source.cache.codec
-    predictor = Predictor(encoding.inputs, experiment.instructions, experiment.sampling, codec, graph, None, source.scales)
-    timetable = Timetable(settings.steps, settings.log_every, settings.save_every, settings.sample_every, rates)
-    batches = iter(dataset)
-    with open_session(out, settings.keep_checkpoints) as session:
-        state = begin_state(learner, adapt.start_from, session, batches)
-        take_step = learner.compile_step(source.cache.codec)
+    source.scales = begin_run(experiment, codec, source.scales, resume=resume, overwrite=overwrite)
+    timetable = Timetable(
+        settings.steps, settings.log_every, settings.save_every, settings.sample_every, learning_rate(settings)
+    )
+    with open_session(experiment.out, settings.keep_checkpoints) as session:
+        state = begin_state(trainer, experiment.adapt.start_from, experiment.model.weights, session, batches)
 
         def draw_samples(state: TrainState, step: int) -> None:
-            params = learner.average_params(state)
-            log_samples(session.log, replace(predictor, params=params), episodes.samples, step)
+            params = trainer.average_params(state)
+            log_samples(session.log, make_predictor(experiment, codec, params, source.scales), episodes.samples, step)
 
-        meter = Meter(summarize, settings.batch, flops)
+        meter = Meter(summarize, settings.batch, flops_of_step(spec))
         state = run_steps(
-            timetable, session, meter, take_step, state, batches, draw_samples, lambda batch: place_batch(batch, mesh)
+            timetable, session, meter, trainer.step, state, batches, draw_samples, lambda batch: place_batch(batch, mesh)
         )
     return int(state.step) >= settings.steps
 

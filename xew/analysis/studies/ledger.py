@@ -21,7 +21,8 @@ from xew.analysis.studies.plan import Step, sort_steps, step_key
 from xew.config import ConfigError, parse
 from xew.dataset import find_accepted
 from xew.episode import EpisodeError
-from xew.files import RUN_FILES, checkpoint_time, file_digest, is_run, read_json, remove_written, replacing
+from xew.files import file_digest, read_json, remove_written, replacing
+from xew.run import RUN_FILES, checkpoint_time, is_run, list_steps
 
 ROLLOUT_FILES = ("*/*/*/rgb.mkv", "*/*/*/rollout.json")
 """Patterns of the paths of what `xew.model.rollout` writes into its tree."""
@@ -196,12 +197,11 @@ def _digest_episodes(data: Path) -> str | None:
 
 def _digest_run(run: Path) -> str | None:
     """Digest of a run's latest checkpoint: its step and the time when it was begun."""
-    steps = [path for path in (run / "checkpoints").glob("*") if path.name.isdecimal()]
+    steps = list_steps(run)
     if not steps:
         return None
-    latest = max(steps, key=lambda path: int(path.name))
-    begun = checkpoint_time(run, int(latest.name))
-    return None if begun is None else _digest([latest.name, begun])
+    begun = checkpoint_time(run, steps[-1])
+    return None if begun is None else _digest([str(steps[-1]), begun])
 
 
 def _digest_rollouts(root: Path) -> str | None:

@@ -10,7 +10,7 @@ from xew.model.codec_training.kinds import KINDS, Kind
 from xew.model.codec_training.pictures import ALIGNED, UNALIGNED, Cut
 from xew.model.episodes.unpaired import Seeds
 from xew.model.settings.checks import LEAST_OF_STEPS, check_least, check_steps
-from xew.model.settings.settings import Clip, StepSettings
+from xew.model.settings.settings import Clip
 from xew.protocol import SPLITS, expand_robots
 
 SMALLEST_SIDE = 32
@@ -35,16 +35,29 @@ class PictureSettings:
 
 
 @dataclass(frozen=True)
-class CodecTrainSettings(StepSettings):
+class CodecTrainSettings:
     """How the autoencoder learns. A sample is a clip."""
 
+    batch: int
+    """Number of samples of a step, over all devices."""
+    steps: int = 0
+    """Number of steps; 0 where `seconds` gives the length."""
+    seed: int = 0
     learning_rate: float = 1e-3
+    """Peak of the learning rate."""
     warmup_steps: int = 200
+    """Number of steps in which the learning rate rises to its peak."""
     decay_to: float = 0.02
+    """Cosine decay of the learning rate to this part of its peak at the end; 1 keeps it constant."""
+    weight_decay: float = 0.01
+    clip_norm: float = 1.0
+    """Largest global norm of the gradients; larger ones are scaled down to it."""
     ema_decay: float = 0.998
+    """Decay of the moving average of the parameters; 0 keeps none."""
     log_every: int = 50
     save_every: int = 2000
     sample_every: int = 2000
+    """Number of steps between samples of what has been learned; 0 draws none."""
     keep_checkpoints: int = 1
     seconds: float = 0.0
     """Time [s] of training after the first step, which compiles; give this or `steps`. The rate follows the time. What has
@@ -147,6 +160,7 @@ class CodecExperiment:
 
 
 LEAST = LEAST_OF_STEPS | {
+    "train.ema_decay": 0,
     "clip.frames": 1,
     "train.seconds": 0,
     "train.l1": 0,
@@ -182,7 +196,9 @@ def check_codec_experiment(experiment: CodecExperiment, path: Path | str) -> Cod
     check_streams(experiment.streams)
     _ = experiment.train_robots
     factor, clip, train = experiment.autoencoder.spatial_factor, experiment.clip, experiment.train
-    check_steps(train, "seconds", str(path))
+    check_steps(train.steps, train.seconds, "seconds", str(path))
+    if train.ema_decay >= 1:
+        raise ConfigError(f"{path}: train.ema_decay is {train.ema_decay:g}; it must be under 1.")
     for name, frames in (("clip.frames", clip.frames), ("pictures.frames", experiment.pictures.frames)):
         if frames % 4 != 1:
             raise ConfigError(f"{path}: {name} is {frames}; it must be 4 k + 1, for example {max(5, frames // 4 * 4 + 1)}.")

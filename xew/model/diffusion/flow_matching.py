@@ -20,8 +20,6 @@ REFERENCE_NOISE = 0.1
 GUESS_SPREAD = 0.7
 """Standard deviation of latents round the guess that a prediction of residuals begins with. Of standardized latents of 18
 episodes it is .67 round the pasted render and 1.0 round the first frame."""
-SMALLEST_LEVEL = 0.05
-"""Noise level under which a prediction of clean latents is divided by no less."""
 ReplaceReference = Callable[[Array, Array], Array]
 """Function (latents [b t h w c], another reference [b 1 h w c]) -> latents [b t h w c] of the same later frames behind it."""
 
@@ -67,15 +65,15 @@ def training_pair(
     return TrainingPair(jnp.concatenate([reference, noisy[:, 1:]], axis=1), noise - latents, sigma)
 
 
-def moving_weights(latents: Float[Array, "b t h w c"], more: float) -> Float[Array, "b t h w"]:
-    """Weights [b t h w] of places in the loss: what moves weighs up to 1 + `more` times what stands still; mean 1.
+def motion_weights(latents: Float[Array, "b t h w c"], strength: float) -> Float[Array, "b t h w"]:
+    """Weights [b t h w] of places in the loss: what moves weighs up to 1 + `strength` times what stands still; mean 1.
 
     Args:
         latents: [b t h w c], clean and of variance 1; a place moves as far as it differs from the first frame.
-        more: 0 weighs all places alike.
+        strength: 0 weighs all places alike.
     """
     change = jnp.square(latents - latents[:, :1]).mean(axis=-1)
-    weights = 1 + more * change / (change + GUESS_SPREAD**2)
+    weights = 1 + strength * change / (change + GUESS_SPREAD**2)
     return weights / weights[:, 1:].mean(axis=(1, 2, 3), keepdims=True)
 
 
@@ -91,7 +89,7 @@ def sample_losses(
         predicted: [b t h w c] float32, velocity.
         pair: what it was predicted for.
         valid: [b t] float32, 1 for latent frames that show the episode and 0 past its end; all count if left out.
-        weights: [b t h w] of places, as from `moving_weights`; all weigh alike if left out.
+        weights: [b t h w] of places, as from `motion_weights`; all weigh alike if left out.
 
     Returns:
         [b] float32; 0 where no frame counts.
@@ -111,16 +109,6 @@ def sampling_sigmas(steps: int, shift: float) -> Float[np.ndarray, " levels"]:
 def shift_sigma(sigma: Float[np.ndarray, "*n"], shift: float) -> Float[np.ndarray, "*n"]:
     """Noise levels [...] float64 moved toward 1: s u / (1 + (s - 1) u)."""
     return shift * sigma / (1 + (shift - 1) * sigma)
-
-
-def velocity_of_clean(
-    clean: Float[Array, "b t h w c"], noisy: Float[Array, "b t h w c"], sigma: Float[Array, " b"]
-) -> Float[Array, "b t h w c"]:
-    """Velocity [b t h w c] that leads from noisy latents [b t h w c] at noise levels [b] to predicted clean ones [b t h w c].
-
-    (x_sigma - x_0) / sigma, where sigma is at least `SMALLEST_LEVEL`: an error of the prediction is not blown up further.
-    """
-    return (noisy - clean) / jnp.maximum(sigma, SMALLEST_LEVEL)[:, None, None, None, None]
 
 
 def velocity_of_residual(

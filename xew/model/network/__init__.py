@@ -3,4 +3,4 @@
 Its functions take and give arrays; nothing here reads an episode or knows a training loop.
 """
 
-__all__ = ["blocks", "dit", "dit_layouts", "lora", "mechanisms", "tokens"]
+__all__ = ["blocks", "dit", "dit_layouts", "lora", "mechanisms", "spec", "tokens"]

@@ -23,7 +23,6 @@ from jax.ad_checkpoint import checkpoint_name
 from jax.typing import DTypeLike
 from jaxtyping import Float, Int, Key
 
-from xew.config import ConfigError
 from xew.model.devices.sharding import shard_over_batch
 from xew.model.network.mechanisms import FramedContext
 from xew.model.network.tokens import WAN_PATCH, WAVELENGTH_BASE, Patch
@@ -36,7 +35,6 @@ Rotary = tuple[Float[Array, "s angles"], Float[Array, "s angles"]]
 """Cosine and sine [s head_dim/2] float32 of every token's rotation angles."""
 Levels = Int[np.ndarray, " s"]
 """Index [s] of each token's noise level among the r of a sample: 0 is no noise, 1 the sample's own."""
-AttentionName = Literal["auto", "xla", "cudnn"]
 RematName = Literal["none", "attention", "dots", "full"]
 
 
@@ -66,7 +64,7 @@ class ModelSize:
     """Number of tokens that the text is padded to."""
     rotary_base: float = WAVELENGTH_BASE
     """Ratio of the slowest to the fastest rotation of positions; Wan's serves clips of hundreds of positions a side, and
-    a model of few positions tells them apart sooner with less."""
+    a model of few positions resolves them sooner with less."""
     epsilon: float = EPSILON
     """Number that all norms add to a mean square; Wan's, but for checkpoints whose config.json says otherwise."""
     patch: Patch = WAN_PATCH
@@ -81,11 +79,11 @@ class ModelSize:
 class Block(nnx.Module):
     """Self-attention over all streams, cross-attention to the text, feed-forward; modulated by the noise level."""
 
-    def __init__(self, size: ModelSize, dtype: DTypeLike, attention: AttentionName, rngs: nnx.Rngs) -> None:
+    def __init__(self, size: ModelSize, dtype: DTypeLike, rngs: nnx.Rngs) -> None:
         self.dtype, self.epsilon = dtype, size.epsilon
         self.modulation = nnx.Param(scaled_normal(rngs.params(), (1, 6, size.dim)))
-        self.self_attn = Attention(size, dtype, attention, rngs)
-        self.cross_attn = Attention(size, dtype, attention, rngs)
+        self.self_attn = Attention(size, dtype, rngs)
+        self.cross_attn = Attention(size, dtype, rngs)
         self.norm3 = nnx.LayerNorm(size.dim, epsilon=size.epsilon, use_fast_variance=False, dtype=jnp.float32, rngs=rngs)
         self.ffn = TwoLayer(size.dim, size.ffn_dim, size.dim, gelu, dtype, nnx.initializers.xavier_uniform(), rngs)
 
@@ -145,8 +143,8 @@ class Block(nnx.Module):
 class Attention(nnx.Module):
     """Multi-head attention; queries and keys are normalized over the full width, before they are split into heads."""
 
-    def __init__(self, size: ModelSize, dtype: DTypeLike, implementation: AttentionName, rngs: nnx.Rngs) -> None:
-        self.heads, self.dtype, self.implementation = size.heads, dtype, implementation
+    def __init__(self, size: ModelSize, dtype: DTypeLike, rngs: nnx.Rngs) -> None:
+        self.heads, self.dtype = size.heads, dtype
         self.q, self.k, self.v, self.o = (linear(size.dim, size.dim, dtype, rngs) for _ in range(4))
         self.norm_q, self.norm_k = (nnx.RMSNorm(size.dim, epsilon=size.epsilon, dtype=jnp.float32, rngs=rngs) for _ in range(2))
 
@@ -211,10 +209,10 @@ class Attention(nnx.Module):
         return shard_over_batch((values if rotary is None else rotate(values, rotary)).astype(self.dtype))
 
     def _attend(self, q: Array, k: Array, v: Array) -> Array:
-        chosen = choose_attention(self.implementation, q.shape[-1], self.dtype)
-        if chosen == "cudnn":
-            return attend_in_pairs(q, k, v, chosen)
-        return checkpoint_name(jax.nn.dot_product_attention(q, k, v, implementation=chosen), "attention")
+        implementation = choose_attention(q.shape[-1], self.dtype)
+        if implementation == "cudnn":
+            return attend_in_pairs(q, k, v, implementation)
+        return checkpoint_name(jax.nn.dot_product_attention(q, k, v, implementation=implementation), "attention")
 
 
 class Head(nnx.Module):
@@ -351,22 +349,20 @@ none       everything that the backward pass reads
 """
 
 
-def choose_attention(asked: AttentionName, head_dim: int, dtype: DTypeLike) -> Literal["xla", "cudnn"]:
+def choose_attention(head_dim: int, dtype: DTypeLike) -> Literal["xla", "cudnn"]:
     """The implementation of `jax.nn.dot_product_attention` on this machine.
 
-    "auto" is cuDNN's on a CUDA GPU of compute capability 8.0 and up, in bfloat16 or float16, where the width of a head is
+    It is cuDNN's on a CUDA GPU of compute capability 8.0 and up, in bfloat16 or float16, where the width of a head is
     a multiple of 8 and at most 256 (128 before Hopper, 9.0); else XLA's, which forms [n s s]. (The limits are those that jax
     itself checks; `attend_in_pairs` sees to the one on the number of tokens.)
-
-    Raises:
-        ConfigError: cuDNN was asked for and cannot do it.
     """
-    if asked == "xla":
+    device = jax.devices()[0]
+    if device.platform != "gpu" or "cuda" not in device.client.platform_version:
         return "xla"
-    reason = _reason_against_cudnn(head_dim, jnp.dtype(dtype))
-    if reason and asked == "cudnn":
-        raise ConfigError(f"attention: cudnn cannot be used: {reason}; set model.attention to auto or xla.")
-    return "xla" if reason else "cudnn"
+    capability = tuple(int(part) for part in str(device.compute_capability).split("."))
+    widest = 256 if capability >= (9, 0) else 128
+    fits = head_dim % 8 == 0 and head_dim <= widest and jnp.dtype(dtype) in (jnp.bfloat16, jnp.float16)
+    return "cudnn" if fits and capability >= (8, 0) else "xla"
 
 
 def attend_in_pairs(
@@ -394,22 +390,6 @@ def attend_in_pairs(
     return attended[:, :queries]
 
 
-def _reason_against_cudnn(head_dim: int, dtype: np.dtype) -> str:
-    """Why cuDNN's attention cannot be used here; empty if it can."""
-    device = jax.devices()[0]
-    if device.platform != "gpu" or "cuda" not in device.client.platform_version:
-        return f"it needs a CUDA GPU and JAX runs on {device.platform}"
-    capability = tuple(int(part) for part in str(device.compute_capability).split("."))
-    widest = 256 if capability >= (9, 0) else 128
-    if capability < (8, 0):
-        return f"it needs compute capability 8.0 and {device.device_kind} has {device.compute_capability}"
-    if dtype not in (jnp.bfloat16, jnp.float16):
-        return f"it needs model.dtype bfloat16 and the model has {dtype.name}"
-    if head_dim % 8 or head_dim > widest:
-        return f"it needs heads of a multiple of 8 and at most {widest} features and the model's have {head_dim}"
-    return ""
-
-
 def gelu(values: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Gelu of values [...] by its approximation with tanh, as Wan has it."""
     return nnx.gelu(values, approximate=True)
@@ -425,12 +405,12 @@ def scaled_normal(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "
     return jax.random.normal(key, shape, jnp.float32) / np.sqrt(shape[-1]).astype(np.float32)
 
 
-def stacked_blocks(size: ModelSize, dtype: DTypeLike, attention: AttentionName, rngs: nnx.Rngs) -> Block:
+def stacked_blocks(size: ModelSize, dtype: DTypeLike, rngs: nnx.Rngs) -> Block:
     """`depth` blocks as one whose parameters have a leading layer axis."""
 
     @nnx.split_rngs(splits=size.depth)
     @nnx.vmap(in_axes=0, out_axes=0)
     def create(layer_rngs: nnx.Rngs) -> Block:
-        return Block(size, dtype, attention, layer_rngs)
+        return Block(size, dtype, layer_rngs)
 
     return create(rngs)

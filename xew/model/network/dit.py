@@ -2,7 +2,7 @@
 
 Reads  latents [b t h w c] of each stream, noise level, text embeddings [b l e]
 Writes velocity [b t h w c] of the RGB stream
-To add a size: one line in MODELS. To add a stream: one line in STREAMS. Published weights: dit_layouts.py.
+Options: spec.py. To add a size: one line in MODELS. To add a stream: one line in STREAMS. Published weights: dit_layouts.py.
 
 Shape letters: b batch, t h w c latent video, s tokens (t' h' w' flattened), d width, n heads, r distinct noise levels of
 a sample, l text tokens of e features, k tokens of context (in attention: features of a head).
@@ -10,6 +10,7 @@ Numbers that look arbitrary (eps 1e-6, 256 frequencies, six modulations) are tho
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -19,19 +20,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax import Array
-from jax.typing import DTypeLike
 from jaxtyping import Float, Int
 
 from xew.model.devices.sharding import gather_parameters, shard_over_batch
-from xew.model.diffusion.flow_matching import velocity_of_clean, velocity_of_residual
+from xew.model.diffusion.flow_matching import velocity_of_residual
 from xew.model.network.blocks import (
     REMAT,
-    AttentionName,
     ConditionCache,
     Head,
     Levels,
     ModelSize,
-    RematName,
     Rotary,
     TwoLayer,
     gelu,
@@ -41,8 +39,10 @@ from xew.model.network.blocks import (
     stacked_blocks,
 )
 from xew.model.network.mechanisms import MECHANISMS, FramedContext, create_mechanism, ray_maps
+from xew.model.network.spec import Network
 from xew.model.network.tokens import (
     TIME_FREQUENCIES,
+    TokenGrid,
     patchify,
     rotary_angles,
     rounded_sinusoid,
@@ -50,6 +50,7 @@ from xew.model.network.tokens import (
     token_grid,
     unpatchify,
 )
+from xew.model.video.frames import TEMPORAL_FACTOR
 
 TIMESTEPS = 1000.0
 """Factor from a noise level in [0, 1] to the timestep that the network gets as input."""
@@ -60,17 +61,11 @@ Conditions = Mapping[str, Float[Array, "b ..."]]
 """Latents [b t' h' w' c] or numbers [b t' n] by the stream or mechanism that they feed."""
 Text = Float[Array, "b l e"] | Int[Array, "b l"]
 """Embeddings [b l e] of a frozen encoder, or ids [b l] of words."""
-TokenGrid = tuple[int, int, int]
-"""Number of tokens in time, height and width."""
-Visibility = Literal["joint", "one_way"]
-Prediction = Literal["velocity", "clean", "residual"]
-TimeEmbedding = Literal["exact", "flowwam"]
 
 MODELS = {
     "tiny": ModelSize(dim=32, depth=2, heads=2, ffn_dim=64, text_dim=16, text_tokens=8),
     "debug": ModelSize(dim=256, depth=4, heads=2, ffn_dim=768, text_dim=32, text_tokens=16, rotary_base=10.0),
-    "small": ModelSize(dim=768, depth=12, heads=12, ffn_dim=3072, text_dim=256, text_tokens=32, rotary_base=100.0),
-    "small_fine": ModelSize(768, 12, 6, 3072, text_dim=256, text_tokens=32, rotary_base=100.0, patch=(1, 1, 1)),
+    "small": ModelSize(768, 12, 6, 3072, text_dim=256, text_tokens=32, rotary_base=100.0, patch=(1, 1, 1)),
     "wan5b": ModelSize(dim=3072, depth=30, heads=24, ffn_dim=14336, text_dim=4096, text_tokens=512),
 }
 
@@ -96,61 +91,22 @@ STREAMS = {
 
 
 class WorldModel(nnx.Module):
-    """Predicts the flow-matching velocity of the RGB stream, given clean condition streams.
+    """Predicts the flow-matching velocity of the RGB stream, given clean condition streams."""
 
-    Args:
-        size: one of `MODELS`.
-        channels: of the latents.
-        streams: names in `STREAMS` beside rgb, and in `mechanisms.MECHANISMS`.
-        dtype: of the matrix products; parameters, norms and modulation stay float32.
-        residual: of the tokens between blocks; sums are float32 either way. bfloat16 (as diffusers') halves what is kept
-            of each block and most of what is moved, and rounds the tokens 90 times.
-        remat: what the backward pass computes again instead of keeping; see `REMAT`.
-        unroll: blocks compiled as one loop body; more is faster on a CPU and slower to compile.
-        attention: see `choose_attention`.
-        visibility: "joint": all tokens see all, as in FlowWAM. "one_way": condition tokens see condition tokens only and
-            get the noise level 0, so that a sampler computes them once a clip (`condition_cache`); a departure.
-        time: "exact", or "flowwam": the rounding with which FlowWAM's published weights were trained.
-        history: when the frames of the stream history were, in latent frames from the clip's first (negative).
-        words: rows of a learned table of words; text is then ids [b l] instead of embeddings. 0 has none.
-        prediction: what the head computes, from which the velocity follows: "velocity" itself, "clean" latents, or the
-            "residual" that a linear estimate from the noisy latents and a guess leaves of them.
-        guess: stream or mechanism whose latents are that guess; "" takes the first frame, which stands still.
-    """
-
-    def __init__(
-        self,
-        size: ModelSize,
-        channels: int,
-        streams: Sequence[str] = (),
-        *,
-        dtype: DTypeLike = jnp.float32,
-        residual: DTypeLike = jnp.float32,
-        remat: RematName = "none",
-        unroll: int = 1,
-        attention: AttentionName = "auto",
-        visibility: Visibility = "joint",
-        time: TimeEmbedding = "exact",
-        history: Sequence[float] = (),
-        words: int = 0,
-        prediction: Prediction = "velocity",
-        guess: str = "",
-        rngs: nnx.Rngs,
-    ) -> None:
-        self.size, self.channels, self.dtype, self.residual = size, channels, dtype, residual
-        self.prediction, self.guess = prediction, guess
-        self.remat, self.unroll, self.visibility, self.time = remat, unroll, visibility, time
-        self.history = tuple(history)
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        size, channels, dtype, rngs = network.size, network.channels, self.dtype, nnx.Rngs(network.seed)
         # Earlier frames come right after RGB's tokens, so that all frames that have a context of their own are one piece.
-        self.condition_streams = tuple(sorted((name for name in streams if name in STREAMS), key="history".__ne__))
+        self.condition_streams = tuple(sorted((name for name in network.streams if name in STREAMS), key="history".__ne__))
         features = channels * int(np.prod(size.patch))
         self.patch_embedding = linear(features, size.dim, dtype, rngs)
         self.text_embedding = TwoLayer(size.text_dim, size.dim, size.dim, gelu, dtype, EMBEDDING_INIT, rngs)
         self.time_embedding = TwoLayer(TIME_FREQUENCIES, size.dim, size.dim, nnx.silu, jnp.float32, EMBEDDING_INIT, rngs)
         self.time_projection = linear(size.dim, 6 * size.dim, jnp.float32, rngs)
-        self.blocks = stacked_blocks(size, dtype, attention, rngs)
+        self.blocks = stacked_blocks(size, dtype, rngs)
         self.head = Head(size.dim, features, rngs, size.epsilon)
-        self.words = nnx.Embed(words, size.text_dim, embedding_init=nnx.initializers.normal(1.0), rngs=rngs) if words else None
+        words, normal = network.words, nnx.initializers.normal(1.0)
+        self.words = nnx.Embed(words, size.text_dim, embedding_init=normal, rngs=rngs) if words else None
         self.stream_embeddings = nnx.data({})
         self.stream_inputs = nnx.data({})
         for name in self.condition_streams:
@@ -158,8 +114,23 @@ class WorldModel(nnx.Module):
             if STREAMS[name].source != "history":
                 self.stream_inputs[name] = self._stream_input(STREAMS[name], rngs)
         self.mechanisms = nnx.data({})
-        for name in (name for name in streams if name not in STREAMS):
+        for name in (name for name in network.streams if name not in STREAMS):
             self.mechanisms[name] = create_mechanism(name, size, channels, dtype, rngs)
+
+    @property
+    def size(self) -> ModelSize:
+        """Size of the network."""
+        return self.network.size
+
+    @property
+    def dtype(self) -> jnp.dtype:
+        """Type of the matrix products and of the tokens between blocks."""
+        return jnp.dtype(self.network.settings.dtype)
+
+    @property
+    def one_way(self) -> bool:
+        """Whether condition tokens attend to condition tokens only."""
+        return self.network.settings.visibility == "one_way"
 
     def _stream_input(self, stream: Stream, rngs: nnx.Rngs) -> nnx.Module:
         """Pixel streams start from a copy of RGB's patch embedding, as FlowWAM and the paper do."""
@@ -195,11 +166,10 @@ class WorldModel(nnx.Module):
         tokens = self.apply_blocks(tokens, self.modulation(time), levels, rotary, context, rgb, cache)
         features = self.head(tokens[:, :rgb].astype(jnp.float32), time, levels[:rgb])
         predicted = unpatchify(features, latents.shape, self.size.patch)
-        if self.prediction == "velocity":
+        if self.network.settings.prediction == "velocity":
             return predicted
-        if self.prediction == "clean":
-            return velocity_of_clean(predicted, latents, sigma)
-        return velocity_of_residual(predicted, latents, sigma, conditions[self.guess] if self.guess else latents[:, :1])
+        guess = conditions[self.network.guess] if self.network.guess else latents[:, :1]
+        return velocity_of_residual(predicted, latents, sigma, guess)
 
     def condition_cache(self, conditions: Conditions, text: Text) -> ConditionCache:
         """Keys and values of the condition tokens in every layer; they hold for all steps of sampling a clip.
@@ -214,7 +184,7 @@ class WorldModel(nnx.Module):
         Raises:
             ValueError: the model is not `one_way`, so that condition tokens depend on the RGB tokens of each step.
         """
-        if self.visibility != "one_way":
+        if not self.one_way:
             raise ValueError("condition tokens can only be computed ahead in a model of visibility one_way.")
         tokens, levels, rotary = self._join({name: conditions[name] for name in self.condition_streams})
         modulation = self.modulation(self.embed_time(jnp.zeros(tokens.shape[0], jnp.float32)))
@@ -226,7 +196,7 @@ class WorldModel(nnx.Module):
             read = ConditionCache(*module.keys_values(carry, modulation, levels, rotary))
             return module(carry, modulation, levels, rotary, context), read
 
-        return jax.lax.scan(block, tokens, layers, unroll=self.unroll)[1]
+        return jax.lax.scan(block, tokens, layers, unroll=self.network.unroll)[1]
 
     def embed_streams(
         self, latents: Latents, conditions: Conditions, cached: bool = False
@@ -246,7 +216,7 @@ class WorldModel(nnx.Module):
         for name in self._entering("channels"):
             pictures = patchify(self._pictures(name, latents, conditions), self.size.patch)
             columns = self.mechanisms[name](pictures).astype(jnp.float32)
-            tokens = tokens.at[:, : columns.shape[1]].add(columns.astype(self.residual))
+            tokens = tokens.at[:, : columns.shape[1]].add(columns.astype(self.dtype))
         return tokens, levels, rotary
 
     def _pictures(self, name: str, latents: Latents, conditions: Conditions) -> Float[Array, "b k h w features"]:
@@ -260,15 +230,20 @@ class WorldModel(nnx.Module):
         grids = {name: token_grid(array.shape, self.size.patch) for name, array in inputs.items()}
         tokens = jnp.concatenate([self._embed(name, array) for name, array in inputs.items()], axis=1)
         levels = np.concatenate([token_levels(self._stream(name), grid) for name, grid in grids.items()])
-        head_dim, base, times = self.size.head_dim, self.size.rotary_base, {"history": self.history}
+        head_dim, base, times = self.size.head_dim, self.size.rotary_base, {"history": self._history_times}
         angles = np.concatenate([rotary_angles(grid, head_dim, base, times.get(name)) for name, grid in grids.items()])
         rotary = jnp.asarray(np.cos(angles), jnp.float32), jnp.asarray(np.sin(angles), jnp.float32)
-        return tokens.astype(self.residual), levels, rotary
+        return tokens.astype(self.dtype), levels, rotary
+
+    @property
+    def _history_times(self) -> tuple[float, ...]:
+        """Times of the earlier frames, in latent frames from the clip's first (negative)."""
+        return tuple(frame / TEMPORAL_FACTOR for frame in self.network.settings.history)
 
     def _stream(self, name: str) -> Stream:
         """A stream with the noise level that it gets in this model: what RGB does not feed cannot know RGB's."""
         stream = STREAMS[name]
-        return dataclasses.replace(stream, timestep="clean") if self.visibility == "one_way" and name != "rgb" else stream
+        return dataclasses.replace(stream, timestep="clean") if self.one_way and name != "rgb" else stream
 
     def _embed(self, name: str, array: Array) -> Array:
         if name == "rgb":
@@ -280,7 +255,8 @@ class WorldModel(nnx.Module):
     def embed_time(self, sigma: Float[Array, " b"]) -> Float[Array, "b 2 d"]:
         """Time embeddings [b 2 d] float32 of the two noise levels of each sample: none, and its own [b]."""
         timesteps = jnp.stack([jnp.zeros_like(sigma), TIMESTEPS * sigma], axis=1)
-        return self.time_embedding(rounded_sinusoid(timesteps) if self.time == "flowwam" else sinusoid(timesteps))
+        embed = rounded_sinusoid if self.network.settings.time == "flowwam" else sinusoid
+        return self.time_embedding(embed(timesteps))
 
     def _entering(self, place: str) -> list[str]:
         """The model's mechanisms that enter the network at one place."""
@@ -375,60 +351,40 @@ class WorldModel(nnx.Module):
             Tokens [b s d].
         """
         graph, layers = nnx.split(self.blocks)
-        start = rgb if self.visibility == "one_way" and rgb != tokens.shape[1] else None
+        start = rgb if self.one_way and rgb != tokens.shape[1] else None
 
         def block(carry: Array, xs: tuple[nnx.State, ConditionCache | None]) -> tuple[Array, None]:
             layer, read = xs
             module = nnx.merge(graph, gather_parameters(layer, layer=True))
             return module(shard_over_batch(carry), modulation, levels, rotary, text, start, read), None
 
-        if self.remat != "none":
+        remat, unroll = self.network.settings.remat, self.network.unroll
+        if remat != "none":
             # The loop already keeps recomputation apart from the forward pass; only without a loop must it be forced.
-            block = jax.checkpoint(block, policy=REMAT[self.remat], prevent_cse=self.unroll >= self.size.depth)
-        return jax.lax.scan(block, tokens, (layers, cache), unroll=self.unroll)[0]
+            block = jax.checkpoint(block, policy=REMAT[remat], prevent_cse=unroll >= self.size.depth)
+        return jax.lax.scan(block, tokens, (layers, cache), unroll=unroll)[0]
+
+
+@functools.lru_cache(maxsize=16)
+def _split_shapes(network: Network) -> tuple[nnx.GraphDef, Any]:
+    """Structure and shapes of a network. To trace its making takes a second, and a command asks several times."""
+    return nnx.split(nnx.eval_shape(lambda: WorldModel(network)), nnx.Param)
+
+
+def network_graph(network: Network) -> nnx.GraphDef:
+    """The structure of a network without its parameters, made without computing anything."""
+    return _split_shapes(network)[0]
+
+
+def network_shapes(network: Network) -> Any:
+    """Shapes and types of a network's parameters, in their tree, made without computing anything."""
+    return jax.tree.map(lambda leaf: leaf, _split_shapes(network)[1])  # a copy of the tree, which the caller may change
 
 
 def token_levels(stream: Stream, grid: TokenGrid) -> Levels:
     """Index [s] of the noise level that each token of a stream gets: 0 is no noise, 1 the sample's own."""
     frames = np.zeros(grid[0], int) if stream.timestep == "clean" else np.minimum(np.arange(grid[0]), 1)
     return np.repeat(frames, grid[1] * grid[2])
-
-
-def flops(
-    size: ModelSize,
-    grids: Sequence[TokenGrid],
-    text_tokens: int | None = None,
-    batch: int = 1,
-    *,
-    visibility: Visibility = "joint",
-    cached: bool = False,
-    channels: int = 48,
-) -> float:
-    """Number of floating-point operations of one forward pass: two for each multiply-add of the matrix products.
-
-    A training step is three times this (what remat computes again is not counted, as is usual for MFU).
-
-    Args:
-        size: of the model.
-        grids: tokens (t', h', w') of each stream, RGB first, as from `token_grid`.
-        text_tokens: the model's own number where left out.
-        batch: samples.
-        visibility: as of the model.
-        cached: a step of sampling in which the condition tokens are read from a cache.
-        channels: of the latents.
-    """
-    text = size.text_tokens if text_tokens is None else text_tokens
-    counts = [int(np.prod(grid)) for grid in grids]
-    rgb, conditions = counts[0], sum(counts[1:])
-    tokens = rgb if cached else rgb + conditions
-    pairs = rgb * (rgb + conditions) + (
-        0 if cached else conditions * (conditions if visibility == "one_way" else rgb + conditions)
-    )
-    dim, features = size.dim, channels * int(np.prod(size.patch))
-    of_block = tokens * (6 * dim * dim + 2 * dim * size.ffn_dim) + 2 * dim * pairs
-    of_text = 2 * text * dim * dim + 2 * dim * tokens * text
-    of_ends = (tokens + rgb) * features * dim + text * (size.text_dim + dim) * dim
-    return 2.0 * batch * (size.depth * (of_block + of_text) + of_ends)
 
 
 def cast_params(graph: nnx.GraphDef, params: Any) -> Any:

@@ -14,6 +14,8 @@ from jaxtyping import Float
 
 Patch = tuple[int, int, int]
 """Latent frames, rows and columns of a token."""
+TokenGrid = tuple[int, int, int]
+"""Number of tokens in time, height and width."""
 WAN_PATCH: Patch = (1, 2, 2)
 WAVELENGTH_BASE = 10_000.0
 TIME_FREQUENCIES = 256

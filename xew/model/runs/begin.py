@@ -11,18 +11,23 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
+from flax import nnx
 from jax.experimental import multihost_utils
 
 from xew import config
 from xew.config import ConfigError
-from xew.files import RUN_FILES, RUN_MARK, checkpoint_time, is_run, remove_written, write_text
+from xew.files import write_text
 from xew.model.cache.keys import RUN_SCALES
-from xew.model.cache.scales import Scale, dump_scales
+from xew.model.cache.scales import Scale, dump_scales, load_run_scales
 from xew.model.codecs.codec import RUN_CODEC, RUN_REMEDY, load_kept_codec
 from xew.model.codecs.contract import Codec
 from xew.model.experiment import Experiment, load_recorded
+from xew.model.network.dit import WorldModel
+from xew.model.network.dit_layouts import check_dit
 from xew.model.runs.folder import load_run_config
 from xew.model.runs.lineage import START, StartNote
+from xew.model.weights.reading import read_tensors
+from xew.run import RUN_MARK, checkpoint_time, is_run, list_steps, remove_run
 
 T = TypeVar("T")
 
@@ -33,9 +38,7 @@ FREE_TO_CHANGE = (
     "codec.chunk",
     "codec.weights",
     "mesh.",
-    "model.attention",
     "model.remat",
-    "model.unroll",
     "train.accumulate",
     "train.epochs",
     "train.seconds",
@@ -52,12 +55,15 @@ FREE_TO_CHANGE = (
 """Settings that a resumed run may change; any other would make it another experiment."""
 
 
-def begin_run(experiment: Experiment, codec: Codec, scales: Mapping[str, Scale], *, resume: bool, overwrite: bool) -> None:
-    """Make the run folder ready, by the first process, as `prepare_run`; the others wait for it."""
+def begin_run(
+    experiment: Experiment, codec: Codec, scales: Mapping[str, Scale], *, resume: bool, overwrite: bool
+) -> dict[str, Scale]:
+    """Make the run folder ready, by the first process, as `prepare_run`; the others wait for it. Returns the run's scales."""
     if jax.process_index() == 0:
         prepare_run(experiment, codec, scales, resume=resume, overwrite=overwrite)
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices("run folder")
+    return load_run_scales(experiment.conditions, experiment.out)
 
 
 def prepare_run(experiment: Experiment, codec: Codec, scales: Mapping[str, Scale], *, resume: bool, overwrite: bool) -> None:
@@ -144,11 +150,6 @@ def _is_bare(out: Path) -> bool:
     return not names or (RUN_MARK in names and all(name.startswith(".") for name in names))
 
 
-def list_steps(run: Path) -> list[int]:
-    """Steps of the checkpoints of a run, in no order."""
-    return [int(path.name) for path in (run / "checkpoints").glob("*") if path.name.isdecimal()]
-
-
 def write_claim(out: Path, settings: Any, *, overwrite: bool) -> None:
     """Write the settings of a run into its folder, which may be claimed, in place of the run there if it is replaced."""
     saved = out / "config.yaml"
@@ -167,22 +168,23 @@ def _remove_run(out: Path) -> None:
     if not is_run(out):
         raise ConfigError(f"{out} has a config.yaml but holds no run, so it is not replaced; choose another --out.")
     try:
-        left = remove_written(out, RUN_FILES)
+        foreign = remove_run(out)
     except OSError as error:
         raise ConfigError(f"cannot replace the run {out}: {error}; choose another --out.") from error
-    if left:
-        shown = ", ".join(str(path.relative_to(out)) for path in left[:3])
-        print(f"{out}: the run is replaced; what is not its own stays there ({shown})")
+    if foreign:
+        names = ", ".join(str(path.relative_to(out)) for path in foreign[:3])
+        print(f"{out}: the run is replaced; files that are not its own stay there ({names})")
 
 
 def check_start(experiment: Experiment) -> None:
-    """Raise ConfigError unless the run to adapt, if any, is another one, of the same network on the same clips and codec."""
-    run = experiment.adapt.start_from
-    if run is None:
-        return
-    if run.resolve() == experiment.out.resolve():
+    """Raise ConfigError unless what the run starts from fits: the run to adapt, or published weights, if there are any."""
+    run, weights = experiment.adapt.start_from, experiment.model.weights
+    if run is not None and run.resolve() == experiment.out.resolve():
         raise ConfigError(f"out is {experiment.out}, the run that adapt.start_from names; choose another --out.")
-    _check_same_network(load_run_config(run), experiment, run)
+    if run is not None:
+        _check_same_network(load_run_config(run), experiment, run)
+    if weights is not None:
+        check_dit(nnx.eval_shape(lambda: WorldModel(experiment.network)), read_tensors(weights))
 
 
 def _check_same(saved: Any, asked: Any, out: Path) -> None:
@@ -190,8 +192,8 @@ def _check_same(saved: Any, asked: Any, out: Path) -> None:
     before, after = dict(_flatten(saved)), dict(_flatten(asked))
     changed = [key for key in after if before[key] != after[key] and not key.startswith(FREE_TO_CHANGE)]
     if changed:
-        found = "; ".join(f"{key} was {before[key]!r}, is {after[key]!r}" for key in changed)
-        raise ConfigError(f"{out} was begun with another config ({found}); set it back, use --overwrite, or choose --out.")
+        changes = "; ".join(f"{key} was {before[key]!r}, is {after[key]!r}" for key in changed)
+        raise ConfigError(f"{out} was begun with another config ({changes}); set it back, use --overwrite, or choose --out.")
 
 
 def _check_same_network(source: Any, asked: Any, run: Path) -> None:
@@ -200,8 +202,8 @@ def _check_same_network(source: Any, asked: Any, run: Path) -> None:
     compared = [key for key in after if key.startswith(("clip.", "codec.", "model.")) and not key.startswith(FREE_TO_CHANGE)]
     changed = [key for key in compared if before[key] != after[key] and key not in ("model.dtype", "model.weights")]
     if changed:
-        found = "; ".join(f"{key} is {before[key]!r} there, {after[key]!r} here" for key in changed)
-        raise ConfigError(f"the network of {run} cannot be adapted as another one ({found}); make them agree.")
+        differences = "; ".join(f"{key} is {before[key]!r} there, {after[key]!r} here" for key in changed)
+        raise ConfigError(f"the network of {run} cannot be adapted as another one ({differences}); make them agree.")
 
 
 def _flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -23,9 +23,10 @@ import orbax.checkpoint as ocp
 from xew.config import ConfigError
 from xew.files import file_digest, read_json, write_text
 from xew.model.devices.sharding import place_like
+from xew.model.network.dit import network_shapes
 from xew.model.network.lora import apply_lora, init_lora
+from xew.model.network.spec import Network
 from xew.model.runs.lineage import KeptStep, trace_run
-from xew.model.settings.network import Network
 
 SUMMING = ThreadPoolExecutor(1, "sums")
 """Thread in which checksums of earlier checkpoints are computed, beside the training."""
@@ -130,7 +131,7 @@ def load_params(
         sharding: where they are to lie; on the first device where left out.
     """
     place = sharding or jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), network.shapes)
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), network_shapes(network))
     return restore_params(run, like, step)
 
 

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from xew import config
 from xew.config import ConfigError
-from xew.files import checkpoint_time, read_json
+from xew.files import read_json
 from xew.model.runs.folder import load_run_config
 from xew.model.settings.settings import AdaptSettings
+from xew.run import checkpoint_time
 
 START = "start.json"
 """Name of the file that says, in an adapted run, which checkpoint of which run it started from."""
@@ -70,7 +71,7 @@ def _read_start(out: Path, run: Path) -> KeptStep:
         note = config.parse(StartNote, read_json(out / START), str(out / START))
     except (OSError, ValueError, ConfigError) as error:
         raise ConfigError(
-            f"{out} does not tell from which checkpoint of {run} it was adapted ({error}); copy the whole run, or "
+            f"{out} does not say from which checkpoint of {run} it was adapted ({error}); copy the whole run, or "
             "adapt again with --overwrite."
         ) from error
     if not (run / "config.yaml").exists() or checkpoint_time(run, note.step) != note.saved:

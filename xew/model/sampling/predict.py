@@ -32,10 +32,12 @@ from xew.model.cache.scales import Scale, apply_scales
 from xew.model.codecs.contract import Codec, encode_pictures, to_pictures, to_signed
 from xew.model.conditions import Condition, clip_numbers
 from xew.model.devices.sharding import batch_sharding, replicated_sharding
-from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES, NoiseSchedule
-from xew.model.network.dit import WorldModel, cast_params
-from xew.model.settings.parts import ClipInputs, Instructions
+from xew.model.diffusion.samplers import SAMPLERS, NoiseSchedule
+from xew.model.experiment import Experiment
+from xew.model.network.dit import WorldModel, cast_params, network_graph
+from xew.model.settings.parts import ClipInputs
 from xew.model.settings.settings import RolloutSettings
+from xew.model.text.instructions import Instructions
 from xew.model.video.frames import to_model_size
 
 Streams = dict[str, np.ndarray]
@@ -57,7 +59,7 @@ class ChunkInputs(NamedTuple):
     """[b 2] uint32, data of random keys, of the episode and the chunk."""
 
 
-class Sampling(NamedTuple):
+class ChunkSampling(NamedTuple):
     """How a chunk is sampled; hashable, static in the compiled function."""
 
     sampler: str
@@ -87,6 +89,7 @@ class Predictor:
     inputs: ClipInputs
     instructions: Instructions
     settings: RolloutSettings
+    schedule: NoiseSchedule
     codec: Codec
     graph: nnx.GraphDef
     params: Any
@@ -126,11 +129,8 @@ class Predictor:
         return Prediction(chunks, len(episodes), frame_count)
 
     @property
-    def _sampling(self) -> Sampling:
-        settings = self.settings
-        assert settings.shift is not None, "give `Experiment.sampling`, whose shift is resolved"
-        schedule = pick(SCHEDULES, settings.grid, "noise schedule")(settings.steps, settings.shift)
-        return Sampling(settings.sampler, schedule, settings.guidance, self.inputs.latent_shape)
+    def _sampling(self) -> ChunkSampling:
+        return ChunkSampling(self.settings.sampler, self.schedule, self.settings.guidance, self.inputs.latent_shape)
 
     def _read(self, episode: Episode) -> Streams:
         """The first frame of an episode, and all of its conditions."""
@@ -205,8 +205,20 @@ class Predictor:
         return jax.device_put(array, batch_sharding(self._mesh) if self._devices > 1 else replicated_sharding(self._mesh))
 
 
+def make_predictor(experiment: Experiment, codec: Codec, params: Any, scales: Mapping[str, Scale]) -> Predictor:
+    """The model of an experiment with these parameters, sampled as its config says.
+
+    Args:
+        codec: that of the run.
+        params: of its network, on one device or on the devices of a mesh.
+        scales: normalization of conditions that are numbers, as in training.
+    """
+    graph, settings = network_graph(experiment.network.for_sampling), experiment.rollout
+    return Predictor(experiment.inputs, experiment.instructions, settings, experiment.schedule, codec, graph, params, scales)
+
+
 @functools.partial(jax.jit, static_argnums=(0, 4))
-def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInputs, sampling: Sampling) -> Array:
+def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInputs, sampling: ChunkSampling) -> Array:
     """Predict one chunk of every episode of a batch, from its reference on: uint8 [b t h w 3]."""
     model = nnx.merge(graph, cast_params(graph, params))
     reference = codec.encode_batch(to_signed(inputs.reference))
@@ -233,7 +245,7 @@ def guided_velocity(model: WorldModel, inputs: ChunkInputs, guidance: float) -> 
 
 def _make_velocity(model: WorldModel, conditions: Mapping[str, Array], text: Array) -> Callable[[Array, Array], Array]:
     """Condition tokens that do not see RGB's are computed here, once a chunk."""
-    once = model.visibility == "one_way" and model.condition_streams
+    once = model.one_way and model.condition_streams
     cache = model.condition_cache(conditions, text) if once else None
     return lambda latents, level: model(latents, conditions, level, text, cache)
 

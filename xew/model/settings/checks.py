@@ -1,4 +1,4 @@
-"""Checks of an experiment: every number and choice that cannot be used is told before anything is done with it."""
+"""Checks of an experiment: a number or choice that cannot be used is an error before anything is done with it."""
 
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
@@ -17,7 +17,6 @@ from xew.model.settings.settings import (
     Clip,
     ModelSettings,
     RolloutSettings,
-    StepSettings,
     TrainSettings,
     count_replayed,
 )
@@ -33,30 +32,30 @@ LEAST_OF_STEPS: dict[str, float] = {
     "train.clip_norm": 0,
     "train.weight_decay": 0,
     "train.seed": 0,
-    "train.ema_decay": 0,
     "train.log_every": 1,
     "train.save_every": 1,
     "train.sample_every": 0,
     "train.keep_checkpoints": 1,
 }
-"""Numbers of any training, of a world model or a codec, that mean nothing below."""
+"""Least values of the settings of any training run, of a world model or a codec."""
 LEAST = LEAST_OF_STEPS | {
     "clip.height": 1,
     "clip.width": 1,
-    "model.unroll": 1,
     "train.epochs": 0,
     "train.accumulate": 1,
     "train.history_noise": 0,
-    "train.moving": 0,
+    "train.ema": 0,
+    "train.motion_loss_weight": 0,
     "adapt.lora_rank": 0,
     "rollout.steps": 1,
     "rollout.batch": 1,
-    "rollout.unroll": 0,
     "rollout.max_frames": 0,
     "rollout.guidance": 0,
     "rollout.seed": 0,
 }
-"""Numbers of an experiment that mean nothing below."""
+"""Least values of an experiment's settings."""
+LONGEST_AVERAGE = 0.25
+"""Largest `train.ema`: an average of a longer reach would still hold the random start (2 % of it at this one)."""
 
 
 class Settings(Protocol):
@@ -94,7 +93,7 @@ def _check_choices(experiment: Settings, source: str) -> None:
     check_least(LEAST, experiment, source)
     codec_class(experiment.codec).check(experiment.codec)
     pick(SAMPLERS, experiment.rollout.sampler, "sampler")
-    pick(SCHEDULES, experiment.rollout.grid, "noise schedule")
+    pick(SCHEDULES, experiment.rollout.noise_schedule, "noise schedule")
     _ = experiment.size, experiment.robots
     conditions = pick_conditions(experiment.model)
     _check_conditions(conditions, source)
@@ -111,13 +110,10 @@ def check_least(least: Mapping[str, float], settings: Any, source: str) -> None:
             raise ConfigError(f"{source}: {name} is {value:g}; it must be at least {smallest:g}.")
 
 
-def check_steps(train: StepSettings, other: str, source: str) -> None:
-    """Raise ConfigError unless a training has one length, in steps or in the `other` unit, and a moving average that moves."""
-    length = getattr(train, other)
-    if (train.steps > 0) == (length > 0):
-        raise ConfigError(f"{source}: train.steps is {train.steps}, train.{other} {length:g}; give one of them, over 0.")
-    if train.ema_decay >= 1:
-        raise ConfigError(f"{source}: train.ema_decay is {train.ema_decay:g}; it must be under 1.")
+def check_steps(steps: int, length: float, unit: str, source: str) -> None:
+    """Raise ConfigError unless a training run has one length, in steps or in another unit."""
+    if (steps > 0) == (length > 0):
+        raise ConfigError(f"{source}: train.steps is {steps}, train.{unit} {length:g}; give one of them, and 0 for the other.")
 
 
 def _check_conditions(conditions: Sequence[Condition], source: str) -> None:
@@ -149,10 +145,11 @@ def _check_sizes(experiment: Settings, source: str) -> None:
 
 def _check_training(experiment: Settings, source: str) -> None:
     train, adapt = experiment.train, experiment.adapt
-    check_steps(train, "epochs", source)
-    for name, shift in {"train": train.shift, "rollout": experiment.rollout.shift}.items():
-        if shift is not None and not shift > 0:
-            raise ConfigError(f"{source}: {name}.shift is {shift:g}; it must be over 0 (1 leaves the levels as they are).")
+    check_steps(train.steps, train.epochs, "epochs", source)
+    if train.ema > LONGEST_AVERAGE:
+        raise ConfigError(f"{source}: train.ema is {train.ema:g} of the run; it must be at most {LONGEST_AVERAGE:g}.")
+    if not train.shift > 0:
+        raise ConfigError(f"{source}: train.shift is {train.shift:g}; it must be over 0 (1 leaves the levels as they are).")
     if adapt.start_from is None:
         if adapt != AdaptSettings():
             raise ConfigError(f"{source}: adapt says how, but adapt.start_from not which run to adapt; give that, or no adapt.")

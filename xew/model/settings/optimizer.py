@@ -13,9 +13,6 @@ from optax.contrib import MuonDimensionNumbers, muon
 from xew.model.devices.sharding import path_names
 from xew.model.settings.settings import TrainSettings, count_replayed
 
-MOST_OF_THE_START = 0.01
-"""Share of a training's start in the average of its parameters above which it is told."""
-
 
 def learning_rate(settings: TrainSettings) -> optax.Schedule:
     """Make the schedule, step -> learning rate: optional warm-up, then constant or decaying by a cosine."""
@@ -80,16 +77,9 @@ def find_matrices(params: Any) -> Any:
     return jax.tree_util.tree_map_with_path(axes, params)
 
 
-def tell_stale_average(settings: TrainSettings) -> str | None:
-    """What to tell of an average of parameters that holds the start at the end of the training; None where it does not."""
-    left = settings.ema_decay**settings.steps if settings.ema_decay else 0.0
-    if left <= MOST_OF_THE_START:
-        return None
-    enough = MOST_OF_THE_START ** (1 / settings.steps)
-    return (
-        f"train.ema_decay {settings.ema_decay:g} leaves {100 * left:.0f} % of the start in the average of {settings.steps}"
-        f" steps; {enough:.4g} would leave {100 * MOST_OF_THE_START:.0f} %"
-    )
+def average_decay(settings: TrainSettings) -> float:
+    """Decay of the moving average whose reach is the fraction `train.ema` of the run's steps."""
+    return 1 - 1 / max(settings.ema * settings.steps, 1)
 
 
 def set_steps(settings: TrainSettings, samples: int, replay: float = 0.0) -> TrainSettings:

@@ -1,11 +1,10 @@
 """The parts that an experiment is resolved into, each for one place that takes it."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import optax
 
 from xew.config import pick
@@ -13,10 +12,10 @@ from xew.model.codecs.contract import CodecSettings
 from xew.model.codecs.vae import VaeSize
 from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition, list_conditions
 from xew.model.network.dit import STREAMS, token_grid
-from xew.model.network.tokens import Patch
-from xew.model.settings.network import Network
+from xew.model.network.spec import Network
+from xew.model.network.tokens import Patch, TokenGrid
+from xew.model.settings.optimizer import make_optimizer, set_steps
 from xew.model.settings.settings import Clip, ModelSettings, TrainSettings
-from xew.model.text.instructions import TextEncoder, TextSource, encode_instructions
 from xew.protocol import SHARED_MOTION, Split, validation_split
 
 
@@ -43,23 +42,10 @@ class ClipInputs:
         return self.shapes["rgb"]
 
     @property
-    def grids(self) -> list[tuple[int, int, int]]:
+    def grids(self) -> list[TokenGrid]:
         """Tokens (t', h', w') of each stream, RGB first."""
         streams = ["rgb", *(name for name in self.conditions if name in STREAMS)]
         return [token_grid((1, *self.shapes[name]), self.patch) for name in streams]
-
-
-@dataclass(frozen=True)
-class Instructions:
-    """How instructions become what the network takes."""
-
-    encoder: TextEncoder
-    source: TextSource
-    prefix: str
-
-    def encode(self, instructions: Iterable[str]) -> dict[str, np.ndarray]:
-        """Every distinct instruction as the network takes it: [l] int32 where the table is learned, else [l e] float32."""
-        return encode_instructions(self.encoder, self.source, instructions, self.prefix)
 
 
 @dataclass(frozen=True)
@@ -85,7 +71,7 @@ class Encoding:
 
 @dataclass(frozen=True)
 class EpisodeChoice:
-    """Which episodes of a data set a training reads; every robot by its own key."""
+    """Which episodes of a data set a training run reads; every robot by its own key."""
 
     robots: tuple[str, ...]
     """Robots whose training episodes are learned from."""
@@ -100,14 +86,26 @@ class EpisodeChoice:
 
 
 @dataclass(frozen=True)
-class Learning:
-    """What is learned, and how: the network, the optimizer and the loss."""
+class TrainSpec:
+    """What a run trains and how: the network, its inputs, and the settings of optimizer and loss."""
 
     network: Network
+    inputs: ClipInputs
     settings: TrainSettings
-    optimizer: optax.GradientTransformation
-    """Optimizer of these settings."""
+    """With `steps` once the number of samples is known, see `with_steps`."""
+    replay: float = 0.0
+    """Part of every batch that is replayed, in an adaptation."""
     lora_rank: int = 0
+    """Rank of the corrections that are learned; 0 learns all weights."""
+
+    @property
+    def optimizer(self) -> optax.GradientTransformation:
+        """Optimizer of these settings."""
+        return make_optimizer(self.settings)
+
+    def with_steps(self, samples: int) -> "TrainSpec":
+        """The same with the length of the run in steps, for so many new (not replayed) training samples."""
+        return replace(self, settings=set_steps(self.settings, samples, self.replay))
 
 
 def pick_conditions(settings: ModelSettings) -> list[Condition]:

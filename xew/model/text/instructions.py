@@ -60,20 +60,27 @@ class TextEncoder:
     """Whether the network itself has the table that the ids are rows of."""
 
 
-def encode_instructions(
-    encoder: TextEncoder, source: TextSource, instructions: Iterable[str], prefix: str = ""
-) -> dict[str, np.ndarray]:
-    """Every distinct instruction as the network takes it; `Experiment.encode_instructions` knows encoder and source.
+@dataclass(frozen=True)
+class Instructions:
+    """How an experiment's instructions become what its network takes."""
 
-    Returns:
-        By instruction, int32 [l] where the table is learned, else float32 [l e]; zero past the end of the text.
+    encoder: TextEncoder
+    source: TextSource
+    prefix: str = ""
+    """Text put before every instruction."""
 
-    Raises:
-        ConfigError: an encoder's files are missing or do not fit.
-    """
-    distinct = list(dict.fromkeys(instructions))
-    encoded = encoder.encode(source, [prefix + instruction for instruction in distinct])
-    return {instruction: _pad(array, source.tokens) for instruction, array in zip(distinct, encoded, strict=True)}
+    def encode(self, instructions: Iterable[str]) -> dict[str, np.ndarray]:
+        """Every distinct instruction as the network takes it.
+
+        Returns:
+            By instruction, int32 [l] where the table is learned, else float32 [l e]; zero past the end of the text.
+
+        Raises:
+            ConfigError: an encoder's files are missing or do not fit.
+        """
+        distinct = list(dict.fromkeys(instructions))
+        encoded = self.encoder.encode(self.source, [self.prefix + instruction for instruction in distinct])
+        return {instruction: _pad(array, self.source.tokens) for instruction, array in zip(distinct, encoded, strict=True)}
 
 
 def _pad(array: np.ndarray, tokens: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Training: batches in an exact order, one compiled step, memory told beforehand, curves and samples.
+"""Training: batches in an exact order, one compiled step, memory estimated beforehand, curves and samples.
 
 The same numbers on one device and on many, interrupted or not.
 """

@@ -17,8 +17,8 @@ from xew.model.cache.clips import sample_starts
 from xew.model.cache.scales import Scale, apply_scales, load_scales
 from xew.model.cache.store import LatentCache, open_cache
 from xew.model.codecs.contract import latent_frames
-from xew.model.settings.parts import ClipInputs, Encoding, Instructions
-from xew.model.text.instructions import VOCABULARY
+from xew.model.settings.parts import ClipInputs, Encoding
+from xew.model.text.instructions import VOCABULARY, Instructions
 from xew.model.video.frames import TEMPORAL_FACTOR
 
 

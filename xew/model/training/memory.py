@@ -1,4 +1,4 @@
-"""How much memory training needs, before anything is compiled.
+"""How much memory a training run needs, before anything is compiled.
 
 The numbers are of one device: parameters, optimizer, moving average and gradients are cut along `fsdp`; activations are
 those of the device's samples of one part of the batch. The estimate is made from shapes alone; what XLA adds (buffers that
@@ -14,15 +14,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jax.sharding import AbstractMesh, Mesh
 
 from xew.config import ConfigError
 from xew.model.codecs.contract import latent_frames
 from xew.model.codecs.vae import abstract_vae
-from xew.model.network.dit import ModelSize, RematName
-from xew.model.runs.checkpoint import TrainState
-from xew.model.settings.network import Network
-from xew.model.settings.parts import ClipInputs, Encoding, Learning
+from xew.model.network.blocks import ModelSize, RematName
+from xew.model.network.spec import Network
+from xew.model.settings.parts import ClipInputs, Encoding
+from xew.model.training.step import Trainer
 from xew.model.video.frames import TEMPORAL_FACTOR
 
 MARGIN = 1.1
@@ -53,19 +52,17 @@ class Memory:
         return "\n".join([f"each device, {self.layout}:", *lines, total])
 
 
-def estimate_memory(learning: Learning, state: TrainState, encoding: Encoding, mesh: Mesh | AbstractMesh) -> Memory:
-    """Estimate what each device of a mesh needs to train.
+def estimate_memory(trainer: Trainer, encoding: Encoding) -> Memory:
+    """Estimate what each device of the trainer's mesh needs to train.
 
     Args:
-        learning: the network and its optimizer.
-        state: shapes, types and shardings of the state.
-        encoding: what the network is given of a clip, and the codec, which works between two chunks.
-        mesh: the devices, which need not be there.
+        trainer: its devices need not be there.
+        encoding: the codec, which works between two chunks.
     """
-    settings, network = learning.settings, learning.network
-    devices, fsdp = mesh.size, mesh.shape["fsdp"]
+    spec, state, params = trainer.spec, trainer.shapes, trainer.network_shapes
+    settings, network = spec.settings, spec.network
+    devices, fsdp = trainer.mesh.size, trainer.mesh.shape["fsdp"]
     compute = jnp.dtype(network.settings.dtype).itemsize
-    params = state.params if state.base is None else state.base
     weights = sum(math.prod(leaf.sharding.shard_shape(leaf.shape)) for leaf in jax.tree.leaves(params))  # numbers a device
     layer = sum(leaf.size for leaf in jax.tree.leaves(params)) / network.size.depth  # numbers of one layer, about
     summed = settings.accumulate > 1 or settings.chunks > 1
@@ -78,7 +75,7 @@ def estimate_memory(learning: Learning, state: TrainState, encoding: Encoding, m
         f"rounded to {network.settings.dtype}": weights * compute if compute < 4 else 0.0,
         "gradients": weights * compute + (weights * 4 if summed else 0.0),
         "layers gathered": 2 * compute * layer if fsdp > 1 else 0.0,
-        "activations": samples * activation_bytes(network, encoding.inputs),
+        "activations": samples * activation_bytes(network, spec.inputs),
         "autoencoder": codec_bytes(encoding, samples) if settings.chunks == 2 else 0.0,
     }
     layout = f"{devices} devices, state in {fsdp} parts, {samples:g} samples at once on each, remat {network.settings.remat}"
@@ -95,10 +92,9 @@ def activation_bytes(network: Network, inputs: ClipInputs) -> float:
     """Bytes of activations of one sample: what is kept of every block, and the work of one block in the backward pass."""
     settings, size = network.settings, network.size
     tokens = sum(math.prod(grid) for grid in inputs.grids)
-    compute, residual = jnp.dtype(settings.dtype).itemsize, jnp.dtype(settings.residual).itemsize
-    logits = logits_bytes(network, tokens)
-    kept = tokens * kept_bytes(size, settings.remat, compute, residual) + (logits if settings.remat == "none" else 0.0)
-    return size.depth * kept + 2 * (tokens * work_bytes(size, compute, residual) + logits)
+    compute, logits = jnp.dtype(settings.dtype).itemsize, logits_bytes(network, tokens)
+    kept = tokens * kept_bytes(size, settings.remat, compute) + (logits if settings.remat == "none" else 0.0)
+    return size.depth * kept + 2 * (tokens * work_bytes(size, compute) + logits)
 
 
 def codec_bytes(encoding: Encoding, samples: float) -> float:
@@ -112,28 +108,25 @@ def codec_bytes(encoding: Encoding, samples: float) -> float:
     return weights + 4 * samples * widest
 
 
-def kept_bytes(size: ModelSize, remat: RematName, compute: int, residual: int) -> float:
+def kept_bytes(size: ModelSize, remat: RematName, compute: int) -> float:
     """Bytes a token that each block leaves for the backward pass (a test counts them in the traced network)."""
     return {
-        "full": residual * size.dim,
-        "attention": (residual + 2 * compute) * size.dim,
-        "dots": residual * size.dim + compute * (9 * size.dim + size.ffn_dim),
+        "full": compute * size.dim,
+        "attention": 3 * compute * size.dim,
+        "dots": compute * (10 * size.dim + size.ffn_dim),
         # Nothing is fused away: every step of the norms, modulations and rotations keeps its float32 result.
         "none": (104 + 7 * compute) * size.dim + 6 * compute * size.ffn_dim,
     }[remat]
 
 
-def work_bytes(size: ModelSize, compute: int, residual: int) -> float:
+def work_bytes(size: ModelSize, compute: int) -> float:
     """Bytes a token of what one block needs at a time: 14 widths and two of the hidden width, and the norms."""
-    return compute * (14 * size.dim + 2 * size.ffn_dim) + residual * 5 * size.dim
+    return compute * (19 * size.dim + 2 * size.ffn_dim)
 
 
 def logits_bytes(network: Network, tokens: int) -> float:
     """Bytes of XLA's attention, which forms every pair of tokens (float32, and rounded); cuDNN's forms none."""
-    settings = network.settings
-    fused = settings.attention == "cudnn" or (settings.attention == "auto" and settings.dtype == "bfloat16")
-    compute = jnp.dtype(settings.dtype).itemsize
-    return 0.0 if fused else network.size.heads * tokens**2 * (4 + compute)
+    return 0.0 if network.settings.dtype == "bfloat16" else 8.0 * network.size.heads * tokens**2
 
 
 def device_memory() -> float:

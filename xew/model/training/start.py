@@ -1,4 +1,4 @@
-"""What a training starts from: random parameters, published weights, another run's, or its own latest checkpoint."""
+"""What a run starts from: random parameters, published weights, another run's, or its own latest checkpoint."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,27 +8,28 @@ from xew.model.network.dit_layouts import load_dit_params
 from xew.model.runs.checkpoint import TrainState, damaged, restore_state, restore_sum
 from xew.model.runs.lineage import trace_start
 from xew.model.runs.session import Session
-from xew.model.training.step import Learner
+from xew.model.training.step import Trainer
 
 
-def begin_state(learner: Learner, start_from: Path | None, session: Session, batches: Any) -> TrainState:
+def begin_state(trainer: Trainer, start_from: Path | None, weights: Path | None, session: Session, batches: Any) -> TrainState:
     """Make the state of step 0, or restore that of the latest checkpoint with the position of the data.
 
     The network starts from the run to adapt, published weights or random numbers; with LoRA it is needed in a resumed run too.
 
     Args:
         start_from: the run that is adapted, if any.
+        weights: published weights to start from, if any.
         batches: the iterator of batches, which goes on where it was left.
     """
-    resumed = _resume(session, learner.shapes, batches) if session.step > 0 else None
-    if resumed is not None and not learner.learning.lora_rank:
+    resumed = _resume(session, trainer.shapes, batches) if session.step > 0 else None
+    if resumed is not None and not trainer.spec.lora_rank:
         return resumed
-    params, weights = None, learner.learning.network.settings.weights
+    params = None
     if start_from is not None:
-        params, _ = restore_sum(trace_start(session.out, start_from), learner.network_shapes)
+        params, _ = restore_sum(trace_start(session.out, start_from), trainer.network_shapes)
     elif weights is not None:
-        params = load_dit_params(*learner.random_network(), weights)
-    return learner.init_state(params) if resumed is None else replace(resumed, base=params)
+        params = load_dit_params(*trainer.random_network(), weights)
+    return trainer.init_state(params) if resumed is None else replace(resumed, base=params)
 
 
 def _resume(session: Session, shapes: TrainState, batches: Any) -> TrainState:

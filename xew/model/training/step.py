@@ -20,22 +20,23 @@ import numpy as np
 import optax
 from flax import nnx
 from jax import Array
-from jax.sharding import Mesh
+from jax.sharding import AbstractMesh, Mesh
 
 from xew.model.codecs.contract import Codec
 from xew.model.devices.sharding import gather_parameters, place_shapes
 from xew.model.diffusion.flow_matching import (
     ReplaceReference,
     TrainingPair,
-    moving_weights,
+    motion_weights,
     put_first,
     sample_losses,
     training_pair,
 )
-from xew.model.network.dit import cast_params
+from xew.model.network.dit import WorldModel, cast_params, network_graph, network_shapes
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs.checkpoint import TrainState
-from xew.model.settings.parts import Learning
+from xew.model.settings.optimizer import average_decay
+from xew.model.settings.parts import TrainSpec
 from xew.model.training.data import Batch
 
 HISTORY_KEY = 7
@@ -57,15 +58,31 @@ class StepResult(NamedTuple):
     """Whether the losses, the gradients and the new parameters are all finite."""
 
 
-@dataclass(frozen=True)
-class Learner:
-    """A network and its optimizer on a mesh: the structure, and where each part of the state lies."""
+class Samples(NamedTuple):
+    """Some samples of a batch: every leaf has them as its leading axis."""
 
-    learning: Learning
-    mesh: Mesh
+    batch: Batch
+    weights: Array
+    """[b k], see `StepResult.weights`."""
+    keys: Array
+    """[b] random keys, so that a sample's noise does not depend on how the batch is cut."""
+
+
+@dataclass(frozen=True)
+class Trainer:
+    """Trains a network on a mesh: the random start, the compiled step, and the parameters for inference.
+
+    The step's noise depends on the seed, the step and the place in the batch only, so that a resumed run repeats it.
+    """
+
+    spec: TrainSpec
+    mesh: Mesh | AbstractMesh
+    """The devices; an abstract mesh serves to ask for shapes alone."""
     graph: nnx.GraphDef
     shapes: TrainState
     """Shapes, types and shardings of the state; its step has a copy on every device."""
+    codec: Codec | None = None
+    """Needed where `train.chunks` is 2, to decode and encode the first chunk's prediction."""
 
     @property
     def network_shapes(self) -> Any:
@@ -81,14 +98,10 @@ class Learner:
         with jax.set_mesh(self.mesh):
             return self._compiled_init(start)
 
-    @functools.cached_property
-    def _compiled_init(self) -> Callable[[Any], TrainState]:
-        return jax.jit(lambda start: _init(self.learning, start), out_shardings=list_shardings(self.shapes), donate_argnums=0)
-
     def random_network(self) -> tuple[nnx.GraphDef, Any]:
         """The network's structure and its parameters at their random start, made where they lie on the mesh."""
-        network = self.learning.network
-        init = jax.jit(lambda: nnx.state(network.create(), nnx.Param), out_shardings=list_shardings(self.network_shapes))
+        network = self.spec.network
+        init = jax.jit(lambda: nnx.state(WorldModel(network), nnx.Param), out_shardings=list_shardings(self.network_shapes))
         return self.graph, init()
 
     def average_params(self, state: TrainState) -> Any:
@@ -96,147 +109,86 @@ class Learner:
         with jax.set_mesh(self.mesh):
             return jax.jit(apply_lora)(state.base, state.params if state.ema is None else state.ema)
 
-    def compile_step(self, codec: Codec | None = None) -> "TrainStep":
-        """The compiled step; its noise depends on the seed, the step and the place in the batch only.
-
-        A resumed run therefore repeats it.
-
-        Args:
-            codec: needed where `train.chunks` is 2, to decode and encode the first chunk's prediction, and where its later
-                latents are relative to the first frame, to say what is to be predicted behind the one that is shown.
-        """
-        settings, graph, optimizer = self.learning.settings, self.graph, self.learning.optimizer
-        places = list_shardings(self.network_shapes)
-        objective = Objective(graph, places, settings.shift, settings.accumulate, settings.history_noise, settings.moving)
-
-        def step(state: TrainState, batch: Batch, codec: Codec | None) -> tuple[TrainState, StepResult]:
-            key = jax.random.fold_in(jax.random.key(settings.seed), state.step)
-            samples = Samples(batch, chunk_weights(batch), jax.random.split(key, len(batch.latents)))
-            params, back = jax.vjp(
-                lambda learned: objective.place(cast_params(graph, apply_lora(state.base, learned))), state.params
-            )
-            gradients, losses, sigma = objective.gradients(params, samples, codec)
-            (gradients,) = back(jax.tree.map(lambda total, like: total.astype(like.dtype), gradients, params))
-            updates, moments = optimizer.update(gradients, state.optimizer, state.params)
-            learned = optax.apply_updates(state.params, updates)
-            ema = None if state.ema is None else optax.incremental_update(learned, state.ema, 1 - settings.ema_decay)
-            norm = optax.tree.norm(gradients)
-            finite = jnp.isfinite(norm) & jnp.isfinite(optax.tree.norm(learned)) & jnp.isfinite(losses).all()
-            result = StepResult(losses, sigma, samples.weights, norm, finite)
-            return TrainState(state.step + 1, learned, moments, ema, state.base), result
-
-        everywhere = self.shapes.step.sharding
-        jitted = jax.jit(step, donate_argnums=0, out_shardings=(list_shardings(self.shapes), everywhere))
-        needed = codec is not None and (settings.chunks == 2 or codec.relative)
-        copies = jax.device_put(jax.tree.map(np.asarray, codec), everywhere) if needed else None
-        return TrainStep(jitted, self.mesh, copies)
-
-
-def make_learner(learning: Learning, mesh: Mesh) -> Learner:
-    """Lay a network and its optimizer out on a mesh, without computing anything."""
-    graph, shapes = abstract_state(learning)
-    return Learner(learning, mesh, graph, place_shapes(shapes, mesh))
-
-
-def abstract_state(learning: Learning) -> tuple[nnx.GraphDef, TrainState]:
-    """The network's structure, and the shapes and types of the state of step 0, without computing anything."""
-    network = learning.network
-    return network.structure, jax.eval_shape(lambda params: _init(learning, params), network.shapes)
-
-
-def _init(learning: Learning, start: Any) -> TrainState:
-    """Make the state of step 0 from loaded parameters, or from random ones where there are none."""
-    params = nnx.state(learning.network.create(), nnx.Param) if start is None else start
-    base, learned, settings = None, params, learning.settings
-    if learning.lora_rank:
-        base = params
-        learned = init_lora(params, learning.lora_rank, jax.random.key(settings.seed))
-    ema = jax.tree.map(jnp.copy, learned) if settings.ema_decay else None
-    return TrainState(jnp.int32(0), learned, learning.optimizer.init(learned), ema, base)
-
-
-def list_shardings(shapes: Any) -> Any:
-    """The shardings of shapes that have their places, in the same tree."""
-    return jax.tree.map(lambda leaf: leaf.sharding, shapes)
-
-
-@dataclass(frozen=True)
-class TrainStep:
-    """The compiled step: (state, batch on the mesh) -> (next state, result). The given state is used up."""
-
-    jitted: Any
-    mesh: Mesh
-    codec: Codec | None
-
-    def __call__(self, state: TrainState, batch: Batch) -> tuple[TrainState, StepResult]:
+    def step(self, state: TrainState, batch: Batch) -> tuple[TrainState, StepResult]:
+        """Take a step with a batch on the mesh. The given state is used up."""
         with jax.set_mesh(self.mesh):
-            return self.jitted(state, batch, self.codec)
+            return self._compiled_step(state, batch, self._codec_copies)
 
-    def lower(self, state: TrainState, batch: Batch) -> jax.stages.Lowered:
-        """The program for arrays or for their shapes and shardings, to compile without running and to look at its memory."""
+    def lower_step(self, state: TrainState, batch: Batch) -> jax.stages.Lowered:
+        """The step's program for arrays or for their shapes and shardings, to compile without running and see its memory."""
         with jax.set_mesh(self.mesh):
-            return self.jitted.lower(state, batch, self.codec)
+            return self._compiled_step.lower(state, batch, self._codec_copies)
 
+    @functools.cached_property
+    def _compiled_init(self) -> Callable[[Any], TrainState]:
+        return jax.jit(lambda start: _init(self.spec, start), out_shardings=list_shardings(self.shapes), donate_argnums=0)
 
-class Samples(NamedTuple):
-    """Some samples of a batch: every leaf has them as its leading axis."""
+    @functools.cached_property
+    def _compiled_step(self) -> Any:
+        shardings = (list_shardings(self.shapes), self.shapes.step.sharding)
+        return jax.jit(self._step, donate_argnums=0, out_shardings=shardings)
 
-    batch: Batch
-    weights: Array
-    """[b k], see `StepResult.weights`."""
-    keys: Array
-    """[b] random keys, so that a sample's noise does not depend on how the batch is cut."""
+    @functools.cached_property
+    def _codec_copies(self) -> Codec | None:
+        """The codec on every device, if the step needs it."""
+        if self.codec is None or not (self.spec.settings.chunks == 2 or self.codec.relative):
+            return None
+        return jax.device_put(jax.tree.map(np.asarray, self.codec), self.shapes.step.sharding)
 
+    def _step(self, state: TrainState, batch: Batch, codec: Codec | None) -> tuple[TrainState, StepResult]:
+        settings = self.spec.settings
+        key = jax.random.fold_in(jax.random.key(settings.seed), state.step)
+        samples = Samples(batch, chunk_weights(batch), jax.random.split(key, len(batch.latents)))
+        params, vjp_fn = jax.vjp(
+            lambda learned: self._keep_sharded(cast_params(self.graph, apply_lora(state.base, learned))), state.params
+        )
+        gradients, losses, sigma = self.gradients(params, samples, codec)
+        (gradients,) = vjp_fn(jax.tree.map(lambda total, like: total.astype(like.dtype), gradients, params))
+        updates, moments = self.spec.optimizer.update(gradients, state.optimizer, state.params)
+        learned = optax.apply_updates(state.params, updates)
+        ema = None if state.ema is None else optax.incremental_update(learned, state.ema, 1 - average_decay(settings))
+        norm = optax.tree.norm(gradients)
+        finite = jnp.isfinite(norm) & jnp.isfinite(optax.tree.norm(learned)) & jnp.isfinite(losses).all()
+        result = StepResult(losses, sigma, samples.weights, norm, finite)
+        return TrainState(state.step + 1, learned, moments, ema, state.base), result
 
-@dataclass(frozen=True)
-class Objective:
-    """The loss of a batch, and its gradients part by part."""
-
-    graph: nnx.GraphDef
-    places: Any
-    """Shardings of the network's parameters, in their tree."""
-    shift: float
-    parts: int
-    """Number of parts of the batch that are computed one after another."""
-    history_noise: float = 0.0
-    """Standard deviation of the noise on earlier frames' latents."""
-    moving: float = 0.0
-    """Additional weight in the loss of what moves, at most."""
-
-    def place(self, tree: Any) -> Any:
+    def _keep_sharded(self, tree: Any) -> Any:
         """Keep a tree like that of the parameters cut along fsdp as they are: the compiler might gather it too soon."""
         leaves, structure = jax.tree.flatten(tree)
-        kept = [jax.lax.with_sharding_constraint(*pair) for pair in zip(leaves, jax.tree.leaves(self.places), strict=True)]
-        return jax.tree.unflatten(structure, kept)
+        shardings = jax.tree.leaves(list_shardings(self.network_shapes))
+        constrained = [jax.lax.with_sharding_constraint(*pair) for pair in zip(leaves, shardings, strict=True)]
+        return jax.tree.unflatten(structure, constrained)
 
     def gradients(self, params: Any, samples: Samples, codec: Codec | None) -> tuple[Any, Array, Array]:
         """Gradients of the mean loss over samples, and the chunks' losses and noise levels [b k].
 
-        A sample's loss is the mean over its chunks. Sums over parts and over chunks are in float32.
+        A sample's loss is the mean over its chunks. Sums over parts of the batch (`train.accumulate`) and over chunks are in
+        float32.
         """
-        size = len(samples.keys)
-        if self.parts == 1:
+        size, parts = len(samples.keys), self.spec.settings.accumulate
+        if parts == 1:
             return self._part_gradients(params, samples, codec, size)
 
         def add(total: Any, part: Samples) -> tuple[Any, tuple[Array, Array]]:
             gradients, losses, sigma = self._part_gradients(params, part, codec, size)
-            return self.place(_sum(total, gradients)), (losses, sigma)
+            return self._keep_sharded(_sum(total, gradients)), (losses, sigma)
 
-        zeros = self.place(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, jnp.float32), params))
-        cut = jax.tree.map(lambda leaf: cut_samples(leaf, self.parts), samples)
+        zeros = self._keep_sharded(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, jnp.float32), params))
+        cut = jax.tree.map(lambda leaf: cut_samples(leaf, parts), samples)
         gradients, (losses, sigma) = jax.lax.scan(add, zeros, cut)
         return gradients, join_samples(losses), join_samples(sigma)
 
     def _part_gradients(self, params: Any, samples: Samples, codec: Codec | None, size: int) -> tuple[Any, Array, Array]:
         """Gradients, losses and noise levels of one part; `size` is the number of samples of the whole batch."""
+        settings = self.spec.settings
         gradients, losses, sigmas, chunk = None, [], [], samples.batch
         replace_reference = put_first if codec is None else codec.replace_reference
         for number in range(samples.weights.shape[1]):
             keys = jax.vmap(jax.random.fold_in, (0, None))(samples.keys, number)
-            pair = sample_pairs(keys, chunk.latents, self.shift, replace_reference)
-            chunk = add_history_noise(keys, chunk, self.history_noise)
-            own, loss, predicted = self._chunk_gradients(params, chunk, pair, samples.weights[:, number] / size)
-            gradients = own if gradients is None else self.place(_sum(gradients, own))
+            pair = sample_pairs(keys, chunk.latents, settings.shift, replace_reference)
+            chunk = add_history_noise(keys, chunk, settings.history_noise)
+            of_chunk, loss, predicted = self._chunk_gradients(params, chunk, pair, samples.weights[:, number] / size)
+            gradients = of_chunk if gradients is None else self._keep_sharded(_sum(gradients, of_chunk))
             losses.append(loss)
             sigmas.append(pair.sigma)
             if chunk.following is not None:
@@ -247,8 +199,8 @@ class Objective:
 
     def _chunk_gradients(self, params: Any, chunk: Batch, pair: TrainingPair, shares: Array) -> tuple[Any, Array, Array]:
         """Gradients, losses [b] and prediction of one chunk, whose samples have these shares in the loss [b]."""
-
-        weights = moving_weights(chunk.latents, self.moving) if self.moving else None
+        strength = self.spec.settings.motion_loss_weight
+        weights = motion_weights(chunk.latents, strength) if strength else None
 
         def loss(params: Any) -> tuple[Array, tuple[Array, Array]]:
             predicted = nnx.merge(self.graph, gather_parameters(params))(pair.noisy, chunk.conditions, pair.sigma, chunk.text)
@@ -256,7 +208,28 @@ class Objective:
             return (shares * losses).sum(), (losses, predicted)
 
         gradients, (losses, predicted) = jax.grad(loss, has_aux=True)(params)
-        return self.place(gradients), losses, predicted
+        return self._keep_sharded(gradients), losses, predicted
+
+
+def make_trainer(spec: TrainSpec, mesh: Mesh | AbstractMesh, codec: Codec | None = None) -> Trainer:
+    """Lay a network and its optimizer out on a mesh, without computing anything."""
+    shapes = jax.eval_shape(lambda params: _init(spec, params), network_shapes(spec.network))
+    return Trainer(spec, mesh, network_graph(spec.network), place_shapes(shapes, mesh), codec)
+
+
+def _init(spec: TrainSpec, start: Any) -> TrainState:
+    """Make the state of step 0 from loaded parameters, or from random ones where there are none."""
+    params = nnx.state(WorldModel(spec.network), nnx.Param) if start is None else start
+    base, learned = None, params
+    if spec.lora_rank:
+        base, learned = params, init_lora(params, spec.lora_rank, jax.random.key(spec.settings.seed))
+    ema = jax.tree.map(jnp.copy, learned) if spec.settings.ema else None
+    return TrainState(jnp.int32(0), learned, spec.optimizer.init(learned), ema, base)
+
+
+def list_shardings(shapes: Any) -> Any:
+    """The shardings of shapes that have them, in the same tree."""
+    return jax.tree.map(lambda leaf: leaf.sharding, shapes)
 
 
 def sample_pairs(keys: Array, latents: Array, shift: float, replace_reference: ReplaceReference = put_first) -> TrainingPair:

@@ -1,0 +1,50 @@
+"""The folder of a trained run, as far as other packages need it: its mark, its files, and its checkpoints' times.
+
+xew/model/runs writes it; xew/model/runs/folder.py says what each file holds.
+"""
+
+from pathlib import Path
+
+from xew.files import read_json, remove_written
+
+RUN_MARK = ".xew-run"
+"""Name of the file that marks the folder of a run."""
+RUN_FILES = (
+    RUN_MARK,
+    "config.yaml",
+    "codec/*",
+    "scales.json",
+    "checkpoints/*",
+    "sums/*.json",
+    "start.json",
+    "metrics.jsonl",
+    "events.out.tfevents.*",
+    "autoencoder.*",
+    "vae.*",
+    "report.md",
+    "pictures/*.png",
+)
+"""Patterns of the paths of what training runs write into their folders."""
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a training run has made a folder, by its mark."""
+    return (folder / RUN_MARK).is_file()
+
+
+def remove_run(folder: Path) -> list[Path]:
+    """Remove the files of a run, and return what else lies there, which stays. Raises OSError as `files.remove_written`."""
+    return remove_written(folder, RUN_FILES)
+
+
+def list_steps(run: Path) -> list[int]:
+    """Steps of the checkpoints of a run, in order."""
+    return sorted(int(path.name) for path in (run / "checkpoints").glob("*") if path.name.isdecimal())
+
+
+def checkpoint_time(run: Path, step: int) -> int | None:
+    """Time at which a checkpoint was begun [ns]; another of the same step has another. None if there is no such checkpoint."""
+    try:
+        return read_json(run / "checkpoints" / str(step) / "_CHECKPOINT_METADATA")["init_timestamp_nsecs"]
+    except (OSError, ValueError, KeyError):
+        return None
