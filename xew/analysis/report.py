@@ -35,7 +35,7 @@ from xew.analysis.reports import study as report_study
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.run_tables import RobotTable, Row, finding, flat_summary, robot_table
 from xew.analysis.reports.study_charts import run_chart
-from xew.analysis.reports.study_text import missing_note
+from xew.analysis.reports.study_text import curves_note, missing_note
 from xew.analysis.scores import TRUTH, MetricInfo, Scores, find_missing_scores, read_scores
 from xew.analysis.tables import formats
 from xew.analysis.tables.labels import robot_title
@@ -54,7 +54,7 @@ from xew.dataset import count_motions, demand_one_motion, find_records
 from xew.episode import Record, episode_folder, read_video
 from xew.files import hold_lock, write_bytes, write_text
 from xew.names import csv_text, path_below, plain_markdown
-from xew.protocol import BASELINES, HELD_OUT_ROBOTS, MIXED_MOTION, ROBOT_NAMES, seed_split
+from xew.protocol import BASELINES, HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
 from xew.rollout import Rollout, find_rollouts, read_rollout_video
 from xew.statistics import MIN_SCENES, find_parting, strict_metrics
 
@@ -96,8 +96,6 @@ class Args:
     """Folder that python -m xew.analysis.distance wrote, for a study; without it the paper's distances are used."""
     other_motion: Path | None = None
     """Score table of the same study in the other kind of motion: action representations of both stand side by side."""
-    mixed_motion: bool = False
-    """Report on scores of episodes of shared and of own motion together."""
     explorer: bool = False
     """Write <out>/explorer too, a page that plays the scenes of the strips, for the report of one run."""
     paper: bool = False
@@ -130,14 +128,10 @@ def main(args: Args) -> None:
 
 
 def _check_motion(args: Args, scores: Scores) -> None:
-    """Raise ConfigError or EpisodeError where scores or data are of both kinds of motion, unless they may, or of different."""
-    if scores.motion == MIXED_MOTION and not args.mixed_motion:
-        raise ConfigError(
-            f"{args.scores} has scores of shared and of own motion, which do not compare; report on them by --mixed-motion."
-        )
+    """Raise ConfigError or EpisodeError where the data are of both kinds of motion, or of another than the scores."""
     records = [record for _, record in find_records(args.data)] if args.data else []
-    motion = demand_one_motion(args.data, records, args.mixed_motion) if args.data and records else scores.motion
-    if motion != scores.motion and not args.mixed_motion:
+    motion = demand_one_motion(args.data, records, mixed=False) if args.data and records else scores.motion
+    if motion != scores.motion:
         raise ConfigError(
             f"{args.data} has episodes of {motion} motion, {args.scores} has scores of {scores.motion} motion; name the data"
             " that was graded."
@@ -191,13 +185,14 @@ def _report_scores(args: Args, scores: Scores) -> None:
         raise ConfigError(f"{args.data} holds no episode; make some: python -m xew.sim_warp.generate --out {args.data}")
     held_out, seen = _make_tables(scores, records, args.held_out)
     missing = find_missing_scores(scores.rows)
+    notes = [*missing_note(missing), *curves_note(scores)]
     strips = _make_strips(scores, args) if args.data and args.rollouts else []
     if args.explorer:
         _write_explorer(scores, args)
     curves = _curve_chart(scores, args.held_out)
     sheets = [_contact_sheet(args.data, records)] if args.data and any(record.success for record in records) else []
     sections = [
-        *map(page.note, missing_note(missing)),
+        *map(page.note, notes),
         _held_out_section(held_out, scores.metrics),
         _strip_section(strips, args),
         page.section("How the error grows with time", page.chart(curves)) if curves.panels else None,
@@ -207,7 +202,7 @@ def _report_scores(args: Args, scores: Scores) -> None:
     ]
     sentences = finding(held_out, seen, scores.metrics)
     html = page.page(TITLE, sentences, [part for part in sections if part], _format_footer(scores.versions))
-    notes = [*missing_note(missing), *_caution_notes(held_out)]
+    notes += _caution_notes(held_out)
     text, files = _write_markdown(sentences, notes, held_out, seen, scores, [*strips, *sheets], chart_files(curves))
     if len(missing):
         files["missing.csv"] = csv_text(missing).encode()

@@ -26,7 +26,7 @@ from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study_beyond import charts_beyond
 from xew.analysis.reports.study_charts import study_charts
 from xew.analysis.reports.study_strips import Strip, study_strips
-from xew.analysis.reports.study_text import missing_note, part_notes, study_sentences, trainings_note
+from xew.analysis.reports.study_text import curves_note, missing_note, part_notes, study_sentences, trainings_note
 from xew.analysis.scores import Scores, find_missing_scores
 from xew.analysis.statistics.grades import PaperGrades, StudyGrades
 from xew.analysis.statistics.suites import StrictGrades
@@ -180,7 +180,7 @@ def build(
         {table.name: table for table in tables},
         study_charts(builder, known, scores.curves) | charts_beyond(builder, difficulty, gaps, motions),
         strips,
-        [*part_notes(builder, scores), *missing_note(missing)],
+        [*part_notes(builder, scores), *missing_note(missing), *curves_note(scores)],
         missing,
         note,
     )

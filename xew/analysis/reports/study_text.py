@@ -259,6 +259,13 @@ def part_notes(builder: Builder, scores: Scores) -> Iterator[str]:
         yield f"Graded, but in no table of the protocol: {', '.join(sorted(unknown))}."
 
 
+def curves_note(scores: Scores) -> list[str]:
+    """A note on missing scores by frame; none where they are there."""
+    if not scores.curves.empty:
+        return []
+    return ["No chart of the error by frame: the file of curves (*.curves.parquet) is missing; evaluate writes it."]
+
+
 def missing_note(missing: pd.DataFrame) -> list[str]:
     """A note on scores that other models have and one lacks; none where nothing is missing."""
     if missing.empty:
