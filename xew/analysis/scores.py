@@ -143,8 +143,8 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
             procedural bodies and robots with an import path `module:NAME` need no further word.
 
     Raises:
-        ConfigError: the table is missing, or a file is damaged; or cells are duplicate, not finite, of unknown robots, of other metrics
-            than described, out of a metric's range, or graded over different numbers of frames. All are named.
+        ConfigError: the table is missing, or a file is damaged; or cells are duplicate, not finite, of unknown robots, of other
+            metrics than described, out of a metric's range, or graded over different numbers of frames. All are named.
     """
     command = EVALUATE.format(path=path)
     rows, by_frame = _read(path, command), path.with_suffix(".curves.parquet")

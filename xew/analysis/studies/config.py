@@ -54,8 +54,8 @@ class Machine:
     gpus_per_training: int = 1
     """Number of GPUs that a training takes at once."""
     steps_per_gpu: int = 1
-    """Number of steps that share a GPU: at most one training, and others, which leave it idle while they read and write. Above 1
-    memory is allocated as it is needed."""
+    """Number of steps that share a GPU: at most one training, and others, which leave it idle while they read and write.
+    Above 1 memory is allocated as it is needed."""
     train_launcher: str = ""
     """Launcher put before a training's command, such as srun --nodes=2; the processes it starts join by jax.distributed."""
     ray: str | None = None

@@ -72,11 +72,15 @@ class Cost:
     disk_mb: float = 0.0
 
 
+def find_size(study: Study) -> str:
+    """Key of the size of the study's network."""
+    settings = merge_settings(merge_settings(RECIPE, read_yaml(study.experiment)), study.settings)
+    return str(settings["model"]["size"])
+
+
 def find_rates(study: Study) -> Rates:
     """The rates of the size of the study's network; those of the small one where its size was not measured."""
-    measured = json.loads(RATES.read_text())
-    settings = merge_settings(merge_settings(RECIPE, read_yaml(study.experiment)), study.settings)
-    size = settings["model"]["size"]
+    measured, size = json.loads(RATES.read_text()), find_size(study)
     return parse(Rates, measured.get(size, measured["small"]), f"{RATES}, {size}")
 
 
