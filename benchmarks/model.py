@@ -5,13 +5,13 @@
 Random weights of Wan2.2-TI2V-5B's shape, clips of 121 frames at 320x256 (31x8x10 tokens a stream), text of 512 tokens.
 The peer is diffusers in PyTorch: WanTransformer3DModel in bfloat16 with gradient checkpointing, its blocks under torch.compile
 and the faster of PyTorch's attentions (measured first), fused AdamW; it gets as many latent frames as our streams have
-together, so that both work on the same number of tokens with full attention among them. Ours: `make_learner` as
+together, so that both work on the same number of tokens with full attention among them. Ours: `make_trainer` as
 `xew.model.train` uses it, float32 parameters and moments, products in bfloat16. The autoencoder's peer is
 AutoencoderKLWan, as its users run it.
 Every side runs in a process of its own, one after another, on the same machine.
 
 Before a figure is told, the work is checked: numbers of parameters and tokens, finite losses, shapes of what comes out.
-FLOPs are those of the model (`dit.flops`, three times forward for training), not what recomputation adds; their share
+FLOPs are those of the model (`training.flops`, three times forward for training), not what recomputation adds; their share
 is of a bfloat16 product of 8192x8192 matrices, measured in the same run.
 
 With several GPUs, `--cases train --no-peer --mesh.data 2` (or `--mesh.fsdp 2`) times the sharded step; `--batches` is per GPU.
@@ -57,9 +57,7 @@ class Args:
     accumulate: int = 1
     """Ours: parts in which a GPU's samples of a training step are computed, one after another."""
     remat: tuple[str, ...] = ("full",)
-    """Ours, each is timed (xew.model.network.dit.REMAT)."""
-    residual: tuple[str, ...] = ("bfloat16",)
-    """Ours: type of the tokens between blocks; diffusers' are bfloat16."""
+    """Ours, each is timed (xew.model.network.blocks.REMAT)."""
     dtypes: tuple[str, ...] = ("bfloat16", "float32")
     """Of the autoencoder; float32 products are rounded to TF32 on both sides, as both do unless told otherwise."""
     vae_chunks: tuple[int, ...] = (0, 8)
@@ -151,18 +149,19 @@ def jax_product() -> dict[str, Any]:
     return {"case": f"bf16 product of {side}x{side}", "seconds": seconds, "flops": 2 * side**3}
 
 
-def experiment_of(args: Args, streams: int, batch: int, remat: str, residual: str, *more: str) -> Any:
+def experiment_of(args: Args, streams: int, batch: int, remat: str, *more: str) -> Any:
     from xew.model.experiment import load_experiment
 
     size = [f"--model.size={args.size}", f"--clip.frames={args.frames}", f"--train.batch={batch}"]
     embodiment = f"--model.embodiment={'robot_render' if streams == 3 else 'none'}"
-    precision = [f"--model.remat={remat}", f"--model.residual={residual}"]
     mesh = [f"--mesh.data={args.mesh.data}", f"--mesh.fsdp={args.mesh.fsdp}"]
-    return load_experiment(CONFIG, [*size, embodiment, *precision, *mesh, "--train.chunks=1", *more])
+    return load_experiment(CONFIG, [*size, embodiment, f"--model.remat={remat}", *mesh, "--train.chunks=1", *more])
 
 
 def forward_flops(experiment: Any, samples: int, **options: Any) -> float:
-    from xew.model.network.dit import MODELS, flops, token_grid
+    from xew.model.network.dit import MODELS
+    from xew.model.network.tokens import token_grid
+    from xew.model.training.flops import flops
 
     grid = token_grid((1, *experiment.inputs.latent_shape))
     streams = 1 + len(experiment.conditions)
@@ -182,12 +181,12 @@ def peak_memory() -> float:
 
 
 def xew_train(args: Args) -> Iterator[dict[str, Any]]:
-    for streams, residual, remat, batch in itertools.product(args.streams, args.residual, args.remat, args.batches):
+    for streams, remat, batch in itertools.product(args.streams, args.remat, args.batches):
         row = {"side": "xew", "case": "train", "streams": streams, "batch a GPU": batch, "remat": remat}
-        row |= {"accumulate": args.accumulate, "residual": residual, "mesh": f"{args.mesh.data}x{args.mesh.fsdp}"}
+        row |= {"accumulate": args.accumulate, "mesh": f"{args.mesh.data}x{args.mesh.fsdp}"}
         devices = args.mesh.data * args.mesh.fsdp
         accumulate = f"--train.accumulate={args.accumulate}"
-        experiment = experiment_of(args, streams, batch * devices, remat, residual, accumulate)
+        experiment = experiment_of(args, streams, batch * devices, remat, accumulate)
         yield or_out_of_memory(functools.partial(xew_train_step, args, experiment, batch), row)
 
 
@@ -197,19 +196,18 @@ def xew_train_step(args: Args, experiment: Any, batch: int) -> dict[str, Any]:
 
     from xew.model.devices.sharding import make_mesh, place_batch
     from xew.model.training.data import fake_batch
-    from xew.model.training.step import make_learner
+    from xew.model.training.step import make_trainer
 
     devices = jax.devices()[: args.mesh.data * args.mesh.fsdp]
     mesh = make_mesh(experiment.mesh, devices)
-    learner = make_learner(experiment.learning, mesh)
-    state = learner.init_state()
+    trainer = make_trainer(experiment.spec, mesh)
+    state = trainer.init_state()
     check_size(args, sum(leaf.size for leaf in jax.tree.leaves(state.params)))
-    step = learner.compile_step()
     samples = place_batch(fake_batch(experiment.inputs, batch * len(devices)), mesh)
     seconds = []
     for _ in range(WARMUP + ROUNDS):
         begin = time.perf_counter()
-        state, result = step(state, samples)
+        state, result = trainer.step(state, samples)
         assert np.isfinite(jax.device_get(result.losses)).all(), "the loss is not finite"
         seconds.append(time.perf_counter() - begin)
     measured = {"samples": batch * len(devices), "first step s": round(seconds[0], 1), "peak GB": peak_memory()}
@@ -222,14 +220,14 @@ def xew_denoise(args: Args) -> Iterator[dict[str, Any]]:
     import jax.numpy as jnp
     from flax import nnx
 
-    from xew.model.experiment import create_model
-    from xew.model.network.dit import cast_params
+    from xew.model.network.dit import WorldModel, cast_params, network_graph
     from xew.model.training.data import fake_batch
 
     for streams, visibility in itertools.product(args.streams, ("joint", "one_way")):
-        experiment = experiment_of(args, streams, 1, "none", "bfloat16", f"--model.visibility={visibility}")
-        graph = nnx.split(nnx.eval_shape(functools.partial(create_model, experiment)), nnx.Param)[0]
-        params = jax.jit(lambda e=experiment, g=graph: cast_params(g, nnx.state(create_model(e), nnx.Param)))()
+        experiment = experiment_of(args, streams, 1, "none", f"--model.visibility={visibility}")
+        network = experiment.network.for_sampling
+        graph = network_graph(network)
+        params = jax.jit(lambda n=network, g=graph: cast_params(g, nnx.state(WorldModel(n), nnx.Param)))()
         fill = jax.jit(lambda p, b, g=graph: nnx.merge(g, p).condition_cache(b.conditions, b.text))
         step = jax.jit(lambda p, b, c, s, g=graph: nnx.merge(g, p)(b.latents, b.conditions, s, b.text, c))
         for samples in args.batches:
@@ -395,7 +393,8 @@ def peer_train_step(model: Any, optimizer: Any, inputs: dict[str, Any]) -> dict[
 
 
 def peer_flops(args: Args, streams: int, samples: int) -> float:
-    from xew.model.network.dit import MODELS, flops
+    from xew.model.network.dit import MODELS
+    from xew.model.training.flops import flops
 
     grid = ((args.frames - 1) // 4 + 1, LATENT[1] // 2, LATENT[2] // 2)
     return flops(MODELS[args.size], [grid] * streams, batch=samples)

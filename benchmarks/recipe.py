@@ -28,26 +28,15 @@ import tyro
 
 CHANGES: dict[str, tuple[str, ...]] = {
     "none": (),
+    "no mask, no flow": ("--model.action", "none"),
     "render as channels": ("--model.embodiment", "robot_render_channels"),
-    "first frame as channels": ("--model.reference", "channels"),
-    "residual": ("--model.prediction", "residual"),
-    "all three": (
-        *("--model.embodiment", "robot_render_channels", "--model.reference", "channels"),
-        *("--model.prediction", "residual"),
-    ),
-    "all three, no flow": (
-        *("--model.embodiment", "robot_render_channels", "--model.reference", "channels"),
-        *("--model.prediction", "residual", "--model.action", "none"),
-    ),
-    "pasted render": (
-        *("--model.embodiment", "pasted_render", "--model.reference", "channels", "--model.prediction", "residual"),
-    ),
-    "pasted render, no flow": (
-        *("--model.embodiment", "pasted_render", "--model.reference", "channels", "--model.prediction", "residual"),
-        *("--model.action", "none"),
-    ),
+    "first frame once": ("--model.reference", "frame"),
+    "velocity": ("--model.prediction", "velocity"),
+    "no earlier frame": ("--model.history",),
+    "all places weigh alike": ("--train.motion-loss-weight", "0"),
+    "AdamW": ("--train.optimizer", "adamw"),
     "shift 3": ("--train.shift", "3"),
-    "two chunks": ("--train.chunks", "2", "--train.batch", "1"),
+    "two chunks": ("--train.chunks", "2", "--train.batch", "2"),
 }
 """Overrides of the config by the name of the change."""
 FRAMES = 32
@@ -129,7 +118,7 @@ def list_commands(run: Path, name: str, graded: Mapping[str, Path], args: Args) 
     data = ["--data", str(args.data)]
     base = [str(args.config), *data, "--out", str(run), *CHANGES[name], "--train.steps", str(args.steps)]
     base += ["--train.save-every", str(args.steps), "--train.sample-every", "0"]
-    base += ["--train.ema-decay", str(round(max(0, 1 - 10 / args.steps), 6)), *shlex.split(args.overrides)]
+    base += shlex.split(args.overrides)
     commands = {"latents": ["model.latents", *base], "training": ["model.train", *base, "--overwrite"]}
     for sampler, scores in graded.items():
         rollouts, (kind, steps) = args.out / "rollouts" / scores.stem, sampler.split(":")

@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 from tests.commands import run_command
+from tests.networks import TINY_CODEC
 from tests.sim_warp.small import work_inline
 from xew.dataset import find_records
 from xew.metrics import METRICS
@@ -64,11 +65,14 @@ data: data
 out: runs/added
 split: additions:SPLIT
 clip: {frames: 5, height: 64, width: 80}
-codec: {spatial_factor: 8, channels: 4}
-model: {size: tiny, action: "additions:CONDITION"}
-train: {steps: 1, batch: 2, sample_every: 0}
-rollout: {steps: 1, batch: 1, max_frames: 5}
-"""
+codec: {weights: TINY_CODEC}
+model: {size: tiny, action: "additions:CONDITION",
+  history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none, embodiment: none}
+train: {steps: 1, batch: 2, sample_every: 0,
+  optimizer: adamw, warmup_steps: 0, decay_to: 1, ema: 0, motion_loss_weight: 0}
+rollout: {steps: 1, batch: 1, max_frames: 5,
+  sampler: euler}
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 @pytest.fixture

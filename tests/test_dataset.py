@@ -15,10 +15,12 @@ from xew.episode import EpisodeError, Record, read_record, write_episode
 from xew.model import latents
 
 CONFIG = """
-clip: {frames: 5, height: 32, width: 48}
-codec: {spatial_factor: 8, channels: 4}
-model: {size: tiny}
-train: {steps: 1, batch: 1}
+clip: {frames: 5, height: 32, width: 64}
+model: {size: tiny,
+  history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none,
+  action: none, embodiment: none}
+train: {steps: 1, batch: 1,
+  optimizer: adamw, warmup_steps: 0, decay_to: 1, ema: 0, motion_loss_weight: 0}
 """
 
 

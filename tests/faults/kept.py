@@ -26,7 +26,7 @@ from xew.model.codecs.vae import VAES
 from xew.model.conditions import ACTIONS, list_conditions
 from xew.model.rollout import is_done
 from xew.model.runs.checkpoint import find_damage
-from xew.model.runs.lineage import START, trace_start
+from xew.model.runs.folder import START, trace_start
 from xew.rollout import read_rollout, read_rollout_video
 from xew.sim_warp.manifest import read_manifest
 

@@ -8,9 +8,9 @@ import optax
 import pytest
 
 from xew.model import train
-from xew.model.settings.parts import Learning
+from xew.model.settings.parts import TrainSpec
 from xew.model.training import step
-from xew.model.training.step import Learner, TrainStep
+from xew.model.training.step import Trainer
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -38,25 +38,18 @@ def alike_trainings_share_programs() -> Iterator[None]:
 
     That a process of its own makes the same of a run, tests of many devices and of killed runs see.
     """
-    learners: dict[Any, Learner] = {}
-    steps: dict[Any, tuple[TrainStep, Learner, Any]] = {}
-    make_new, compile_new = step.make_learner, Learner.compile_step
+    trainers: dict[Any, tuple[Trainer, Any]] = {}
+    make_new = step.make_trainer
 
-    def make_learner(learning: Learning, mesh: Any) -> Learner:
-        key = (learning.network, learning.settings, learning.lora_rank, mesh)  # the optimizer follows from the settings
-        if key not in learners:
-            learners[key] = make_new(learning, mesh)
-        return learners[key]
-
-    def compile_step(learner: Learner, codec: Any = None) -> TrainStep:
-        key = (id(learner), None if codec is None else getattr(codec, "hash", id(codec)))
-        if key not in steps:
-            steps[key] = (compile_new(learner, codec), learner, codec)  # with both, so that no other gets their ids
-        return steps[key][0]
+    def make_trainer(spec: TrainSpec, mesh: Any, codec: Any = None) -> Trainer:
+        of_codec = None if codec is None else getattr(codec, "hash", id(codec))
+        key = (spec.network, spec.settings, spec.lora_rank, mesh, of_codec)
+        if key not in trainers:
+            trainers[key] = make_new(spec, mesh, codec), codec  # with the codec, so that no other gets its id
+        return trainers[key][0]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train, "make_learner", make_learner)
-        patch.setattr(Learner, "compile_step", compile_step)
+        patch.setattr(train, "make_trainer", make_trainer)
         yield
 
 

@@ -228,7 +228,7 @@ def test_what_lies_beside_the_data_does_so_wherever_one_stands(tmp_path: Path, m
     [
         (["--clip.frames", "16"], r"clip.frames is 16; it must be 4 k \+ 1 .* for example 17"),
         (["--train.steps", "-1"], "train.steps is -1; it must be at least 0"),
-        (["--train.ema-decay", "1"], "train.ema_decay is 1; it must be under 1"),
+        (["--train.ema", "0.5"], "train.ema is 0.5 of the run; it must be at most 0.25"),
         (["--clip.width", "100"], "both sides must be multiples of"),
         (["--model.size", "debgu"], "unknown model size 'debgu'; did you mean 'debug'"),
         (["--model.embodiment", "render"], "unknown embodiment 'render'; did you mean 'robot_render'"),

@@ -10,23 +10,27 @@ import pytest
 from flax import nnx
 from safetensors.numpy import load_file, save_file
 
+from tests.networks import TINY_CODEC
 from xew.config import ConfigError
 from xew.model import export
 from xew.model.devices.sharding import make_mesh
-from xew.model.experiment import create_model, load_experiment
+from xew.model.experiment import load_experiment
+from xew.model.network.dit import WorldModel
 from xew.model.network.dit_layouts import check_dit, load_dit, load_dit_params
+from xew.model.runs.begin import check_start
 from xew.model.runs.checkpoint import TrainState, open_checkpoints, save_state
-from xew.model.settings.network import check_network
-from xew.model.training.step import make_learner
+from xew.model.training.step import make_trainer
 from xew.model.weights.reading import read_tensors
 
 CONFIG = """
 data: data
 clip: {frames: 5, height: 64, width: 80}
-codec: {spatial_factor: 8, channels: 4}
-model: {size: tiny, embodiment: robot_render}
-train: {steps: 2, batch: 1}
-"""
+codec: {weights: TINY_CODEC}
+model: {size: tiny, embodiment: robot_render,
+  history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none, action: none}
+train: {steps: 2, batch: 1,
+  optimizer: adamw, warmup_steps: 0, decay_to: 1, ema: 0, motion_loss_weight: 0}
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +41,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     experiment = load_experiment(out / "config.yaml")
     with open_checkpoints(out, keep=2) as checkpoints:
         for step in (1, 2):
-            params = jax.tree.map(lambda leaf, step=step: leaf + step, nnx.state(create_model(experiment), nnx.Param))
+            params = jax.tree.map(lambda leaf, step=step: leaf + step, nnx.state(WorldModel(experiment.network), nnx.Param))
             save_state(checkpoints, TrainState(jnp.int32(step), params, {"count": jnp.int32(0)}), {})
         checkpoints.wait_until_finished()
     return out
@@ -48,7 +52,7 @@ def test_network_goes_out_and_comes_back(naming: str, run: Path, tmp_path: Path,
     export.main([str(run), "--out", str(tmp_path / "out"), "--naming", naming])
     assert "of step 2" in capsys.readouterr().out
     assert (tmp_path / "out" / "config.json").exists() == (naming == "diffusers")
-    model = create_model(load_experiment(run / "config.yaml"))
+    model = WorldModel(load_experiment(run / "config.yaml").network)
     expected = jax.tree.map(lambda leaf: leaf + 2, nnx.state(model, nnx.Param))
     load_dit(model, tmp_path / "out")
     jax.tree.map(np.testing.assert_array_equal, nnx.state(model, nnx.Param), expected)
@@ -58,7 +62,7 @@ def test_constants_of_a_checkpoint_are_those_of_the_model(run: Path, tmp_path: P
     """What weights alone do not tell: the eps of norms, and the base of rotary positions, which diffusers cannot have."""
     export.export(run, tmp_path / "out")
     config = tmp_path / "out" / "config.json"
-    written, model = json.loads(config.read_text()), create_model(load_experiment(run / "config.yaml"))
+    written, model = json.loads(config.read_text()), WorldModel(load_experiment(run / "config.yaml").network)
     assert written["eps"] == model.size.epsilon and written["_rope_base"] == model.size.rotary_base
     for key, other, said in (
         ("eps", 1e-5, "eps = 1e-05 .*has epsilon = 1e-06"),
@@ -108,10 +112,10 @@ def test_training_starts_from_published_weights(run: Path, tmp_path: Path) -> No
     only_wan = {key: array for key, array in tensors.items() if not key.startswith("stream")}
     save_file(only_wan, tmp_path / "wan.safetensors")
     experiment = load_experiment(run / "config.yaml", ["--model.weights", str(tmp_path / "wan.safetensors")])
-    check_network(experiment.network)
-    learner = make_learner(experiment.learning, make_mesh(experiment.mesh))
-    params = load_dit_params(*learner.random_network(), tmp_path / "wan.safetensors")
-    expected = nnx.state(create_model(experiment), nnx.Param)
+    check_start(experiment)
+    trainer = make_trainer(experiment.spec, make_mesh(experiment.mesh))
+    params = load_dit_params(*trainer.random_network(), tmp_path / "wan.safetensors")
+    expected = nnx.state(WorldModel(experiment.network), nnx.Param)
     np.testing.assert_array_equal(
         params["blocks"]["ffn"]["first"]["kernel"][...], expected["blocks"]["ffn"]["first"]["kernel"][...] + 2
     )
@@ -123,9 +127,6 @@ def test_networks_that_cannot_be_trained_are_told_first(run: Path, tmp_path: Pat
     export.export(run, tmp_path / "wan.safetensors", "official")
     foreign = ["--model.weights", str(tmp_path / "wan.safetensors"), "--model.size", "debug"]
     with pytest.raises(ConfigError, match=r"wan\.safetensors does not fit the model: .* missing"):
-        check_network(load_experiment(run / "config.yaml", foreign).network)
+        check_start(load_experiment(run / "config.yaml", foreign))
     with pytest.raises(ConfigError, match="there are no weights at nowhere"):
-        check_network(load_experiment(run / "config.yaml", ["--model.weights", "nowhere"]).network)
-    if jax.default_backend() == "cpu":
-        with pytest.raises(ConfigError, match="cudnn cannot be used: it needs a CUDA GPU and JAX runs on cpu"):
-            check_network(load_experiment(run / "config.yaml", ["--model.attention", "cudnn"]).network)
+        check_start(load_experiment(run / "config.yaml", ["--model.weights", "nowhere"]))

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests import synthetic
+from tests.networks import TINY_CODEC
 from xew.dataset import find_records, read_dataset
 from xew.episode import HEIGHT, WIDTH, read_video
 from xew.model import latents, rollout, train
@@ -32,11 +33,14 @@ from xew.rollout import find_rollouts, read_rollout_video
 FRAMES = 12
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}
-codec: {spatial_factor: 8, channels: 4}
-model: {size: tiny, action: joints, embodiment: robot_render}
-train: {steps: 4, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, ema_decay: 0.5}
-rollout: {steps: 2, batch: 3}
-"""
+codec: {weights: TINY_CODEC}
+model: {size: tiny, action: joints, embodiment: robot_render,
+  history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none}
+train: {steps: 4, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, ema: 0.25, sample_every: 1000,
+  optimizer: adamw, warmup_steps: 0, decay_to: 1, motion_loss_weight: 0}
+rollout: {steps: 2, batch: 3,
+  sampler: euler}
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +136,7 @@ def test_other_data_makes_the_cache_stale(world: Path, tmp_path: Path, capsys: p
     said = refusal(
         train.main, [str(world / "config.yaml"), "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")], capsys
     )
-    assert "no codec fitted on" in said and "python -m xew.model.latents" in said
+    assert "was encoded from other data" in said and "python -m xew.model.latents" in said
 
 
 def test_stale_stream_is_an_error(

@@ -15,16 +15,17 @@ from flax import nnx
 
 from tests import synthetic
 from tests.commands import on_devices
+from tests.networks import TINY_CODEC
 from xew.dataset import Episode, read_dataset
 from xew.episode import EpisodeError, read_video
 from xew.model import latents, rollout
 from xew.model.cache.codecs import load_codec
 from xew.model.codecs.contract import encode_pictures
-from xew.model.episodes.choice import training_episodes
-from xew.model.experiment import Experiment, create_model, load_experiment
+from xew.model.experiment import Experiment, load_experiment
+from xew.model.network.dit import WorldModel
 from xew.model.network.dit_layouts import save_dit
 from xew.model.rollout import RolloutWriter
-from xew.model.sampling.predict import ChunkInputs, Predictor, guided_velocity
+from xew.model.sampling.predict import ChunkInputs, Predictor, guided_velocity, make_predictor
 from xew.protocol import ROBOT_NAMES
 from xew.rollout import find_rollouts, read_rollout_video
 
@@ -33,11 +34,14 @@ CONFIG = """
 data: {root}/data
 out: {root}/run
 clip: {{frames: 5, height: 64, width: 80}}
-codec: {{spatial_factor: 8, channels: 4}}
-model: {{size: tiny, action: joints, embodiment: robot_render, history: [-4]}}
-train: {{steps: 1, batch: 2}}
-rollout: {{steps: 2, batch: 3}}
-"""
+codec: {{weights: TINY_CODEC}}
+model: {{size: tiny, action: joints, embodiment: robot_render, history: [-4],
+  reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none}}
+train: {{steps: 1, batch: 2,
+  optimizer: adamw, warmup_steps: 0, decay_to: 1, ema: 0, motion_loss_weight: 0}}
+rollout: {{steps: 2, batch: 3,
+  sampler: euler}}
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 @pytest.fixture(scope="module")
@@ -51,16 +55,16 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def predictor(world: Path) -> Predictor:
-    return make_predictor(load_experiment(world / "config.yaml"))
+    return random_predictor(load_experiment(world / "config.yaml"))
 
 
-def make_predictor(experiment: Experiment) -> Predictor:
+def random_predictor(experiment: Experiment) -> Predictor:
     """A network whose output depends on all that it is given: nothing of it is zero."""
-    codec = load_codec(experiment.encoding, training_episodes(read_dataset(experiment.data), experiment.choice))
-    graph, params = nnx.split(create_model(experiment), nnx.Param)
+    codec = load_codec(experiment.encoding)
+    params = nnx.state(WorldModel(experiment.network), nnx.Param)
     keys = iter(jax.random.split(jax.random.key(3), 200))
     noisy = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(next(keys), leaf.shape, leaf.dtype), params)
-    return Predictor(experiment.inputs, experiment.instructions, experiment.sampling, codec, graph, noisy)
+    return make_predictor(experiment, codec, noisy, {})
 
 
 def choose_tests(data: Path) -> list[Episode]:
@@ -132,7 +136,7 @@ def test_guidance_reaches_the_rollout(predictor: Predictor, world: Path) -> None
 
 def test_one_way_streams_are_computed_once_with_the_same_result(world: Path) -> None:
     options = ["--model.visibility", "one_way", "--model.history"]
-    one_way = make_predictor(load_experiment(world / "config.yaml", options))
+    one_way = random_predictor(load_experiment(world / "config.yaml", options))
     model = nnx.merge(one_way.graph, one_way.params)
     shape = one_way.inputs.latent_shape
     conditions = {
@@ -147,22 +151,24 @@ def test_one_way_streams_are_computed_once_with_the_same_result(world: Path) -> 
     assert one_way.predict(episode, FRAMES).shape == (1, FRAMES, 64, 80, 3)
 
 
-def test_sampler_and_grid_are_chosen_by_name(predictor: Predictor, world: Path) -> None:
-    settings = replace(predictor.settings, sampler="unipc", grid="wan_official")
-    other = replace(predictor, settings=settings)
+def test_sampler_and_noise_schedule_are_chosen_by_name(predictor: Predictor, world: Path) -> None:
+    def choose(sampler: str, schedule: str) -> Predictor:
+        options = ["--rollout.sampler", sampler, "--rollout.noise-schedule", schedule]
+        chosen = load_experiment(world / "config.yaml", options)
+        return replace(predictor, settings=chosen.rollout, schedule=chosen.schedule)
+
     episodes = choose_tests(world / "data")[:1]
     plain = predictor.predict(episodes, 5)
-    assert np.abs(other.predict(episodes, 5).astype(int) - plain).max() > 0
-    settings = replace(settings, sampler="xew.model.diffusion.samplers:euler", grid="xew.model.diffusion.samplers:flowwam")
-    from_outside = replace(predictor, settings=settings)
+    assert np.abs(choose("unipc", "wan_official").predict(episodes, 5).astype(int) - plain).max() > 0
+    from_outside = choose("xew.model.diffusion.samplers:euler", "xew.model.diffusion.samplers:flowwam")
     np.testing.assert_array_equal(from_outside.predict(episodes, 5), plain)
 
 
 def test_a_codec_may_come_from_outside(world: Path) -> None:
-    config = [str(world / "config.yaml"), "--codec.name", "xew.model.codecs.codec:PatchCodec"]
+    config = [str(world / "config.yaml"), "--codec.name", "xew.model.codecs.codec:ConvAutoencoderCodec"]
     latents.main(config)
     experiment = load_experiment(config[0], config[1:])
-    assert load_codec(experiment.encoding, training_episodes(read_dataset(experiment.data), experiment.choice)).channels == 4
+    assert load_codec(experiment.encoding).channels == 8
 
 
 DEVICES = """
@@ -170,12 +176,12 @@ import sys
 sys.path[:0] = {path!r}
 import jax, numpy as np
 from pathlib import Path
-from tests.model.test_rollout import FRAMES, choose_tests, load_experiment, make_predictor
+from tests.model.test_rollout import FRAMES, choose_tests, load_experiment, random_predictor
 from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
 from dataclasses import replace
 assert len(jax.devices()) == 2
 experiment = load_experiment({config!r})
-predictor = make_predictor(experiment)
+predictor = random_predictor(experiment)
 mesh = make_mesh(MeshSettings())
 predictor = replace(predictor, params=jax.device_put(predictor.params, replicated_sharding(mesh)))
 episodes = choose_tests(experiment.data)[:3]
@@ -201,7 +207,7 @@ def published(world: Path) -> Path:
     """A config with published weights, and no run."""
     experiment = load_experiment(world / "config.yaml")
     save_dit(
-        create_model(replace(experiment, model=replace(experiment.model, text="learned"))),
+        WorldModel(replace(experiment, model=replace(experiment.model, text="learned")).network),
         world / "dit.safetensors",
         "official",
     )
@@ -236,7 +242,7 @@ def test_mistakes_end_in_one_clear_error(
     assert "names no model.weights" in refusal([str(world / "config.yaml")], capsys)
     assert "did you mean 'piper'" in refusal([str(published), "--robots", "pipr"], capsys)
     assert "did you mean 'unipc'" in refusal([str(published), "--rollout.sampler", "unipcc"], capsys)
-    assert "did you mean 'flowwam'" in refusal([str(published), "--rollout.grid", "flowam"], capsys)
+    assert "did you mean 'flowwam'" in refusal([str(published), "--rollout.noise-schedule", "flowam"], capsys)
     assert "xew.sim_warp.generate" in refusal([str(published), "--data", str(tmp_path)], capsys)
     assert "rollout.steps is 0; it must be at least 1" in refusal([str(published), "--rollout.steps", "0"], capsys)
 

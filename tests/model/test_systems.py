@@ -10,6 +10,7 @@ import pytest
 from flax import nnx
 
 from tests import synthetic
+from tests.networks import TINY_CODEC
 from xew.config import ConfigError
 from xew.dataset import find_accepted, read_dataset
 from xew.episode import read_record, read_states, read_video, write_episode
@@ -19,8 +20,9 @@ from xew.model.cache.keys import scales_path
 from xew.model.cache.scales import load_scales
 from xew.model.conditions import ACTIONS, list_conditions
 from xew.model.episodes.choice import training_episodes
-from xew.model.experiment import create_model, load_experiment
-from xew.model.sampling.predict import Predictor
+from xew.model.experiment import load_experiment
+from xew.model.network.dit import WorldModel
+from xew.model.sampling.predict import make_predictor
 from xew.model.training.data import ClipSource, fake_batch
 from xew.rollout import find_rollouts
 
@@ -31,10 +33,10 @@ SHIPPED = {path.stem: path for path in sorted((CONFIGS / "baselines").glob("*.ya
 SYSTEMS = [*SHIPPED, "mask_and_flow_channels"]
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}
-codec: {spatial_factor: 8, channels: 4}
-train: {steps: 2, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, sample_every: 0, history_noise: 0.3}
+codec: {weights: TINY_CODEC}
+train: {steps: 2, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, history_noise: 0.3, ema: 0}
 rollout: {steps: 1, batch: 1}
-"""
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +45,10 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("systems")
     synthetic.write_synthetic_data(root / "data", seeds=(0, 1_000_000), robots=ROBOTS, frames=FRAMES)
     for name in SYSTEMS:
-        shipped = load_experiment(SHIPPED.get(name, CONFIGS / "small_fine.yaml")).model
-        model = {"size": "tiny", "action": shipped.action, "history": [frame // 10 for frame in shipped.history]}
+        shipped = load_experiment(SHIPPED.get(name, CONFIGS / "fixed.yaml")).model
+        history = [frame // 10 for frame in shipped.history if frame > -400]
+        plain = {"reference": "frame", "visibility": "joint", "prediction": "velocity", "dtype": "float32", "remat": "none"}
+        model = {"size": "tiny", "action": shipped.action, "embodiment": "none", "history": history, **plain}
         text = f"data: {root / 'data'}\nout: {root / name}\nmodel: {json.dumps(model)}\n{CONFIG}"
         (root / f"{name}.yaml").write_text(text)
     return root
@@ -84,13 +88,13 @@ def test_a_rollout_s_history_is_its_own(world: Path, tmp_path: Path) -> None:
     experiment = load_experiment(world / "ctrl_world.yaml")
     latents.main([str(world / "ctrl_world.yaml")])
     episodes = training_episodes(read_dataset(experiment.data), experiment.choice)
-    graph, params = nnx.split(create_model(experiment), nnx.Param)
+    params = nnx.state(WorldModel(experiment.network), nnx.Param)
     leaves, tree = jax.tree.flatten(params)
     keys = jax.random.split(jax.random.key(1), len(leaves))
     drawn = [0.2 * jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
-    codec, scales = load_codec(experiment.encoding, episodes), load_scales(experiment.encoding, episodes)
+    codec, scales = load_codec(experiment.encoding), load_scales(experiment.encoding, episodes)
     drawn_params = jax.tree.unflatten(tree, drawn)
-    predictor = Predictor(experiment.inputs, experiment.instructions, experiment.sampling, codec, graph, drawn_params, scales)
+    predictor = make_predictor(experiment, codec, drawn_params, scales)
     folder, record = next((f, r) for f, r in find_accepted(world / "data") if r.robot == "piper" and r.seed)
     before = predictor.predict([(folder, record)], FRAMES)
 
@@ -108,7 +112,7 @@ def test_a_rollout_s_history_is_its_own(world: Path, tmp_path: Path) -> None:
     assert not changed[:, :5].any() and changed[:, 5:].any()
 
 
-def test_what_a_system_needs_and_lacks_is_told(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_a_system_needs_and_lacks_is_an_error(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = world / "bwm.yaml"
     latents.main([str(config)])
     experiment = load_experiment(config)

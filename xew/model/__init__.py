@@ -1,7 +1,7 @@
 """Episodes -> latent cache -> checkpoint -> rollouts, on JAX, Flax NNX, Optax, Orbax and Grain.
 
-Its commands are `latents`, `train`, `train_codec`, `train_vae`, `rollout`, `outside`, `export` and `release`; `conditions`
-holds what the network may be told, and `experiment` reads a config.
+Its commands are `latents`, `train`, `rollout`, `outside`, `export` and `release`; `conditions` lists
+what the network can be conditioned on, and `experiment` reads a config.
 """
 
 __all__ = [
@@ -13,6 +13,4 @@ __all__ = [
     "release",
     "rollout",
     "train",
-    "train_codec",
-    "train_vae",
 ]

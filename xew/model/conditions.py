@@ -1,4 +1,4 @@
-"""What the model is told of a robot's motion (ACTIONS) and looks (CONDITIONS), made from commands alone.
+"""What the model is conditioned on: a robot's motion (ACTIONS) and appearance (CONDITIONS), made from commands alone.
 
 Reads  a `Command`: which robot, its commanded joints, the camera, the robot-only render of those commands, and the first frame
 Writes uint8 [t h w 3] pictures for the codec, or float32 [t n] numbers
@@ -75,7 +75,7 @@ class Command:
 
     @cached_property
     def robot_spec(self) -> "xew.sim_warp.embodiment.spec.RobotSpec":
-        """The simulator's description of the robot: of the registry, or kept beside the data."""
+        """The simulator's description of the robot: of the registry, or stored with the data."""
         from xew.sim_warp.robots import recorded_robot
 
         return recorded_robot(self.robot, self.data)
@@ -108,21 +108,21 @@ class Condition:
     """Whether it has one frame for each frame of the episode. Else it is a short description of 4 k + 1 frames, which every
     chunk reuses."""
     change: Callable[[np.ndarray], np.ndarray] = keep_numbers
-    """Function from the numbers of a clip's frames [t n] to what the network is told of them [t n]; a later frame changes
+    """Function from the numbers of a clip's frames [t n] to what the network is given of them [t n]; a later frame changes
     nothing of an earlier one."""
     group: bool = False
-    """Whether a latent frame is told the numbers of its four frames [t' 4*n], or those of its last [t' n]."""
+    """Whether a latent frame is given the numbers of its four frames [t' 4*n], or those of its last [t' n]."""
     scale: Literal["none", "percentiles", "standard"] = "none"
     """Normalization of numbers by those of the training episodes (cache/scales.py)."""
     with_history: bool = False
-    """Whether earlier frames (`model.history`) are told theirs too, before the clip's."""
+    """Whether earlier frames (`model.history`) are given theirs too, before the clip's."""
     is_guess: bool = False
     """Whether it is a first guess of the video itself, made of its first frame too: what a prediction of residuals
-    (`model.prediction`) then begins with, in the place of the first frame that stands still."""
+    (`model.prediction`) then begins with, instead of the first frame."""
     title: str = ""
     """Name at the head of a table's row or a figure."""
     label: str = ""
-    """Description of what the network is told, in a few words."""
+    """Description of what the network is given, in a few words."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class System:
     title: str
     """Name at the head of a table's row or a figure."""
     label: str
-    """Description of what the network is told, in a few words."""
+    """Description of what the network is given, in a few words."""
 
     def __iter__(self) -> Iterator[Condition]:
         return iter(self.conditions)
@@ -146,8 +146,8 @@ def list_conditions(entry: Condition | System | Sequence[Condition]) -> tuple[Co
 
 def clip_numbers(
     condition: Condition, numbers: Shaped[np.ndarray, "t n"], start: int, frames: int, history: Sequence[int] = ()
-) -> Float32[np.ndarray, "latent_frames told"]:
-    """What the network is told of one clip by a condition of numbers.
+) -> Float32[np.ndarray, "latent_frames numbers"]:
+    """The numbers of one clip that the network is given by a condition.
 
     Args:
         condition: how frames are grouped, and whether earlier ones count.
@@ -164,14 +164,14 @@ def clip_numbers(
     def take_frames(frames: np.ndarray) -> np.ndarray:
         return condition.change(numbers[np.clip(frames, 0, len(numbers) - 1)]).astype(np.float32)
 
-    told = take_frames(np.arange(start, start + frames))
+    clip = take_frames(np.arange(start, start + frames))
     if condition.group:
-        told = np.concatenate([told[:1].repeat(TEMPORAL_FACTOR - 1, 0), told]).reshape(-1, TEMPORAL_FACTOR * told.shape[1])
+        clip = np.concatenate([clip[:1].repeat(TEMPORAL_FACTOR - 1, 0), clip]).reshape(-1, TEMPORAL_FACTOR * clip.shape[1])
     else:
-        told = told[::TEMPORAL_FACTOR]
+        clip = clip[::TEMPORAL_FACTOR]
     if not condition.with_history or not len(history):
-        return told
-    return np.concatenate([take_frames(start + np.asarray(history)), told])
+        return clip
+    return np.concatenate([take_frames(start + np.asarray(history)), clip])
 
 
 def make_command(

@@ -40,8 +40,8 @@ def export(run: Path, out: Path, naming: Naming = "diffusers", dtype: str = "flo
     save_dit(model, out, naming)
     total = parameter_count(model)
     added = total - sum(math.prod(shape) for shape in checkpoint_shapes(model, wan_layout(model, naming)).values())
-    beside = f"; {added:,} of them belong to streams, mechanisms or words, which Wan does not have" if added else ""
-    print(f"{out}: {total:,} parameters of step {step} under the names of {naming}, {dtype}{beside}")
+    extra = f"; {added:,} of them belong to streams, mechanisms or words, which Wan does not have" if added else ""
+    print(f"{out}: {total:,} parameters of step {step} under the names of {naming}, {dtype}{extra}")
     base = experiment.size.rotary_base
     if base != WAVELENGTH_BASE:
         print(f"its positions turn with base {base:g}; code with Wan's {WAVELENGTH_BASE:g} does not compute the same")

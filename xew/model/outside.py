@@ -36,8 +36,8 @@ from xew.protocol import LEFT_GRIPPER, RIGHT_GRIPPER
 class EpisodeInputs:
     """What a model may know of an episode: its first frame, the instruction, the commands and the camera; nothing measured.
 
-    It holds arrays of its own, numbers and words, and no path: nothing in it leads to the true video or the recorded states.
-    Whatever a system wants to be told (relative poses, deltas, trajectory maps, ray maps) follows from these.
+    It holds arrays of its own, numbers and words, and no path. Nothing in it leads to the true video or the recorded states.
+    What a system is conditioned on (relative poses, deltas, trajectory maps, ray maps) follows from these.
     """
 
     task: str
@@ -88,7 +88,7 @@ class EpisodeInputs:
 
 
 class OutsideModel(Protocol):
-    """What an outside model is to this room. One with the attribute `needs_streams = True` is also given mask and flow."""
+    """An outside model. One with the attribute `needs_streams = True` is also given mask and flow."""
 
     def __call__(self, inputs: EpisodeInputs) -> np.ndarray:
         """uint8 [t h w 3] with t = inputs.frame_count, frame 0 the given one as the model sees it; any h and w of 4:3."""
@@ -98,12 +98,12 @@ def load_model(name: str) -> OutsideModel:
     """The model `module:NAME`, made where it is a class. Raises ConfigError if there is none."""
     module, _, attribute = name.partition(":")
     try:
-        found = getattr(importlib.import_module(module), attribute)
+        imported = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(
             f"cannot import the model {name!r}: {error}; expected module:NAME, as examples.own_model:freeze."
         ) from error
-    model = found() if isinstance(found, type) else found
+    model = imported() if isinstance(imported, type) else imported
     if not callable(model):
         raise ConfigError(f"the model {name!r} is a {type(model).__name__}; expected a function, or a class with __call__.")
     return model
@@ -168,7 +168,7 @@ class Args:
     max_frames: int = 0
     """Predict only the first so many frames; 0 predicts all."""
     condition: str = ""
-    """Name of what the model is told of the robot, for the tables."""
+    """Name of what the model is conditioned on, for the tables."""
     out: Path | None = None
     """Folder to write to; rollouts/NAME where left out."""
     mixed_motion: bool = False

@@ -34,7 +34,7 @@ CARD = "README.md"
 
 
 def release(run: Path, out: Path, data: Path | None = None, scores: Path | None = None, step: int | None = None) -> int:
-    """Write the network of a run in bfloat16 as a run of its own, with its card, and return the step that it is of.
+    """Write the network of a run in bfloat16 as a new run, with its card, and return the step that it is of.
 
     Args:
         run: folder of the run; corrections of an adaptation are added to its network.
@@ -52,7 +52,7 @@ def release(run: Path, out: Path, data: Path | None = None, scores: Path | None 
         experiment = replace(experiment, out=run)
     if scores and not scores.is_file():
         raise ConfigError(f"{scores} is no file; expected scores.summary.md of `python -m xew.metrics.evaluate`: --scores.")
-    seen = list_training(replace(experiment, data=data or experiment.data))
+    data_counts = list_training(replace(experiment, data=data or experiment.data))
     summary = read_text(scores) if scores else ""
     params, step = load_params(run, experiment.network, step)
     released = replace(experiment, out=out, data=Path("data"), cache=None, adapt=AdaptSettings())
@@ -60,7 +60,7 @@ def release(run: Path, out: Path, data: Path | None = None, scores: Path | None 
     with write_checkpoints(out) as checkpoints:
         save_params(checkpoints, step, jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), params))
     size = sum(leaf.size for leaf in jax.tree.leaves(params))
-    write_text(out / CARD, write_card(experiment, step, size, seen, summary))
+    write_text(out / CARD, write_card(experiment, step, size, data_counts, summary))
     return step
 
 
@@ -75,7 +75,7 @@ def count_by_task(records: Iterable[Record]) -> dict[str, tuple[int, int]]:
     seeds: dict[str, list[int]] = defaultdict(list)
     for record in records:
         seeds[record.task].append(record.seed)
-    return {task: (len(set(found)), len(found)) for task, found in sorted(seeds.items())}
+    return {task: (len(set(of_task)), len(of_task)) for task, of_task in sorted(seeds.items())}
 
 
 def write_card(experiment: Experiment, step: int, size: int, seen: dict[str, tuple[int, int]], summary: str) -> str:

@@ -29,6 +29,7 @@ from xew.config import CONVERTER, ConfigError, admit, find_config, is_packaged, 
 from xew.dataset import Episode
 from xew.episode import Record, episode_folder, remove_left_overs
 from xew.files import hold_lock, read_json
+from xew.model.cache.codecs import load_codec
 from xew.model.cache.scales import Scale, load_run_scales
 from xew.model.codecs.contract import Codec
 from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
@@ -38,7 +39,7 @@ from xew.model.network.dit import cast_params, network_graph
 from xew.model.network.dit_layouts import load_dit_params
 from xew.model.runs.checkpoint import load_params
 from xew.model.runs.folder import load_run_codec, load_run_config
-from xew.model.runs.roundtrip import load_untrained_codec
+from xew.model.runs.layout import checkpoint_time
 from xew.model.sampling.predict import Prediction, Predictor, make_predictor
 from xew.model.settings.checks import check_experiment
 from xew.model.settings.settings import RolloutSettings
@@ -46,7 +47,6 @@ from xew.model.training.step import make_trainer
 from xew.model.video.frames import to_camera_size
 from xew.protocol import MIXED_MOTION
 from xew.rollout import write_rollout
-from xew.run import checkpoint_time
 
 Item = tuple[Episode, dict[str, Any]]
 """An episode to predict and the header that its rollout will have."""
@@ -61,7 +61,7 @@ def load_predictor(run: Path, experiment: Experiment, step: int | None = None) -
 
     Args:
         run: folder of a trained run; or a config, whose `model.weights` are then taken as they are (the step is None).
-        experiment: the config of the run, with what is chosen anew for sampling.
+        experiment: the config of the run, with the sampling settings that were changed.
         step: of the run's checkpoint; the latest where left out.
 
     Raises:
@@ -106,7 +106,7 @@ def load_published(experiment: Experiment, source: Path) -> Predictor:
     mesh = make_mesh(MeshSettings())
     graph, params = make_trainer(experiment.spec, mesh).random_network()
     params = load_dit_params(graph, params, experiment.model.weights)
-    return _place_predictor(experiment, load_untrained_codec(experiment), params, mesh, {})
+    return _place_predictor(experiment, load_codec(experiment.encoding), params, mesh, {})
 
 
 def check_out(out: Path, data: Path) -> None:
@@ -280,7 +280,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _find_trusted(words: Sequence[str]) -> list[str]:
-    """Modules behind --trust among a command's arguments; what is no name of a module is told when the options are parsed."""
+    """Modules behind --trust among a command's arguments; an invalid name is an error later, when the options are parsed."""
     first = words.index("--trust") + 1 if "--trust" in words else len(words)
     given = itertools.takewhile(lambda word: not word.startswith("-"), words[first:])
     return [word for word in given if word.replace(".", "_").isidentifier() and ".." not in word]
@@ -289,7 +289,7 @@ def _find_trusted(words: Sequence[str]) -> list[str]:
 def parse_rollout(arguments: Sequence[str] | None) -> tuple[Path, Flags, Experiment]:
     """Parse the command line: the run or config, the command's flags, and the experiment with its overrides.
 
-    Of a run only --rollout.… can be chosen anew; of a config with published weights all but what is also a flag.
+    A run takes only --rollout.… overrides; a config with published weights takes all that are not flags too.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     path, prog, description = find_path(words, Flags), "python -m xew.model.rollout", __doc__.splitlines()[0]
@@ -298,7 +298,7 @@ def parse_rollout(arguments: Sequence[str] | None) -> tuple[Path, Flags, Experim
         return path, flags, experiment
     wrong = [word for word in words if word.startswith("--") and "." in word and not word.startswith("--rollout.")]
     if path is not None and wrong:
-        raise ConfigError(f"{' '.join(wrong)}: of a trained run only --rollout.… can be chosen anew (see --help for the rest).")
+        raise ConfigError(f"{' '.join(wrong)}: a trained run takes only --rollout.… overrides (see --help for the rest).")
     admit(_find_trusted(words))  # the run's config is read before the options are parsed
     command = parse_command(
         Flags,

@@ -17,9 +17,11 @@ diffusers = pytest.importorskip("diffusers")
 
 from safetensors.torch import load_file, save_file  # noqa: E402
 
+from tests.networks import world_model  # noqa: E402
 from xew.model.network import dit  # noqa: E402
 from xew.model.network.dit import ModelSize, WorldModel  # noqa: E402
 from xew.model.network.dit_layouts import diffusers_config, load_dit, save_dit  # noqa: E402
+from xew.model.network.spec import Visibility  # noqa: E402
 
 CHANNELS, TEXT, WORDS = 8, 24, 5
 TOLERANCE = 1e-4
@@ -43,7 +45,7 @@ def size_of(head_dim: int) -> ModelSize:
 
 def reference(size: ModelSize, seed: int = 0) -> torch.nn.Module:
     """Diffusers' network with every parameter N(0, 0.2): its own start leaves modulations too small to matter."""
-    arguments = diffusers_config(nnx.eval_shape(lambda: WorldModel(size, CHANNELS, rngs=nnx.Rngs(0))))
+    arguments = diffusers_config(nnx.eval_shape(lambda: world_model(size, CHANNELS)))
     model = diffusers.WanTransformer3DModel(**{key: value for key, value in arguments.items() if key[0] != "_"}).eval()
     torch.manual_seed(seed)
     for parameter in model.parameters():
@@ -61,7 +63,7 @@ class Float64Features(torch.nn.Module):
 
 def ours(theirs: torch.nn.Module, size: ModelSize, path: Path, *streams: str, **options: object) -> WorldModel:
     save_file({key: value.contiguous() for key, value in theirs.state_dict().items()}, path)
-    model = WorldModel(size, CHANNELS, streams, rngs=nnx.Rngs(1), **options)
+    model = world_model(size, CHANNELS, streams, seed=1, **options)
     load_dit(model, path)
     return model
 
@@ -109,7 +111,7 @@ def test_whole_network(exact: bool, head_dim: int, grid: tuple[int, int, int], t
 @pytest.mark.parametrize("streams", [("action",), ("action", "embodiment")])
 @pytest.mark.parametrize("visibility", ["joint", "one_way"])
 def test_streams_are_plain_blocks_on_concatenated_tokens(
-    streams: tuple[str, ...], visibility: dit.Visibility, tmp_path: Path
+    streams: tuple[str, ...], visibility: Visibility, tmp_path: Path
 ) -> None:
     """Two and three streams, by diffusers' own blocks; seen one way, with a mask that forbids looking back at RGB."""
     size, grid, text = size_of(16), (3, 4, 6), padded_text()
@@ -193,6 +195,6 @@ def test_time_features_are_as_exact_as_float64() -> None:
 
 
 def test_rounded_time_is_an_option() -> None:
-    models = [WorldModel(size_of(16), CHANNELS, time=time, rngs=nnx.Rngs(0)) for time in ("exact", "flowwam")]
+    models = [world_model(size_of(16), CHANNELS, time=time) for time in ("exact", "flowwam")]
     exact, rounded = (np.asarray(model.embed_time(jnp.asarray(LEVELS))) for model in models)
     assert np.abs(exact[:, 1] - rounded[:, 1]).max() > 1e-3

@@ -12,7 +12,7 @@ from safetensors.numpy import save_file
 from test_dit import tiny
 
 from tests import synthetic
-from tests.networks import normal
+from tests.networks import normal, world_model
 from xew.config import ConfigError
 from xew.episode import HEIGHT, WIDTH, read_record, read_states
 from xew.model.codecs.codec import CODECS
@@ -30,7 +30,7 @@ from xew.model.weights.layout import checkpoint_shapes
 ROOT = Path(__file__).parents[3]
 CHANNELS = 3
 SHAPE = (2, 3, 4, 6, CHANNELS)
-EARLIER = (-2.5, -1.0)
+EARLIER = (-10, -4)
 SIGMA = jnp.array([0.3, 0.9], jnp.float32)
 
 
@@ -94,9 +94,7 @@ def test_mechanisms_are_named_by_the_registry() -> None:
 
 def test_without_mechanisms_nothing_changes_but_the_named_leaves() -> None:
     """New leaves stand beside the published ones, which keep their shapes."""
-    plain, system = (
-        nnx.eval_shape(lambda s=s: WorldModel(MODELS["wan5b"], 48, s, rngs=nnx.Rngs(0))) for s in ((), tuple(MECHANISMS))
-    )
+    plain, system = (nnx.eval_shape(lambda s=s: world_model(MODELS["wan5b"], 48, s)) for s in ((), tuple(MECHANISMS)))
     before, after = (dict(nnx.to_flat_state(nnx.state(model, nnx.Param))) for model in (plain, system))
     assert {path: leaf.shape for path, leaf in before.items()} == {path: after[path].shape for path in before}
     assert {path[0] for path in after if path not in before} == {"mechanisms"}
@@ -105,7 +103,7 @@ def test_without_mechanisms_nothing_changes_but_the_named_leaves() -> None:
 def test_new_parts_that_can_start_at_zero_do() -> None:
     """Vectors of frames and channels leave a network as it is at first: what is pretrained stays so."""
     names = tuple(name for name, mechanism in MECHANISMS.items() if mechanism.enters in ("time", "channels"))
-    model, plain = (WorldModel(MODELS["tiny"], CHANNELS, streams, rngs=nnx.Rngs(0)) for streams in (names, ()))
+    model, plain = (world_model(MODELS["tiny"], CHANNELS, streams) for streams in (names, ()))
     for network in (model, plain):  # the head starts at zero too
         network.head.head.kernel.set_value(normal(5, *network.head.head.kernel.shape))
     conditions = make_conditions(names)
@@ -131,17 +129,15 @@ def test_the_reference_in_channels_is_its_first_frame_in_every_frame() -> None:
     assert np.abs(fed(LATENTS, {"map_channels": first + 1.0}, SIGMA, TEXT) - expected)[:, 1:].max() > 1e-3
 
 
-def test_a_network_at_its_start_predicts_the_guess_that_it_is_told() -> None:
+def test_a_network_at_its_start_predicts_the_guess_that_it_is_given() -> None:
     """Its head starts at zero, so a prediction of residuals is the guess itself where nothing but noise is seen."""
     noise, guess = jnp.ones((2,), jnp.float32), normal(9, *SHAPE)
-    model = WorldModel(
-        MODELS["tiny"], CHANNELS, ("map_channels",), prediction="residual", guess="map_channels", rngs=nnx.Rngs(0)
-    )
+    model = world_model(MODELS["tiny"], CHANNELS, ("map_channels",), prediction="residual", guess="map_channels")
     clean = LATENTS - model(LATENTS, {"map_channels": guess}, noise, TEXT)
     np.testing.assert_allclose(clean, guess, atol=1e-5)
     settings = load_experiment(ROOT / "configs" / "debug.yaml", ["--model.embodiment", "pasted_render"])
-    assert settings.network.guess == "map_channels" and settings.network.create().guess == "map_channels"
-    assert load_experiment(ROOT / "configs" / "fixed.yaml").network.guess == ""
+    assert settings.network.guess == "map_channels"
+    assert load_experiment(ROOT / "configs" / "fixed.yaml", ["--model.embodiment", "none"]).network.guess == ""
 
 
 def test_no_condition_feeds_what_the_network_has_of_itself(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -283,7 +279,7 @@ def test_earlier_frames_are_rgb_at_their_own_times() -> None:
     embedded = model.patch_embedding(patches) + model.stream_embeddings["history"][...][None, None]
     np.testing.assert_allclose(tokens[:, 18:30], embedded, atol=1e-5)
     assert levels[18:30].tolist() == [0] * 12
-    angles = dit.rotary_angles((2, 2, 3), 16, times=EARLIER)
+    angles = dit.rotary_angles((2, 2, 3), 16, times=[frame / 4 for frame in EARLIER])
     np.testing.assert_allclose(cos[18:30], np.cos(angles), atol=1e-6)
     assert not np.allclose(cos[18:24], cos[:6])
     assert "history" not in model.stream_inputs
@@ -322,7 +318,7 @@ def test_the_public_checkpoint_of_bwm_loads(tmp_path: Path) -> None:
 
 def test_shapes_of_bwm_at_full_size() -> None:
     streams = streams_of("bwm", "none", history=False)
-    model = nnx.eval_shape(lambda: WorldModel(MODELS["wan5b"], 48, streams, rngs=nnx.Rngs(0)))
+    model = nnx.eval_shape(lambda: world_model(MODELS["wan5b"], 48, streams))
     shapes = checkpoint_shapes(model, dit_layout(model, "official"))
     own = {key.removeprefix("action_encoder."): shape for key, shape in shapes.items() if key.startswith("action_encoder")}
     assert len(shapes) - len(own) == 825
@@ -383,4 +379,4 @@ def test_the_page_s_condition_from_outside_works(tmp_path: Path, monkeypatch: py
     system = load_experiment(
         ROOT / "configs" / "fixed.yaml", ["--model.action", "my_conditions:SYSTEM", "--model.embodiment", "none"]
     )
-    assert set(system.conditions) == {"embodiment", "joints"}
+    assert set(system.conditions) == {"embodiment", "joints", "history"}

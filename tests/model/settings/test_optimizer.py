@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from xew.model.settings.optimizer import RMS_OF_ADAM, find_matrices, make_optimizer, tell_stale_average
+from xew.model.settings.checks import LONGEST_AVERAGE
+from xew.model.settings.optimizer import RMS_OF_ADAM, average_decay, find_matrices, make_optimizer
 from xew.model.settings.settings import TrainSettings
 
 SHAPES = {
@@ -29,7 +30,7 @@ def test_muon_takes_the_matrices_of_blocks_and_nothing_else(params: dict) -> Non
     found = find_matrices(params)
     assert found["blocks"]["first"]["kernel"] is not None
     assert jax.tree.leaves((found["blocks"]["first"]["bias"], found["blocks"]["modulation"], found["head"])) == []
-    settings = TrainSettings(batch=1, steps=2, optimizer="muon")
+    settings = TrainSettings(steps=2)
     kept = jax.tree.leaves(make_optimizer(settings).init(params))
     shapes = sorted(leaf.shape for leaf in kept)
     assert shapes.count((2, 8, 32)) == 1, "Muon has one moment"
@@ -38,7 +39,7 @@ def test_muon_takes_the_matrices_of_blocks_and_nothing_else(params: dict) -> Non
 
 @pytest.mark.parametrize("mu_dtype", ["float32", "bfloat16"])
 def test_updates_of_muon_are_near_orthogonal_and_as_large_as_those_of_adamw(params: dict, mu_dtype: Any) -> None:
-    settings = TrainSettings(batch=1, steps=2, optimizer="muon", learning_rate=1.0, weight_decay=0.0, mu_dtype=mu_dtype)
+    settings = TrainSettings(steps=2, warmup_steps=0, learning_rate=1.0, weight_decay=0.0, mu_dtype=mu_dtype)
     optimizer = make_optimizer(settings)
     updates, _ = optimizer.update(params, optimizer.init(params), jax.tree.map(jnp.zeros_like, params))
     for update in np.asarray(updates["blocks"]["first"]["kernel"], np.float32):
@@ -49,7 +50,7 @@ def test_updates_of_muon_are_near_orthogonal_and_as_large_as_those_of_adamw(para
 
 def test_muon_computes_in_the_type_of_its_moments(params: dict) -> None:
     """Its products are in bfloat16 where that is asked for; the updates stay near those of float32."""
-    settings = TrainSettings(batch=1, steps=2, optimizer="muon", learning_rate=1.0, weight_decay=0.0)
+    settings = TrainSettings(steps=2, warmup_steps=0, learning_rate=1.0, weight_decay=0.0)
     exact, rounded = (make_optimizer(replace(settings, mu_dtype=dtype)) for dtype in ("float32", "bfloat16"))
     kept = rounded.init(params)
     program = str(jax.make_jaxpr(rounded.update)(params, kept, params))
@@ -59,11 +60,12 @@ def test_muon_computes_in_the_type_of_its_moments(params: dict) -> None:
     assert 0 < np.linalg.norm(found - true) < 0.1 * np.linalg.norm(true)
 
 
-def test_an_average_that_holds_the_start_is_told() -> None:
-    """.999 to the power of 2,000 is .135; of 7,500 it is 5e-4."""
-    short = TrainSettings(batch=1, steps=2000, ema_decay=0.999)
-    said = tell_stale_average(short)
-    assert said == "train.ema_decay 0.999 leaves 14 % of the start in the average of 2000 steps; 0.9977 would leave 1 %"
-    assert tell_stale_average(replace(short, ema_decay=0.9977)) is None
-    assert tell_stale_average(replace(short, steps=7500)) is None
-    assert tell_stale_average(replace(short, ema_decay=0.0)) is None
+@pytest.mark.parametrize("steps", [4, 200, 7500])
+@pytest.mark.parametrize("ema", [0.1, LONGEST_AVERAGE])
+def test_an_average_forgets_the_random_start(steps: int, ema: float) -> None:
+    """However short the run: what is left of the start at its end is at most exp(-1 / ema)."""
+    assert average_decay(TrainSettings(steps=steps, ema=ema)) ** steps <= np.exp(-1 / ema) < 0.02
+
+
+def test_an_average_reaches_over_its_fraction_of_the_run() -> None:
+    assert average_decay(TrainSettings(steps=7500, ema=0.1)) == pytest.approx(1 - 1 / 750)

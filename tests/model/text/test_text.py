@@ -9,8 +9,10 @@ import pytest
 import tokenizers
 from flax import nnx
 
+from tests.networks import TINY_CODEC
 from xew.config import ConfigError
-from xew.model.experiment import Experiment, create_model, load_experiment
+from xew.model.experiment import Experiment, load_experiment
+from xew.model.network.dit import WorldModel
 from xew.model.text.instructions import VOCABULARY, clean, load_tokenizer, token_ids
 from xew.model.text.umt5 import UMT5S, Umt5Encoder, official_layout
 from xew.model.weights.writing import save_weights
@@ -20,10 +22,12 @@ CONFIG = """
 data: {root}/data
 out: {root}/run
 clip: {{frames: 5, height: 64, width: 80}}
-codec: {{channels: 4}}
-model: {{size: tiny, {model}}}
-train: {{steps: 1, batch: 1}}
-"""
+codec: {{weights: TINY_CODEC}}
+model: {{size: tiny, history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none,
+  {model}}}
+train: {{steps: 1, batch: 1,
+  optimizer: adamw, warmup_steps: 0, decay_to: 1, ema: 0, motion_loss_weight: 0}}
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 def experiment(root: Path, model: str) -> Experiment:
@@ -80,7 +84,7 @@ def test_embeddings_are_the_encoders_and_zero_past_the_end(files: Path, tmp_path
         expected = np.asarray(encoder(jnp.asarray(ids)[None], jnp.array([len(ids)])))[0]
         assert not embedding[len(ids) :].any()
         assert np.corrcoef(embedding[: len(ids)].ravel(), expected.ravel())[0, 1] > 0.99  # bfloat16
-    model = nnx.eval_shape(lambda: create_model(asked))
+    model = nnx.eval_shape(lambda: WorldModel(asked.network))
     assert model.text_embedding.first.kernel.shape == (UMT5S["tiny"].dim, 32) and model.words is None
 
 
@@ -136,7 +140,7 @@ def test_words_are_rows_of_a_table_that_is_learned(tmp_path: Path) -> None:
     assert stack[1] != found["stack the bowls"][1] and not stack[3:].any() and not found[""].any()
     assert all(0 < row < VOCABULARY for row in found["a b c d e f g h i j k"])
 
-    model = create_model(asked)
+    model = WorldModel(asked.network)
     model.head.head.kernel[...] = jnp.ones_like(model.head.head.kernel[...])
     latents = jax.random.normal(jax.random.key(0), (1, *asked.inputs.latent_shape), jnp.float32)
 

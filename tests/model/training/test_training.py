@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,17 +15,18 @@ from flax import nnx
 from jax.sharding import AbstractMesh
 
 from tests import synthetic
+from tests.networks import TINY_CODEC
 from xew.config import ConfigError, save
 from xew.dataset import read_dataset
 from xew.model import latents, train
-from xew.model.devices.sharding import AXES, make_mesh, place_batch, place_shapes
-from xew.model.diffusion.flow_matching import put_first, sample_losses
+from xew.model.devices.sharding import AXES, make_mesh, place_batch
+from xew.model.diffusion.flow_matching import sample_losses
 from xew.model.episodes.choice import first_of_each, replay_episodes, sample_episodes, training_episodes
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs import checkpoint
 from xew.model.runs.checkpoint import TrainState, restore_sum
-from xew.model.runs.lineage import trace_start
+from xew.model.runs.folder import trace_start
 from xew.model.settings.optimizer import learning_rate, set_steps
 from xew.model.training import data, memory
 from xew.model.training.data import Batch, ClipSource, fake_batch
@@ -33,11 +34,10 @@ from xew.model.training.flops import flops_of_step
 from xew.model.training.memory import estimate_memory
 from xew.model.training.order import make_dataset
 from xew.model.training.step import (
-    abstract_state,
     cut_samples,
     estimate_clean,
     join_samples,
-    make_learner,
+    make_trainer,
     sample_pairs,
 )
 from xew.protocol import HELD_OUT_ROBOTS, seed_split
@@ -45,11 +45,14 @@ from xew.protocol import HELD_OUT_ROBOTS, seed_split
 FRAMES = 12
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}
-codec: {spatial_factor: 8, channels: 4}
-model: {size: tiny, action: joints, embodiment: robot_render}
-train: {steps: 2, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 1, sample_every: 0}
-rollout: {steps: 2, batch: 3}
-"""
+codec: {weights: TINY_CODEC}
+model: {size: tiny, action: joints, embodiment: robot_render,
+  history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none}
+train: {steps: 2, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 1, sample_every: 0,
+  optimizer: adamw, warmup_steps: 0, decay_to: 1, ema: 0, motion_loss_weight: 0}
+rollout: {steps: 2, batch: 3,
+  sampler: euler}
+""".replace("TINY_CODEC", str(TINY_CODEC))
 ADAPT = ("--adapt.robots", "piper", "--adapt.episodes", "2")
 
 
@@ -92,7 +95,7 @@ def fails(command: Callable[[list[str]], None], arguments: list[str], capsys: py
 def network(run: Path) -> tuple[Any, int]:
     """Parameters of a run, and of which step they are."""
     experiment = load_experiment(run / "config.yaml")
-    return checkpoint.restore_params(run, make_learner(experiment.learning, make_mesh(experiment.mesh)).network_shapes)
+    return checkpoint.restore_params(run, make_trainer(experiment.spec, make_mesh(experiment.mesh)).network_shapes)
 
 
 def changed(experiment: Experiment, **settings: Any) -> Experiment:
@@ -105,12 +108,11 @@ Step = Callable[[Batch], tuple[TrainState, Any]]
 def first_step(experiment: Experiment, codec: Any = None) -> Step:
     """The first step from parameters that are random throughout: at its own start the network predicts zero."""
     mesh = make_mesh(experiment.mesh)
-    learner = make_learner(experiment.learning, mesh)
-    start = learner.init_state()
+    trainer = make_trainer(experiment.spec, mesh, codec)
+    start = trainer.init_state()
     noise = jax.tree.map(lambda leaf: 0.1 * np.random.default_rng(7).standard_normal(leaf.shape, np.float32), start.params)
     start = jax.device_get(replace(start, params=jax.tree.map(np.add, start.params, noise)))
-    step = learner.compile_step(codec)
-    return lambda batch: step(jax.device_put(start), place_batch(batch, mesh))
+    return lambda batch: trainer.step(jax.device_put(start), place_batch(batch, mesh))
 
 
 # Parts of a batch.
@@ -134,7 +136,7 @@ def test_rows_of_parts_come_back_in_order() -> None:
 
 
 def test_bfloat16_moment_is_kept_as_such(experiment: Experiment) -> None:
-    _, state = abstract_state(changed(experiment, mu_dtype="bfloat16").learning)
+    state = make_trainer(changed(experiment, mu_dtype="bfloat16").spec, make_mesh(experiment.mesh)).shapes
     assert {str(leaf.dtype) for leaf in jax.tree.leaves(state.optimizer)} == {"int32", "float32", "bfloat16"}
     assert {str(leaf.dtype) for leaf in jax.tree.leaves(state.params)} == {"float32"}
 
@@ -147,14 +149,9 @@ def test_bfloat16_moment_is_kept_as_such(experiment: Experiment) -> None:
 class LastFrame:
     """Stands for a codec in which the last latent frame is the last picture; notes what it was given."""
 
-    relative: ClassVar[bool] = False
-
     def next_reference(self, latents: jax.Array) -> jax.Array:
         jax.debug.callback(lambda value: SEEN.append(np.asarray(value)), latents)
         return latents[:, -1:]
-
-    def replace_reference(self, latents: jax.Array, reference: jax.Array) -> jax.Array:
-        return put_first(latents, reference)
 
 
 SEEN: list[np.ndarray] = []
@@ -292,8 +289,7 @@ def test_log_lines_hold_what_a_run_is_watched_by(world: Path) -> None:
 
 def estimate(experiment: Experiment, devices: int) -> memory.Memory:
     """Memory of each device where the state is cut over all of them."""
-    learning, mesh = experiment.learning, AbstractMesh((1, devices), AXES)
-    return estimate_memory(learning, place_shapes(abstract_state(learning)[1], mesh), experiment.encoding, mesh)
+    return estimate_memory(make_trainer(experiment.spec, AbstractMesh((1, devices), AXES)), experiment.encoding)
 
 
 def test_projection_is_that_of_the_arithmetic() -> None:
@@ -341,7 +337,7 @@ def test_adaptations_have_the_network_of_the_run_they_start_from(path: Path) -> 
     )
     assert adapted.adapt.start_from == trained.out
     assert (adapted.clip, adapted.codec) == (trained.clip, trained.codec)
-    network, source = (replace(settings.model, weights=None, unroll=1) for settings in (adapted, trained))
+    network, source = (replace(settings.model, weights=None) for settings in (adapted, trained))
     assert network == source
     assert set(adapted.adapt.robots) <= set(HELD_OUT_ROBOTS)
     assert adapted.train.epochs == 20
@@ -350,14 +346,13 @@ def test_adaptations_have_the_network_of_the_run_they_start_from(path: Path) -> 
 @pytest.mark.loose_types("JAX's own attention, which loosens them for itself, is traced inside a checkpoint that does not")
 def test_step_of_the_full_size_is_made_from_shapes() -> None:
     """The whole program of wan5b, two chunks of 121 frames in three streams, without one of its weights."""
-    experiment = load_experiment(WAN5B, ["--model.attention", "xla"])
+    experiment = load_experiment(WAN5B)
     mesh = make_mesh(experiment.mesh)
-    learner = make_learner(experiment.learning, mesh)
-    step = learner.compile_step(LastFrame())
+    trainer = make_trainer(experiment.spec, mesh, LastFrame())
     batch = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, fake_batch(experiment.inputs, 8)))
-    state, result = step.lower(learner.shapes, batch).out_info
+    state, result = trainer.lower_step(trainer.shapes, batch).out_info
     assert result.losses.shape == (8, 2)
-    assert jax.tree.map(lambda leaf: leaf.shape, state) == jax.tree.map(lambda leaf: leaf.shape, learner.shapes)
+    assert jax.tree.map(lambda leaf: leaf.shape, state) == jax.tree.map(lambda leaf: leaf.shape, trainer.shapes)
 
 
 # Length and settings.
@@ -379,10 +374,10 @@ def test_epochs_are_passes_over_the_new_samples(experiment: Experiment) -> None:
         (["--train.batch", "3", "--train.accumulate", "2"], "train.batch is 3; it must be a multiple of"),
         (["--mesh.fsdp", "3"], "mesh is data -1 x fsdp 3, there are 1 devices"),
         (["--adapt.start-from", "x"], "adapt needs the robots"),
-        (["--rollout.shift", "0"], "rollout.shift is 0; it must be over 0"),
+        (["--train.shift", "0"], "train.shift is 0; it must be over 0"),
         (["--train.log-every", "0"], "train.log_every is 0; it must be at least 1"),
         (["--train.batch", "0"], "train.batch is 0; it must be at least 1"),
-        (["--train.ema-decay", "1"], "train.ema_decay is 1; it must be under 1"),
+        (["--train.ema", "0.5"], "train.ema is 0.5 of the run; it must be at most 0.25"),
         (["--adapt.robots", "piper"], "adapt.start_from not which run to adapt"),
         (["--adapt.start-from", "x", "--adapt.robots", "piper", "--adapt.replay", "0.9"], "a part that leaves room"),
         (["--adapt.start-from", "nowhere", "--adapt.robots", "piper"], "nowhere holds no run"),
@@ -404,7 +399,7 @@ def test_the_rate_has_decayed_at_the_last_step(experiment: Experiment) -> None:
 
 def test_arithmetic_that_one_way_streams_save_is_not_counted(experiment: Experiment) -> None:
     one_way = replace(experiment, model=replace(experiment.model, visibility="one_way"))
-    assert flops_of_step(one_way.learning, one_way.inputs) < flops_of_step(experiment.learning, experiment.inputs)
+    assert flops_of_step(one_way.spec) < flops_of_step(experiment.spec)
 
 
 def test_episodes_without_videos_are_told_before_training(
@@ -472,9 +467,9 @@ def test_adapted_run_starts_from_the_trained_weights(world: Path, tmp_path: Path
     arguments = adapt(world, tmp_path / "run")
     train.main([*arguments, "--train.steps", "1", "--resume"])  # of nothing: it begins, and notes where
     adapted = load_experiment(tmp_path / "run" / "config.yaml")
-    learner = make_learner(adapted.learning, make_mesh(adapted.mesh))
+    trainer = make_trainer(adapted.spec, make_mesh(adapted.mesh))
     start, base = (
-        restore_sum(trace_start(tmp_path / "run", world / "run"), learner.network_shapes)[0],
+        restore_sum(trace_start(tmp_path / "run", world / "run"), trainer.network_shapes)[0],
         network(world / "run")[0],
     )
     jax.tree.map(np.testing.assert_array_equal, start, base)
@@ -521,18 +516,17 @@ def test_replay_is_a_part_of_every_batch(world: Path, experiment: Experiment) ->
 def test_corrections_change_nothing_at_first_and_only_they_are_learned(experiment: Experiment) -> None:
     low_rank = replace(experiment, adapt=replace(experiment.adapt, lora_rank=2))
     mesh = make_mesh(experiment.mesh)
-    full = make_learner(experiment.learning, mesh).init_state()
+    full = make_trainer(experiment.spec, mesh).init_state()
     start = jax.tree.map(lambda leaf: leaf + 0.1, full.params)  # the head's own start is zero and gives no gradient
     base = jax.device_get(start)
-    learner = make_learner(low_rank.learning, mesh)
-    state = learner.init_state(start)
+    trainer = make_trainer(low_rank.spec, mesh)
+    state = trainer.init_state(start)
     jax.tree.map(np.testing.assert_array_equal, apply_lora(state.base, state.params), base)
     assert len(state.params["blocks"]) == 10, "q, k, v, o of both attentions and both layers of the feed-forward"
     moments = sum(leaf.size for leaf in jax.tree.leaves(state.optimizer))
     assert moments < 2.1 * sum(leaf.size for leaf in jax.tree.leaves(state.params))
-    step = learner.compile_step()
     for _ in range(2):
-        state, _ = step(state, place_batch(fake_batch(low_rank.inputs, 2), mesh))
+        state, _ = trainer.step(state, place_batch(fake_batch(low_rank.inputs, 2), mesh))
     jax.tree.map(np.testing.assert_array_equal, state.base, base)
     assert all(np.abs(np.asarray(leaf["b"])).max() > 0 for leaf in state.params["blocks"].values())
 
@@ -569,7 +563,7 @@ def test_run_with_corrections_resumes_and_is_read(world: Path, tmp_path: Path, c
     elsewhere = (tmp_path / "run").rename(tmp_path / "elsewhere")
     jax.tree.map(np.testing.assert_array_equal, network(elsewhere)[0], after)
     shutil.rmtree(base / "checkpoints" / "2")
-    with pytest.raises(ConfigError, match="not there any more or was trained anew"):
+    with pytest.raises(ConfigError, match="not there any more or was trained again"):
         network(elsewhere)
     (elsewhere / "start.json").unlink()
     with pytest.raises(ConfigError, match="does not tell from which checkpoint"):

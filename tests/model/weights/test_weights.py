@@ -13,6 +13,7 @@ import pytest
 from flax import nnx
 from safetensors.numpy import load_file, save_file
 
+from tests.networks import world_model
 from xew.config import ConfigError
 from xew.model.network.dit import MODELS, WorldModel
 from xew.model.network.dit_layouts import (
@@ -66,7 +67,7 @@ def arrays() -> Arrays:
 
 
 def wan(*streams: str, **options: int) -> WorldModel:
-    return WorldModel(MODELS["tiny"], CHANNELS, streams, rngs=nnx.Rngs(0), **options)
+    return world_model(MODELS["tiny"], CHANNELS, streams, **options)
 
 
 def wan_arrays(naming: str = "official", *streams: str) -> Arrays:
@@ -319,7 +320,7 @@ def test_where_nothing_can_be_written(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("naming", ["official", "diffusers"])
 def test_names_and_shapes_at_full_size(naming: str) -> None:
-    model = nnx.eval_shape(lambda: WorldModel(MODELS["wan5b"], 48, rngs=nnx.Rngs(0)))
+    model = nnx.eval_shape(lambda: world_model(MODELS["wan5b"], 48))
     rows = (line.split("\t") for line in (REFERENCE / f"keys_dit_{naming}.tsv").read_text().splitlines())
     expected = {key: tuple(ast.literal_eval(shape)) for key, shape in rows}
     assert len(expected) == 825
@@ -334,7 +335,7 @@ def flat(model: nnx.Module) -> list[tuple[str, object]]:
 def test_models_that_no_other_project_has_go_out_and_in(tmp_path: Path) -> None:
     """Streams, mechanisms and words beside Wan's leaves: every leaf is written and read again."""
     names = ("action", "embodiment", "joints", "history", *MECHANISMS)
-    model, other = (WorldModel(MODELS["tiny"], CHANNELS, names, words=7, rngs=nnx.Rngs(seed)) for seed in (0, 1))
+    model, other = (world_model(MODELS["tiny"], CHANNELS, names, words=7, seed=seed) for seed in (0, 1))
     save_dit(model, tmp_path / "weights.safetensors")
     load_dit(other, tmp_path / "weights.safetensors")
     written = dict(flat(model))
@@ -411,7 +412,7 @@ def test_another_size_is_told(tmp_path: Path) -> None:
     arrays = wan_arrays()
     save_file(arrays, tmp_path / "in.safetensors")
     check_dit(nnx.eval_shape(lambda: wan(*STREAMS)), read_tensors(tmp_path / "in.safetensors"))
-    larger = nnx.eval_shape(lambda: WorldModel(MODELS["debug"], CHANNELS, rngs=nnx.Rngs(0)))
+    larger = nnx.eval_shape(lambda: world_model(MODELS["debug"], CHANNELS))
     for refuses, given in ((check_dit, read_tensors(tmp_path / "in.safetensors")), (load_dit, tmp_path / "in.safetensors")):
         with pytest.raises(ConfigError, match=r"blocks\.2\.self_attn\.q\.weight \(for blocks.*and 48 more.*another shape"):
             refuses(larger, given)

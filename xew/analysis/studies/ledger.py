@@ -22,7 +22,7 @@ from xew.config import ConfigError, parse
 from xew.dataset import find_accepted
 from xew.episode import EpisodeError
 from xew.files import file_digest, read_json, remove_written, replacing
-from xew.run import RUN_FILES, checkpoint_time, is_run, list_steps
+from xew.model.runs.layout import RUN_FILES, checkpoint_time, is_run, list_steps
 
 ROLLOUT_FILES = ("*/*/*/rgb.mkv", "*/*/*/rollout.json")
 """Patterns of the paths of what `xew.model.rollout` writes into its tree."""

@@ -10,7 +10,6 @@ __all__ = [
     "codec",
     "contract",
     "conv_autoencoder",
-    "patches",
     "vae",
     "vae_chunks",
     "vae_layers",

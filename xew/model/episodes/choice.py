@@ -1,4 +1,4 @@
-"""Choosing the episodes of a data set that a training, its samples or a rollout read."""
+"""Choosing the episodes of a data set that a training run, its samples or a rollout read."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from xew.protocol import expand_robots
 
 @dataclass(frozen=True)
 class TrainingEpisodes:
-    """The episodes that a training reads."""
+    """The episodes that a training run reads."""
 
     fresh: list[Episode]
     """Those to learn from."""
@@ -24,7 +24,7 @@ class TrainingEpisodes:
 
 
 def choose_episodes(dataset: Dataset, choice: EpisodeChoice) -> TrainingEpisodes:
-    """Choose all episodes that a training reads.
+    """Choose all episodes that a training run reads.
 
     Raises:
         ConfigError, EpisodeError: there are none to learn from, too few to adapt to, or no videos to draw samples of.
@@ -93,8 +93,8 @@ def sample_episodes(dataset: Dataset, roles: Mapping[str, str], motion: str | No
         motion: kind of motion that the episodes have to be of; left open, any.
     """
     robots = tuple(roles)
-    found = [e for family in ("validation", "train") for e in dataset.select(robots=robots, split=family, motion=motion)]
-    first = {record.robot: (folder, record) for folder, record in reversed(found)}
+    candidates = [e for family in ("validation", "train") for e in dataset.select(robots=robots, split=family, motion=motion)]
+    first = {record.robot: (folder, record) for folder, record in reversed(candidates)}
     return {f"{roles[robot]}/{robot}": first[robot] for robot in roles if robot in first}
 
 

@@ -15,6 +15,6 @@ def episode_command(
 
     Args:
         rendered: [t 240 320 3] uint8, the robot alone, where it is in memory; else its video is read when it is needed.
-        scene: [t 240 320 3] uint8, the episode's video, likewise; conditions see its first frame alone.
+        scene: [t 240 320 3] uint8, the episode's video, where it is in memory; conditions see its first frame alone.
     """
     return make_command(folder, record, read_states(folder), rendered, scene)

@@ -163,7 +163,7 @@ class Attention(nnx.Module):
             context: [b l d]; the tokens themselves if left out.
             rotary: rotations of the tokens' positions.
             condition_start: tokens from here on see none before them, by two calls of attention instead of a mask [s s].
-            cache: keys and values of one layer, seen beside the tokens' own.
+            cache: keys and values of one layer, attended to with the tokens' own.
 
         Returns:
             [b s d].
@@ -340,7 +340,7 @@ REMAT: dict[str, Callable[..., bool] | None] = {
     "dots": _POLICIES.save_from_both_policies(_POLICIES.dots_with_no_batch_dims_saveable, _KEEP_ATTENTION),
     "full": None,
 }
-"""Policy of what is kept for the backward pass beside each block's input, by name.
+"""Policy of what is kept for the backward pass besides each block's input, by name.
 
 full       nothing: the forward pass is computed twice (4/3 of the work), the least memory
 attention  results of attention, so that all but its quadratic part is computed twice; two widths more a token and block

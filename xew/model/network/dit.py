@@ -72,7 +72,7 @@ MODELS = {
 
 @dataclass(frozen=True)
 class Stream:
-    """One sequence of tokens beside the others. Only RGB is noised and has a head and a loss."""
+    """One of the sequences of tokens. Only RGB is noised and has a head and a loss."""
 
     source: Literal["latents", "joints", "history"]
     """Encoded video [b t h w c], the 16-number action of each latent frame [b t 16], or earlier RGB frames, each encoded
@@ -265,7 +265,7 @@ class WorldModel(nnx.Module):
     def add_frame_vectors(
         self, time: Float[Array, "b r d"], levels: Levels, shape: Sequence[int], conditions: Conditions
     ) -> tuple[Float[Array, "b r2 d"], Levels]:
-        """Give each latent frame of RGB a time embedding of its own, with the vectors of the mechanisms that enter there.
+        """Give each latent frame of RGB its own time embedding, with the vectors of the mechanisms that enter there.
 
         Without such a mechanism all stays as it is. Other streams keep their two levels.
 
@@ -292,7 +292,7 @@ class WorldModel(nnx.Module):
 
         Args:
             text: embeddings [b l e], or ids of words [b l].
-            conditions: of mechanisms whose tokens stand beside the text, or instead of it.
+            conditions: of mechanisms whose tokens stand next to the text, or instead of it.
         """
         names = self._entering("context")
         tokens = [self.mechanisms[name]((conditions or {})[name]).astype(self.dtype) for name in names]
@@ -303,7 +303,7 @@ class WorldModel(nnx.Module):
         return jnp.concatenate([self.text_embedding(text), *tokens], axis=1)
 
     def framed_context(self, text: Text, shape: Sequence[int], conditions: Conditions) -> Float[Array, "b k d"] | FramedContext:
-        """What cross-attention reads: `context`, and beside it what only the tokens of one frame read.
+        """What cross-attention reads: `context`, and with it what only the tokens of one frame read.
 
         Args:
             text: as of `context`.
@@ -311,7 +311,7 @@ class WorldModel(nnx.Module):
             conditions: as of `__call__`.
 
         Returns:
-            [b k d] where no mechanism has tokens of single frames. Else these stand beside, [b f k d]: those of RGB's frames
+            [b k d] where no mechanism has tokens of single frames. Else these come with it, [b f k d]: those of RGB's frames
             and, after them as in the tokens, those of the history.
         """
         shared, names = self.context(text, conditions), self._entering("frame")

@@ -67,7 +67,7 @@ BWM_LINEARS = {
     "mechanisms.pose_time.first": "action_encoder.action_mlp2.0",
     "mechanisms.pose_time.second": "action_encoder.action_mlp2.2",
 }
-"""Names in Boundless-World-Model of the two paths of its tool poses (action bwm), which it has beside Wan's keys."""
+"""Names in Boundless-World-Model of the two paths of its tool poses (action bwm), which it has besides Wan's keys."""
 NOT_OURS = ("flow_stream.flow_head.*", "action_encoder.action_embedding.*")
 """Patterns of keys that we do not use. FlowWAM has a head for its flow too, which its published file may lack; BWM's class has
 an embedding that its network does not use."""
@@ -89,7 +89,7 @@ def wan_layout(model: WorldModel, naming: Naming) -> Layout:
 
 
 def flowwam_layout(model: WorldModel) -> Layout:
-    """What FlowWAM has beside: the patch embedding and the embedding of its flow stream."""
+    """What FlowWAM has besides: the patch embedding and the embedding of its flow stream."""
     if FLOW_STREAM not in model.condition_streams:
         return {}
     embedding = Source(("flow_stream.stream_embed",), "leading_ones", (1, 1))
@@ -98,7 +98,7 @@ def flowwam_layout(model: WorldModel) -> Layout:
 
 
 def bwm_layout(model: WorldModel) -> Layout:
-    """What Boundless-World-Model has beside: its two paths of tool poses."""
+    """What Boundless-World-Model has besides: its two paths of tool poses."""
     layout: dict[str, Source] = {}
     for ours, theirs in BWM_LINEARS.items():
         if ours.split(".")[1] in model.mechanisms:
@@ -114,7 +114,7 @@ def dit_layout(model: WorldModel, naming: Naming) -> Layout:
 
 
 def load_dit(model: WorldModel, path: Path) -> None:
-    """Fill a model in place from published weights: official Wan, diffusers' (either as told by its keys), or FlowWAM.
+    """Fill a model in place from published weights: official Wan, diffusers' (its keys say which), or FlowWAM.
 
     What the file lacks of the streams starts from what it has: a picture stream's patch embedding becomes a copy of the
     loaded RGB one. FlowWAM's flow stream without a stream embedding gets none (zeros), as its world model was trained;
@@ -125,7 +125,7 @@ def load_dit(model: WorldModel, path: Path) -> None:
         path: as for `reading.read_tensors`.
 
     Raises:
-        ConfigError: tensors are missing, left over or of another shape, or config.json beside them tells of other norms or
+        ConfigError: tensors are missing, left over or of another shape, or config.json next to them has other norms or
             positions than the model's.
     """
     tensors = read_tensors(path)
@@ -148,7 +148,7 @@ def check_dit(model: WorldModel, tensors: Tensors) -> None:
 
 
 def _check_constants(model: WorldModel, tensors: Tensors) -> None:
-    """Raise ConfigError if config.json beside the weights says another eps or base of positions than the model's."""
+    """Raise ConfigError if config.json next to the weights says another eps or base of positions than the model's."""
     config, size = tensors.config, model.size
     for key, field in (("eps", "epsilon"), (ROPE_BASE, "rotary_base")):
         theirs, ours = config.get(key, getattr(size, field)), getattr(size, field)
@@ -160,7 +160,7 @@ def _check_constants(model: WorldModel, tensors: Tensors) -> None:
 
 
 def _find_layout(model: WorldModel, tensors: Tensors) -> tuple[Layout, tuple[str, ...]]:
-    """The layout of a checkpoint; and leaves that it may lack (all that Wan does not have) and keys that it may have beside."""
+    """The layout of a checkpoint; leaves that it may lack (all that Wan does not have) and keys that it may have besides."""
     naming = find_naming(tensors)
     layout = dit_layout(model, naming)
     return layout, (*(layout.keys() - wan_layout(model, naming).keys()), *NOT_OURS)
@@ -177,7 +177,7 @@ def save_dit(model: WorldModel, path: Path, naming: Naming = "diffusers") -> Non
     """Write a model as safetensors (one file, or a folder of shards) under the names of a project.
 
     A folder of diffusers' names gets its config.json too, so that `WanTransformer3DModel.from_pretrained` opens it. What
-    streams, mechanisms and words add is written beside, under the names that `load_dit` knows; that class passes over it.
+    streams, mechanisms and words add is written with them, under the names that `load_dit` knows; that class passes over it.
 
     Raises:
         ConfigError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Ways into the network beside token streams: how other systems tell a video model what the robot does.
+"""Ways into the network besides token streams: how other systems condition a video model on what the robot does.
 
 Reads  numbers of the commands [b f n], or latents [b t h w c], of each way that a model has
 Writes what the network adds or attends to: vectors, context tokens, features of patches
@@ -7,7 +7,7 @@ To add a way: a module and one line in MECHANISMS; what feeds it is said in `con
 Each mechanism enters the network in one of four places, and a system is a combination of them:
     time     a vector for each latent frame, added to the time embedding of that frame's RGB tokens (IRASim, BWM)
     frame    tokens that only the tokens of their own latent frame attend to (Ctrl-World)
-    context  tokens that all tokens attend to, beside the text or instead of it (EnerVerse-AC, BWM)
+    context  tokens that all tokens attend to, next to the text or instead of it (EnerVerse-AC, BWM)
     channels pictures joined to RGB's latents before they are embedded (EnerVerse-AC); the clip's own first frame can be one
 
 Shape letters: b batch, t h w c latent video, f latent frames (earlier ones first), n numbers, d width, k context tokens.
@@ -149,7 +149,7 @@ class Mechanism:
     width: int = 0
     """Number of numbers of a latent frame; 0 for pictures."""
     replaces_text: bool = False
-    """Whether its context stands in the place of the text, which is then not attended to."""
+    """Whether its context replaces the text, which is then not attended to."""
 
 
 def _frame_vector(activation: Activation, null: bool) -> Callable[[Any, int, DTypeLike, nnx.Rngs], nnx.Module]:
@@ -212,7 +212,7 @@ def frames_of_groups(numbers: Float[Array, "b t n"]) -> Float[Array, "b k m"]:
 
 
 def ray_maps(camera: Float[Array, "b t 16"], shape: Sequence[int]) -> Float[Array, "b t h w 6"]:
-    """Where each latent pixel looks: unit direction and origin of its ray in the world (EnerVerse-AC's ray maps).
+    """View ray of each latent pixel: unit direction and origin of its ray in the world (EnerVerse-AC's ray maps).
 
     Args:
         camera: [b t 16], see `CAMERA`.
@@ -235,7 +235,7 @@ def ray_maps(camera: Float[Array, "b t 16"], shape: Sequence[int]) -> Float[Arra
 
 
 def positions(count: int, dim: int) -> Float[np.ndarray, "count dim"]:
-    """Sines and cosines [count dim] float32 that tell the order of frames."""
+    """Sines and cosines [count dim] float32 that encode the order of frames."""
     angles = np.arange(count)[:, None] * 10_000.0 ** (-np.arange(0, dim, 2) / dim)
     return np.concatenate([np.sin(angles), np.cos(angles)], axis=-1)[:, :dim].astype(np.float32)
 

@@ -1,4 +1,4 @@
-"""Videos to tokens and back, and the numbers that tell tokens their place and their noise level.
+"""Videos to tokens and back, and the features of their place and noise level.
 
 Reads  latents [b t h w c], timesteps
 Writes tokens' features [b s c*ph*pw], rotation angles [s head_dim/2], time features [... 256]

@@ -24,10 +24,9 @@ from xew.model.codecs.contract import Codec
 from xew.model.experiment import Experiment, load_recorded
 from xew.model.network.dit import WorldModel
 from xew.model.network.dit_layouts import check_dit
-from xew.model.runs.folder import load_run_config
-from xew.model.runs.lineage import START, StartNote
+from xew.model.runs.folder import START, StartNote, load_run_config
+from xew.model.runs.layout import RUN_MARK, checkpoint_time, is_run, list_steps, remove_run
 from xew.model.weights.reading import read_tensors
-from xew.run import RUN_MARK, checkpoint_time, is_run, list_steps, remove_run
 
 T = TypeVar("T")
 
@@ -151,7 +150,7 @@ def _is_bare(out: Path) -> bool:
 
 
 def write_claim(out: Path, settings: Any, *, overwrite: bool) -> None:
-    """Write the settings of a run into its folder, which may be claimed, in place of the run there if it is replaced."""
+    """Write the settings of a run into its folder, which may be claimed, instead of the run there if it is replaced."""
     saved = out / "config.yaml"
     if overwrite and saved.exists():
         _remove_run(out)

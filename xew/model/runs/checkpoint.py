@@ -2,8 +2,7 @@
 
 Reads, writes <out>/checkpoints/STEP, and <out>/sums/STEP.json: SHA-256 of each of its files, once it is complete
 
-A checkpoint whose sums were not written yet, because the run was killed just then, or which an earlier version made, is read
-without them.
+A checkpoint whose sums were not written yet, because the run was killed just then, is read without them.
 """
 
 import contextlib
@@ -26,16 +25,16 @@ from xew.model.devices.sharding import place_like
 from xew.model.network.dit import network_shapes
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.network.spec import Network
-from xew.model.runs.lineage import KeptStep, trace_run
+from xew.model.runs.folder import KeptStep, trace_run
 
 SUMMING = ThreadPoolExecutor(1, "sums")
-"""Thread in which checksums of earlier checkpoints are computed, beside the training."""
+"""Thread in which checksums of earlier checkpoints are computed, during training."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrainState:
-    """The state of a training."""
+    """The state of a training run."""
 
     step: jax.Array
     """[] int32, number of optimizer steps taken."""
@@ -90,7 +89,7 @@ def restore_state(checkpoints: ocp.CheckpointManager, like: TrainState) -> tuple
     """Restore the latest state and the position of the data.
 
     Args:
-        like: arrays, or their shapes, types and shardings: where each is to lie, whatever devices saved it.
+        like: arrays, or their shapes, types and shardings: where each is to lie, independent of the devices that saved it.
 
     Raises:
         ConfigError: the checkpoint is damaged: something is missing, of another size, changed since, or not finite.
@@ -246,10 +245,10 @@ def find_damage(out: Path, step: int, items: Collection[str]) -> str:
         if "/" in name and name.partition("/")[0] not in items:
             continue
         try:
-            found = file_digest(folder / name)
+            actual = file_digest(folder / name)
         except OSError:
             return f"{name} is missing"
-        if found != digest:
+        if actual != digest:
             return f"{name} has other bytes than were written"
     return ""
 
@@ -258,7 +257,7 @@ def damaged(out: Path, step: int, items: Collection[str], what: object) -> Confi
     """The error for a damaged checkpoint, in one line: what is wrong with which, and the last one that is whole."""
     steps = sorted((int(path.name) for path in (out / "checkpoints").glob("*") if path.name.isdecimal()), reverse=True)
     whole = [other for other in steps if other != step and _sums(out, other).exists() and not find_damage(out, other, items)]
-    offer = "no other is known to be whole: copy the run again, or train it anew with --overwrite"
+    offer = "no other is known to be whole: copy the run again, or train it again with --overwrite"
     if whole:
         offer = f"step {whole[0]} is whole: move that folder away to go on from it, or read it by --checkpoint {whole[0]}"
     reason = " ".join(str(what).split())[:200] or type(what).__name__

@@ -120,7 +120,7 @@ class Predictor:
         unaligned = self._encode_unaligned(streams)
         chunks: list[Array] = []
         for number, start in enumerate(range(0, max(frame_count - 1, 1), self.inputs.clip.frames - 1)):
-            conditions = self._encode_conditions(streams, start) | unaligned | self._encode_history(given, chunks, start)
+            conditions = unaligned | self._encode_history(given, chunks, start) | self._encode_conditions(streams, start)
             keys = self._place(np.stack([self._key(episode, number) for episode in whole]))
             reference = chunks[-1][:, -1:] if chunks else given
             inputs = ChunkInputs(reference, conditions, text, negative, keys)
@@ -172,7 +172,7 @@ class Predictor:
         return pictures | {name: self._place(array) for name, array in scaled.items()}
 
     def _encode_history(self, given: Array, chunks: Sequence[Array], start: int) -> dict[str, Array]:
-        """Encode earlier frames one by one: what the model has made itself, for the recorded ones would show the future."""
+        """Encode earlier frames one by one: the model's own predictions, since the recorded ones would show the future."""
         names = [name for name, condition in self.inputs.conditions.items() if condition.make is None]
         if not names:
             return {}

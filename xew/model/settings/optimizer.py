@@ -34,7 +34,7 @@ def make_optimizer(settings: TrainSettings) -> optax.GradientTransformation:
     """Make the optimizer of `train.optimizer` after clipping by the global norm; the first moments are in `mu_dtype`.
 
     Muon makes its updates orthogonal in that type too, in bfloat16 as its author does (Jordan 2024): the products take less
-    time, and their error is small beside that of the iteration itself, which ends long before it converges.
+    time, and their error is small compared with that of the iteration itself, which ends long before it converges.
     """
     rate, decay, mu_dtype = learning_rate(settings), settings.weight_decay, jnp.dtype(settings.mu_dtype)
     if settings.optimizer == "muon":

@@ -184,7 +184,7 @@ HF_DUPLICATE = "encoder.embed_tokens.weight"
 
 
 def load_umt5(path: Path, size: Umt5Size, dtype: DTypeLike = jnp.bfloat16) -> Umt5Encoder:
-    """The encoder with a checkpoint's weights, kept and multiplied in `dtype`; the names tell which layout it is in.
+    """The encoder with a checkpoint's weights, kept and multiplied in `dtype`; the names say which layout it is in.
 
     Raises:
         ConfigError: there is no such file, or it does not fit; what differs is named.

@@ -1,4 +1,4 @@
-"""The loop of every training: steps, log lines, checkpoints, samples, and an orderly end when a signal asks for it."""
+"""The loop of every training run: steps, log lines, checkpoints, samples, and an orderly end when a signal asks for it."""
 
 import contextlib
 import signal
@@ -23,7 +23,7 @@ STOPPED = 128 + signal.SIGTERM
 
 @dataclass(frozen=True)
 class Timetable:
-    """When a training logs, saves and draws samples, all in steps."""
+    """When a run logs, saves and draws samples, all in steps."""
 
     steps: int
     log_every: int
@@ -33,7 +33,7 @@ class Timetable:
     learning_rate: Callable[[int], Any]
     """Function from the number of steps taken to the rate of the next."""
     is_over: Callable[[int], bool] | None = None
-    """Function from the number of steps taken to whether the training ends before `steps`, as one with a budget of time."""
+    """Function from the number of steps taken to whether the run ends before `steps`, as one with a budget of time."""
 
 
 @dataclass
@@ -67,7 +67,7 @@ class Meter:
                 )
 
     def take(self) -> dict[str, float]:
-        """Take the values of a log line, and begin anew."""
+        """Take the values of a log line, and start over."""
         results, seconds = jax.device_get(self.results), time.perf_counter() - self.since
         values = self.summarize(results) | {
             "time/step_s": seconds / len(results),
@@ -155,7 +155,7 @@ def run_steps(
             stops = stops or stop.is_agreed()
         if saves or stops:
             save_state(session.checkpoints, state, batches.get_state())
-        if stops and not last:  # whoever asked will not wait for samples
+        if stops and not last:  # the launcher will not wait for samples
             of = "" if total is None else f" of {total}"
             progress.write(f"stopped at step {step}{of} and saved; continue with --resume", file=sys.stderr)
             break

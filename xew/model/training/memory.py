@@ -25,7 +25,7 @@ from xew.model.training.step import Trainer
 from xew.model.video.frames import TEMPORAL_FACTOR
 
 MARGIN = 1.1
-"""Factor that leaves room for what the estimate does not see."""
+"""Factor for what the estimate does not see."""
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,12 @@ class Memory:
     def line(self) -> str:
         """All parts in one line of text."""
         shares = ", ".join(f"{name} {size / 1e9:.2f}" for name, size in self.parts.items() if size)
-        return f"memory of each device [GB]: {shares}; with {MARGIN - 1:.0%} of room {self.total / 1e9:.2f} ({self.layout})"
+        return f"memory of each device [GB]: {shares}; with a margin of {MARGIN - 1:.0%} {self.total / 1e9:.2f} ({self.layout})"
 
     def table(self) -> str:
-        """Text with every part on a line of its own."""
+        """Text with one part a line."""
         lines = [f"{name:<28}{size / 1e9:10.3f} GB" for name, size in self.parts.items()]
-        total = f"{'total with ' + format(MARGIN - 1, '.0%') + ' of room':<28}{self.total / 1e9:10.3f} GB"
+        total = f"{'total with a margin of ' + format(MARGIN - 1, '.0%'):<28}{self.total / 1e9:10.3f} GB"
         return "\n".join([f"each device, {self.layout}:", *lines, total])
 
 
@@ -138,7 +138,7 @@ def device_memory() -> float:
 
 
 def check_memory(memory: Memory, ignore: bool = False) -> None:
-    """Print the estimate beside the memory that there is. Raises ConfigError if it is too much, unless that is ignored."""
+    """Print the estimate and the memory that is available. Raises ConfigError if it is too much, unless that is ignored."""
     available = device_memory()
     if jax.process_index() == 0:
         print(f"{memory.line()}; there is {available / 1e9:.2f}", file=sys.stderr)

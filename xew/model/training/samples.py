@@ -1,4 +1,4 @@
-"""Sample videos in training: one clip of each sample episode, predicted beside the ground truth."""
+"""Sample videos in training: one clip of each sample episode, predicted and compared with the ground truth."""
 
 from collections.abc import Mapping
 

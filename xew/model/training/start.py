@@ -6,7 +6,7 @@ from typing import Any
 
 from xew.model.network.dit_layouts import load_dit_params
 from xew.model.runs.checkpoint import TrainState, damaged, restore_state, restore_sum
-from xew.model.runs.lineage import trace_start
+from xew.model.runs.folder import trace_start
 from xew.model.runs.session import Session
 from xew.model.training.step import Trainer
 

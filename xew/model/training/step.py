@@ -25,7 +25,6 @@ from jax.sharding import AbstractMesh, Mesh
 from xew.model.codecs.contract import Codec
 from xew.model.devices.sharding import gather_parameters, place_shapes
 from xew.model.diffusion.flow_matching import (
-    ReplaceReference,
     TrainingPair,
     motion_weights,
     put_first,
@@ -131,7 +130,7 @@ class Trainer:
     @functools.cached_property
     def _codec_copies(self) -> Codec | None:
         """The codec on every device, if the step needs it."""
-        if self.codec is None or not (self.spec.settings.chunks == 2 or self.codec.relative):
+        if self.codec is None or self.spec.settings.chunks == 1:
             return None
         return jax.device_put(jax.tree.map(np.asarray, self.codec), self.shapes.step.sharding)
 
@@ -182,10 +181,9 @@ class Trainer:
         """Gradients, losses and noise levels of one part; `size` is the number of samples of the whole batch."""
         settings = self.spec.settings
         gradients, losses, sigmas, chunk = None, [], [], samples.batch
-        replace_reference = put_first if codec is None else codec.replace_reference
         for number in range(samples.weights.shape[1]):
             keys = jax.vmap(jax.random.fold_in, (0, None))(samples.keys, number)
-            pair = sample_pairs(keys, chunk.latents, settings.shift, replace_reference)
+            pair = sample_pairs(keys, chunk.latents, settings.shift)
             chunk = add_history_noise(keys, chunk, settings.history_noise)
             of_chunk, loss, predicted = self._chunk_gradients(params, chunk, pair, samples.weights[:, number] / size)
             gradients = of_chunk if gradients is None else self._keep_sharded(_sum(gradients, of_chunk))
@@ -193,8 +191,9 @@ class Trainer:
             sigmas.append(pair.sigma)
             if chunk.following is not None:
                 assert codec is not None, "two chunks need the codec"
-                clean = estimate_clean(chunk.latents, pair, predicted, replace_reference)
-                chunk = behind_reference(chunk.following, codec.next_reference(clean), replace_reference)
+                clean = estimate_clean(chunk.latents, pair, predicted)
+                latents = put_first(chunk.following.latents, codec.next_reference(clean))
+                chunk = replace(chunk.following, latents=latents)
         return gradients, jnp.stack(losses, axis=1), jnp.stack(sigmas, axis=1)
 
     def _chunk_gradients(self, params: Any, chunk: Batch, pair: TrainingPair, shares: Array) -> tuple[Any, Array, Array]:
@@ -232,9 +231,9 @@ def list_shardings(shapes: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf.sharding, shapes)
 
 
-def sample_pairs(keys: Array, latents: Array, shift: float, replace_reference: ReplaceReference = put_first) -> TrainingPair:
+def sample_pairs(keys: Array, latents: Array, shift: float) -> TrainingPair:
     """Make the `training_pair` of each sample of latents [b t h w c], with its own key [b]."""
-    pairs = jax.vmap(lambda key, sample: training_pair(key, sample[None], shift, replace_reference))(keys, latents)
+    pairs = jax.vmap(lambda key, sample: training_pair(key, sample[None], shift))(keys, latents)
     return jax.tree.map(lambda leaf: leaf[:, 0], pairs)
 
 
@@ -248,20 +247,13 @@ def add_history_noise(keys: Array, chunk: Batch, strength: float) -> Batch:
     return replace(chunk, conditions={**chunk.conditions, "history": history + strength * noise})
 
 
-def estimate_clean(
-    latents: Array, pair: TrainingPair, predicted: Array, replace_reference: ReplaceReference = put_first
-) -> Array:
+def estimate_clean(latents: Array, pair: TrainingPair, predicted: Array) -> Array:
     """Estimate the clean latents [b t h w c] in one step from a predicted velocity [b t h w c].
 
-    The prediction is of the video behind the perturbed reference; frame 0 of the estimate is the given one [b t h w c].
+    Frame 0 of the estimate is the given one [b t h w c].
     """
     clean = pair.noisy - pair.sigma[:, None, None, None, None] * predicted
-    return replace_reference(put_first(clean, pair.noisy[:, :1]), latents[:, :1])
-
-
-def behind_reference(chunk: Batch, reference: Array, replace_reference: ReplaceReference) -> Batch:
-    """The same chunk behind another first latent frame [b 1 h w c]."""
-    return replace(chunk, latents=replace_reference(chunk.latents, reference))
+    return put_first(clean, latents[:, :1])
 
 
 def chunk_weights(batch: Batch) -> Array:

@@ -1,4 +1,4 @@
-"""Two videos beside each other, and how far they are apart; for watching training only."""
+"""Two videos side by side, and their PSNR; for watching training only."""
 
 import numpy as np
 

@@ -22,7 +22,7 @@ class Source:
     """Place of one leaf of a module in somebody's checkpoint."""
 
     keys: tuple[str, ...]
-    """Key of one tensor, or a key for each layer; `stacked` tells which."""
+    """Key of one tensor, or a key for each layer; `stacked` says which."""
     layout: Literal["as_is", "linear", "conv", "patches", "ones", "leading_ones"] = "as_is"
     """Way in which the tensor's axes become the leaf's.
 

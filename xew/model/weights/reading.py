@@ -1,7 +1,7 @@
 """Checkpoints of other projects: their files, opened as `Tensors` by key.
 
 Reads  .safetensors, *.safetensors.index.json, a folder of either, .pth and .pt (PyTorch state dicts, `weights_only`), and
-       config.json beside them
+       config.json next to them
 Writes `Tensors`, each of which is read when it is asked for
 
 Nothing is ever unpickled freely.
@@ -68,7 +68,7 @@ class Tensors(Mapping):
 
     @property
     def config(self) -> dict[str, Any]:
-        """What config.json beside the checkpoint says, as diffusers writes one; nothing where there is none.
+        """What config.json next to the checkpoint says, as diffusers writes one; nothing where there is none.
 
         Raises ConfigError if it is broken.
         """
@@ -126,7 +126,7 @@ class _TorchEntry:
 
     def read(self) -> np.ndarray:
         tensor = self.tensor.detach()
-        if str(tensor.dtype) == "torch.bfloat16":  # NumPy has no such type of its own: the same bits by another name
+        if str(tensor.dtype) == "torch.bfloat16":  # NumPy has no such type: the same bits by another name
             import torch
 
             return tensor.contiguous().view(torch.uint16).numpy().view(ml_dtypes.bfloat16)
@@ -165,7 +165,7 @@ def _open_folder(folder: Path) -> dict[str, Entry]:
 
 
 def _open_index(index: Path) -> dict[str, Entry]:
-    """Open the shards that an index names; they lie beside it, and whatever points elsewhere is refused."""
+    """Open the shards that an index names; they lie next to it, and a path that leads elsewhere is refused."""
     try:
         names = read_json(index)["weight_map"]
         shards = sorted(set(names.values()))
@@ -174,7 +174,7 @@ def _open_index(index: Path) -> dict[str, Entry]:
         raise ConfigError(f"{index} is no index of safetensors (no weight_map of keys to files); download it again.") from error
     if elsewhere:
         raise ConfigError(
-            f"{index} names files that are no .safetensors beside it: {list_some(map(repr, elsewhere))}; do not use it."
+            f"{index} names files that are no .safetensors next to it: {list_some(map(repr, elsewhere))}; do not use it."
         )
     absent = [name for name in shards if not (index.parent / name).is_file()]
     if absent:
@@ -227,7 +227,7 @@ def _merge(files: Iterable[tuple[Path, Mapping[str, Entry]]]) -> dict[str, Entry
     for path, entries in files:
         twice = merged.keys() & entries.keys()
         if twice:
-            raise ConfigError(f"{path} repeats tensors of another file beside it: {list_some(sorted(twice))}; name one file.")
+            raise ConfigError(f"{path} repeats tensors of another file next to it: {list_some(sorted(twice))}; name one file.")
         merged |= entries
     return merged
 

@@ -1,6 +1,6 @@
-"""The folder of a trained run, as far as other packages need it: its mark, its files, and its checkpoints' times.
+"""The folder of a trained run: its mark, its files, and its checkpoints' times. It loads without JAX, for `xew.analysis.study`.
 
-xew/model/runs writes it; xew/model/runs/folder.py says what each file holds.
+folder.py says what each file holds.
 """
 
 from pathlib import Path
