@@ -356,12 +356,9 @@ def test_the_registry_of_robots_is_complete() -> None:
 
 
 def test_the_registry_of_metrics_is_complete() -> None:
-    """Metrics of old score tables and of the paper are still there, and no exported one of a family's file was forgotten."""
+    """Metrics of the paper are there, and no exported one of a family's file was forgotten."""
     metrics = importlib.import_module("xew.metrics")
     kinds = importlib.import_module("xew.metrics.metric")
-    assert set(metrics.METRICS) >= set(importlib.import_module("xew.analysis.scores").EARLIER_TITLES), (
-        "names that score tables hold"
-    )
     assert set(metrics.METRICS) >= set(importlib.import_module("xew.analysis.paper").read_paper().metrics)
     registered = {metric.function for metric in metrics.METRICS.values()}
     registered |= {metric.curve for metric in metrics.METRICS.values()}

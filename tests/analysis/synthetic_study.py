@@ -70,6 +70,11 @@ def attributes() -> dict[str, object]:
             "low": None if np.isinf(METRICS[name].range[0]) else METRICS[name].range[0],
             "high": None if np.isinf(METRICS[name].range[1]) else METRICS[name].range[1],
             "reference": METRICS[name].reference,
+            "title": METRICS[name].title,
+            "estimated": METRICS[name].estimated,
+            "suites": [],
+            "counterpart": "",
+            "reported": True,
         }
         for name in PAPER_METRICS
     }

@@ -28,7 +28,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     with pytest.MonkeyPatch.context() as patch:
         lines: list[str] = []
         patch.setattr("builtins.print", lambda *words, **_: lines.append(" ".join(map(str, words))))
-        main(Args((str(stick(out, 0.2)),), out, seeds=3, perceptual=f"{__name__}:gray_levels", workers=1))
+        main(Args((str(stick(out, 0.2)),), out, seeds=3, perceptual=f"{__name__}:gray_levels"))
     return out, "\n".join(lines)
 
 
@@ -78,7 +78,7 @@ def test_what_is_printed_says_what_is_what(table: tuple[Path, str]) -> None:
 
 
 def test_one_seed_has_no_spread(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    main(Args(out=tmp_path, seeds=1, looks=False, workers=1))
+    main(Args(out=tmp_path, seeds=1, looks=False))
     assert (pd.read_csv(tmp_path / "distances.csv")["spread"] == 0).all()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["distances.csv", "robots.csv"]
     assert "±" not in capsys.readouterr().out
@@ -98,5 +98,5 @@ def test_one_seed_has_no_spread(tmp_path: Path, capsys: pytest.CaptureFixture) -
 )
 def test_mistakes_are_told_in_words(args: Args, message: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(SystemExit) as exit_:
-        main(Args(args.robot, tmp_path / "out", args.seeds, args.looks, args.perceptual, 1))
+        main(Args(args.robot, tmp_path / "out", args.seeds, args.looks, args.perceptual))
     assert exit_.value.code == 2 and message in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -20,23 +20,12 @@ from xew.config import ConfigError
 from xew.protocol import VARIANTS
 
 ADAPTED = ("fixed-optical_flow-nine_views", "few_shot-piper-1", "few_shot-franka_panda-1")
+COMMON = {"title": "", "estimated": False, "suites": [], "counterpart": "", "reported": True, "reference": "x", "low": 0.0}
 METRICS = {
-    "lpips": {"dimension": "visual", "unit": "", "higher_is_better": False, "reference": "x", "low": 0.0, "high": None},
-    "pck": {"dimension": "kinematics", "unit": "", "higher_is_better": True, "reference": "x", "low": 0.0, "high": 1.0},
+    "lpips": {"dimension": "visual", "unit": "", "higher_is_better": False, "high": None, **COMMON},
+    "pck": {"dimension": "kinematics", "unit": "", "higher_is_better": True, "high": 1.0, **COMMON},
 }
 ATTRIBUTES = {"protocol": 2, "metrics": METRICS, "versions": {"xew": "1.0"}, "estimators": {"masks": "default"}}
-
-
-def test_tables_without_titles_keep_those_that_they_were_shown_with(tmp_path: Path) -> None:
-    """Tables that were written before they carried titles, and metrics that nobody gave one."""
-    table = graded(baselines=False).replace({"metric": {"pck": "wobble"}})
-    table.attrs = ATTRIBUTES | {"metrics": {"lpips": METRICS["lpips"], "wobble": METRICS["pck"]}}
-    for path in (tmp_path / "scores.parquet", tmp_path / "scores.curves.parquet"):
-        table.to_parquet(path, index=False)
-    assert {metric.name: metric.title for metric in read_scores(tmp_path / "scores.parquet").metrics} == {
-        "lpips": "LPIPS",
-        "wobble": "wobble",
-    }
 
 
 def test_several_trainings_of_a_variant_are_told_by_their_seed(tmp_path: Path) -> None:
@@ -104,6 +93,16 @@ def test_a_wrong_cell_is_named(message: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as error:
         read_scores(written(tmp_path / "s.parquet", WRONG[message](graded())))
     assert message in str(error.value) and "--overwrite" in str(error.value)
+
+
+def test_curves_may_be_missing(tmp_path: Path) -> None:
+    path = written(tmp_path / "s.parquet", graded())
+    path.with_suffix(".curves.parquet").unlink()
+    scores = read_scores(path)
+    assert scores.curves.empty and len(scores.rows) == len(graded())
+    merged = merge_scores([("flow", path)])
+    write_scores(merged, tmp_path / "merged.parquet")
+    assert read_scores(tmp_path / "merged.parquet").curves.empty
 
 
 def test_nobody_is_told_to_delete_a_folder(tmp_path: Path) -> None:

@@ -46,7 +46,6 @@ WRITERS: tuple[tuple[str, str, str], ...] = (
 )
 """Commands with options, and what they write, whose lock they take."""
 OTHERS = {
-    "analysis.null": "prints",
     "model.latents": "waits: see below",
     "model.rollout": "needs a trained run: see below",
     "sim_warp.motions": "prints",

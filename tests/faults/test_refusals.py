@@ -127,7 +127,6 @@ def test_workers_that_are_none_are_refused(number: int, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "command",
     [
-        "xew.analysis.distance --no-looks --out out --workers 0",
         "xew.metrics.evaluate rollouts --data data --out scores.parquet --processes 0",
     ],
 )

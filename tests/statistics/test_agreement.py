@@ -11,14 +11,15 @@ import pytest
 from tests.analysis.synthetic_study import paper_axes
 from xew.analysis.paper import read_paper
 from xew.analysis.report import run_table
+from xew.analysis.reports.run_tables import finding, flat_summary, robot_table
 from xew.analysis.scores import COPY, TRUTH, Scores, read_scores
 from xew.analysis.statistics.grades import StudyGrades
-from xew.analysis.statistics.summary import finding, flat_summary, robot_table
 from xew.analysis.tables.builder import Builder, paired_verdict
 from xew.metrics import METRICS
 from xew.metrics.grading.scores import describe
-from xew.metrics.grading.summary import Summary, summarize, to_markdown
+from xew.metrics.grading.summary import summarize_robots, to_markdown
 from xew.protocol import CODEC_TRUTH, PASTED_RENDER, ROBOT_NAMES, SEEN_ROBOTS, reference
+from xew.statistics import Summary
 
 ROBOTS = ("ur5_wsg", "piper")
 JOINTS, FLOW = (reference(action=action).name for action in ("joints", "optical_flow"))
@@ -88,7 +89,7 @@ def pairs_of(summary: Summary, model: str, other: str) -> Iterator[tuple[tuple[s
 
 
 def test_a_run_is_the_same_in_both(scores: Scores) -> None:
-    summary = summarize(scores.rows)
+    summary = summarize_robots(scores.rows)
     means = summary.means.set_index(["robot", "model", "metric"])
     reported = {robot: robot_table(scores, robot, [robot], None) for robot in ROBOTS}
     compared = 0
@@ -115,7 +116,7 @@ def test_which_suite_decides_and_where_they_part_is_the_same_in_both(tmp_path: P
     value = scores.rows["value"].where(~worse, 29.0).where(~better, 0.1)
     rows = scores.rows.assign(value=value)
     rows.attrs = scores.rows.attrs
-    summary = summarize(rows)
+    summary = summarize_robots(rows)
     tables = [robot_table(replace(scores, rows=rows), robot, [robot], None) for robot in ROBOTS]
     assert set(summary.pairs.loc[~summary.pairs["decides"], "metric"]) == BESIDE
     flat = flat_summary(tables, scores.metrics)
@@ -144,7 +145,7 @@ def test_tasks_without_power_leave_the_means_of_the_suite_strict_in_both(tmp_pat
     at_rest &= scores.rows["metric"].isin(["keypoint_error", "keypoint_error_strict"])
     rows = scores.rows.assign(value=scores.rows["value"].where(~at_rest, 1.0))
     rows.attrs = scores.rows.attrs
-    summary = summarize(rows)
+    summary = summarize_robots(rows)
     power = summary.power.set_index(["metric", "task"])
     assert set(power.index.get_level_values("metric")) == {"mask_iou", "keypoint_error_strict"}, "estimated, and strict"
     assert not power.loc[("keypoint_error_strict", "task2"), "kept"] and power["kept"].sum() == 2 * 4 - 1
@@ -172,7 +173,7 @@ def test_tasks_without_power_leave_the_means_of_the_suite_strict_in_both(tmp_pat
     assert "leave the mean of keypoint_error_strict: task2." in to_markdown(summary)
     assert "leave the mean of Strict keypoint error: task2." in grades.notes
     alone = rows[rows["model"] != COPY]
-    assert summarize(alone).power.empty, "without the baseline nothing is known, and all tasks stay"
+    assert summarize_robots(alone).power.empty, "without the baseline nothing is known, and all tasks stay"
 
 
 def two_models(summary: Summary) -> pd.DataFrame:
@@ -181,7 +182,7 @@ def two_models(summary: Summary) -> pd.DataFrame:
 
 
 def test_a_study_is_the_same_in_both(scores: Scores) -> None:
-    summary = summarize(scores.rows)
+    summary = summarize_robots(scores.rows)
     means = summary.means.set_index(["robot", "model", "metric"])
     variants = scores.rows["model"].where(scores.rows["model"].isin([JOINTS, FLOW]), "")
     rows = scores.rows.assign(variant=variants)
@@ -211,7 +212,7 @@ def test_what_the_two_once_disagreed_on(tmp_path: Path) -> None:
         scores = write_scores(tmp_path / "scores.parquet", scenes, truth, 0.01, 0.0)
         tables = [robot_table(scores, robot, [robot], None) for robot in ROBOTS]
         reported = [row.verdicts for table in tables for row in table.rows if row.model == FLOW]
-        graded = dict(pairs_of(summarize(scores.rows), FLOW, COPY))
+        graded = dict(pairs_of(summarize_robots(scores.rows), FLOW, COPY))
         for words in (*reported, {metric: word for (_, metric), word in graded.items()}):
             found = {metric for metric, word in words.items() if word == "better"}
             assert found <= resolved and (found & {"psnr", "ssim"}) == (resolved & {"psnr", "ssim"})

@@ -91,8 +91,6 @@ class Args:
     perceptual: str = "xew.metrics:lpips_embedding"
     """module:NAME of a function from images [n h w 3] uint8 to vectors [n d], whose squared distances are measured; empty for
     none. The default's are LPIPS."""
-    workers: int = -1
-    """Threads that compare workspaces; -1 for one a core."""
 
 
 @user_errors
@@ -100,8 +98,6 @@ def main(args: Args) -> None:
     """Measure the distances, write both tables and print them."""
     if args.seeds < 1:
         raise ConfigError(f"--seeds is {args.seeds}; expected 1 or more.")
-    if args.workers != -1 and args.workers < 1:
-        raise ConfigError(f"--workers is {args.workers}; expected 1 or more, or -1 for all cores.")
     embed = _import_embedding(args.perceptual) if args.looks and args.perceptual else None
     robots = find_robots((*ROBOT_NAMES, *args.robot))
     with hold_lock(args.out):
@@ -110,10 +106,10 @@ def main(args: Args) -> None:
 
 def write_distances(args: Args, robots: dict[str, RobotSpec | Urdf], embed: ImageEmbedding | None) -> None:
     """Measure the distances between robots, by name, and write and print both tables."""
-    features = measure(robots, range(args.seeds), workers=args.workers)
+    features = measure(robots, range(args.seeds))
     axes = {"kinematic": Axis(features.robots, features.kinematic.mean(axis=0), features.kinematic)}
     for other in OTHER_FRAMES:
-        draws = measure(robots, range(args.seeds), other, args.workers).kinematic
+        draws = measure(robots, range(args.seeds), other).kinematic
         axes[other] = Axis(features.robots, draws.mean(axis=0), draws)
     if args.looks:
         axes |= _measure_looks([robot for robot in robots.values() if isinstance(robot, RobotSpec)], embed)

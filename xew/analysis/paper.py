@@ -14,7 +14,7 @@ The figures lie in `paper.json` with the table that each is from:
         baselines   by model: irasim, ctrl_world, enerverse_ac, reference
     changes     percentages that the text prints, each with the two values that it compares
 
-`xew.analysis.statistics.recompute` rebuilds the correlations and percentages from the scores and distances.
+`lab/paper_figures` rebuilds the correlations and percentages from the scores and distances.
 """
 
 import json

@@ -33,11 +33,12 @@ from xew.analysis.reports import page, pictures
 from xew.analysis.reports import paper as paper_report
 from xew.analysis.reports import study as report_study
 from xew.analysis.reports.charts import Chart, chart_files
+from xew.analysis.reports.run_tables import RobotTable, Row, finding, flat_summary, robot_table
 from xew.analysis.reports.study_charts import run_chart
-from xew.analysis.reports.study_text import missing_note
+from xew.analysis.reports.study_text import curves_note, missing_note
 from xew.analysis.scores import TRUTH, MetricInfo, Scores, find_missing_scores, read_scores
-from xew.analysis.statistics.summary import RobotTable, Row, finding, flat_summary, robot_table, robot_title
 from xew.analysis.tables import formats
+from xew.analysis.tables.labels import robot_title
 from xew.analysis.tables.table import (
     Table,
     TableCell,
@@ -49,7 +50,7 @@ from xew.analysis.tables.table import (
     parting_note,
 )
 from xew.config import ConfigError, user_errors
-from xew.dataset import count_motions, demand_one_motion, find_records
+from xew.dataset import demand_one_motion, find_records
 from xew.episode import Record, episode_folder, read_video
 from xew.files import hold_lock, write_bytes, write_text
 from xew.names import csv_text, path_below, plain_markdown
@@ -73,8 +74,6 @@ NO_FILE_NAME = re.compile(r"[<>\"/\\|?*()\[\]`']+")
 """Letters of the names of models that stand in no name of a figure's file."""
 EXPLORER = "explorer/index.html"
 """Path of the explorer's page below the report's folder."""
-SHEET_TASKS = 8
-"""Largest number of tasks on the contact sheet."""
 
 
 @dataclass(frozen=True)
@@ -184,24 +183,23 @@ def _report_scores(args: Args, scores: Scores) -> None:
         raise ConfigError(f"{args.data} holds no episode; make some: python -m xew.sim_warp.generate --out {args.data}")
     held_out, seen = _make_tables(scores, records, args.held_out)
     missing = find_missing_scores(scores.rows)
+    notes = [*missing_note(missing), *curves_note(scores)]
     strips = _make_strips(scores, args) if args.data and args.rollouts else []
     if args.explorer:
         _write_explorer(scores, args)
     curves = _curve_chart(scores, args.held_out)
-    sheets = [_contact_sheet(args.data, records)] if args.data and any(record.success for record in records) else []
     sections = [
-        *map(page.note, missing_note(missing)),
+        *map(page.note, notes),
         _held_out_section(held_out, scores.metrics),
         _strip_section(strips, args),
         page.section("How the error grows with time", page.chart(curves)) if curves.panels else None,
         _seen_section(seen, scores.metrics),
-        _data_section(sheets, records),
         _method_section(scores, args),
     ]
     sentences = finding(held_out, seen, scores.metrics)
     html = page.page(TITLE, sentences, [part for part in sections if part], _format_footer(scores.versions))
-    notes = [*missing_note(missing), *_caution_notes(held_out)]
-    text, files = _write_markdown(sentences, notes, held_out, seen, scores, [*strips, *sheets], chart_files(curves))
+    notes += _caution_notes(held_out)
+    text, files = _write_markdown(sentences, notes, held_out, seen, scores, strips, chart_files(curves))
     if len(missing):
         files["missing.csv"] = csv_text(missing).encode()
     _write_report(args.out, html, (text, files), flat_summary(held_out + seen, scores.metrics))
@@ -323,16 +321,6 @@ def _strip_section(strips: Sequence[Picture], args: Args) -> Markup:
     return page.section("What it looks like", page.paragraph(text), *played, *(strip.html for strip in strips))
 
 
-def _data_section(sheets: Sequence[Picture], records: Sequence[Record]) -> Markup | None:
-    if not sheets:
-        return None
-    accepted = sum(record.success for record in records)
-    motions = " and of ".join(count_motions(records))
-    tried = f"{len(records)} cells of {motions} motion were tried, {accepted} succeeded."
-    text = f"{tried} A seed counts when every robot has mastered it."
-    return page.section("The paired data", page.paragraph(text), *(sheet.html for sheet in sheets))
-
-
 def _method_section(scores: Scores, args: Args) -> Markup:
     definitions = {metric.title: metric.reference for metric in scores.metrics}
     notes = (
@@ -405,34 +393,6 @@ def _curve_chart(scores: Scores, held_out: Sequence[str]) -> Chart:
     metrics = [metric for metric in scores.metrics if metric.name in CURVE_METRICS] or list(scores.metrics[:3])
     robots = [robot for robot in held_out if robot in set(scores.rows["robot"])] or sorted(set(scores.rows["robot"]))
     return run_chart(scores.curves, metrics, robots)
-
-
-def _contact_sheet(data: Path, records: Sequence[Record]) -> Picture:
-    """One seed of each task, middle frame, all robots side by side."""
-    accepted = [record for record in records if record.success]
-    tasks = sorted({record.task for record in accepted})[:SHEET_TASKS]
-    known = dict.fromkeys((*ROBOT_NAMES, *(record.robot for record in accepted)))
-    robots = [robot for robot in known if any(record.robot == robot for record in accepted)]
-    rows = [_task_row(data, [record for record in accepted if record.task == task], robots) for task in tasks]
-    image = pictures.encode_png(pictures.sheet(rows))
-    caption = "One seed of each task half-way through: the scene is the same for every robot."
-    titles = [robot_title(robot) for robot in robots]
-    names = [task.replace("_", " ") for task in tasks]
-    return Picture("data.png", image, page.labeled_picture(pictures.data_uri(image), caption, titles, names))
-
-
-def _task_row(data: Path, records: Sequence[Record], robots: Sequence[str]) -> list[np.ndarray]:
-    """Middle frames of the seed that most robots have, a white picture for those that have not."""
-    by_seed: dict[int, dict[str, Record]] = {}
-    for record in records:
-        by_seed.setdefault(record.seed, {})[record.robot] = record
-    seed = max(sorted(by_seed), key=lambda seed: len(by_seed[seed]))
-    found = {}
-    for robot, record in by_seed[seed].items():
-        video = read_video(episode_folder(data, record.task, seed, robot) / "rgb.mkv")
-        found[robot] = video[len(video) // 2]
-    blank = np.full_like(next(iter(found.values())), 255)
-    return [found.get(robot, blank) for robot in robots]
 
 
 def _format_footer(graded_with: Mapping[str, str]) -> str:

@@ -6,7 +6,6 @@ several times, the column `training` has the seed of the training; it is 0 for b
 variant has one training.
 """
 
-import operator
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -19,7 +18,6 @@ from xew.config import IMPORT_PATH, ConfigError, parse
 from xew.files import demand_regular, replacing
 from xew.names import EpisodeError, check_label, check_name
 from xew.protocol import BASELINES, BODY_NAME, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES, SHARED_MOTION
-from xew.statistics import find_power
 
 VARIANT = "variant"
 TRAINING = "training"
@@ -33,26 +31,6 @@ COPY, TRUTH = COPY_FIRST_FRAME, GROUND_TRUTH
 """Baselines that others are measured by: the frozen first frame, and the true video, which is the ceiling."""
 COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero", "motion")
 """Attributes that say how a table was graded, and on what motion; tables that differ in one cannot be compared."""
-EARLIER = {"motion": SHARED_MOTION}
-"""Values of attributes in tables that were written before tables carried them."""
-DEFINITION = ("dimension", "unit", "higher_is_better", "low", "high", "reference")
-"""Attributes of each metric that every table has, old ones too."""
-EARLIER_TITLES = {
-    "psnr": "PSNR",
-    "ssim": "SSIM",
-    "lpips": "LPIPS",
-    "mask_iou": "Mask IoU",
-    "boundary_f1": "Boundary F1",
-    "region_lpips": "Region LPIPS",
-    "pck": "PCK",
-    "pck_05": "PCK at 0.05",
-    "keypoint_error": "Keypoint error",
-    "ndtw": "nDTW",
-    "coverage": "Keypoints found",
-    "trajectory_error": "Object error",
-    "object_coverage": "Objects found",
-}
-"""Titles of metrics in score tables that were written before tables carried them."""
 LISTED = 20
 """Largest number of rows of each kind that an error names; it counts the others."""
 
@@ -75,7 +53,7 @@ class MetricInfo:
     estimated: bool = False
     """Whether it needs an estimator, so that even the true video does not get the best score."""
     suites: tuple[str, ...] = ()
-    """Suites that it belongs to; none in tables that were written before there were two."""
+    """Suites that it belongs to."""
     counterpart: str = ""
     """Name of the metric of the suite paper in whose place it stands in the suite strict, and decides."""
     reported: bool = False
@@ -83,7 +61,7 @@ class MetricInfo:
 
     def __post_init__(self) -> None:
         if not self.title:
-            object.__setattr__(self, "title", EARLIER_TITLES.get(self.name, self.name))
+            object.__setattr__(self, "title", self.name)
 
     @property
     def leaves_tasks(self) -> bool:
@@ -103,7 +81,7 @@ class Scores:
     rows: pd.DataFrame
     """Table with one row per model, condition, task, seed, robot and metric; of a study also per variant."""
     curves: pd.DataFrame
-    """Table of the same scores by frame."""
+    """Table of the same scores by frame; empty where its file is not there."""
     metrics: tuple[MetricInfo, ...]
     attributes: Mapping[Hashable, Any]
     """Attributes of the table: protocol, metrics, versions, estimators, frame_zero."""
@@ -124,7 +102,7 @@ class Scores:
     @property
     def motion(self) -> str:
         """Kind of motion of the graded episodes (`xew.protocol.MOTIONS`)."""
-        return self.attributes.get("motion", EARLIER["motion"])
+        return self.attributes.get("motion", SHARED_MOTION)
 
     @property
     def codecs(self) -> dict[str, list[str]]:
@@ -157,7 +135,7 @@ class Scores:
 
 
 def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
-    """Read and check a score table and its curves.
+    """Read and check a score table, and its curves where they are there.
 
     Args:
         path: what `xew.metrics.evaluate` or `write_scores` wrote.
@@ -165,11 +143,12 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
             procedural bodies and robots with an import path `module:NAME` need no further word.
 
     Raises:
-        ConfigError: a file is missing or damaged; or cells are duplicate, not finite, of unknown robots, of other metrics
-            than described, out of a metric's range, or graded over different numbers of frames. All are named.
+        ConfigError: the table is missing, or a file is damaged; or cells are duplicate, not finite, of unknown robots, of other
+            metrics than described, out of a metric's range, or graded over different numbers of frames. All are named.
     """
     command = EVALUATE.format(path=path)
-    rows, curves = _read(path, command), _read(path.with_suffix(".curves.parquet"), command)
+    rows, by_frame = _read(path, command), path.with_suffix(".curves.parquet")
+    curves = _read(by_frame, command) if by_frame.exists() else pd.DataFrame(columns=[*rows.columns, "frame"])
     missing = [column for column in COLUMNS if column not in rows]
     missing += [key for key in ("protocol", "metrics") if key not in rows.attrs]
     if missing:
@@ -251,11 +230,6 @@ def write_scores(scores: Scores, path: Path) -> None:
         raise ConfigError(f"cannot write {path}: {error}. Free some space or choose another place.") from error
 
 
-def measure_power(rows: pd.DataFrame, metrics: Sequence[MetricInfo]) -> pd.DataFrame:
-    """The power of each task for each metric whose mean tasks may leave (`xew.statistics.find_power`)."""
-    return find_power(rows, {m.name: m.best for m in metrics if m.leaves_tasks and m.best is not None})
-
-
 def find_missing_scores(rows: pd.DataFrame) -> pd.DataFrame:
     """Find scores that some models have and others lack: means over such cells would compare different episodes.
 
@@ -307,18 +281,17 @@ def _check_texts(path: Path, rows: pd.DataFrame) -> None:
 
 def _read_metric_infos(path: Path, described: Mapping[str, Mapping[str, Any]]) -> tuple[MetricInfo, ...]:
     """Read the descriptions of a table's metrics; further entries are ignored."""
-    for metric, info in described.items():
-        if missing := [name for name in DEFINITION if name not in info]:
-            raise ConfigError(f"{path} does not say the {', '.join(missing)} of {metric}; it is no score table of this xew.")
     known = {field.name for field in fields(MetricInfo)} - {"name"}
+    for metric, info in described.items():
+        if missing := sorted(known - info.keys()):
+            raise ConfigError(f"{path} does not say the {', '.join(missing)} of {metric}; it is no score table of this xew.")
     infos = []
     for metric, info in described.items():
-        said = {"estimated": _guess_estimated(metric, info)} | {key: value for key, value in info.items() if key in known}
-        found = parse(MetricInfo, {"name": metric, **said}, f"{path}: the metric {metric}")
-        low, high = (-np.inf if found.low is None else found.low), (np.inf if found.high is None else found.high)
-        if not low < high:
-            raise ConfigError(f"{path}: the metric {metric} ranges from {found.low} to {found.high}; make the table anew.")
-        infos.append(found)
+        content = {"name": metric} | {key: value for key, value in info.items() if key in known}
+        parsed = parse(MetricInfo, content, f"{path}: the metric {metric}")
+        if parsed.low is not None and parsed.high is not None and parsed.low >= parsed.high:
+            raise ConfigError(f"{path}: the metric {metric} ranges from {parsed.low} to {parsed.high}; make the table again.")
+        infos.append(parsed)
     return tuple(infos)
 
 
@@ -342,20 +315,6 @@ def _check_attributes(path: Path, attributes: Mapping[Hashable, Any]) -> None:
     """Raise ConfigError for attributes of other types than they have."""
     known = {entry.name for entry in fields(_Attributes)}
     parse(_Attributes, {name: value for name, value in attributes.items() if name in known}, f"{path}, its attributes")
-
-
-def _guess_estimated(metric: str, info: Mapping[str, Any]) -> bool:
-    """Whether a metric is estimated, for tables that were written before they said so: metrics of whole pictures are not."""
-    return info["dimension"] != "visual" and metric != "region_lpips"
-
-
-def _have_same_metrics(one: Mapping[str, Mapping[str, Any]], other: Mapping[str, Mapping[str, Any]]) -> bool:
-    """Do two tables define their metrics alike? Titles and the like do not count, which older tables do not have."""
-
-    def definitions(described: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-        return {metric: {name: info.get(name) for name in DEFINITION} for metric, info in described.items()}
-
-    return definitions(one) == definitions(other)
 
 
 def _find_wrong_rows(rows: pd.DataFrame, metrics: Sequence[MetricInfo], robots: set[str]) -> dict[str, pd.DataFrame]:
@@ -387,10 +346,9 @@ def _merge_attributes(tables: Sequence[tuple[Path, Mapping[Hashable, Any]]]) -> 
     """Attributes that all tables share; versions of packages may differ and are all named."""
     first = tables[0][1]
     for key in COMPARABLE:
-        same = _have_same_metrics if key == "metrics" else operator.eq
-        values = [attributes.get(key, EARLIER.get(key, {})) for _, attributes in tables]
-        if not all(same(value, values[0]) for value in values):
-            found = "\n".join(f"  {path}: {value or None}" for (path, _), value in zip(tables, values, strict=True))
+        values = [attributes.get(key) for _, attributes in tables]
+        if any(value != values[0] for value in values):
+            found = "\n".join(f"  {path}: {value}" for (path, _), value in zip(tables, values, strict=True))
             raise ConfigError(
                 f"the score tables differ in {key}, so their numbers do not compare:\n{found}\n"
                 f"Grade all by the same version and options: {EVALUATE.format(path='SCORES')} --overwrite"

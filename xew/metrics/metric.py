@@ -103,6 +103,11 @@ class Metric:
         return self.inputs in ESTIMATED_INPUTS
 
     @property
+    def best(self) -> float:
+        """The best score."""
+        return self.range[self.higher_is_better]
+
+    @property
     def leaves_tasks(self) -> bool:
         """Do tasks without power leave its mean (`xew.statistics.find_power`)?"""
         return self.estimated and "strict" in self.suites

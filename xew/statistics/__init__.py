@@ -8,6 +8,7 @@ The package stands on the ground: it imports NumPy, SciPy and pandas, and nothin
     verdicts.py    noise floors, and better, worse or unresolved
     suites.py      which of two suites' metrics decides, and where they part
     power.py       which tasks say nothing about a metric, and leave its mean
+    summary.py     means of a table by group of robots, and differences between its models
 """
 
 from xew.statistics.bootstrap import (
@@ -27,6 +28,7 @@ from xew.statistics.bootstrap import (
 from xew.statistics.inference import LEVEL, SIGNIFICANCE, Drawn, holm
 from xew.statistics.power import LEAST_POWER, describe_power, drop_powerless, find_power, find_powerless
 from xew.statistics.suites import describe_parting, find_parting, strict_metrics
+from xew.statistics.summary import Summary, measure_power, summarize
 from xew.statistics.verdicts import (
     BETTER,
     UNRESOLVED,
@@ -50,6 +52,7 @@ __all__ = [
     "WORSE",
     "Drawn",
     "Mean",
+    "Summary",
     "Units",
     "bootstrap_means",
     "combine",
@@ -67,8 +70,10 @@ __all__ = [
     "floor_sources",
     "holm",
     "largest_floor",
+    "measure_power",
     "noise_floor",
     "pool_trainings",
     "strict_metrics",
+    "summarize",
     "verdict",
 ]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.analysis.studies.chains import ROOT, STEPS, chain, run
-from xew.analysis.studies.config import Study, check_study, load_study
+from xew.analysis.studies.config import Study, load_study
 from xew.analysis.studies.machines import RayCluster, ThisMachine, open_machines
 from xew.analysis.studies.plan import Step, plan
 from xew.analysis.studies.processes import start_step
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("cheap_steps")
 
 
 def test_a_gpu_has_one_training_and_a_few_steps_beside(tmp_path: Path) -> None:
-    machine = ThisMachine(("4", "7"), 1, {}, beside=1)
+    machine = ThisMachine(("4", "7"), 1, {}, steps_per_gpu=2)
     shows = (sys.executable, "-c", "import os; print('on', os.environ['CUDA_VISIBLE_DEVICES'], flush=True)")
     steps = [Step(kind, name, (), (), None, tmp_path / name, launcher=shows) for kind, name in
              (("train", "a"), ("rollout", "b"), ("adapt", "c"), ("evaluate", "d"))]  # fmt: skip
@@ -37,28 +37,17 @@ def test_a_gpu_has_one_training_and_a_few_steps_beside(tmp_path: Path) -> None:
 
 def test_gradings_beside_trainings_give_memory_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shows = (sys.executable, "-c", "import os; print('by', os.environ.get('XLA_PYTHON_CLIENT_ALLOCATOR'), flush=True)")
-    told = {}
-    for beside, kind in itertools.product((0, 1), ("train", "evaluate")):
-        machine, log = ThisMachine(("4",), 1, {}, beside=beside), tmp_path / f"{kind}{beside}.log"
+    allocators = {}
+    for count, kind in itertools.product((1, 2), ("train", "evaluate")):
+        machine, log = ThisMachine(("4",), 1, {}, steps_per_gpu=count), tmp_path / f"{kind}{count}.log"
         machine.start(Step(kind, "a", (), (), None, tmp_path / "a", launcher=shows), (), log)
         machine.wait()
-        told[beside, kind] = log.read_text().split("by ")[1].split()[0]
-    assert told == {(0, "train"): "None", (0, "evaluate"): "None", (1, "train"): "None", (1, "evaluate"): "platform"}
+        allocators[count, kind] = log.read_text().split("by ")[1].split()[0]
+    assert allocators == {(1, "train"): "None", (1, "evaluate"): "None", (2, "train"): "None", (2, "evaluate"): "platform"}
     monkeypatch.setenv("XLA_PYTHON_CLIENT_ALLOCATOR", "default")
     machine.start(Step("evaluate", "a", (), (), None, tmp_path / "a", launcher=shows), (), tmp_path / "told.log")
     machine.wait()
     assert "by default" in (tmp_path / "told.log").read_text()
-
-
-def test_a_gpu_may_have_two_trainings(tmp_path: Path) -> None:
-    machine = ThisMachine(("4", "7"), 1, {}, beside=1, trainings=2)
-    steps = [Step("train", name, (), (), None, tmp_path / name, launcher=("sleep", "1")) for name in "abcde"]
-    started = [
-        step for step in steps if machine.has_room_for(step) and not machine.start(step, (), tmp_path / f"{step.variant}.log")
-    ]
-    assert started == steps[:4] and machine.has_room_for(replace(steps[4], kind="rollout"))
-    machine.stop()
-    assert all(machine.has_room_for(step) for step in steps)
 
 
 def test_a_launcher_starts_the_command(tmp_path: Path) -> None:
@@ -85,14 +74,14 @@ def test_gpus_are_shared_out(study: Study) -> None:
 
 
 def test_data_are_made_on_every_gpu(study: Study) -> None:
-    machine, generate = ThisMachine(("2", "5", "7"), 1, {}, beside=2), plan(study)["generate"]
+    machine, generate = ThisMachine(("2", "5", "7"), 1, {}, steps_per_gpu=3), plan(study)["generate"]
     machine.start(generate, (STEPS, str(study.out / "x"), "x"), study.out / "generate.log")
     assert machine._running["generate"].slots == ("2", "5", "7")
     assert machine.has_room_for(Step("distances", "", (), (), None, study.out)), "others go beside"
-    steps, beside = plan(study), plan(replace(study, machine=replace(study.machine, beside=2)))
+    steps, shared = plan(study), plan(replace(study, machine=replace(study.machine, steps_per_gpu=3)))
     assert generate.gpus_of(3) == 3 and steps["distances"].gpus_of(3) == 1
     assert [step.gpus_of(3) for step in steps.values() if step.kind == "latents"][:2] == [3, 1], "others wait for the first"
-    assert [found["baselines"].gpus_of(3) for found in (steps, beside)] == [1, 3], "what trains need not wait for them"
+    assert [planned["baselines"].gpus_of(3) for planned in (steps, shared)] == [1, 3], "what trains need not wait for them"
     while machine._running:
         machine.wait()
     assert ThisMachine((), 2, {}).has_room_for(generate)
@@ -134,18 +123,3 @@ def test_a_ray_cluster_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> 
     pytest.importorskip("ray")
     with pytest.raises(ConfigError, match="ray start --head"):
         RayCluster("auto", {})
-
-
-def test_how_many_share_a_grading_changes_nothing_that_is_done(study: Study) -> None:
-    def gradings(*overrides: str) -> list[Step]:
-        asked = load_study(ROOT / "configs" / "study_debug.yaml", ["--out", str(study.out), *overrides])
-        return [step for step in plan(asked).values() if step.kind in ("baselines", "evaluate")]
-
-    threads, processes = gradings(), gradings("--machine.graders", "20")
-    assert [step.inputs for step in threads] == [step.inputs for step in processes]
-    assert all(step.command[-4:] == ("--processes", "20", "--workers", "1") for step in processes)
-    assert not any("--processes" in step.command for step in threads)
-    with pytest.raises(ConfigError, match=r"machine\.graders is -1; expected"):
-        gradings("--machine.graders", "-1")
-    with pytest.raises(ConfigError, match=r"machine\.graders is 2 and evaluate names --processes"):
-        check_study(replace(study, evaluate=("--processes", "3"), machine=replace(study.machine, graders=2)), Path("a.yaml"))

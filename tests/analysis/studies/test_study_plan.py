@@ -9,13 +9,14 @@ import pytest
 import yaml
 
 import xew
-from xew.analysis.studies.config import Study, build_experiment, check_study, load_study, run_folder
+from xew.analysis.studies.config import Study, build_experiment, load_study, run_folder
 from xew.analysis.studies.cost import (
     correct_by_ledger,
     count_optimizer_steps,
     critical_paths,
     estimate,
     estimate_wall_seconds,
+    find_rates,
     format_costs,
     format_duration,
 )
@@ -116,7 +117,7 @@ def test_coverage_is_told_of_one_variant_and_of_many() -> None:
     assert said("ab", "b") == "INCOMPLETE, 1 of 2 variants lack scored episodes:\n  b: piper 1 of 2"
 
 
-BODIES, BODIES_DEBUG = CONFIGS / "study_bodies.yaml", CONFIGS / "study_bodies_debug.yaml"
+BODIES = CONFIGS / "study_bodies.yaml"
 
 
 def test_a_study_of_bodies_makes_what_its_variants_ask_for() -> None:
@@ -140,14 +141,6 @@ def test_a_study_of_bodies_makes_what_its_variants_ask_for() -> None:
     costs = estimate(study, steps)
     assert costs["generate"].amount == 6 * (10 * 18 + 2 * 12)
     assert costs["distances"].amount == 13 * 12 / 2, "of the five robots and eight bodies"
-
-
-def test_a_condition_may_stand_in_for_one_of_the_protocol() -> None:
-    study = load_study(BODIES_DEBUG)
-    model = build_experiment(study, study.planned_variants[0])["model"]
-    assert (model["action"], model["embodiment"]) == ("none", "robot_render_channels")
-    with pytest.raises(ConfigError, match="unknown condition of the protocol 'robot_rendr'; did you mean"):
-        check_study(replace(study, conditions={"robot_rendr": "none"}), BODIES)
 
 
 def test_a_model_of_bodies_is_trained_on_all_of_them_or_not_planned() -> None:
@@ -207,8 +200,8 @@ def test_a_subset_keeps_what_it_starts_from(study: Study) -> None:
         (["--variants", "loeo_*", "leo_*"], "variants 'leo_\\*' matches none of the parts"),
         (["--variants", "few_shot-piper-3"], "no variant"),
         (["--train-seeds", "0"], "expected at least 1 and 1"),
-        (["--machine.workers", "0"], "at least 1"),
-        (["--machine.trainings", "2"], "more where machine.beside is not 0"),
+        (["--machine.workers", "0"], "machine.workers is 0"),
+        (["--machine.steps-per-gpu", "0"], "machine.steps_per_gpu is 0; expected at least 1"),
     ],
 )
 def test_what_cannot_be_planned_is_said(overrides: list[str], says: str) -> None:
@@ -217,7 +210,8 @@ def test_what_cannot_be_planned_is_said(overrides: list[str], says: str) -> None
 
 
 def test_a_key_that_does_not_exist_is_said(tmp_path: Path) -> None:
-    (tmp_path / "study.yaml").write_text(DEBUG.read_text().replace("train_seeds:", "train_seed:"))
+    text = DEBUG.read_text().replace("base: study_small.yaml", f"base: {CONFIGS}/study_small.yaml")
+    (tmp_path / "study.yaml").write_text(text.replace("train_seeds:", "train_seed:"))
     with pytest.raises(ConfigError, match="did you mean 'train_seeds'"):
         load_study(tmp_path / "study.yaml")
 
@@ -250,7 +244,8 @@ def test_steps_of_a_kind_have_an_environment_of_their_own(
     machine.start(step, (), tmp_path / "step.log")
     assert machine.wait() == [("train/fixed-joints-none", 0)]
     config = tmp_path / "study.yaml"
-    config.write_text(DEBUG.read_text().replace("  train: &quick", "  training: &quick"))
+    text = DEBUG.read_text().replace("base: study_small.yaml", f"base: {CONFIGS}/study_small.yaml")
+    config.write_text(text.replace("  train: &quick", "  training: &quick"))
     with pytest.raises(ConfigError, match=r"unknown kind of step in step_environment 'training'; did you mean 'train'"):
         load_study(config)
 
@@ -350,7 +345,7 @@ def test_wall_time_of_steps_beside_trainings_by_hand() -> None:
     for name in "ab":
         steps[f"rollout/{name}"] = Step("rollout", name, (), (f"train/{name}",), None, Path(name))
     seconds = {"train/a": 3.0, "train/b": 2.0, "rollout/a": 2.0, "rollout/b": 2.0}
-    assert estimate_wall_seconds(steps, seconds, (), slots=1, beside=1) == 7.0
+    assert estimate_wall_seconds(steps, seconds, (), slots=1, steps_per_gpu=2) == 7.0
     assert estimate_wall_seconds(steps, seconds, (), slots=1) == 9.0
 
 
@@ -362,7 +357,7 @@ def test_a_training_that_takes_all_gpus_runs_alone() -> None:
 
 def test_the_estimate_adds_up_and_learns(study: Study, tmp_path: Path) -> None:
     study = replace(study, out=tmp_path / "study")
-    steps, rates = plan(study), study.rates
+    steps, rates = plan(study), find_rates(study)
     costs = estimate(study, steps)
     assert costs["generate"].seconds == rates.start_s + 10 * rates.episode_s
     assert costs["rollout/few_shot-piper-1"].amount == 2
@@ -371,11 +366,13 @@ def test_the_estimate_adds_up_and_learns(study: Study, tmp_path: Path) -> None:
     before = correct_by_ledger(costs, steps, ledger)
     assert before == {name: cost.seconds for name, cost in costs.items()}
     table = format_costs(study, steps, costs, before, ledger, slots=2)
-    assert table.splitlines()[1].split()[:3] == ["generate", "1", "0"] and rates.measured_on in table
+    assert table.splitlines()[1].split()[:3] == ["generate", "1", "0"] and rates.machine in table
 
 
-def test_the_estimate_warns_of_a_full_disk(study: Study, tmp_path: Path) -> None:
-    study = replace(study, out=tmp_path, rates=replace(study.rates, episode_mb=1e9))
+def test_the_estimate_warns_of_a_full_disk(study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    study = replace(study, out=tmp_path)
+    huge = replace(find_rates(study), episode_mb=1e9)
+    monkeypatch.setattr("xew.analysis.studies.cost.find_rates", lambda study: huge)
     steps = plan(study)
     costs = estimate(study, steps)
     table = format_costs(study, steps, costs, correct_by_ledger(costs, steps, Ledger(tmp_path)), Ledger(tmp_path), slots=1)

@@ -20,7 +20,7 @@ from xew.metrics.evaluate import Args, main
 from xew.metrics.grade import Comparison
 from xew.metrics.grade import grade as grade_one
 from xew.metrics.grading.baselines import BASELINES
-from xew.metrics.grading.summary import summarize
+from xew.metrics.grading.summary import summarize_robots
 from xew.metrics.track import failure_distance
 from xew.metrics.truth import Truth, _find_visible, read_truth
 from xew.projection import project
@@ -93,7 +93,7 @@ def test_the_floor_of_a_model_is_the_truth_through_its_codec(
         target, mask = truth(data, robot)[:ASKED], read_states(episode_folder(data, TASK, SEED, robot)).robot_mask[:ASKED]
         expected = float(np.mean(mask_iou(estimate_masks(Halved(Path("late"))(target), target, mask), mask)[1:]))
         assert value(scores, CODEC_TRUTH, robot, "mask_iou") == pytest.approx(expected, rel=1e-5)
-    summary = summarize(scores)
+    summary = summarize_robots(scores)
     means = summary.means.set_index(["robot", "model", "metric"])
     for robot in ROBOTS:
         through_codec, softened = (means.loc[(robot, model, "mask_iou"), "mean"] for model in (CODEC_TRUTH, "ground_truth"))
@@ -102,7 +102,7 @@ def test_the_floor_of_a_model_is_the_truth_through_its_codec(
         assert means.loc[(robot, "late", "psnr"), "noise"] == 0
     assert key in summary.floors and summary.floors in (rollouts.parent / "scores.summary.md").read_text()
     assert "softened" in describe_floors(["late"], {})
-    alone = summarize(grade(rollouts, data, codec=(Path("runs/late"),), **codec | {"baselines": False}))
+    alone = summarize_robots(grade(rollouts, data, codec=(Path("runs/late"),), **codec | {"baselines": False}))
     pairs = alone.pairs[alone.pairs["metric"] == "mask_iou"].set_index("robot")
     assert set(pairs["other"]) == {CODEC_TRUTH}, "the true video was not graded"
     for robot in ROBOTS:

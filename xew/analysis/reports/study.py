@@ -5,7 +5,7 @@ main table, what it looks like, and all metrics folded away.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pandas as pd
@@ -26,7 +26,7 @@ from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study_beyond import charts_beyond
 from xew.analysis.reports.study_charts import study_charts
 from xew.analysis.reports.study_strips import Strip, study_strips
-from xew.analysis.reports.study_text import missing_note, part_notes, study_sentences, trainings_note
+from xew.analysis.reports.study_text import curves_note, missing_note, part_notes, study_sentences, trainings_note
 from xew.analysis.scores import Scores, find_missing_scores
 from xew.analysis.statistics.grades import PaperGrades, StudyGrades
 from xew.analysis.statistics.suites import StrictGrades
@@ -81,6 +81,19 @@ SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]]
     "outside": ((), ("outside",), ()),
 }
 """Content of each part's section: charts, tables that stand open, and tables that are folded away."""
+METHOD = "How it was measured"
+HERE, BY_PAPER, PRINTED = "here", "here, paper's definitions", "paper"
+"""Sources of answers to claims: the scores by the suite strict, the scores by the paper's definitions, the paper's figures."""
+CLAIMS_TEXT = (
+    "Each claim of the paper as inequalities, asked of this study and of the paper's own printed figures. It holds where "
+    "every number lies on its side of the bound, and fails where one lies on the other side, each at 5 % after Holm's "
+    "correction for the comparisons of the claim (for the paper: with all that prints the same); anything else is "
+    "unresolved. “Among all claims” corrects once more, for all of them. That something saturates or is alike is an "
+    "equivalence: two one-sided tests with the margins that the claim names. Metrics of the suite strict decide, in which "
+    "what is lost is an error; where the paper's definitions give another answer, it stands beside. Claims about what a "
+    "model is told also say whether these models beat the first frame with the robot's render pasted in. The last ones, "
+    "“ours”, ask more than the paper claims."
+)
 FRAME_CHARTS = {"actions": "frames_actions", "ladder": "frames_ladder"}
 
 
@@ -99,22 +112,26 @@ class Report:
 class Content:
     """Everything that the page and the Markdown show."""
 
+    title: str
     sentences: Sequence[str]
-    findings: Sequence[Finding]
-    """Answers to the claims, by the suite strict."""
-    by_paper: Sequence[Finding]
-    """Answers by the paper's definitions; the same where no metric of the suite strict was graded."""
-    printed: Sequence[Finding]
-    """Answers to the same claims on the paper's own figures."""
+    findings: Mapping[str, Sequence[Finding]]
+    """Answers to the claims by what they were asked of: HERE, BY_PAPER and PRINTED; the first decides. Empty where none was."""
+    claims_text: str
+    """Paragraph that explains the answers."""
     tables: Mapping[str, Table]
     charts: Mapping[str, Chart]
-    strips: Mapping[str, Strip]
-    lacks: Sequence[str]
-    """Notes on what is not there."""
-    missing: pd.DataFrame
+    strips: Mapping[str, Strip] = field(default_factory=dict)
+    notes: Sequence[str] = ()
+    """Notes on what is missing."""
+    missing: pd.DataFrame = field(default_factory=pd.DataFrame)
     """Scores that other models have."""
-    trainings: str
+    trainings: str = ""
     """Sentence that says whether intervals are of one training or of several."""
+
+    @property
+    def deciding(self) -> Sequence[Finding]:
+        """The answers that decide."""
+        return next(iter(self.findings.values()), ())
 
 
 def build(
@@ -156,19 +173,25 @@ def build(
     findings, by_paper, by_print = (ask(g) if of_paper else [] for g in (StrictGrades(grades), grades, printed))
     missing = find_missing_scores(scores.rows)
     content = Content(
+        TITLE,
         study_sentences(grades, known, (difficulty.get("lpips"), gaps.get("lpips")), motions, findings, by_paper),
-        findings,
-        by_paper,
-        by_print,
+        {HERE: findings, BY_PAPER: by_paper, PRINTED: by_print} if of_paper else {},
+        CLAIMS_TEXT,
         {table.name: table for table in tables},
         study_charts(builder, known, scores.curves) | charts_beyond(builder, difficulty, gaps, motions),
         strips,
-        [*part_notes(builder, scores), *missing_note(missing)],
+        [*part_notes(builder, scores), *missing_note(missing), *curves_note(scores)],
         missing,
         note,
     )
-    html = _write_html(content, scores, footer)
-    return Report(html, _write_markdown(content), formats.tables_frame(tables), dict(_files(content)))
+    return write_report(content, {METHOD: _method_section(content, scores)}, footer)
+
+
+def write_report(content: Content, endings: Mapping[str, Markup], footer: str) -> Report:
+    """A report of a study's tables; `endings` are the last sections of the page by title."""
+    html = _write_html(content, endings, footer)
+    frame = formats.tables_frame(list(content.tables.values()))
+    return Report(html, _write_markdown(content), frame, dict(_files(content)))
 
 
 def _make_tables(builder: Builder, scores: Scores, known: Distances, notes: Sequence[str]) -> list[Table]:
@@ -186,32 +209,20 @@ def _make_tables(builder: Builder, scores: Scores, known: Distances, notes: Sequ
     return tables
 
 
-def _write_html(content: Content, scores: Scores, footer: str) -> str:
+def _write_html(content: Content, endings: Mapping[str, Markup], footer: str) -> str:
     """The page."""
     sections = {"Claims": _claims_section(content)} if content.findings else {}
     sections |= {PART_TITLES[part]: text for part in SECTIONS if (text := _part_section(content, part))}
-    sections["How it was measured"] = _method_section(content, scores)
-    head = [page.contents(list(sections)), *map(page.note, content.lacks)]
-    return page.page(TITLE, content.sentences, [*head, *sections.values()], footer)
+    sections |= endings
+    head = [page.contents(list(sections)), *map(page.note, content.notes)]
+    return page.page(content.title, content.sentences, [*head, *sections.values()], footer)
 
 
 def _claims_section(content: Content) -> Markup:
-    text = (
-        "Each claim of the paper as inequalities, asked of this study and of the paper's own printed figures. It holds where "
-        "every number lies on its side of the bound, and fails where one lies on the other side, each at 5 % after Holm's "
-        "correction for the comparisons of the claim (for the paper: with all that prints the same); anything else is "
-        "unresolved. “Among all claims” corrects once more, for all of them. That something saturates or is alike is an "
-        "equivalence: two one-sided tests with the margins that the claim names. Metrics of the suite strict decide, in which "
-        "what is lost is an error; where the paper's definitions give another answer, it stands beside. Claims about what a "
-        "model is told also say whether these models beat the first frame with the robot's render pasted in. The last ones, "
-        "“ours”, ask more than the paper claims."
-    )
-    return page.section(
-        "Claims",
-        page.paragraph(text),
-        page.paragraph(content.trainings),
-        page.claims(content.findings, content.printed, content.by_paper),
-    )
+    paragraphs = [page.paragraph(text) for text in (content.claims_text, content.trainings) if text]
+    printed, by_paper = _other_answers(content)
+    claims = page.claims(content.deciding, printed or None, by_paper or None)
+    return page.section("Claims", *paragraphs, claims)
 
 
 def _part_section(content: Content, part: str) -> Markup | None:
@@ -236,7 +247,7 @@ def _method_section(content: Content, scores: Scores) -> Markup:
     made = {"scenes graded": str(len(scores.rows[["task", "seed"]].drop_duplicates())), **scores.measured_by}
     definitions = {metric.title: metric.reference for metric in scores.metrics}
     return page.section(
-        "How it was measured",
+        METHOD,
         page.paragraph(
             f"Means over episodes with 95 % bootstrap intervals. {content.trainings} Scenes (seeds) are resampled within their "
             "tasks, the same ones for every model and robot, so that all comparisons are paired. Behind a value, against the "
@@ -253,14 +264,14 @@ def _method_section(content: Content, scores: Scores) -> Markup:
 
 def _write_markdown(content: Content) -> str:
     lines = [
-        f"# {TITLE}",
+        f"# {content.title}",
         "",
         *(f"- {plain_markdown(sentence)}" for sentence in content.sentences),
         "",
-        *(f"> {note}\n" for note in content.lacks),
+        *(f"> {note}\n" for note in content.notes),
     ]
     if content.findings:
-        claims = formats.findings_markdown(content.findings, content.printed, content.by_paper)
+        claims = formats.findings_markdown(content.deciding, *_other_answers(content))
         lines += ["## Claims", "", content.trainings, "", claims]
     for part, (charts, shown, folded) in SECTIONS.items():
         if not any(name in content.tables for name in shown):
@@ -293,7 +304,12 @@ def _files(content: Content) -> Iterator[tuple[str, bytes]]:
     if len(content.missing):
         yield "missing.csv", csv_text(content.missing).encode()
     if content.findings:
-        sources = {"here": content.findings, "here, paper's definitions": content.by_paper, "paper": content.printed}
-        together = pd.concat([findings_frame(found, of) for of, found in sources.items()])
+        together = pd.concat([findings_frame(found, of) for of, found in content.findings.items()])
         yield "findings.csv", csv_text(together).encode()
-        yield "tables/findings.tex", formats.findings_latex(content.findings, content.printed, content.by_paper).encode()
+        yield "tables/findings.tex", formats.findings_latex(content.deciding, *_other_answers(content)).encode()
+
+
+def _other_answers(content: Content) -> tuple[Sequence[Finding], Sequence[Finding]]:
+    """Answers on the paper's figures and by the paper's definitions, as far as they stand next to those that decide."""
+    others = dict(list(content.findings.items())[1:])
+    return others.get(PRINTED, ()), others.get(BY_PAPER, ())

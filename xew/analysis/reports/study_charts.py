@@ -1,7 +1,7 @@
 """The charts of a study: bars of gains, adaptation against forgetting, distances, error by frame."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from typing import Literal
@@ -15,10 +15,9 @@ from xew.analysis.reports import charts
 from xew.analysis.reports.charts import SERIES, SOFT, Chart, Panel, Series
 from xew.analysis.scores import COPY, TRUTH, VARIANT, MetricInfo
 from xew.analysis.statistics.grades import Grades, PaperGrades, find_variant, relative_gain
-from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables.builder import Builder, interval_ends
 from xew.analysis.tables.distances import AXIS_TITLES, Distances, unseen_gaps
-from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, SHORT_ROBOTS
+from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, ROBOT_TITLES, SHORT_ROBOTS
 from xew.analysis.tables.table import metric_title
 from xew.protocol import BASELINES, FORGETTING_ROBOT, HELD_OUT_ROBOTS, PASTED_RENDER, ROBOT_NAMES, SHOTS
 from xew.statistics import Mean
@@ -227,25 +226,12 @@ def frame_chart(curves: pd.DataFrame, part: str, labels: Mapping[str, str]) -> C
     chosen = curves[(curves["metric"] == CURVE_METRIC) & curves["robot"].isin(HELD_OUT_ROBOTS)]
     own = chosen[chosen[VARIANT].isin(names)].assign(row=lambda rows: rows[VARIANT].map(names))
     baselines = chosen[chosen["model"].isin([COPY, PASTED_RENDER])].assign(row=lambda rows: rows["model"].map(BASELINES))
-    grouped = pd.concat([own, baselines]).groupby(["robot", "row", "frame"], sort=False)["value"]
-    data = pd.DataFrame({"mean": grouped.mean(), "low": grouped.quantile(0.25), "high": grouped.quantile(0.75)}).reset_index()
     colors = charts.color_of(list(names.values()))
     styles = [Series(label, colors[label]) for label in names.values() if label in set(own["row"])]
-    styles += _baseline_styles(data["row"])
-
-    def draw(axes: Axes, robot: str) -> None:
-        lines = []
-        for style in styles:
-            line = data[(data["robot"] == robot) & (data["row"] == style.label)].sort_values("frame")
-            if len(line):
-                lines.append((style, line["frame"].to_numpy(), line["mean"].to_numpy(), line[["low", "high"]].to_numpy()))
-        charts.lines(axes, lines, "frame", "LPIPS ↓")
-
-    panels = [
-        Panel(ROBOT_TITLES[robot], partial(draw, robot=robot)) for robot in HELD_OUT_ROBOTS if robot in set(data["robot"])
-    ]
     caption = "LPIPS by frame, mean over episodes; bands hold the middle half of them."
-    return Chart(f"frames_{part}", caption, panels, data, styles)
+    return _chart_by_frame(
+        f"frames_{part}", caption, pd.concat([own, baselines]), styles, {CURVE_METRIC: "LPIPS ↓"}, HELD_OUT_ROBOTS
+    )
 
 
 def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Sequence[str]) -> Chart:
@@ -256,35 +242,48 @@ def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Seque
     shown = shown[~((shown["model"] == TRUTH) & (shown["metric"] == "psnr"))]
     shown = shown[~shown["model"].isin(set(BASELINES) - set(DASHES))]
     shown = shown.assign(row=[_run_title(*key) for key in zip(shown["model"], shown["condition"], strict=True)])
-    grouped = shown.groupby(["metric", "robot", "row", "frame"], sort=False)["value"]
-    data = pd.DataFrame({"mean": grouped.mean(), "low": grouped.quantile(0.25), "high": grouped.quantile(0.75)}).reset_index()
     own = [row for row in dict.fromkeys(shown["row"]) if row not in BASELINES.values()]
     styles = [Series(label, color) for label, color in charts.color_of(own).items()]
-    styles += _baseline_styles(data["row"])
+    caption = "Mean over episodes frame by frame; bands hold the middle half of the episodes."
+    titles = {metric.name: metric_title(metric) for metric in metrics}
+    chart = _chart_by_frame("curves", caption, shown, styles, titles, robots)
+    return replace(chart, columns=len(robots))
 
-    def draw(axes: Axes, metric: MetricInfo, robot: str) -> None:
+
+def _chart_by_frame(
+    name: str, caption: str, rows: pd.DataFrame, styles: Sequence[Series], titles: Mapping[str, str], robots: Sequence[str]
+) -> Chart:
+    """Means by frame with bands of the middle half of the episodes, a panel for each metric and robot.
+
+    Args:
+        name, caption: of the chart.
+        rows: scores by frame; the column `row` has the label of the line.
+        styles: lines of the models; those of the baselines come behind them.
+        titles: axis title of each metric.
+        robots: in the order of the panels.
+    """
+    grouped = rows.groupby(["metric", "robot", "row", "frame"], sort=False, observed=True)["value"]
+    data = pd.DataFrame({"mean": grouped.mean(), "low": grouped.quantile(0.25), "high": grouped.quantile(0.75)}).reset_index()
+    drawn = set(data["row"])
+    styles = [*styles, *(Series(BASELINES[key], SOFT, dash) for key, dash in DASHES.items() if BASELINES[key] in drawn)]
+
+    def draw(axes: Axes, metric: str, robot: str) -> None:
         lines = []
         for style in styles:
-            line = data[(data["metric"] == metric.name) & (data["robot"] == robot) & (data["row"] == style.label)]
+            line = data[(data["metric"] == metric) & (data["robot"] == robot) & (data["row"] == style.label)]
             line = line.sort_values("frame")  # the first episode may lack early frames
             if len(line):
                 band = line[["low", "high"]].to_numpy() if style.color != SOFT else None
                 lines.append((style, line["frame"].to_numpy(), line["mean"].to_numpy(), band))
-        charts.lines(axes, lines, "frame", metric_title(metric))
+        charts.lines(axes, lines, "frame", titles[metric])
 
+    graded = set(zip(data["metric"], data["robot"], strict=True))
     panels = [
         Panel(ROBOT_TITLES.get(robot, robot), partial(draw, metric=metric, robot=robot))
-        for metric in metrics
-        if (data["metric"] == metric.name).any()
-        for robot in robots
+        for metric, robot in product(titles, robots)
+        if (metric, robot) in graded
     ]
-    caption = "Mean over episodes frame by frame; bands hold the middle half of the episodes."
-    return Chart("curves", caption, panels, data, styles, columns=len(robots))
-
-
-def _baseline_styles(rows: pd.Series) -> list[Series]:
-    """Styles of the baselines that are among the rows' titles."""
-    return [Series(BASELINES[name], SOFT, dash) for name, dash in DASHES.items() if BASELINES[name] in set(rows)]
+    return Chart(name, caption, panels, data, styles)
 
 
 def _run_title(model: str, condition: str) -> str:

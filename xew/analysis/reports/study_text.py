@@ -9,12 +9,11 @@ from xew.analysis.beyond import Motions, OverBodies
 from xew.analysis.paper import AXES
 from xew.analysis.scores import Scores, describe_scores
 from xew.analysis.statistics.grades import BODIES, Grades, StudyGrades, relative_gain
-from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.comparisons import OTHER_ROBOTS, NotMeasuredError, Reader
 from xew.analysis.tables.distances import Distances, correlate, format_signed
 from xew.analysis.tables.findings import BEATS, FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding
-from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, SHORT_ROBOTS
+from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, ROBOT_TITLES, SHORT_ROBOTS
 from xew.protocol import BODY_SCALES, FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
 from xew.statistics import strict_metrics
 
@@ -258,6 +257,13 @@ def part_notes(builder: Builder, scores: Scores) -> Iterator[str]:
     unknown = set(scores.rows["variant"]) - {variant.name for variants in PARTS.values() for variant in variants} - {""}
     if unknown:
         yield f"Graded, but in no table of the protocol: {', '.join(sorted(unknown))}."
+
+
+def curves_note(scores: Scores) -> list[str]:
+    """A note on missing scores by frame; none where they are there."""
+    if not scores.curves.empty:
+        return []
+    return ["No chart of the error by frame: the file of curves (*.curves.parquet) is missing; evaluate writes it."]
 
 
 def missing_note(missing: pd.DataFrame) -> list[str]:

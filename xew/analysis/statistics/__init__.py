@@ -3,4 +3,4 @@
 Draws, levels, floors and verdicts are those of `xew.statistics`, as everywhere.
 """
 
-__all__ = ["grades", "recompute", "suites", "summary"]
+__all__ = ["grades", "suites"]

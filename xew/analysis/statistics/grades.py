@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.paper import Paper
-from xew.analysis.scores import TRAINING, TRUTH, MetricInfo, measure_power, name_graded
+from xew.analysis.scores import TRAINING, TRUTH, MetricInfo, name_graded
 from xew.protocol import BASELINES, CODEC_TRUTH, MULTI_VIEW, PARTS, ROBOT_NAMES, SPLITS, UNSEEN_BODIES, Variant, reference
 from xew.statistics import (
     DRAWS,
@@ -33,6 +33,7 @@ from xew.statistics import (
     find_strata,
     floor_sources,
     largest_floor,
+    measure_power,
     noise_floor,
     pool_trainings,
 )
@@ -224,7 +225,7 @@ class StudyGrades:
         named = named if TRAINING in named else named.assign(**{TRAINING: 0})
         columns = ["variant", "robot", "metric", TRAINING]
         self._cells = named.pivot(index=["task", "seed"], columns=columns, values="value").sort_index()
-        self.power = measure_power(rows, metrics)
+        self.power = measure_power(rows, self.metrics)
         tasks, names_of = self._cells.index.get_level_values("task"), self._cells.columns.get_level_values("metric")
         for task, metric in find_powerless(self.power):
             self._cells = self._cells.mask(np.outer(tasks == task, names_of == metric))

@@ -24,7 +24,6 @@ from xew.protocol import (
     TASK_COUNT,
     TEST_SEEDS_PER_TASK,
     TRAIN_SEEDS_PER_TASK,
-    VARIANTS,
     Variant,
     expand_robots,
     expected_counts,
@@ -39,42 +38,9 @@ KINDS = ("generate", "latents", "baselines", "train", "adapt", "rollout", "evalu
 _KNOWN_ROBOTS = tuple(
     dict.fromkeys(robot for split in SPLITS.values() for robot in (*split.train_robots, *split.held_out_robots))
 )
-_CONDITIONS = tuple(dict.fromkeys(name for variant in VARIANTS.values() for name in (variant.action, variant.embodiment)))
 
 Settings = dict[str, Any]
 """A part of an experiment's config, nested as in its file."""
-
-
-@dataclass(frozen=True)
-class Rates:
-    """Measured speeds and sizes, from which the cost of a study is estimated before it starts."""
-
-    measured_on: str
-    """Machine that they were measured on, and where the figures stand."""
-    episode_s: float
-    """Time to make one episode."""
-    encode_s: float
-    """Time to encode one stream of one episode."""
-    step_s: float
-    """Time of one optimizer step of the experiment, on the GPUs that a training has."""
-    rollout_s: float
-    """Time to predict one episode."""
-    grade_s: float
-    """Time to grade one video: a predicted episode, or a baseline's."""
-    start_s: float
-    """Time from the start of a command to its first real work, compiling included."""
-    episode_mb: float
-    """Size of one episode."""
-    stream_mb: float
-    """Size of one encoded stream of one episode."""
-    run_mb: float
-    """Size of all checkpoints that a run keeps."""
-    rollout_mb: float
-    """Size of one predicted episode."""
-    episode_frames: int = 178
-    """Mean number of frames of an episode; 178 over all tasks."""
-    pair_s: float = 0.0
-    """Time to measure how far two robots are from one another; it counts where there are many bodies."""
 
 
 @dataclass(frozen=True)
@@ -87,13 +53,9 @@ class Machine:
     """Number of steps at once where there is no GPU."""
     gpus_per_training: int = 1
     """Number of GPUs that a training takes at once."""
-    beside: int = 0
-    """Number of steps of other kinds that share a GPU with a training at once: latents, rollouts and grading leave it idle
-    while they read and write. Memory is then taken as it is needed. With 0 a GPU has one step at a time."""
-    trainings: int = 1
-    """Number of trainings that share a GPU at once, where `beside` is not 0: one compiles while another trains."""
-    graders: int = 0
-    """Number of processes of each grading, for a GPU with many processor cores; with 0 it has threads."""
+    steps_per_gpu: int = 1
+    """Number of steps that share a GPU: at most one training, and others, which leave it idle while they read and write.
+    Above 1 memory is allocated as it is needed."""
     train_launcher: str = ""
     """Launcher put before a training's command, such as srun --nodes=2; the processes it starts join by jax.distributed."""
     ray: str | None = None
@@ -129,8 +91,6 @@ class Study:
     """Folder for everything of the study."""
     experiment: Path
     """Config of xew.model that all variants are made from."""
-    rates: Rates
-    """Measured speeds and sizes."""
     parts: tuple[str, ...] = PAPER_PARTS
     """Keys of protocol.PARTS: which tables."""
     variants: tuple[str, ...] = ()
@@ -159,8 +119,6 @@ class Study:
     """Settings laid over it for adaptations with replay or LoRA."""
     systems: dict[str, Settings] = field(default_factory=dict)
     """Settings laid over it for another project's system."""
-    conditions: dict[str, str] = field(default_factory=dict)
-    """Conditions of the model that stand in for those of the protocol, such as robot_render_channels for robot_render."""
     motion: str = SHARED_MOTION
     """Kind of motion of all episodes, one of protocol.MOTIONS."""
     other_motion: Path | None = None
@@ -175,15 +133,13 @@ class Study:
     """Environment variables set for every step."""
     step_environment: dict[str, dict[str, str]] = field(default_factory=dict)
     """Environment variables set beside them for the steps of one kind, such as XLA_FLAGS for `train`."""
-    data: Path | None = None
-    """Folder of the episodes; <out>/data where left out. What is missing in it is made."""
     machine: Machine = Machine()
     """Devices to run on."""
 
     @property
     def data_folder(self) -> Path:
         """Folder of the episodes."""
-        return self.data or self.out / "data"
+        return self.out / "data"
 
     @property
     def baselines_path(self) -> Path:
@@ -296,19 +252,9 @@ def check_study(study: Study, path: Path) -> None:
         shlex.split(study.machine.train_launcher)
     except ValueError as error:
         raise ConfigError(f"{path}: machine.train_launcher is {study.machine.train_launcher!r}: {error}.") from error
-    if study.machine.workers < 1 or study.machine.gpus_per_training < 1:
-        raise ConfigError(f"{path}: machine.workers and machine.gpus_per_training must be at least 1.")
-    if study.machine.beside < 0:
-        raise ConfigError(f"{path}: machine.beside is {study.machine.beside}, expected 0 or more.")
-    if study.machine.graders < 0 or (study.machine.graders and "--processes" in study.evaluate):
-        said = " and evaluate names --processes" if study.machine.graders > 0 else ""
-        raise ConfigError(
-            f"{path}: machine.graders is {study.machine.graders}{said}; expected a number of processes in one place."
-        )
-    if study.machine.trainings < 1 or (study.machine.trainings > 1 and not study.machine.beside):
-        raise ConfigError(
-            f"{path}: machine.trainings is {study.machine.trainings}; expected 1, or more where machine.beside is not 0."
-        )
+    for name in ("workers", "gpus_per_training", "steps_per_gpu"):
+        if (count := getattr(study.machine, name)) < 1:
+            raise ConfigError(f"{path}: machine.{name} is {count}; expected at least 1.")
 
 
 def _check_names(study: Study, path: Path) -> None:
@@ -319,7 +265,6 @@ def _check_names(study: Study, path: Path) -> None:
     for kind, names, known in (
         ("part", study.parts, tuple(PARTS)),
         ("robot", expand_robots(study.robots), _KNOWN_ROBOTS),
-        ("condition of the protocol", tuple(study.conditions), _CONDITIONS),
         ("number of shots", shots, known_shots),
         ("kind of motion", (study.motion,), MOTIONS),
         ("task", study.tasks, study.tasks),  # known: checked above, and may be outside tasks
@@ -358,8 +303,8 @@ def build_experiment(study: Study, variant: Variant) -> Settings:
         "cache": str(study.out / "latents"),
         "split": split_key(variant.split, study.motion),
         "model": {
-            "action": study.conditions.get(variant.action, variant.action),
-            "embodiment": study.conditions.get(variant.embodiment, variant.embodiment),
+            "action": variant.action,
+            "embodiment": variant.embodiment,
         },
     }
     return merge_settings(settings, given)

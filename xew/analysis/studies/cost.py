@@ -1,9 +1,12 @@
-"""The cost of a study: time, GPU-hours and disk for every kind of step, from measured rates, before anything starts.
+"""The cost of a study: time, GPU-hours and disk for every kind of step, before anything starts.
+
+`rates.json` has measured rates by the size of the network; `benchmarks/rates.py` writes an entry from a study that was run.
 
 Where steps of a kind are done in this study already, the others of that kind are estimated by how long those took.
 """
 
 import heapq
+import json
 import math
 import shutil
 from collections.abc import Collection, Mapping
@@ -15,7 +18,47 @@ from xew.analysis.studies.config import KINDS, Settings, Study, build_experiment
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import TRAININGS, usable_gpus
 from xew.analysis.studies.plan import Step, measured_bodies, sort_steps
+from xew.config import merge_settings, parse, read_yaml
 from xew.protocol import BASELINES, ROBOT_NAMES, Variant, training_counts
+
+RATES = Path(__file__).with_name("rates.json")
+"""Measured rates by the size of the network."""
+RECIPE: Settings = {"clip": {"frames": 33}, "model": {"size": "small"}, "train": {"batch": 4, "steps": 7500}}
+"""Defaults of xew.model's experiments, which the analysis does not import, as far as costs depend on them."""
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Measured times [s] and sizes [MB], by network size."""
+
+    machine: str
+    """Machine that they were measured on."""
+    measured: str
+    """Where and when."""
+    episode_s: float
+    """Time to make one episode."""
+    encode_s: float
+    """Time to encode one stream of one episode."""
+    step_s: float
+    """Time of one optimizer step, on the GPUs that a training has."""
+    rollout_s: float
+    """Time to predict one episode."""
+    grade_s: float
+    """Time to grade one video: a predicted episode, or a baseline's."""
+    start_s: float
+    """Time from the start of a command to its first real work, with compilation."""
+    pair_s: float
+    """Time to measure the distance between two robots."""
+    episode_mb: float
+    """Size of one episode."""
+    stream_mb: float
+    """Size of one encoded stream of one episode."""
+    run_mb: float
+    """Size of all checkpoints that a run keeps."""
+    rollout_mb: float
+    """Size of one predicted episode."""
+    episode_frames: int
+    """Mean number of frames of an episode."""
 
 
 @dataclass(frozen=True)
@@ -29,13 +72,25 @@ class Cost:
     disk_mb: float = 0.0
 
 
+def find_size(study: Study) -> str:
+    """Key of the size of the study's network."""
+    settings = merge_settings(merge_settings(RECIPE, read_yaml(study.experiment)), study.settings)
+    return str(settings["model"]["size"])
+
+
+def find_rates(study: Study) -> Rates:
+    """The rates of the size of the study's network; those of the small one where its size was not measured."""
+    measured, size = json.loads(RATES.read_text()), find_size(study)
+    return parse(Rates, measured.get(size, measured["small"]), f"{RATES}, {size}")
+
+
 def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     """The cost of every step from the study's rates, as if nothing were done."""
-    rates, costs = study.rates, {}
+    rates, costs = find_rates(study), {}
     tested = study.task_count * study.test_seeds * len(study.graded_robots)
     episodes = study.task_count * study.train_seeds * len(study.trained_robots) + tested
     costs["generate"] = Cost(episodes, "episodes", rates.start_s + episodes * rates.episode_s, episodes * rates.episode_mb)
-    encoded: dict[tuple[str, ...], int] = {}
+    encoded: dict[tuple[str, str], int] = {}
     for variant in study.planned_runs:
         experiment = build_experiment(study, variant)
         streams = _count_new_streams(study, variant, experiment, encoded)
@@ -60,14 +115,15 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     return {name: costs[name] for name in steps}
 
 
-def _count_new_streams(study: Study, variant: Variant, experiment: Settings, encoded: dict[tuple[str, ...], int]) -> int:
+def _count_new_streams(study: Study, variant: Variant, experiment: Settings, encoded: dict[tuple[str, str], int]) -> int:
     """Number of streams of single episodes that no earlier variant has encoded."""
     model, new = experiment["model"], 0
     counts = training_counts(variant, study.task_count, study.train_seeds, study.robot_keys)
     for stream in (name for name in ("rgb", model["action"], model["embodiment"]) if name != "none"):
         for robot, count in counts.items():
-            new += max(0, count - encoded.get((robot, stream), 0))
-            encoded[robot, stream] = max(count, encoded.get((robot, stream), 0))
+            key = (robot, stream)
+            new += max(0, count - encoded.get(key, 0))
+            encoded[key] = max(count, encoded.get(key, 0))
     return new
 
 
@@ -76,10 +132,11 @@ def count_optimizer_steps(study: Study, variant: Variant, experiment: Settings) 
 
     `train.epochs` are passes over its samples, of which an episode gives as many as it has chunks.
     """
+    experiment = merge_settings(RECIPE, experiment)
     train, clip = experiment["train"], experiment["clip"]
     if not train.get("epochs"):
-        return int(train.get("steps", 0))
-    chunks = -(-(study.rates.episode_frames - 1) // (clip["frames"] - 1))
+        return int(train["steps"])
+    chunks = -(-(find_rates(study).episode_frames - 1) // (clip["frames"] - 1))
     samples = study.training_count(variant) * max(1, chunks - (train.get("chunks", 1) - 1))
     return max(1, round(float(train["epochs"]) * samples / train["batch"]))
 
@@ -100,7 +157,7 @@ def correct_by_ledger(costs: Mapping[str, Cost], steps: Mapping[str, Step], ledg
 
 
 def estimate_wall_seconds(
-    steps: Mapping[str, Step], seconds: Mapping[str, float], done: Collection[str], slots: int, beside: int = 0
+    steps: Mapping[str, Step], seconds: Mapping[str, float], done: Collection[str], slots: int, steps_per_gpu: int = 1
 ) -> float:
     """Time to the end, with each step started as soon as it can be, the longest critical path first.
 
@@ -109,12 +166,12 @@ def estimate_wall_seconds(
         seconds: that each takes.
         done: names of steps that need no time.
         slots: number of GPUs, or of steps at once where there is none.
-        beside: number of other steps that share a GPU with its training; 0 where every step has a slot for itself. Trainings
-            that share a GPU count as one after another, since each then takes as much longer.
+        steps_per_gpu: number of steps that share a slot, one of them a training; 1 where every step has a slot for itself.
     """
     left = {name: {need for need in step.predecessors if need not in done} for name, step in steps.items() if name not in done}
-    pools = {name: "training" if step.kind in TRAININGS or not beside else "beside" for name, step in steps.items()}
-    free = {"training": slots, "beside": slots * beside}
+    alone = steps_per_gpu == 1
+    pools = {name: "training" if step.kind in TRAININGS or alone else "other" for name, step in steps.items()}
+    free = {"training": slots, "other": slots * (steps_per_gpu - 1)}
     paths, now = critical_paths(steps, seconds), 0.0
     running: list[tuple[float, str, int]] = []
     while left or running:
@@ -163,12 +220,12 @@ def format_costs(
             amount = f"{sum(costs[name].amount for name in left):,} {costs[names[0]].unit}"
             counts = f"{kind:<10}{len(names):>7}{len(names) - len(left):>7}{amount:>22}"
             lines.append(f"{counts}{hours:>9.2f}{f'{gpu_hours:.2f}' if on_gpus else '':>11}{disk:>8.1f}")
-    beside = study.machine.beside if on_gpus else 0
-    wall = estimate_wall_seconds(steps, seconds, done, slots, beside)
+    rates, shared = find_rates(study), study.machine.steps_per_gpu if on_gpus else 1
+    wall = estimate_wall_seconds(steps, seconds, done, slots, shared)
     total = f"{'all':<10}{len(steps):>7}{len(done):>7}{'':>22}{totals[0]:>9.2f}"
     lines.append(f"{total}{f'{totals[1]:.2f}' if on_gpus else '':>11}{totals[2]:>8.1f}")
-    shared = f"{slots} GPUs and {beside} steps beside a training" if beside else f"{slots} at once"
-    lines.append(f"about {format_duration(wall)} with {shared}, by the rates of: {study.rates.measured_on}")
+    places = f"{slots} GPUs and {shared} steps on each" if shared > 1 else f"{slots} at once"
+    lines.append(f"about {format_duration(wall)} with {places}, by the rates of: {rates.machine} ({rates.measured})")
     free = free_gb(study.out)
     if free < totals[2]:
         lines.append(f"WARNING: {totals[2]:.1f} GB are needed and {free:.1f} GB are free under {study.out}")

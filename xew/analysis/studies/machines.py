@@ -65,9 +65,9 @@ def open_machines(study: Study) -> Machines:
     needed = study.machine.gpus_per_training
     if gpus and needed > len(gpus):
         raise ConfigError(f"machine.gpus_per_training is {needed}, there are {len(gpus)} GPUs ({', '.join(gpus)}); lower it.")
-    if gpus and study.machine.beside:
+    if gpus and study.machine.steps_per_gpu > 1:
         environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | environment
-    return ThisMachine(gpus, study.machine.workers, environment, study.machine.beside, study.machine.trainings)
+    return ThisMachine(gpus, study.machine.workers, environment, study.machine.steps_per_gpu)
 
 
 def usable_gpus(study: Study) -> tuple[str, ...]:
@@ -83,12 +83,11 @@ class _Running:
 
 
 class ThisMachine:
-    """This machine: one step per GPU, or some trainings and others; without a GPU as many steps as there are workers."""
+    """This machine: one step per GPU, or a training and others; without a GPU as many steps as there are workers."""
 
-    def __init__(
-        self, gpus: tuple[str, ...], workers: int, environment: Mapping[str, str], beside: int = 0, trainings: int = 1
-    ) -> None:
-        self.gpus, self.environment, self.beside, self.trainings = gpus, dict(environment), beside if gpus else 0, trainings
+    def __init__(self, gpus: tuple[str, ...], workers: int, environment: Mapping[str, str], steps_per_gpu: int = 1) -> None:
+        self.gpus, self.environment = gpus, dict(environment)
+        self._others_per_gpu = steps_per_gpu - 1 if gpus else 0
         self._slots = gpus or tuple(map(str, range(workers)))
         self.slots = len(self._slots)
         self._running: dict[str, _Running] = {}
@@ -104,19 +103,19 @@ class ThisMachine:
     def _open_slots(self, step: Step) -> list[str]:
         """Slots that may take a step, the least busy first."""
         steps = {slot: [running.step for running in self._running.values() if slot in running.slots] for slot in self._slots}
-        if not self.beside:
-            return [slot for slot, here in steps.items() if not here]
-        room = self.trainings if step.kind in TRAININGS else self.beside
+        if not self._others_per_gpu:
+            return [slot for slot, running in steps.items() if not running]
+        most = 1 if step.kind in TRAININGS else self._others_per_gpu
         same = {slot: sum((other.kind in TRAININGS) == (step.kind in TRAININGS) for other in steps[slot]) for slot in steps}
-        return sorted((slot for slot in steps if same[slot] < room), key=lambda slot: len(steps[slot]))
+        return sorted((slot for slot in steps if same[slot] < most), key=lambda slot: len(steps[slot]))
 
     def start(self, step: Step, command: tuple[str, ...], log: Path) -> None:
         slots = tuple(self._open_slots(step)[: self._count_slots(step)])
         own = {"CUDA_VISIBLE_DEVICES": ",".join(slots)} if self.gpus else {}
-        grades_beside = bool(self.beside) and step.kind in GRADINGS
-        sharing = {name: os.environ.get(name, value) for name, value in SHARING.items()} if grades_beside else {}
+        shares_gpu = bool(self._others_per_gpu) and step.kind in GRADINGS
+        sharing = {name: os.environ.get(name, value) for name, value in SHARING.items()} if shares_gpu else {}
         environment = {**sharing, **self.environment, **step.environment, **own}
-        niceness = GRADING_NICENESS if grades_beside else 0
+        niceness = GRADING_NICENESS if shares_gpu else 0
         process = start_step(command, log, environment, launcher=step.launcher, niceness=niceness)
         self._running[step.name] = _Running(process, step, slots)
 

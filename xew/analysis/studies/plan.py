@@ -141,7 +141,7 @@ def _plan_latents(study: Study, variant: Variant, experiment: Settings, first: s
         needs=("generate", *started),
         inputs=_training_inputs(experiment),
         product=study.out / "latents",
-        # Streams that variants share are encoded by the first of them that is run: of a split, or of all where the codec is.
+        # Streams that variants share are encoded by the first of them that is run.
         after=() if started or first == name else (first,),
         every_gpu=first == name and not started,  # all others wait for it
     )
@@ -187,7 +187,7 @@ def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Ste
     """
     out, frames = study.baselines_path, experiment.get("rollout", {}).get("max_frames", 0)
     given = ("--data", str(study.data_folder), "--out", str(out), "--codec", str(_config_path(study, variant)))
-    asked = ("--baselines-of", "test", "--max-frames", str(frames), *study.evaluate, *_graders(study))
+    asked = ("--baselines-of", "test", "--max-frames", str(frames), *study.evaluate)
     return Step(
         "baselines",
         "",
@@ -195,7 +195,7 @@ def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Ste
         needs=("generate", f"latents/{variant.name}"),
         inputs=[frames, study.evaluate, GRADING_PROTOCOL],
         product=out,
-        every_gpu=study.machine.beside > 0,  # alone it would wait for all GPUs to be free, or trainings for it
+        every_gpu=study.machine.steps_per_gpu > 1,  # alone it would wait for all GPUs to be free, or trainings for it
     )
 
 
@@ -203,7 +203,7 @@ def _plan_evaluate(study: Study, variant: Variant) -> Step:
     """Grading of a variant. The truth through a codec is graded once for all variants that share it."""
     out = study.scores_path(variant.name)
     given = ("--data", str(study.data_folder), "--out", str(out))
-    asked = ("--no-baselines", "--codec", str(run_folder(study, variant)), *study.evaluate, *_graders(study))
+    asked = ("--no-baselines", "--codec", str(run_folder(study, variant)), *study.evaluate)
     return Step(
         "evaluate",
         variant.name,
@@ -212,12 +212,6 @@ def _plan_evaluate(study: Study, variant: Variant) -> Step:
         inputs=[study.evaluate, GRADING_PROTOCOL],
         product=out,
     )
-
-
-def _graders(study: Study) -> tuple[str, ...]:
-    """Options of `evaluate` on how many processes share the work, which is no input: no score depends on it."""
-    count = study.machine.graders
-    return ("--processes", str(count), "--workers", "1") if count else ()
 
 
 def measured_bodies(study: Study) -> list[str]:

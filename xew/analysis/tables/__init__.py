@@ -13,6 +13,5 @@ __all__ = [
     "labels",
     "layouts",
     "outside",
-    "paper",
     "table",
 ]

@@ -13,8 +13,7 @@ import pandas as pd
 from xew.analysis.correlation import Correlation, dof_correlation, loeo_correlation
 from xew.analysis.paper import AXES, PAPER_TITLES, Paper
 from xew.analysis.statistics.grades import Grades, unseen_gap
-from xew.analysis.statistics.summary import ROBOT_TITLES
-from xew.analysis.tables.labels import PAPER_METRICS, SHORT_ROBOTS
+from xew.analysis.tables.labels import PAPER_METRICS, ROBOT_TITLES, SHORT_ROBOTS
 from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, metric_title
 from xew.config import ConfigError
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES

@@ -11,7 +11,6 @@ from xew.names import plain_markdown
 
 MARK = {"better": "▲", "worse": "▼", "unresolved": "≈", "": ""}
 """Mark of a verdict; that of the paper's definition, where it parts from the suite strict, stands in parentheses."""
-AGREES = {None: "", True: "✓", False: "✗"}
 LATEX_MARK = {"better": r"\blacktriangle", "worse": r"\blacktriangledown", "unresolved": r"\approx", "": ""}
 LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
@@ -47,7 +46,7 @@ def _markdown_cell(cell: TableCell) -> str:
     text = f"**{cell.text}**" if cell.best else cell.text
     interval = f"[{cell.interval}]" if cell.interval else ""
     paper = f"(paper {cell.published})" if cell.published else ""
-    return " ".join(filter(None, (text, interval, _mark(cell), paper, AGREES[cell.agrees])))
+    return " ".join(filter(None, (text, interval, _mark(cell), paper)))
 
 
 def _mark(cell: TableCell) -> str:
@@ -104,7 +103,7 @@ def _latex_rows(row: TableRow, above: TableRow | None) -> Iterator[str]:
     labels = ["" if repeated else _escape(label) for label, repeated in zip(row.labels, same, strict=True)]
     yield _latex_line([*labels, *map(_latex_cell, row.cells)])
     intervals = [f"[{cell.interval}]" if cell.interval else "" for cell in row.cells]
-    papers = [f"({cell.published}){AGREES[cell.agrees]}" if cell.published else "" for cell in row.cells]
+    papers = [f"({cell.published})" if cell.published else "" for cell in row.cells]
     for below in filter(any, (intervals, papers)):
         small = (rf"{{\tiny {_escape(text)}}}" if text else "" for text in below)
         yield _latex_line([*[""] * len(row.labels), *small])

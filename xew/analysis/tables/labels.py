@@ -12,6 +12,8 @@ from xew.sim_warp.robots import ROBOTS
 
 PAPER_METRICS = tuple(PAPER_TITLES)
 """Metrics of the paper's suite, in its order."""
+ROBOT_TITLES = {key: robot.title for key, robot in ROBOTS.items()}
+"""Title of each robot by its key."""
 SHORT_ROBOTS = {key: robot.label for key, robot in ROBOTS.items()}
 """Label of each robot by its key."""
 SEEN_TITLE = "Seen pool: {}, {} and {}".format(*(ROBOTS[robot].title.partition(" with ")[0] for robot in SEEN_ROBOTS))
@@ -20,6 +22,11 @@ HELD_OUT_TITLES = {robot: f"Held-out {ROBOTS[robot].title}" for robot in HELD_OU
 """Title of each robot that the fixed split holds out."""
 GROUP_TITLES = {SEEN: SEEN_TITLE, **HELD_OUT_TITLES}
 """Titles of the robots that tables of the fixed split grade together, by their names in addresses."""
+
+
+def robot_title(robot: str) -> str:
+    """Title of a robot; the key of one that no registry holds."""
+    return ROBOT_TITLES.get(robot, robot)
 
 
 def action_title(key: str) -> str:

@@ -12,7 +12,6 @@ import numpy as np
 
 from xew.analysis.scores import TRUTH
 from xew.analysis.statistics.grades import REFERENCE, SEEN, StudyGrades, find_variant, pooled
-from xew.analysis.statistics.summary import ROBOT_TITLES
 from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.labels import (
     ACTIONS,
@@ -20,6 +19,7 @@ from xew.analysis.tables.labels import (
     HELD_OUT_TITLES,
     LADDER,
     REMEDIES,
+    ROBOT_TITLES,
     SHORT_ROBOTS,
     SYSTEM_ACTIONS,
     SYSTEMS,

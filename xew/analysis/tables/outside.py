@@ -3,8 +3,8 @@
 import pandas as pd
 
 from xew.analysis.scores import VARIANT
-from xew.analysis.statistics.summary import robot_title
 from xew.analysis.tables.builder import Builder
+from xew.analysis.tables.labels import robot_title
 from xew.analysis.tables.table import Table, TableRow, TableSection, metric_columns
 from xew.protocol import VARIANTS
 

@@ -33,8 +33,6 @@ class TableCell:
     """Verdict on the difference from the row that the caption names: better, worse or unresolved; '' where there is none."""
     parting: str = ""
     """Verdict by the paper's definition where that of the suite strict, which decides, is another one; else ''."""
-    agrees: bool | None = None
-    """Whether a recomputed value prints like the paper's; None where this is not asked."""
     best: bool = False
     """Whether it is the best of its section's models."""
     value: float = np.nan

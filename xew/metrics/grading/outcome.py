@@ -15,7 +15,7 @@ from xew.files import write_section
 from xew.metrics.grading.bundle import write_bundle
 from xew.metrics.grading.power import HEADING, power_section
 from xew.metrics.grading.scores import Cell, CellStore, path_beside, write_diagnostics, write_tables, write_whole
-from xew.metrics.grading.summary import summarize, to_markdown
+from xew.metrics.grading.summary import summarize_robots, to_markdown
 from xew.names import csv_text
 from xew.protocol import HELD_OUT_ROBOTS
 
@@ -67,7 +67,7 @@ def _write_summary(out: Path, rows: pd.DataFrame, resample: str, power_page: Pat
     """Write the summary's files and return what is printed."""
     if rows.empty:
         return "no scores"
-    summary = summarize(rows, resample, HELD_OUT_ROBOTS)
+    summary = summarize_robots(rows, resample, HELD_OUT_ROBOTS)
     write_whole(path_beside(out, "summary.md"), to_markdown(summary).encode())
     write_whole(path_beside(out, "summary.csv"), csv_text(summary.means).encode())
     write_whole(path_beside(out, "pairs.csv"), csv_text(summary.pairs).encode())

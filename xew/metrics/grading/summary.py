@@ -1,71 +1,35 @@
-"""The summary that `evaluate` writes beside scores: means with intervals by robot, and differences of models with a verdict.
+"""The summary that `evaluate` prints and writes next to its scores, as Markdown.
 
-Draws, intervals, noise floors and verdicts are those of `xew.statistics`, as in the report. The ground truth that the floor
-is of is graded softened, as any prediction is (`jobs.SOFTNESS`).
+The ground truth that noise floors are of is graded softened, as any prediction is (`jobs.SOFTNESS`).
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import combinations
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
-import numpy as np
 import pandas as pd
 
 from xew.metrics import METRICS
 from xew.names import plain_markdown
-from xew.protocol import BASELINES, CODEC_TRUTH, COPY_FIRST_FRAME, GROUND_TRUTH
+from xew.protocol import BASELINES, COPY_FIRST_FRAME, GROUND_TRUTH
 from xew.statistics import (
     DRAWS,
     LEVEL,
     MIN_SCENES,
     UNITS,
-    Mean,
-    Units,
-    bootstrap_means,
-    describe_floors,
+    Summary,
     describe_parting,
     describe_power,
-    drop_powerless,
     find_parting,
-    find_power,
-    floor_sources,
-    largest_floor,
-    noise_floor,
-    strict_metrics,
-    verdict,
+    summarize,
 )
 
 PAIRS_SHOWN = 6
 """Largest number of pairs of models in the Markdown summary; where there are more, they stand in the file of pairs alone."""
 
 
-Column = tuple[str, str, str]
-"""Metric, model and condition."""
-Codecs = Mapping[str, Sequence[str]]
-"""Conditions of the truth through the codecs of each model."""
-
-
-@dataclass(frozen=True)
-class Summary:
-    """The means of some models' scores and the differences between them, robot by robot."""
-
-    means: pd.DataFrame
-    """robot dimension metric unit model condition mean low high episodes truth noise versus_truth."""
-    pairs: pd.DataFrame
-    """robot metric model condition other other_condition difference low high episodes noise verdict decides: model minus other.
-    `decides` is False for a metric of the suite paper beside that of the suite strict which stands in its place."""
-    unit: str
-    """Unit that was resampled, a key of UNITS."""
-    floors: str
-    """Sentence that says what the noise floors are of."""
-    power: pd.DataFrame
-    """Power of each task for each metric (`xew.statistics.find_power`); tasks without it are in no mean and no difference."""
-
-
-def summarize(rows: pd.DataFrame, unit: str = "scene", robots_first: Sequence[str] = ()) -> Summary:
-    """Summarize a score table.
+def summarize_robots(rows: pd.DataFrame, unit: str = "scene", robots_first: Sequence[str] = ()) -> Summary:
+    """Summarize a score table, each robot by itself.
 
     Args:
         rows: model condition task seed robot metric value; in the attribute `codecs` the truth through whose codec is the noise
@@ -73,100 +37,11 @@ def summarize(rows: pd.DataFrame, unit: str = "scene", robots_first: Sequence[st
         unit: what is resampled, a key of UNITS.
         robots_first: robots that come before the others.
     """
-    power = find_power(rows, {name: _best(name) for name in rows["metric"].unique() if METRICS[name].leaves_tasks})
-    units, codecs = Units(rows, unit), cast(Codecs, rows.attrs.get("codecs", {}))
-    # Metrics of the suite paper that are shown beside those of the suite strict, as the report counts them.
-    beside = strict_metrics({name: METRICS[name] for name in rows.attrs.get("metrics", rows["metric"].unique())})
-    means: list[dict[str, Any]] = []
-    pairs: list[dict[str, Any]] = []
-    rows = drop_powerless(rows, power)
-    for robot in sorted(rows["robot"].unique(), key=lambda robot: (robot not in robots_first, robot)):
-        found, compared = _summarize_robot(str(robot), _table(rows[rows["robot"] == robot]), units, codecs, beside)
-        means += found
-        pairs += compared
-    floors = describe_floors([model for model in rows["model"].unique() if model not in BASELINES], codecs)
-    return Summary(pd.DataFrame(means, columns=MEANS), pd.DataFrame(pairs, columns=PAIRS), unit, floors, power)
-
-
-MEANS = ["robot", "dimension", "metric", "unit", "model", "condition", "mean", "low", "high", "episodes"]
-MEANS += ["truth", "noise", "versus_truth"]
-PAIRS = ["robot", "metric", "model", "condition", "other", "other_condition", "difference", "low", "high", "episodes"]
-PAIRS += ["noise", "verdict", "decides"]
-
-
-def _table(rows: pd.DataFrame) -> pd.DataFrame:
-    """One robot's values: a row per (task, seed), a column per (metric, model, condition); NaN where there is none."""
-    table = rows.pivot(index=["task", "seed"], columns=["metric", "model", "condition"], values="value")
-    ranks = {name: rank for rank, name in enumerate(BASELINES)}
-    order = sorted(_columns(table), key=lambda c: (list(METRICS).index(c[0]), ranks.get(c[1], -1), c[1:]))
-    return table.reindex(columns=pd.MultiIndex.from_tuples(order, names=table.columns.names))
-
-
-def _columns(table: pd.DataFrame) -> list[Column]:
-    """Metric, model and condition of each column."""
-    return cast(list[Column], list(table.columns))
-
-
-def _bootstrap(values: np.ndarray, table: pd.DataFrame, units: Units) -> list[Mean]:
-    """The mean of each column [n c] of a robot's episodes, which are the rows of its table."""
-    means = bootstrap_means(values, units.numbers(cast(pd.MultiIndex, table.index)), units.strata)
-    return [mean or Mean(np.full(1, np.nan), 0, 0) for mean in means]
-
-
-def _best(metric: str) -> float:
-    low, high = METRICS[metric].range
-    return high if METRICS[metric].higher_is_better else low
-
-
-def _find_floor(column: Column, means: Mapping[Column, Mean], codecs: Codecs) -> float:
-    """The noise floor of a model in a metric: of the truth through its codec where that was graded, else of the true video.
-
-    The truth through a codec is its own floor.
-    """
-    metric, model, condition = column
-    sources = [(model, condition)] if model == CODEC_TRUTH else floor_sources(model, codecs)
-    graded = [means.get((metric, *source)) for source in sources]
-    known: list[Mean | None] = [mean for mean in graded if mean] or [means.get((metric, GROUND_TRUTH, ""))]
-    return largest_floor(noise_floor(m.value if m else None, _best(metric), METRICS[metric].estimated) for m in known)
-
-
-def _summarize_robot(
-    robot: str, table: pd.DataFrame, units: Units, codecs: Codecs, beside: Collection[str]
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Rows of the means and of the pairs of one robot."""
-    means = dict(zip(_columns(table), _bootstrap(table.to_numpy(), table, units), strict=True))
-    truths = {metric: means.get((metric, GROUND_TRUTH, "")) for metric, _, _ in means}
-    floors = {column: _find_floor(column, means, codecs) for column in means}
-    pairs = _compare_pairs(robot, table, floors, units, beside)
-    verdicts = {(p["metric"], p["model"], p["condition"]): p["verdict"] for p in pairs if p["other"] == GROUND_TRUTH}
-    rows = []
-    for (metric, model, condition), mean in means.items():
-        truth, (low, high) = truths[metric], mean.interval()
-        names = (robot, METRICS[metric].dimension, metric, METRICS[metric].unit, model, condition)
-        numbers = (mean.value, low, high, mean.count, truth.value if truth else math.nan)
-        versus_truth = verdicts.get((metric, model, condition), "")
-        rows.append(dict(zip(MEANS, (*names, *numbers, floors[metric, model, condition], versus_truth), strict=True)))
-    return rows, pairs
-
-
-def _compare_pairs(
-    robot: str, table: pd.DataFrame, floors: dict[Column, float], units: Units, beside: Collection[str]
-) -> list[dict[str, Any]]:
-    """Rows of the pairs of one robot: each model minus each that comes after it."""
-    metrics = dict.fromkeys(metric for metric, _, _ in floors)
-    columns = [pair for metric in metrics for pair in combinations([c for c in _columns(table) if c[0] == metric], 2)]
-    if not columns:
-        return []
-    place = {column: i for i, column in enumerate(_columns(table))}
-    values, ones, others = table.to_numpy(), [place[a] for a, _ in columns], [place[b] for _, b in columns]
-    differences = values[:, ones] - values[:, others]
-    rows = []
-    for (a, b), mean in zip(columns, _bootstrap(differences, table, units), strict=True):
-        floor, ends = largest_floor((floors[a], floors[b])), mean.interval()
-        found = verdict(mean.value, ends, floor, METRICS[a[0]].higher_is_better)
-        decides = a[0] not in beside
-        rows.append(dict(zip(PAIRS, (robot, *a, *b[1:], mean.value, *ends, mean.count, floor, found, decides), strict=True)))
-    return rows
+    names = {*rows.attrs.get("metrics", ()), *rows["metric"].unique()}
+    robots = sorted(rows["robot"].unique(), key=lambda robot: (robot not in robots_first, robot))
+    codecs = cast(Mapping[str, Sequence[str]], rows.attrs.get("codecs", {}))
+    metrics = {name: metric for name, metric in METRICS.items() if name in names}
+    return summarize(rows, metrics, {str(robot): [robot] for robot in robots}, codecs, unit)
 
 
 def to_markdown(summary: Summary, with_pairs: bool = True) -> str:

@@ -4,8 +4,8 @@ from functools import cache
 
 import pytest
 
-from xew.analysis import null
-from xew.analysis.null import Args, Null, Rates, format_rates, main, measure, nulls
+from lab import null
+from lab.null import Args, Null, Rates, format_rates, main, measure, nulls
 
 EQUAL, SEVERAL, UNEQUAL, ONE = nulls(trainings=3, spread=0.02)
 

@@ -1,6 +1,6 @@
 """How often claims are answered where there is nothing to find: studies whose variants are all equal.
 
-    python -m xew.analysis.null [--studies 200 --scenes 24 --trainings 3 --spread 0.02]
+    python -m lab.null [--studies 200 --scenes 24 --trainings 3 --spread 0.02]
 
 Every study has the scores of one model under all names. A claim that variants differ is then false whichever way it is
 answered; one that a difference is large is false only where it "holds", one that it is small only where it "fails". The rates
@@ -219,4 +219,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    user_errors(lambda: main(tyro.cli(Args, prog="python -m xew.analysis.null")))()
+    user_errors(lambda: main(tyro.cli(Args, prog="python -m lab.null")))()

@@ -1,34 +1,23 @@
-"""The tables in the report on one run: its scores as means, intervals and verdicts, robot by robot."""
+"""The report on one run: its scores as tables, robot by robot, and its result in sentences."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import cast
 
 import numpy as np
 import pandas as pd
 
-from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores, measure_power
+from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores
 from xew.protocol import BASELINES, PASTED_RENDER
-from xew.sim_warp.robots import ROBOTS
 from xew.statistics import (
     MIN_SCENES,
     UNRESOLVED,
-    Mean,
-    Units,
-    bootstrap_means,
-    describe_floors,
+    Summary,
     describe_parting,
     describe_power,
-    drop_powerless,
     find_parting,
-    floor_sources,
-    largest_floor,
-    noise_floor,
     strict_metrics,
-    verdict,
+    summarize,
 )
-
-ROBOT_TITLES = {key: robot.title for key, robot in ROBOTS.items()}
 
 
 @dataclass(frozen=True)
@@ -86,107 +75,35 @@ class RobotTable:
         return self.expected is None or all(count == self.expected for count in self.counts)
 
 
-def robot_title(robot: str) -> str:
-    """Its name in print; robots of one's own are called by their key."""
-    return ROBOT_TITLES.get(robot, robot)
-
-
-def mean_interval(scores: pd.Series, units: Units | None = None) -> Interval:
-    """Mean of episodes' scores and its bootstrap interval; the same at every call.
-
-    Args:
-        scores: indexed by task, seed and robot; scenes (task, seed) are drawn, with all robots that they have.
-        units: scenes of the whole table; those of the scores where left out.
-    """
-    mean = _bootstrap(scores, units)
-    return Interval(mean.value, *mean.interval(), mean.count)
-
-
-def verdict_on(
-    model: pd.Series, baseline: pd.Series, higher_is_better: bool, floor: float = 0, units: Units | None = None
-) -> str:
-    """Is a model better than a baseline on the episodes that both have? See `xew.statistics.verdict`.
-
-    Args:
-        model, baseline: their scores, indexed by task, seed and robot.
-        higher_is_better: of the metric.
-        floor: its noise floor; NaN where it is not known.
-        units: as of `mean_interval`.
-    """
-    difference = (model - baseline).dropna()
-    if difference.empty:
-        return UNRESOLVED
-    mean = _bootstrap(difference, units)
-    return verdict(mean.value, mean.interval(), floor, higher_is_better)
-
-
-def _bootstrap(scores: pd.Series, units: Units | None) -> Mean:
-    index = cast(pd.MultiIndex, scores.index)
-    units = units or Units(index.to_frame(index=False))
-    mean = next(bootstrap_means(scores.to_numpy(np.float64)[:, None], units.numbers(index), units.strata))
-    assert mean is not None, "no episode"
-    return mean
-
-
 def robot_table(scores: Scores, title: str, robots: Sequence[str], expected: int | None) -> RobotTable:
     """Rows for all models, then for the baselines."""
-    power = measure_power(scores.rows, scores.metrics)
-    kept = drop_powerless(scores.rows, power)
-    rows = kept[kept["robot"].isin(robots)]
-    groups = rows.groupby(["model", "condition"], sort=False)
-    by_model = {(str(model), str(condition)): group for (model, condition), group in groups}
-    ends = [key for name in BASELINES for key in by_model if key[0] == name]
-    order = [key for key in by_model if key[0] not in BASELINES] + ends
-    units = Units(scores.rows)
-    truth, others = by_model.get((TRUTH, "")), [by_model.get((name, "")) for name in (COPY, PASTED_RENDER)]
-    truths = {key: [by_model[s] for s in floor_sources(key[0], scores.codecs) if s in by_model] for key in order}
-    built = tuple(_row(key, by_model[key], others, truth, truths[key], scores.metrics, units) for key in order)
-    models = list(dict.fromkeys(model for model, _ in order if model not in BASELINES))
-    notes = describe_floors(models, scores.codecs), describe_power(power, {m.name: m.title for m in scores.metrics})
-    return RobotTable(title, tuple(robots), built, expected, " ".join(filter(None, notes)))
+    metrics = {metric.name: metric for metric in scores.metrics}
+    summary = summarize(scores.rows, metrics, {title: robots}, scores.codecs)
+    own = scores.rows[scores.rows["robot"].isin(robots)]
+    summarized = set(zip(summary.means["model"], summary.means["condition"], strict=True))
+    keys = own[["model", "condition"]].drop_duplicates().itertuples(index=False, name=None)
+    graded = [key for key in keys if key in summarized]
+    order = [
+        *(key for key in graded if key[0] not in BASELINES),
+        *(key for name in BASELINES for key in graded if key[0] == name),
+    ]
+    known = [name for name in (COPY, PASTED_RENDER) if (name, "") in graded]
+    notes = summary.floors, describe_power(summary.power, {m.name: m.title for m in scores.metrics})
+    rows = tuple(_row(key, summary, list(metrics), known) for key in order)
+    return RobotTable(title, tuple(robots), rows, expected, " ".join(filter(None, notes)))
 
 
-def _row(
-    key: tuple[str, str],
-    group: pd.DataFrame,
-    others: Sequence[pd.DataFrame | None],
-    truth: pd.DataFrame | None,
-    truths: Sequence[pd.DataFrame],
-    metrics: Sequence[MetricInfo],
-    units: Units,
-) -> Row:
-    """A row of a table.
-
-    `others` are the rows of the baselines that it is compared with, `truths` those of the truth through its codec, and `truth`
-    those of the true video.
-    """
-    values = {metric.name: _by_episode(group, metric.name) for metric in metrics}
-    verdicts: list[dict[str, str]] = [{} for _ in others]
-    floors = {metric.name: _pair_floor(truths, truth, metric, units) for metric in metrics} if key[0] not in BASELINES else {}
-    for found, other in zip(verdicts, others, strict=True):
-        if other is None or not floors:
-            continue
-        for metric in metrics:
-            baseline = _by_episode(other, metric.name)
-            floor, own = floors[metric.name], values[metric.name]
-            found[metric.name] = verdict_on(own, baseline, metric.higher_is_better, floor, units)
-    intervals = {name: mean_interval(series, units) for name, series in values.items() if len(series)}
-    return Row(*key, intervals, *verdicts)
-
-
-def _pair_floor(truths: Sequence[pd.DataFrame], truth: pd.DataFrame | None, metric: MetricInfo, units: Units) -> float:
-    """The floor of a difference of a model, whose codec's truth is in `truths`, from the frozen first frame."""
-    own = [rows for rows in truths if (rows["metric"] == metric.name).any()]
-    return largest_floor(_noise_floor(rows, metric, units) for rows in (*own, truth))
-
-
-def _noise_floor(truth: pd.DataFrame | None, metric: MetricInfo, units: Units) -> float:
-    graded = _by_episode(truth, metric.name) if truth is not None else pd.Series()
-    return noise_floor(_bootstrap(graded, units).value if len(graded) else None, metric.best, metric.estimated)
-
-
-def _by_episode(rows: pd.DataFrame, metric: str) -> pd.Series:
-    return rows[rows["metric"] == metric].set_index(["task", "seed", "robot"])["value"]
+def _row(key: tuple[str, str], summary: Summary, metrics: Sequence[str], baselines: Sequence[str]) -> Row:
+    """A row of a table; a model has verdicts against each of these baselines."""
+    means, pairs = (t[(t["model"] == key[0]) & (t["condition"] == key[1])] for t in (summary.means, summary.pairs))
+    scores = {
+        row["metric"]: Interval(row["mean"], row["low"], row["high"], row["episodes"]) for row in means.to_dict("records")
+    }
+    against: dict[str, dict[str, str]] = {COPY: {}, PASTED_RENDER: {}}
+    for name in baselines if key[0] not in BASELINES else ():
+        found = pairs[pairs["other"] == name]
+        against[name] = dict.fromkeys(metrics, UNRESOLVED) | dict(zip(found["metric"], found["verdict"], strict=True))
+    return Row(*key, scores, against[COPY], against[PASTED_RENDER])
 
 
 def finding(held_out: Sequence[RobotTable], seen: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> list[str]:

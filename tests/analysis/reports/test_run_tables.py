@@ -4,9 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from xew.analysis.reports.run_tables import Interval, RobotTable, Row, finding, progress
 from xew.analysis.scores import MetricInfo
-from xew.analysis.statistics.summary import Interval, RobotTable, Row, finding, mean_interval, progress, verdict_on
 from xew.analysis.tables.table import format_number
+from xew.statistics import summarize
 
 rng = np.random.default_rng(0)
 
@@ -17,6 +18,24 @@ def episodes(values: object, robots: tuple[str, ...] = ("piper",)) -> pd.Series:
     scenes = [("lift_pot", seed) for seed in range(len(values) // len(robots))]
     index = pd.MultiIndex.from_tuples([(*s, r) for s in scenes for r in robots], names=["task", "seed", "robot"])
     return pd.Series(values, index)
+
+
+def mean_interval(scores: pd.Series) -> Interval:
+    """Mean and interval of one model's scores in a summary."""
+    rows = scores.rename("value").reset_index().assign(model="m", condition="", metric="x")
+    mean = summarize(rows, {"x": info("x")}, {"all": list(rows["robot"].unique())}, {}).means.iloc[0]
+    return Interval(mean["mean"], mean["low"], mean["high"], mean["episodes"])
+
+
+def verdict_on(model: pd.Series, copy: pd.Series, higher: bool, floor: float = 0.0) -> str:
+    """Verdict of a summary on a model against the frozen first frame; the true video misses the best of 1 by the floor."""
+    tables = {"m": model, "copy_first_frame": copy, "ground_truth": model * 0 + 1 - floor}
+    rows = [
+        scores.rename("value").reset_index().assign(model=name, condition="", metric="x") for name, scores in tables.items()
+    ]
+    metric = MetricInfo("x", "visual", "", higher, 1.0 if not higher else None, 1.0, "", "X", estimated=floor > 0)
+    pairs = summarize(pd.concat(rows), {"x": metric}, {"all": list(rows[0]["robot"].unique())}, {}).pairs
+    return str(pairs[(pairs["model"] == "m") & (pairs["other"] == "copy_first_frame")]["verdict"].item())
 
 
 def info(name: str, unit: str = "", higher: bool = False) -> MetricInfo:

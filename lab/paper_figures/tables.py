@@ -1,27 +1,24 @@
-"""Tables of what follows from the paper's own figures, for the report on them."""
+"""Tables of the recomputed figures; ✓ behind a value says that it agrees with the printed one, ✗ that it does not."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
+from lab.paper_figures.recompute import RecomputedChange, RecomputedFigure
 from xew.analysis.correlation import Correlation, loeo_correlation
 from xew.analysis.distances.matrices import mean_distances
 from xew.analysis.distances.workspaces import Frame, chamfer_floor, measure
 from xew.analysis.paper import AXES, PAPER_TITLES, Paper, PublishedChange
-from xew.analysis.statistics.grades import PaperGrades
-from xew.analysis.statistics.recompute import RecomputedChange, RecomputedFigure
-from xew.analysis.statistics.summary import ROBOT_TITLES
-from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import format_signed
-from xew.analysis.tables.findings import Finding
-from xew.analysis.tables.labels import ACTIONS, LADDER, SYSTEMS
+from xew.analysis.tables.labels import ACTIONS, LADDER, ROBOT_TITLES, SYSTEMS
 from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection
 from xew.protocol import ROBOT_NAMES
 from xew.sim_warp.robots import ROBOTS
 
 AXIS_TITLES = {"appearance": "Appearance distance", "kinematic": "Kinematic distance"}
+AGREES = {True: "✓", False: "✗"}
+"""Marks of whether a recomputed value agrees with the printed one."""
 SEEDS = range(20)
 """Seeds of the draws that our own kinematic distances are means of."""
 SECTIONS = {
@@ -37,11 +34,6 @@ CORRELATION_TEXT = (
     "robot is left out. Positive means: farther is worse. Ours is computed from the printed scores and distances; the "
     "printed value is below it. ✓ says that inputs which print like these exist for which the value prints like the "
     "paper's; ✗ says that none was found. DoF r is a diagnostic: one robot alone has seven joints."
-)
-CERTAINTY_TEXT = (
-    "What five points can say. p is exact and two-sided, over all 120 pairings; the paper prints it for LPIPS only. Spearman's "
-    "ρ and the 95 % bootstrap interval of r (all resamples of three or more different robots) are ours. The sign is stable "
-    "where it survives leaving out any one robot."
 )
 FRAME_TEXT = (
     "The paper's text has the origins of every link in the arm's base frame. Its figures are those of each URDF's root frame, "
@@ -60,15 +52,6 @@ CHANGE_TEXT = (
     "print the same. Shares of a gap are of the way from zero-shot to the seen robots."
 )
 ROBOT_TEXT = "Means of the rows of the printed matrices, the printed means below them; features as printed."
-
-
-class PrintedBuilder(Builder):
-    """Makes tables of the paper alone, its means with all the digits that it prints."""
-
-    def cell(self, part: str, row: str, robots: str, metric: str, base: str = "") -> TableCell:
-        assert isinstance(self.ours, PaperGrades)
-        cell = super().cell(part, row, robots, metric, base)
-        return replace(cell, text=self.ours.print(part, row, robots, metric) or cell.text)
 
 
 @cache
@@ -90,18 +73,6 @@ def frame_results(paper: Paper, distances: np.ndarray) -> dict[str, Correlation]
         name: loeo_correlation(axis, paper.scores(name).tolist(), metric.higher_is_better)
         for name, metric in paper.metrics.items()
     }
-
-
-def claims_table(claims: Sequence[Finding]) -> Table:
-    rows = []
-    for one in claims:
-        numbers = "; ".join(other.text for other in one.comparisons) or f"not printed: {one.missing}"
-        cells = (TableCell(one.answer), TableCell(numbers))
-        rows.append(TableRow((f"{one.claim.says} ({one.claim.where})", one.claim.test), cells))
-    columns = (Column("verdict"), Column("numbers"))
-    return Table(
-        "claims", "Claims, asked of the paper's own figures", "", ("claim", "test"), columns, (TableSection("", tuple(rows)),)
-    )
 
 
 def correlation_table(paper: Paper, cells: Sequence[RecomputedFigure]) -> Table:
@@ -126,41 +97,7 @@ def _compared_cell(cells: Sequence[RecomputedFigure]) -> TableCell:
     published = " to ".join(format_signed(cell.published) for cell in cells)
     value, printed = (cells[0].ours, cells[0].published) if len(cells) == 1 else (np.nan, np.nan)
     agrees = all(cell.agrees for cell in cells)
-    return TableCell(ours, published=published, agrees=agrees, value=value, printed=printed)
-
-
-def certainty_table(paper: Paper, cells: Sequence[RecomputedFigure], results: Mapping[tuple[str, str], Correlation]) -> Table:
-    printed = {(cell.metric, cell.axis): cell for cell in cells if cell.quantity == "p_value"}
-
-    def row(metric: str) -> TableRow:
-        columns = []
-        for axis in AXES:
-            result, p = results[metric, axis], printed.get((metric, axis))
-            text = f"{result.p_value:.3f}"
-            compared = TableCell(text, value=result.p_value)
-            if p:
-                compared = replace(compared, published=f"{p.published:.3f}", agrees=p.agrees, printed=p.published)
-            columns += [compared, *_certainty_cells(result)]
-        return TableRow((PAPER_TITLES[metric],), tuple(columns))
-
-    heads = ("p", "Spearman ρ", "bootstrap of r", "sign")
-    columns = [Column(head, AXIS_TITLES[axis]) for axis in AXES for head in heads]
-    return _table(
-        "certainty", "How certain it is", CERTAINTY_TEXT, "metric", columns, [row(metric) for metric in paper.metrics]
-    )
-
-
-def _certainty_cells(result: Correlation) -> list[TableCell]:
-    ends = (result.bootstrap_low, result.bootstrap_high)
-    return [
-        TableCell(format_signed(result.spearman), value=result.spearman),
-        TableCell(" to ".join(map(format_signed, ends)), low=ends[0], high=ends[1]),
-        _stability_cell(result),
-    ]
-
-
-def _stability_cell(result: Correlation) -> TableCell:
-    return TableCell("stable" if result.stable else "unstable", value=float(result.stable))
+    return TableCell(f"{ours} {AGREES[agrees]}", published=published, value=value, printed=printed)
 
 
 def frame_table(paper: Paper, frames: Mapping[Frame, np.ndarray]) -> Table:
@@ -219,10 +156,9 @@ def _change_cell(found: RecomputedChange) -> TableCell:
     if found.change.word != "rounded":
         printed = f"{found.change.word} {printed.lstrip('+−') if found.change.word == 'less than' else printed}"
     return TableCell(
-        format_percent(found.ours),
+        f"{format_percent(found.ours)} {AGREES[found.agrees]}",
         f"{format_percent(found.least)} to {format_percent(found.most)}",
         printed,
-        agrees=found.agrees,
         value=found.ours,
         low=found.least,
         high=found.most,
@@ -269,7 +205,8 @@ def robot_table(paper: Paper, means: Sequence[RecomputedFigure]) -> Table:
 
 def _mean_cell(cell: RecomputedFigure) -> TableCell:
     printed = f"{cell.published:.3f}"
-    return TableCell(f"{cell.ours:.3f}", published=printed, agrees=cell.agrees, value=cell.ours, printed=cell.published)
+    text = f"{cell.ours:.3f} {AGREES[cell.agrees]}"
+    return TableCell(text, published=printed, value=cell.ours, printed=cell.published)
 
 
 def _signed_cell(value: float) -> TableCell:
