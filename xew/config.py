@@ -114,7 +114,7 @@ def read_yaml(path: Path | str) -> Any:
     base = changes.pop(BASE)
     if not isinstance(base, str):
         raise ConfigError(f"{path}: {BASE} is {base!r}; expected the path of a config from this folder, or xew:NAME.")
-    below = _read_content(find_config(base if is_packaged(base) else path.parent / base))
+    below = _read_content(find_config(base if is_packaged(Path(base)) else path.parent / base))
     if not isinstance(below, Mapping):
         raise ConfigError(f"{path}: its base {base} has no keys and values.")
     if BASE in below:
