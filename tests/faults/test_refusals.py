@@ -21,7 +21,8 @@ from xew.model import outside
 from xew.model.episodes.choice import select_episodes
 from xew.model.experiment import load_experiment
 from xew.model.runs.begin import claim_run
-from xew.sim_warp import generate, yields
+from lab.seeds import yields
+from xew.sim_warp import generate
 
 REPOSITORY = Path(__file__).parents[2]
 
