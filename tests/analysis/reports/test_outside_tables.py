@@ -15,7 +15,12 @@ METRIC = {
         "title": "Grip sharpness", "reported": True, "estimated": False,
     }
 }  # fmt: skip
-BARE = {"wobble": {"dimension": "visual", "unit": "", "higher_is_better": False, "low": 0.0, "high": 1.0, "reference": "ours"}}
+BARE = {
+    "wobble": {
+        "dimension": "visual", "unit": "", "higher_is_better": False, "low": 0.0, "high": 1.0, "reference": "ours",
+        "estimated": False,
+    }
+}  # fmt: skip
 """As tables describe a metric that say no title."""
 ROBOT, TASK, VARIANT_NAME = "my_lab_robot", "my_tasks:FOLD", "fixed-my_action-none"
 
