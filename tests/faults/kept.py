@@ -102,7 +102,15 @@ def ledger(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
 def scores(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
     """The attributes of a score table; its file is made of them when it is read."""
     path = folder / "scores.parquet"
-    metric = {"dimension": "visual", "unit": "dB", "higher_is_better": True, "low": 0.0, "high": None, "reference": "r"}
+    metric = {
+        "dimension": "visual",
+        "unit": "dB",
+        "higher_is_better": True,
+        "estimated": False,
+        "low": 0.0,
+        "high": None,
+        "reference": "r",
+    }
     content = {"protocol": 4, "metrics": {"psnr": metric | {"title": "PSNR", "estimated": False, "reported": False}}}
     content |= {"versions": {"xew": "1"}, "estimators": {"mask": "default"}, "frame_zero": "given", "robots": ["piper"]}
     row = {"model": "m", "condition": "c", "task": "lift_pot", "seed": 1, "robot": "piper", "metric": "psnr", "value": 20.0}

@@ -192,7 +192,15 @@ def write_scores(folder: Path, **names: str) -> Path:
     """A score table of one row with these names."""
     row = {"model": "m", "condition": "c", "task": "lift_pot", "seed": 1, "robot": "piper", "metric": "psnr", "value": 20.0}
     rows = pd.DataFrame([row | {"frames": 5, "exact_frames": 0} | names])
-    metric = {"dimension": "visual", "unit": "dB", "higher_is_better": True, "low": 0, "high": None, "reference": ""}
+    metric = {
+        "dimension": "visual",
+        "unit": "dB",
+        "higher_is_better": True,
+        "estimated": False,
+        "low": 0,
+        "high": None,
+        "reference": "",
+    }
     rows.attrs = {"protocol": 4, "metrics": {"psnr": metric}}
     curves = rows.assign(frame=1)[[*row, "frame"]]
     rows.to_parquet(folder / "scores.parquet")

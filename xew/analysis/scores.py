@@ -31,6 +31,8 @@ COPY, TRUTH = COPY_FIRST_FRAME, GROUND_TRUTH
 """Baselines that others are measured by: the frozen first frame, and the true video, which is the ceiling."""
 COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero", "motion")
 """Attributes that say how a table was graded, and on what motion; tables that differ in one cannot be compared."""
+REQUIRED = ("dimension", "unit", "higher_is_better", "low", "high", "reference", "estimated")
+"""Attributes of each metric that every table has."""
 LISTED = 20
 """Largest number of rows of each kind that an error names; it counts the others."""
 
@@ -283,7 +285,7 @@ def _read_metric_infos(path: Path, described: Mapping[str, Mapping[str, Any]]) -
     """Read the descriptions of a table's metrics; further entries are ignored."""
     known = {field.name for field in fields(MetricInfo)} - {"name"}
     for metric, info in described.items():
-        if missing := sorted(known - info.keys()):
+        if missing := [name for name in REQUIRED if name not in info]:
             raise ConfigError(f"{path} does not say the {', '.join(missing)} of {metric}; it is no score table of this xew.")
     infos = []
     for metric, info in described.items():

@@ -12,10 +12,15 @@ from xew.analysis.scores import VARIANT
 METRIC = {
     "grip_sharpness": {
         "dimension": "hands", "unit": "N", "higher_is_better": True, "low": 0.0, "high": None, "reference": "ours",
-        "title": "Grip sharpness", "reported": True,
+        "title": "Grip sharpness", "reported": True, "estimated": False,
     }
 }  # fmt: skip
-BARE = {"wobble": {"dimension": "visual", "unit": "", "higher_is_better": False, "low": 0.0, "high": 1.0, "reference": "ours"}}
+BARE = {
+    "wobble": {
+        "dimension": "visual", "unit": "", "higher_is_better": False, "low": 0.0, "high": 1.0, "reference": "ours",
+        "estimated": False,
+    }
+}  # fmt: skip
 """As tables describe a metric that say no title."""
 ROBOT, TASK, VARIANT_NAME = "my_lab_robot", "my_tasks:FOLD", "fixed-my_action-none"
 
