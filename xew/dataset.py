@@ -150,7 +150,7 @@ def demand_motion(data: Path, records: Iterable[Record], motion: str) -> None:
         )
 
 
-def demand_one_motion(data: Path, records: Iterable[Record], mixed: bool) -> str:
+def demand_one_motion(data: Path, records: Iterable[Record], mixed: bool = False) -> str:
     """The kind of motion of a data set's episodes, one of `MOTIONS`; MIXED_MOTION if they have both and may.
 
     Raises:

@@ -28,7 +28,6 @@ WRITERS: tuple[tuple[str, str, str], ...] = (
     ("analysis.study_analyse", "study", "study/scores.parquet"),
     ("exchange.lerobot", "data --out out", "out"),
     ("exchange.robotwin", "data --out out", "out"),
-    ("metrics.calibrate", "--data data --out out", "out"),
     ("metrics.evaluate", "rollouts --data data --out out.parquet", "out.parquet"),
     ("model.export", "run --out out", "out"),
     ("model.outside", "examples.own_model:freeze --data data --out out", "out"),

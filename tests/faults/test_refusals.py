@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import yaml
 
+from lab.calibration import calibrate
 from tests import synthetic
 from tests.commands import run_command
 from xew.analysis.studies.config import load_study
 from xew.config import ConfigError, check_finite, user_errors
 from xew.episode import EpisodeError, read_record, read_states, read_video, write_episode
 from xew.files import write_text
-from xew.metrics import calibrate
 from xew.model import outside
 from xew.model.episodes.choice import select_episodes
 from xew.model.experiment import load_experiment
@@ -132,7 +132,6 @@ def test_workers_that_are_none_are_refused(number: int, tmp_path: Path) -> None:
     [
         "xew.sim_warp.bodies --count 1 --out bodies.npz --workers 0",
         "xew.analysis.distance --no-looks --out out --workers 0",
-        "xew.metrics.evaluate rollouts --data data --out scores.parquet --processes 0",
     ],
 )
 def test_commands_without_workers_end_in_one_line(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,9 +7,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from lab.power import HEADING as POWER
 from tests.sim_warp.small import CLOSE, TASK, plan, success
 from xew.episode import EpisodeError, Record
-from xew.metrics.grading.power import HEADING as POWER
 from xew.sim_warp.inspection.visibility import HEADING as SEEN
 from xew.sim_warp.scene import Scene
 from xew.sim_warp.tasks import Task

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.analysis.studies.chains import ROOT, STEPS, chain, run
-from xew.analysis.studies.config import Study, check_study, load_study
+from xew.analysis.studies.config import Study, load_study
 from xew.analysis.studies.machines import RayCluster, ThisMachine, open_machines
 from xew.analysis.studies.plan import Step, plan
 from xew.analysis.studies.processes import start_step
@@ -134,18 +134,3 @@ def test_a_ray_cluster_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> 
     pytest.importorskip("ray")
     with pytest.raises(ConfigError, match="ray start --head"):
         RayCluster("auto", {})
-
-
-def test_how_many_share_a_grading_changes_nothing_that_is_done(study: Study) -> None:
-    def gradings(*overrides: str) -> list[Step]:
-        asked = load_study(ROOT / "configs" / "study_debug.yaml", ["--out", str(study.out), *overrides])
-        return [step for step in plan(asked).values() if step.kind in ("baselines", "evaluate")]
-
-    threads, processes = gradings(), gradings("--machine.graders", "20")
-    assert [step.inputs for step in threads] == [step.inputs for step in processes]
-    assert all(step.command[-4:] == ("--processes", "20", "--workers", "1") for step in processes)
-    assert not any("--processes" in step.command for step in threads)
-    with pytest.raises(ConfigError, match=r"machine\.graders is -1; expected"):
-        gradings("--machine.graders", "-1")
-    with pytest.raises(ConfigError, match=r"machine\.graders is 2 and evaluate names --processes"):
-        check_study(replace(study, evaluate=("--processes", "3"), machine=replace(study.machine, graders=2)), Path("a.yaml"))

@@ -94,8 +94,6 @@ class Machine:
     while they read and write. Memory is then taken as it is needed. With 0 a GPU has one step at a time."""
     trainings: int = 1
     """Number of trainings that share a GPU at once, where `beside` is not 0: one compiles while another trains."""
-    graders: int = 0
-    """Number of processes of each grading, for a GPU with many processor cores; with 0 it has threads."""
     train_launcher: str = ""
     """Launcher put before a training's command, such as srun --nodes=2; the processes it starts join by jax.distributed."""
     ray: str | None = None
@@ -302,11 +300,6 @@ def check_study(study: Study, path: Path) -> None:
         raise ConfigError(f"{path}: machine.workers and machine.gpus_per_training must be at least 1.")
     if study.machine.beside < 0:
         raise ConfigError(f"{path}: machine.beside is {study.machine.beside}, expected 0 or more.")
-    if study.machine.graders < 0 or (study.machine.graders and "--processes" in study.evaluate):
-        said = " and evaluate names --processes" if study.machine.graders > 0 else ""
-        raise ConfigError(
-            f"{path}: machine.graders is {study.machine.graders}{said}; expected a number of processes in one place."
-        )
     if study.machine.trainings < 1 or (study.machine.trainings > 1 and not study.machine.beside):
         raise ConfigError(
             f"{path}: machine.trainings is {study.machine.trainings}; expected 1, or more where machine.beside is not 0."

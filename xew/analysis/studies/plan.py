@@ -188,7 +188,7 @@ def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Ste
     """
     out, frames = study.baselines_path, experiment.get("rollout", {}).get("max_frames", 0)
     given = ("--data", str(study.data_folder), "--out", str(out), "--codec", str(_config_path(study, variant)))
-    asked = ("--baselines-of", "test", "--max-frames", str(frames), *study.evaluate, *_graders(study))
+    asked = ("--baselines-of", "test", "--max-frames", str(frames), *study.evaluate)
     return Step(
         "baselines",
         "",
@@ -204,7 +204,7 @@ def _plan_evaluate(study: Study, variant: Variant) -> Step:
     """Grading of a variant. The truth through a codec is graded once for all variants that share it."""
     out = study.scores_path(variant.name)
     given = ("--data", str(study.data_folder), "--out", str(out))
-    asked = ("--no-baselines", "--codec", str(run_folder(study, variant)), *study.evaluate, *_graders(study))
+    asked = ("--no-baselines", "--codec", str(run_folder(study, variant)), *study.evaluate)
     return Step(
         "evaluate",
         variant.name,
@@ -213,12 +213,6 @@ def _plan_evaluate(study: Study, variant: Variant) -> Step:
         inputs=[study.evaluate, GRADING_PROTOCOL],
         product=out,
     )
-
-
-def _graders(study: Study) -> tuple[str, ...]:
-    """Options of `evaluate` on how many processes share the work, which is no input: no score depends on it."""
-    count = study.machine.graders
-    return ("--processes", str(count), "--workers", "1") if count else ()
 
 
 def measured_bodies(study: Study) -> list[str]:
