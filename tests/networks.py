@@ -1,6 +1,7 @@
 """Networks with random parameters, made without compiling anything: every random array of JAX is a program of its own."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 import jax
@@ -9,6 +10,9 @@ import numpy as np
 from flax import nnx
 
 Module = TypeVar("Module", bound=nnx.Module)
+
+TINY_CODEC = Path(__file__).parent / "model" / "tiny_codec.safetensors"
+"""Weights of a tiny codec: eight channels for 8x8 pixels and four frames. It was trained for a minute on synthetic episodes."""
 
 
 def normal(seed: int, *shape: int) -> jax.Array:

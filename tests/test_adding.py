@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 from tests.commands import run_command
+from tests.networks import TINY_CODEC
 from tests.sim_warp.small import work_inline
 from xew.dataset import find_records
 from xew.metrics import METRICS
@@ -64,11 +65,11 @@ data: data
 out: runs/added
 split: additions:SPLIT
 clip: {frames: 5, height: 64, width: 80}
-codec: {spatial_factor: 8, channels: 4}
+codec: {weights: TINY_CODEC}
 model: {size: tiny, action: "additions:CONDITION"}
 train: {steps: 1, batch: 2, sample_every: 0}
 rollout: {steps: 1, batch: 1, max_frames: 5}
-"""
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 @pytest.fixture

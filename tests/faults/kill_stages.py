@@ -17,6 +17,7 @@ import pytest
 
 from tests.analysis.inline import InlineMachines
 from tests.metrics.quick import QUICK, QUICK_TRACKS
+from tests.networks import TINY_CODEC
 from tests.sim_warp.small import SLOW, TASK, work_inline
 from tests.synthetic import write_synthetic_data
 from xew.model.runs.checkpoint import open_checkpoints
@@ -26,11 +27,11 @@ CONFIG = """
 data: data
 out: run
 clip: {frames: 5, height: 32, width: 48}
-codec: {spatial_factor: 8, channels: 4}
+codec: {weights: TINY_CODEC}
 model: {size: tiny, action: joints, embodiment: robot_render}
 train: {steps: 2, batch: 1, log_every: 1, save_every: 1, sample_every: 0, keep_checkpoints: 2}
 rollout: {steps: 1, batch: 2}
-"""
+""".replace("TINY_CODEC", str(TINY_CODEC))
 ROLLED_OUT = ("piper", SEEN_ROBOTS[0])
 TIMES = "time/"
 """Beginning of the names of logged numbers that differ between two runs of the same training."""

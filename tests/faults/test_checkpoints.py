@@ -8,10 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
 
+from tests.networks import TINY_CODEC
 from xew.config import ConfigError
+from xew.model.codecs.autoencoders import ConvAutoencoderCodec
 from xew.model.codecs.codec import load_kept_codec
-from xew.model.codecs.patches import PatchCodec
+from xew.model.codecs.contract import CodecSettings
 from xew.model.runs.checkpoint import TrainState, note_sums, open_checkpoints, restore_state, save_state
 from xew.model.runs.log import RunLog
 
@@ -108,25 +112,28 @@ def test_whole_checkpoints_are_read_and_sums_go_with_them(whole: Path, tmp_path:
     assert [path.name for path in (out / "sums").iterdir()] == ["2.json"]
 
 
-def test_a_damaged_codec_is_told(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    codec = PatchCodec.fit([rng.integers(0, 256, (5, 16, 16, 3), np.uint8)], 8, 4)
+def test_a_damaged_codec_is_refused(tmp_path: Path) -> None:
+    codec = ConvAutoencoderCodec.open(CodecSettings(weights=TINY_CODEC))
     codec.save(tmp_path)
-    assert load_kept_codec(PatchCodec, tmp_path, "copy it again").hash == codec.hash
-    content = (tmp_path / "codec.npz").read_bytes()
-    arrays = dict(np.load(tmp_path / "codec.npz"))
-    for damaged in (b"", content[:100], content[:-30], b"PK\x03\x04" + content[4:200], b"text"):
-        (tmp_path / "codec.npz").write_bytes(damaged)
-        with pytest.raises(ConfigError, match="copy it again"):
-            load_kept_codec(PatchCodec, tmp_path, "copy it again")
-    for name in arrays:
-        for other in (arrays[name] * np.nan if arrays[name].dtype.kind == "f" else np.int64(0), arrays[name][..., None]):
-            np.savez(tmp_path / "codec.npz", **(arrays | {name: other}))
-            with pytest.raises(ConfigError):
-                load_kept_codec(PatchCodec, tmp_path, "copy it again")
-    (tmp_path / "codec.npz").unlink()
-    with pytest.raises(ConfigError, match=r"lacks its codec \(.*codec.npz\); copy it again"):
-        load_kept_codec(PatchCodec, tmp_path, "copy it again")
+    assert load_kept_codec(ConvAutoencoderCodec, tmp_path, "copy it again").hash == codec.hash
+    weights = tmp_path / "autoencoder.safetensors"
+    content, tensors = weights.read_bytes(), load_file(weights)
+    with safe_open(weights, framework="numpy") as stored:
+        metadata = stored.metadata()
+    for damaged in (b"", content[:100], content[:-30], content[:8] + b"x" + content[9:], b"text"):
+        weights.write_bytes(damaged)
+        with pytest.raises(ConfigError, match=r"(copy|download) it again"):
+            load_kept_codec(ConvAutoencoderCodec, tmp_path, "copy it again")
+    for name, tensor in list(tensors.items())[:4]:
+        save_file(tensors | {name: tensor[..., None]}, weights, metadata=metadata)
+        with pytest.raises(ConfigError):
+            load_kept_codec(ConvAutoencoderCodec, tmp_path, "copy it again")
+    weights.unlink()
+    with pytest.raises(ConfigError, match=r"no weights at .*autoencoder.safetensors"):
+        load_kept_codec(ConvAutoencoderCodec, tmp_path, "copy it again")
+    (tmp_path / "autoencoder.json").unlink()
+    with pytest.raises(ConfigError, match=r"lacks its codec \(.*autoencoder.json\); copy it again"):
+        load_kept_codec(ConvAutoencoderCodec, tmp_path, "copy it again")
 
 
 def test_a_damaged_log_of_numbers_is_gone_on_from(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import yaml
 
 from tests import synthetic
 from tests.commands import run_command
+from tests.networks import TINY_CODEC
 from xew.analysis.studies.config import load_study
 from xew.config import save
 from xew.episode import EpisodeError
@@ -33,8 +34,6 @@ WRITERS: tuple[tuple[str, str, str], ...] = (
     ("model.outside", "examples.own_model:freeze --data data --out out", "out"),
     ("model.release", "run --out out", "out"),
     ("model.train", f"{CONFIGS}/debug.yaml --data data --out out", "out"),
-    ("model.train_codec", f"{CONFIGS}/codec_debug.yaml --data data --out out", "out"),
-    ("model.train_vae", f"{CONFIGS}/vae_debug.yaml --data data --out out", "out"),
     ("sim_warp.generate", "--device cpu --out out", "out"),
     ("sim_warp.inspect", "data --render", "data"),
     ("sim_warp.inspect", "data --pictures out", "out"),
@@ -161,7 +160,7 @@ def test_who_waits_for_a_lock_says_for_whom_and_goes_on(tmp_path: Path, capsys: 
     assert said.count("waiting:") == 1 and f"is being written by process {process.pid}" in said
 
 
-def test_encoding_waits_for_who_fits_the_codec_of_the_same_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_encoding_waits_for_others_of_the_same_streams(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[str, bool]] = []
 
     @contextmanager
@@ -172,7 +171,7 @@ def test_encoding_waits_for_who_fits_the_codec_of_the_same_cache(tmp_path: Path,
     monkeypatch.setattr(latents, "hold_lock", note)
     synthetic.write_synthetic_data(tmp_path / "data", seeds=(0,), robots=SEEN_ROBOTS, frames=5)
     content = {"data": str(tmp_path / "data"), "out": str(tmp_path / "run"), "clip": {"frames": 5, "height": 32, "width": 48}}
-    content |= {"codec": {"spatial_factor": 8, "channels": 4}, "model": {"size": "tiny"}, "train": {"steps": 1, "batch": 1}}
+    content |= {"codec": {"weights": str(TINY_CODEC)}, "model": {"size": "tiny"}, "train": {"steps": 1, "batch": 1}}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(content))
     for embodiment in ("none", "reference_image", "nine_views"):
         latents.main([str(tmp_path / "config.yaml"), "--model.action", "optical_flow", "--model.embodiment", embodiment])

@@ -10,6 +10,7 @@ import pytest
 from flax import nnx
 from safetensors.numpy import load_file, save_file
 
+from tests.networks import TINY_CODEC
 from xew.config import ConfigError
 from xew.model import export
 from xew.model.devices.sharding import make_mesh
@@ -23,10 +24,10 @@ from xew.model.weights.reading import read_tensors
 CONFIG = """
 data: data
 clip: {frames: 5, height: 64, width: 80}
-codec: {spatial_factor: 8, channels: 4}
+codec: {weights: TINY_CODEC}
 model: {size: tiny, embodiment: robot_render}
 train: {steps: 2, batch: 1}
-"""
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 @pytest.fixture(scope="module")

@@ -9,22 +9,24 @@ import numpy as np
 import pytest
 
 from tests import synthetic
+from tests.networks import TINY_CODEC
 from tests.sim_warp.small import TASK, work_inline
 from xew.episode import EpisodeError, read_record, write_video
 from xew.model import latents
 from xew.model.cache.clips import needed_pixels
 from xew.model.cache.encode import encode_many
-from xew.model.codecs.patches import PatchCodec
+from xew.model.codecs.autoencoders import ConvAutoencoderCodec
+from xew.model.codecs.contract import CodecSettings
 from xew.model.conditions import Command
 from xew.model.experiment import load_experiment
 from xew.model.video.pixels import stored_pixels
 
 CONFIG = """
 clip: {frames: 9, height: 64, width: 80}
-codec: {spatial_factor: 8, channels: 4}
+codec: {weights: TINY_CODEC}
 model: {size: tiny, action: optical_flow, embodiment: robot_render}
 train: {steps: 1, batch: 1}
-"""
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 def write_config(root: Path) -> str:
@@ -94,12 +96,11 @@ def test_processes_encode_as_one_does(simulated: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def codec() -> PatchCodec:
-    rng = np.random.default_rng(0)
-    return PatchCodec.fit([rng.integers(0, 255, (5, 32, 32, 3), np.uint8) for _ in range(2)], 8, 4)
+def codec() -> ConvAutoencoderCodec:
+    return ConvAutoencoderCodec.open(CodecSettings(weights=TINY_CODEC))
 
 
-def test_batches_encode_as_single_clips_do(codec: PatchCodec) -> None:
+def test_batches_encode_as_single_clips_do(codec: ConvAutoencoderCodec) -> None:
     rng = np.random.default_rng(1)
     clips = [rng.integers(0, 255, (frames, 32, 32, 3), np.uint8) for frames in (5, 1, 5, 5, 9, 1, 5, 5)]
     for batch in (1, 4):
@@ -107,7 +108,7 @@ def test_batches_encode_as_single_clips_do(codec: PatchCodec) -> None:
             np.testing.assert_allclose(encoded, codec.encode(clip), atol=1e-5)
 
 
-def test_clip_of_a_wrong_length_is_told(codec: PatchCodec) -> None:
+def test_clip_of_a_wrong_length_is_told(codec: ConvAutoencoderCodec) -> None:
     with pytest.raises(ValueError, match="needs 4 k \\+ 1 frames"):
         encode_many(codec, [np.zeros((6, 32, 32, 3), np.uint8)], 4)
 

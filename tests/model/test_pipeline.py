@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests import synthetic
+from tests.networks import TINY_CODEC
 from xew.dataset import find_records, read_dataset
 from xew.episode import HEIGHT, WIDTH, read_video
 from xew.model import latents, rollout, train
@@ -32,11 +33,11 @@ from xew.rollout import find_rollouts, read_rollout_video
 FRAMES = 12
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}
-codec: {spatial_factor: 8, channels: 4}
+codec: {weights: TINY_CODEC}
 model: {size: tiny, action: joints, embodiment: robot_render}
 train: {steps: 4, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, ema_decay: 0.5}
 rollout: {steps: 2, batch: 3}
-"""
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 @pytest.fixture(scope="module")

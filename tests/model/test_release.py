@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests import synthetic
+from tests.networks import TINY_CODEC
 from xew.episode import EpisodeError
 from xew.model import latents, release, train
 from xew.model.rollout import load_predictor
@@ -16,10 +17,10 @@ from xew.model.runs.folder import load_run_config
 
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}
-codec: {spatial_factor: 8, channels: 4}
+codec: {weights: TINY_CODEC}
 model: {size: tiny, action: joints, embodiment: robot_render}
 train: {steps: 1, batch: 2, learning_rate: 1e-3, ema_decay: 0.9, log_every: 1, save_every: 1, sample_every: 0}
-"""
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 @pytest.fixture(scope="module")

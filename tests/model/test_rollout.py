@@ -15,12 +15,12 @@ from flax import nnx
 
 from tests import synthetic
 from tests.commands import on_devices
+from tests.networks import TINY_CODEC
 from xew.dataset import Episode, read_dataset
 from xew.episode import EpisodeError, read_video
 from xew.model import latents, rollout
 from xew.model.cache.codecs import load_codec
 from xew.model.codecs.contract import encode_pictures
-from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment, create_model, load_experiment
 from xew.model.network.dit_layouts import save_dit
 from xew.model.rollout import RolloutWriter
@@ -33,11 +33,11 @@ CONFIG = """
 data: {root}/data
 out: {root}/run
 clip: {{frames: 5, height: 64, width: 80}}
-codec: {{spatial_factor: 8, channels: 4}}
+codec: {{weights: TINY_CODEC}}
 model: {{size: tiny, action: joints, embodiment: robot_render, history: [-4]}}
 train: {{steps: 1, batch: 2}}
 rollout: {{steps: 2, batch: 3}}
-"""
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def predictor(world: Path) -> Predictor:
 
 def make_predictor(experiment: Experiment) -> Predictor:
     """A network whose output depends on all that it is given: nothing of it is zero."""
-    codec = load_codec(experiment.encoding, training_episodes(read_dataset(experiment.data), experiment.choice))
+    codec = load_codec(experiment.encoding)
     graph, params = nnx.split(create_model(experiment), nnx.Param)
     keys = iter(jax.random.split(jax.random.key(3), 200))
     noisy = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(next(keys), leaf.shape, leaf.dtype), params)
@@ -159,10 +159,10 @@ def test_sampler_and_grid_are_chosen_by_name(predictor: Predictor, world: Path) 
 
 
 def test_a_codec_may_come_from_outside(world: Path) -> None:
-    config = [str(world / "config.yaml"), "--codec.name", "xew.model.codecs.codec:PatchCodec"]
+    config = [str(world / "config.yaml"), "--codec.name", "xew.model.codecs.codec:ConvAutoencoderCodec"]
     latents.main(config)
     experiment = load_experiment(config[0], config[1:])
-    assert load_codec(experiment.encoding, training_episodes(read_dataset(experiment.data), experiment.choice)).channels == 4
+    assert load_codec(experiment.encoding).channels == 8
 
 
 DEVICES = """

@@ -10,6 +10,7 @@ import pytest
 from flax import nnx
 
 from tests import synthetic
+from tests.networks import TINY_CODEC
 from xew.config import ConfigError
 from xew.dataset import find_accepted, read_dataset
 from xew.episode import read_record, read_states, read_video, write_episode
@@ -31,10 +32,10 @@ SHIPPED = {path.stem: path for path in sorted((CONFIGS / "baselines").glob("*.ya
 SYSTEMS = [*SHIPPED, "mask_and_flow_channels"]
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}
-codec: {spatial_factor: 8, channels: 4}
+codec: {weights: TINY_CODEC}
 train: {steps: 2, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, sample_every: 0, history_noise: 0.3}
 rollout: {steps: 1, batch: 1}
-"""
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +89,7 @@ def test_a_rollout_s_history_is_its_own(world: Path, tmp_path: Path) -> None:
     leaves, tree = jax.tree.flatten(params)
     keys = jax.random.split(jax.random.key(1), len(leaves))
     drawn = [0.2 * jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
-    codec, scales = load_codec(experiment.encoding, episodes), load_scales(experiment.encoding, episodes)
+    codec, scales = load_codec(experiment.encoding), load_scales(experiment.encoding, episodes)
     drawn_params = jax.tree.unflatten(tree, drawn)
     predictor = Predictor(experiment.inputs, experiment.instructions, experiment.sampling, codec, graph, drawn_params, scales)
     folder, record = next((f, r) for f, r in find_accepted(world / "data") if r.robot == "piper" and r.seed)

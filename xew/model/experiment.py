@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from xew.command_line import parse_command
 from xew.config import admit, demand_admitted, load, pick
-from xew.model.codecs.codec import codec_class
+from xew.model.codecs.codec import RUN_CODEC, codec_class, latent_size
 from xew.model.codecs.contract import CodecSettings, latent_frames
 from xew.model.codecs.vae import VAES
 from xew.model.conditions import Condition
@@ -81,7 +81,7 @@ class Experiment:
         own = ("reference_channels",) if self.model.reference == "channels" else ()
         guess = next((name for name, condition in self.conditions.items() if condition.is_guess), "")
         streams = (*self.conditions, *own)
-        return Network(self.size, self.codec.channels, streams, guess, words, self.train.seed, self.model)
+        return Network(self.size, latent_size(self.codec).channels, streams, guess, words, self.train.seed, self.model)
 
     @property
     def sampling_network(self) -> Network:
@@ -133,8 +133,8 @@ class Experiment:
 
 def _latent_shape(clip: Clip, codec: CodecSettings) -> tuple[int, ...]:
     """Shape [t h w c] of one clip's latents."""
-    factor = codec.spatial_factor
-    return latent_frames(clip.frames), clip.height // factor, clip.width // factor, codec.channels
+    factor, channels = latent_size(codec)
+    return latent_frames(clip.frames), clip.height // factor, clip.width // factor, channels
 
 
 def _condition_shape(latents: tuple[int, ...], condition: Condition, history: int) -> tuple[int, ...]:
@@ -167,6 +167,8 @@ def load_recorded(path: Path) -> Experiment:
         ConfigError: as `load_experiment`.
     """
     experiment = load(Experiment, path)
+    if experiment.codec.weights is not None and (path.parent / RUN_CODEC).is_dir():  # a run may have moved without them
+        experiment = replace(experiment, codec=replace(experiment.codec, weights=path.parent / RUN_CODEC))
     demand_admitted(experiment, str(path))
     check_experiment(experiment, str(path))
     return experiment

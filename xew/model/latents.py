@@ -2,7 +2,7 @@
 
 Reads  episodes
 Writes <cache>/<task>/<seed>/<robot>/<stream>-KEY.safetensors float16 [clips ...], <cache>/header.json,
-       <cache>/codec-KEY/ if the codec is one that is fitted, <cache>/text/ if a text encoder is used
+       <cache>/text/ if a text encoder is used
 
 KEY names the codec, the source data and the cut into clips, so that what is stale is not found and never mistaken.
 Command: python -m xew.model.latents CONFIG [--data … and other overrides]
@@ -21,7 +21,7 @@ from xew.compilation import keep_compiled_programs, take_memory_as_needed
 from xew.config import ConfigError, user_errors
 from xew.dataset import Dataset, Episode, read_dataset
 from xew.files import hold_lock, read_json, write_text
-from xew.model.cache.codecs import prepare_codec
+from xew.model.cache.codecs import load_codec
 from xew.model.cache.encode import default_processes, encode_episodes
 from xew.model.cache.keys import CACHE_VERSION
 from xew.model.cache.scales import keep_scales
@@ -78,8 +78,8 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
     check_lpips()
     encoding, choice, dataset = experiment.encoding, experiment.choice, read_dataset(experiment.data)
     episodes = training_episodes(dataset, choice)
-    with hold_lock(encoding.folder, wait=True):  # whoever comes second finds a codec that is fitted already
-        codec = prepare_codec(encoding, episodes, source)
+    codec = load_codec(encoding)
+    with hold_lock(encoding.folder, wait=True):
         keep_scales(encoding, episodes)
         experiment.instructions.encode(record.instruction for _, record in dataset.accepted)
     cache = LatentCache(encoding, codec)

@@ -29,6 +29,7 @@ from xew.config import CONVERTER, ConfigError, admit, find_config, is_packaged, 
 from xew.dataset import Episode
 from xew.episode import Record, episode_folder, remove_left_overs
 from xew.files import checkpoint_time, hold_lock, read_json
+from xew.model.cache.codecs import load_codec
 from xew.model.cache.scales import Scale, load_run_scales
 from xew.model.codecs.contract import Codec
 from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
@@ -38,7 +39,6 @@ from xew.model.network.dit import cast_params
 from xew.model.network.dit_layouts import load_dit_params
 from xew.model.runs.checkpoint import load_params
 from xew.model.runs.folder import load_run_codec, load_run_config
-from xew.model.runs.roundtrip import load_untrained_codec
 from xew.model.sampling.predict import Prediction, Predictor
 from xew.model.settings.checks import check_experiment
 from xew.model.settings.settings import RolloutSettings
@@ -106,7 +106,7 @@ def load_published(experiment: Experiment, source: Path) -> Predictor:
     mesh = make_mesh(MeshSettings())
     graph, params = make_learner(experiment.learning, mesh).random_network()
     params = load_dit_params(graph, params, experiment.model.weights)
-    return _make_predictor(experiment, load_untrained_codec(experiment), params, mesh, {})
+    return _make_predictor(experiment, load_codec(experiment.encoding), params, mesh, {})
 
 
 def check_out(out: Path, data: Path) -> None:

@@ -1,18 +1,17 @@
-"""The codecs, linear and learned, and the way between the camera's frames and the model's."""
+"""The codecs, and the way between the camera's frames and the model's."""
 
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
 
+from tests.networks import TINY_CODEC
 from xew.config import ConfigError
 from xew.metrics import psnr
-from xew.model.codecs.autoencoders import WanVaeCodec
-from xew.model.codecs.contract import CodecSettings, decode_to_pictures, encode_pictures, latent_frames, to_pictures, to_signed
-from xew.model.codecs.patches import PatchCodec, cut_patches, join_patches
+from xew.model.codecs.autoencoders import ConvAutoencoderCodec, WanVaeCodec
+from xew.model.codecs.contract import CodecSettings, decode_to_pictures, encode_pictures, latent_frames
 from xew.model.codecs.vae import VAES, abstract_vae
 from xew.model.codecs.vae_layouts import save_vae
 from xew.model.video.frames import to_camera_size, to_model_size
@@ -27,33 +26,34 @@ def smooth_clip(seed: int, frames: int = 9) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def codec() -> PatchCodec:
-    return PatchCodec.fit([smooth_clip(seed) for seed in range(8)], spatial_factor=8, channels=24)
+def codec() -> ConvAutoencoderCodec:
+    return ConvAutoencoderCodec.open(CodecSettings(weights=TINY_CODEC))
 
 
-def test_shapes(codec: PatchCodec) -> None:
+def test_shapes(codec: ConvAutoencoderCodec) -> None:
     latents = codec.encode(smooth_clip(9, frames=13))
-    assert latents.shape == (latent_frames(13), 4, 6, 24) and latents.dtype == np.float32
+    assert latents.shape == (latent_frames(13), 4, 6, 8) and latents.dtype == np.float32
     assert codec.decode(latents).shape == (13, 32, 48, 3)
 
 
-def test_round_trip_of_unseen_video(codec: PatchCodec) -> None:
+def test_round_trip_of_unseen_video(codec: ConvAutoencoderCodec) -> None:
     for seed in (9, 10):
         clip = smooth_clip(seed)
-        assert np.mean(psnr(codec.decode(codec.encode(clip)), clip)) > 35
+        frozen = np.repeat(clip[:1], len(clip), axis=0)
+        assert np.mean(psnr(codec.decode(codec.encode(clip)), clip)) > np.mean(psnr(frozen, clip)[1:]) + 5
 
 
-def test_causal(codec: PatchCodec) -> None:
+def test_causal(codec: ConvAutoencoderCodec) -> None:
     """The first frame stands alone; each latent depends on frames up to its own group only."""
     video, changed = smooth_clip(9), smooth_clip(9)
     changed[5:] = 255 - changed[5:]
     before, after = codec.encode(video), codec.encode(changed)
     np.testing.assert_array_equal(before[:2], after[:2])
     assert not np.allclose(before[2], after[2])
-    np.testing.assert_array_equal(codec.encode(video[:1])[0], before[0])
+    np.testing.assert_allclose(codec.encode(video[:1])[0], before[0], atol=1e-5)
 
 
-def test_a_batch_is_its_clips(codec: PatchCodec) -> None:
+def test_a_batch_is_its_clips(codec: ConvAutoencoderCodec) -> None:
     """On the device and in a batch, and one clip at a time as pictures, the codec is the same."""
     videos = np.stack([smooth_clip(8), smooth_clip(9)])
     latents = encode_pictures(codec, videos)
@@ -62,60 +62,26 @@ def test_a_batch_is_its_clips(codec: PatchCodec) -> None:
     assert np.abs(decoded.astype(int) - np.asarray(decode_to_pictures(codec, latents))).max() <= 1
 
 
-def test_the_next_reference_is_what_a_rollout_would_encode(codec: PatchCodec) -> None:
+def test_the_next_reference_is_what_a_rollout_would_encode(codec: ConvAutoencoderCodec) -> None:
     latents = codec.encode(smooth_clip(9))
     expected = codec.encode(codec.decode(latents)[-1:])
     found = jax.jit(lambda codec, latents: codec.next_reference(latents))(codec, latents[None])
-    assert found.shape == (1, 1, 4, 6, 24)
+    assert found.shape == (1, 1, 4, 6, 8)
     np.testing.assert_allclose(found[0], expected, atol=1e-4)
 
 
-def test_a_codec_s_arrays_are_no_constants_of_a_program(codec: PatchCodec) -> None:
-    leaves = jax.tree.leaves(codec)
-    assert sum(np.size(leaf) for leaf in leaves) > 2 * 8 * 8 * 3 * 24
-    twice = jax.tree.map(lambda leaf: leaf * 2, codec)
-    program = jax.jit(lambda codec, latents: codec.decode_batch(latents))
-    latents = codec.encode(smooth_clip(9))[None]
-    assert not np.allclose(program(codec, latents), program(twice, latents))
-
-
-def test_stillness_is_zero(codec: PatchCodec) -> None:
-    still = np.repeat(smooth_clip(9)[:1], 9, 0)
-    latents = codec.encode(still)
-    np.testing.assert_array_equal(latents[1:], np.zeros_like(latents[1:]))
-    decoded = codec.decode(latents)
-    np.testing.assert_array_equal(decoded, np.repeat(decoded[:1], 9, 0))
-
-
-def test_latents_are_of_unit_size(codec: PatchCodec) -> None:
-    latents = np.stack([codec.encode(smooth_clip(seed)) for seed in range(8)])
-    assert latents[:, :1].std() == pytest.approx(1, abs=0.1)
-    assert np.sqrt(np.square(latents[:, 1:]).mean()) == pytest.approx(1, abs=0.1)
-
-
-def test_patches_are_lossless() -> None:
-    videos = np.random.default_rng(0).integers(0, 256, (2, 9, 16, 24, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(to_pictures(join_patches(*cut_patches(to_signed(jnp.asarray(videos)), 8), 8)), videos)
-
-
-def test_refuses_clips_that_do_not_fit(codec: PatchCodec) -> None:
+def test_refuses_clips_that_do_not_fit(codec: ConvAutoencoderCodec) -> None:
     with pytest.raises(ValueError, match="needs 4 k"):
         codec.encode(smooth_clip(0)[:8])
     with pytest.raises(ValueError, match="sides in 8s"):
         codec.encode(smooth_clip(0)[:, :30])
 
 
-def test_saved_codec_is_the_same(codec: PatchCodec, tmp_path: Path) -> None:
+def test_saved_codec_is_the_same(codec: ConvAutoencoderCodec, tmp_path: Path) -> None:
     codec.save(tmp_path)
-    loaded = PatchCodec.load(tmp_path)
+    loaded = ConvAutoencoderCodec.load(tmp_path)
     assert loaded.hash == codec.hash
     np.testing.assert_array_equal(loaded.encode(smooth_clip(9)), codec.encode(smooth_clip(9)))
-
-
-def test_fit_is_deterministic_and_hash_tells_codecs_apart(codec: PatchCodec) -> None:
-    clips = [smooth_clip(seed) for seed in range(8)]
-    assert PatchCodec.fit(clips, 8, 24).hash == codec.hash
-    assert PatchCodec.fit(clips, 8, 23).hash != codec.hash
 
 
 def test_padding_to_the_paper_s_size_is_lossless() -> None:
@@ -151,11 +117,11 @@ def vae_codec(tmp_path_factory: pytest.TempPathFactory) -> WanVaeCodec:
         leaf.set_value(jax.numpy.asarray(values if len(leaf.shape) > 1 else np.abs(values)))
     vae.latents_mean.set_value(jax.numpy.linspace(-1.0, 1.0, 48))
     save_vae(vae, path)
-    return WanVaeCodec.prepare(settings(path), list)
+    return WanVaeCodec.open(settings(path))
 
 
 def settings(weights: Path | None) -> CodecSettings:
-    return CodecSettings("wan_vae", spatial_factor=8, channels=48, vae="tiny", weights=weights, chunk=2)
+    return CodecSettings("wan_vae", vae="tiny", weights=weights, chunk=2)
 
 
 def test_autoencoder_codec(vae_codec: WanVaeCodec) -> None:
@@ -193,13 +159,9 @@ def test_saved_autoencoder_is_the_same(vae_codec: WanVaeCodec, tmp_path: Path) -
 
 
 def test_an_autoencoder_s_settings_are_checked(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="has 8 and 48: write those"):
-        WanVaeCodec.check(CodecSettings("wan_vae", spatial_factor=16, channels=8, vae="tiny"))
     with pytest.raises(ConfigError, match=r"needs codec\.weights: Wan2\.2_VAE\.pth"):
-        WanVaeCodec.prepare(settings(None), list)
+        WanVaeCodec.open(settings(None))
     with pytest.raises(ConfigError, match="there are no weights at"):
-        WanVaeCodec.prepare(settings(tmp_path / "nowhere.safetensors"), list)
+        WanVaeCodec.open(settings(tmp_path / "nowhere.safetensors"))
     with pytest.raises(ConfigError, match="did you mean 'tiny'"):
-        WanVaeCodec.check(CodecSettings("wan_vae", vae="tny"))
-    with pytest.raises(ConfigError, match="give 1 to 192"):
-        PatchCodec.check(CodecSettings(spatial_factor=8, channels=200))
+        WanVaeCodec.latent_size(CodecSettings("wan_vae", vae="tny"))

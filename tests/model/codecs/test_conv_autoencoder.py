@@ -34,17 +34,14 @@ def weights(tmp_path_factory: pytest.TempPathFactory, random_autoencoder: ConvAu
 
 @pytest.fixture(scope="module")
 def codec(weights: Path) -> ConvAutoencoderCodec:
-    return ConvAutoencoderCodec.prepare(settings(weights), list)
-
-
-def settings(weights: Path | None, channels: int = 48) -> CodecSettings:
-    return CodecSettings("conv_autoencoder", spatial_factor=16, channels=channels, weights=weights)
+    return ConvAutoencoderCodec.open(CodecSettings(weights=weights))
 
 
 def test_the_shipped_size_fits_into_20_megabytes() -> None:
     """Two bytes a number, and a little for names and norms."""
     assert 9.0e6 < parameter_count(abstract_autoencoder(AUTOENCODERS["base"])) <= 9.7e6
-    assert (AUTOENCODERS["base"].spatial_factor, AUTOENCODERS["base"].channels) == autoencoders.PACKAGED_SHAPE
+    assert ConvAutoencoderCodec.latent_size(CodecSettings()) == (16, 48)
+    assert load_autoencoder(autoencoders.PACKAGED_WEIGHTS).size == AUTOENCODERS["base"]
 
 
 def test_shapes_and_types(codec: ConvAutoencoderCodec) -> None:
@@ -130,24 +127,19 @@ def test_a_block_begins_as_its_shortcut() -> None:
 
 def test_missing_weights_are_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(autoencoders, "PACKAGED_WEIGHTS", tmp_path / "nothing.safetensors")
-    with pytest.raises(ConfigError, match=r"train one by `python -m xew\.model\.train_codec"):
-        ConvAutoencoderCodec.prepare(settings(None), list)
-    with pytest.raises(ConfigError, match="there are no weights at"):
-        ConvAutoencoderCodec.prepare(settings(tmp_path / "nowhere.safetensors"), list)
+    for path in (None, tmp_path / "nowhere.safetensors"):
+        with pytest.raises(ConfigError, match="there are no weights at"):
+            ConvAutoencoderCodec.open(CodecSettings(weights=path))
     with pytest.raises(ConfigError, match=r"holds no \.safetensors; name one file"):
-        ConvAutoencoderCodec.prepare(settings(tmp_path), list)
+        ConvAutoencoderCodec.open(CodecSettings(weights=tmp_path))
 
 
 def test_packaged_weights_are_found(monkeypatch: pytest.MonkeyPatch, weights: Path, codec: ConvAutoencoderCodec) -> None:
     monkeypatch.setattr(autoencoders, "PACKAGED_WEIGHTS", weights)
-    assert ConvAutoencoderCodec.prepare(settings(None), list).hash == codec.hash
+    assert ConvAutoencoderCodec.open(CodecSettings()).hash == codec.hash
 
 
 def test_settings_and_files_that_do_not_fit_are_told(weights: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="has 16 and 48: write those"):
-        ConvAutoencoderCodec.check(CodecSettings("conv_autoencoder"))
-    with pytest.raises(ConfigError, match="has 16 and 48: write those"):
-        ConvAutoencoderCodec.prepare(settings(weights, channels=8), list)
     tensors = load_file(weights)
     save_file(tensors, tmp_path / "nameless.safetensors")
     with pytest.raises(ConfigError, match="does not say the size"):

@@ -7,7 +7,7 @@ import numpy as np
 
 from xew.files import file_digest
 from xew.metrics import psnr
-from xew.model.codecs.autoencoders import PACKAGED_SHAPE, PACKAGED_WEIGHTS, ConvAutoencoderCodec
+from xew.model.codecs.autoencoders import PACKAGED_WEIGHTS, ConvAutoencoderCodec
 from xew.model.codecs.ceiling import reconstruct
 from xew.model.codecs.contract import CodecSettings
 
@@ -32,9 +32,7 @@ def test_the_file_is_the_one_that_the_docs_describe() -> None:
 
 
 def test_a_config_that_names_no_weights_gets_it_and_it_renders_a_scene() -> None:
-    factor, channels = PACKAGED_SHAPE
-    settings = CodecSettings("conv_autoencoder", spatial_factor=factor, channels=channels)
-    codec = ConvAutoencoderCodec.prepare(settings, lambda: [])
+    codec = ConvAutoencoderCodec.open(CodecSettings())
     video = draw_scene(5)
     decoded = reconstruct(codec, video, 5, 256, 320)
     frozen = np.repeat(video[:1], 5, axis=0)

@@ -18,6 +18,7 @@ from jax.sharding import PartitionSpec
 
 from tests import synthetic
 from tests.commands import on_devices
+from tests.networks import TINY_CODEC
 from xew.config import ConfigError
 from xew.model import latents
 from xew.model.cache.clips import clip_starts, sample_starts
@@ -27,11 +28,11 @@ from xew.model.training.data import valid_frames
 HERE = Path(__file__).parent
 CONFIG = """
 clip: {frames: 5, height: 32, width: 32}
-codec: {spatial_factor: 8, channels: 4}
+codec: {weights: TINY_CODEC}
 model: {size: tiny, action: joints, embodiment: robot_render}
 train: {steps: 4, batch: 4, learning_rate: 1e-3, log_every: 1, save_every: 2, sample_every: 0, ema_decay: 0.5}
 rollout: {steps: 1, batch: 4}
-"""
+""".replace("TINY_CODEC", str(TINY_CODEC))
 TWO, FOUR = ("--mesh.fsdp", "2"), ("--mesh.data", "2", "--mesh.fsdp", "2")
 """Overrides for so many devices."""
 FLOAT_NOISE = 1e-5

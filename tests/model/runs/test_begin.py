@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.networks import TINY_CODEC
 from xew.config import ConfigError
 from xew.files import RUN_MARK, is_run
-from xew.model.codecs.patches import PatchCodec
+from xew.model.codecs.autoencoders import ConvAutoencoderCodec
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.begin import prepare_run
 from xew.model.settings.settings import AdaptSettings
@@ -16,49 +17,51 @@ from xew.model.settings.settings import AdaptSettings
 
 @pytest.fixture(scope="module")
 def experiment() -> Experiment:
-    return load_experiment("xew:debug", ["--codec.name", "patch_pca", "--codec.spatial-factor", "8", "--codec.channels", "4"])
+    return load_experiment("xew:debug", ["--codec.weights", str(TINY_CODEC)])
 
 
-def fit_codec(experiment: Experiment, seed: int) -> PatchCodec:
-    """A codec of the experiment, whose hash depends on the seed."""
-    factor = experiment.codec.spatial_factor
-    pictures = np.random.default_rng(seed).integers(0, 256, (5, 2 * factor, 2 * factor, 3), np.uint8)
-    return PatchCodec.fit([pictures], factor, experiment.codec.channels)
+def make_codec(experiment: Experiment, seed: int) -> ConvAutoencoderCodec:
+    """The experiment's codec with a change that depends on the seed, and so with a hash of its own."""
+    autoencoder = ConvAutoencoderCodec.open(experiment.codec).autoencoder
+    autoencoder.latents_mean.set_value(autoencoder.latents_mean[...] + np.float32(seed))
+    return ConvAutoencoderCodec.from_autoencoder(autoencoder)
 
 
 def test_a_run_is_continued_with_its_own_codec_only(experiment: Experiment, tmp_path: Path) -> None:
     begun = replace(experiment, out=tmp_path / "run")
-    prepare_run(begun, fit_codec(experiment, 0), {}, resume=False, overwrite=False)
+    prepare_run(begun, make_codec(experiment, 0), {}, resume=False, overwrite=False)
     config = (tmp_path / "run/config.yaml").read_bytes()
     longer = replace(begun, train=replace(begun.train, steps=begun.train.steps + 7))
     with pytest.raises(ConfigError, match="was begun with another codec"):
-        prepare_run(longer, fit_codec(experiment, 1), {}, resume=True, overwrite=False)
+        prepare_run(longer, make_codec(experiment, 1), {}, resume=True, overwrite=False)
     assert (tmp_path / "run/config.yaml").read_bytes() == config
-    prepare_run(longer, fit_codec(experiment, 0), {}, resume=True, overwrite=False)
+    prepare_run(longer, make_codec(experiment, 0), {}, resume=True, overwrite=False)
     assert load_experiment(tmp_path / "run/config.yaml") == longer
 
 
 def test_a_run_without_a_checkpoint_is_not_adapted(experiment: Experiment, tmp_path: Path) -> None:
     source = replace(experiment, out=tmp_path / "source")
-    prepare_run(source, fit_codec(experiment, 0), {}, resume=False, overwrite=False)
+    prepare_run(source, make_codec(experiment, 0), {}, resume=False, overwrite=False)
     adapt = AdaptSettings(start_from=source.out, robots=("piper",))
     with pytest.raises(ConfigError, match="source has no checkpoint to start from"):
         prepare_run(
-            replace(experiment, out=tmp_path / "run", adapt=adapt), fit_codec(experiment, 0), {}, resume=False, overwrite=False
+            replace(experiment, out=tmp_path / "run", adapt=adapt), make_codec(experiment, 0), {}, resume=False, overwrite=False
         )
     assert is_run(source.out) and not (tmp_path / "run").exists()
 
 
 def test_a_run_that_was_killed_while_it_was_begun_is_begun_again(experiment: Experiment, tmp_path: Path) -> None:
     """Before its config was there, and before its codec was; what is damaged once a checkpoint depends on it, is told."""
-    begun, codec = replace(experiment, out=tmp_path / "run"), fit_codec(experiment, 0)
+    begun, codec = replace(experiment, out=tmp_path / "run"), make_codec(experiment, 0)
     begun.out.mkdir()
     (begun.out / RUN_MARK).touch()
     (begun.out / ".config.yaml.4194302").write_text("half")
     for left in ("config", "codec"):
         prepare_run(begun, codec, {}, resume=True, overwrite=False)
-        assert load_experiment(begun.out / "config.yaml") == begun and (begun.out / "codec/codec.npz").stat().st_size, left
-        (begun.out / "codec/codec.npz").unlink()
+        assert load_experiment(begun.out / "config.yaml") == begun and (begun.out / "codec/autoencoder.json").stat().st_size, (
+            left
+        )
+        (begun.out / "codec/autoencoder.json").unlink()
     (begun.out / "checkpoints/4").mkdir(parents=True)
     with pytest.raises(ConfigError, match="lacks its codec"):
         prepare_run(begun, codec, {}, resume=True, overwrite=False)

@@ -13,7 +13,7 @@ class Copy:
     """A codec that changes nothing but the first frame of what it is given, and notes how long that was."""
 
     def __init__(self, alone: bool) -> None:
-        self.alone = alone
+        self.groups_independent = alone
         self.lengths: list[int] = []
 
     def encode(self, video: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import pytest
 import tokenizers
 from flax import nnx
 
+from tests.networks import TINY_CODEC
 from xew.config import ConfigError
 from xew.model.experiment import Experiment, create_model, load_experiment
 from xew.model.text.instructions import VOCABULARY, clean, load_tokenizer, token_ids
@@ -20,10 +21,10 @@ CONFIG = """
 data: {root}/data
 out: {root}/run
 clip: {{frames: 5, height: 64, width: 80}}
-codec: {{channels: 4}}
+codec: {{weights: TINY_CODEC}}
 model: {{size: tiny, {model}}}
 train: {{steps: 1, batch: 1}}
-"""
+""".replace("TINY_CODEC", str(TINY_CODEC))
 
 
 def experiment(root: Path, model: str) -> Experiment:

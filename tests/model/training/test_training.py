@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +15,12 @@ from flax import nnx
 from jax.sharding import AbstractMesh
 
 from tests import synthetic
+from tests.networks import TINY_CODEC
 from xew.config import ConfigError, save
 from xew.dataset import read_dataset
 from xew.model import latents, train
 from xew.model.devices.sharding import AXES, make_mesh, place_batch, place_shapes
-from xew.model.diffusion.flow_matching import put_first, sample_losses
+from xew.model.diffusion.flow_matching import sample_losses
 from xew.model.episodes.choice import first_of_each, replay_episodes, sample_episodes, training_episodes
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.network.lora import apply_lora, init_lora
@@ -45,11 +46,11 @@ from xew.protocol import HELD_OUT_ROBOTS, seed_split
 FRAMES = 12
 CONFIG = """
 clip: {frames: 5, height: 64, width: 80}
-codec: {spatial_factor: 8, channels: 4}
+codec: {weights: TINY_CODEC}
 model: {size: tiny, action: joints, embodiment: robot_render}
 train: {steps: 2, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 1, sample_every: 0}
 rollout: {steps: 2, batch: 3}
-"""
+""".replace("TINY_CODEC", str(TINY_CODEC))
 ADAPT = ("--adapt.robots", "piper", "--adapt.episodes", "2")
 
 
@@ -147,14 +148,9 @@ def test_bfloat16_moment_is_kept_as_such(experiment: Experiment) -> None:
 class LastFrame:
     """Stands for a codec in which the last latent frame is the last picture; notes what it was given."""
 
-    relative: ClassVar[bool] = False
-
     def next_reference(self, latents: jax.Array) -> jax.Array:
         jax.debug.callback(lambda value: SEEN.append(np.asarray(value)), latents)
         return latents[:, -1:]
-
-    def replace_reference(self, latents: jax.Array, reference: jax.Array) -> jax.Array:
-        return put_first(latents, reference)
 
 
 SEEN: list[np.ndarray] = []

@@ -35,8 +35,6 @@ from xew.sim_warp.tasks import get_task
 
 KINDS = ("generate", "latents", "baselines", "train", "adapt", "rollout", "evaluate", "distances", "analyse")
 """Kinds of steps, in the order of the work."""
-FITTED = "patch_pca"
-"""Codec that is fitted to the training episodes of a split; the others are the same for all."""
 
 _KNOWN_ROBOTS = tuple(
     dict.fromkeys(robot for split in SPLITS.values() for robot in (*split.train_robots, *split.held_out_robots))
@@ -358,11 +356,6 @@ def build_experiment(study: Study, variant: Variant) -> Settings:
         },
     }
     return merge_settings(settings, given)
-
-
-def has_fitted_codec(experiment: Settings) -> bool:
-    """Whether its codec is one of its own split, and so are its latents."""
-    return bool(experiment.get("codec", {}).get("name", FITTED) == FITTED)
 
 
 def run_folder(study: Study, variant: Variant) -> Path:

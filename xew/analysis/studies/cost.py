@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from xew.analysis.studies.config import KINDS, Settings, Study, build_experiment, has_fitted_codec
+from xew.analysis.studies.config import KINDS, Settings, Study, build_experiment
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import TRAININGS, usable_gpus
 from xew.analysis.studies.plan import Step, measured_bodies, sort_steps
@@ -61,18 +61,13 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
 
 
 def _count_new_streams(study: Study, variant: Variant, experiment: Settings, encoded: dict[tuple[str, ...], int]) -> int:
-    """Number of streams of single episodes that no earlier variant has encoded with the same codec.
-
-    A codec that is fitted is another one for every split, and that of the start for an adaptation.
-    """
+    """Number of streams of single episodes that no earlier variant has encoded."""
     model, new = experiment["model"], 0
-    fitted = has_fitted_codec(experiment)
     counts = training_counts(variant, study.task_count, study.train_seeds, study.robot_keys)
     for stream in (name for name in ("rgb", model["action"], model["embodiment"]) if name != "none"):
         for robot, count in counts.items():
-            key = (variant.split if fitted else "", robot, stream)
-            new += max(0, count - encoded.get(key, 0))
-            encoded[key] = max(count, encoded.get(key, 0))
+            new += max(0, count - encoded.get((robot, stream), 0))
+            encoded[robot, stream] = max(count, encoded.get((robot, stream), 0))
     return new
 
 

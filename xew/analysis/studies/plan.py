@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 
 import xew
-from xew.analysis.studies.config import Settings, Study, build_experiment, has_fitted_codec, run_folder
+from xew.analysis.studies.config import Settings, Study, build_experiment, run_folder
 from xew.episode import SCHEMA_VERSION
 from xew.files import file_digest, write_text
 from xew.protocol import DISTANCE_BODIES, GRADING_PROTOCOL, SHARED_MOTION, Variant
@@ -70,10 +70,9 @@ def plan(study: Study) -> dict[str, Step]:
     """All steps of a study by name, each after those that it needs."""
     experiments = {run.name: build_experiment(study, run) for run in study.planned_runs}
     steps = [_plan_generate(study)]
-    firsts: dict[str, str] = {}
+    first = f"latents/{study.planned_runs[0].name}"
     for variant in study.planned_runs:
         experiment = experiments[variant.name]
-        first = firsts.setdefault(variant.split if has_fitted_codec(experiment) else "", f"latents/{variant.name}")
         steps += [
             _plan_latents(study, variant, experiment, first),
             _plan_train(study, variant, experiment),

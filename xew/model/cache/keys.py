@@ -12,7 +12,6 @@ from typing import Any
 from xew.config import digest
 from xew.dataset import Episode
 from xew.episode import Record, episode_folder
-from xew.model.codecs.codec import RUN_CODEC
 from xew.model.settings.parts import Encoding
 
 CACHE_VERSION = 2
@@ -34,14 +33,6 @@ def stream_path(encoding: Encoding, codec_hash: str, record: Record, stream: str
     cut = digest(inputs.clip) if inputs.chunks == 1 else (digest(inputs.clip), "chunks")
     key = _hash((CACHE_VERSION, codec_hash, cut, name, *sources))
     return episode_folder(encoding.folder, record.task, record.seed, record.robot) / f"{name}-{key}.safetensors"
-
-
-def codec_path(encoding: Encoding, episodes: Sequence[Episode]) -> Path:
-    """The folder where the codec of these episodes is kept: in the cache if it is fitted on them, or in the run to adapt."""
-    if encoding.start_from is not None:
-        return encoding.start_from / RUN_CODEC
-    hashes = [(record.hashes["rgb"], record.hashes["robot"]) for _, record in episodes]
-    return encoding.folder / f"codec-{_hash((CACHE_VERSION, digest(encoding.codec), digest(encoding.inputs.clip), hashes))}"
 
 
 def scales_path(encoding: Encoding, episodes: Sequence[Episode]) -> Path:

@@ -1,6 +1,5 @@
 """The latent cache on disk: each stream of each episode in one file, written once and read clip by clip."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +8,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from xew.config import ConfigError
-from xew.dataset import Episode
 from xew.episode import Record
 from xew.files import demand_regular, replacing
 from xew.model.cache.clips import clip_starts
@@ -86,10 +84,6 @@ class LatentCache:
         return [name for name in self.streams if not self.path(record, name).exists()]
 
 
-def open_cache(encoding: Encoding, episodes: Sequence[Episode]) -> LatentCache:
-    """Open the cache with the codec of these training episodes.
-
-    Raises:
-        ConfigError: `latents` has not been run for them, or the codec's weights are missing or do not fit.
-    """
-    return LatentCache(encoding, load_codec(encoding, episodes))
+def open_cache(encoding: Encoding) -> LatentCache:
+    """Open the cache with its codec. Raises ConfigError if the codec's weights are missing or damaged."""
+    return LatentCache(encoding, load_codec(encoding))

@@ -4,8 +4,7 @@ import functools
 import hashlib
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -18,12 +17,12 @@ from jaxtyping import Float
 
 from xew.config import ConfigError, parse, pick
 from xew.files import read_json, write_text
-from xew.model.codecs.contract import BatchCodec, CodecSettings, FrameBatch, LatentBatch, to_pictures, to_signed
+from xew.model.codecs.contract import BatchCodec, CodecSettings, FrameBatch, LatentBatch, LatentSize, to_pictures, to_signed
 from xew.model.codecs.conv_autoencoder import (
     AutoencoderSize,
     ConvAutoencoder,
-    find_weights,
     load_autoencoder,
+    read_size,
     save_autoencoder,
 )
 from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae, check_size
@@ -31,8 +30,6 @@ from xew.model.codecs.vae_layouts import load_vae, save_vae
 
 PACKAGED_WEIGHTS = Path(__file__).with_name("conv_autoencoder.safetensors")
 """Weights of conv_autoencoder that come with the package."""
-PACKAGED_SHAPE = (16, 48)
-"""Spatial factor and channels of the packaged weights."""
 
 
 class OfSize:
@@ -52,7 +49,6 @@ class OfSize:
 class AutoencoderCodec(OfSize, BatchCodec, ABC):  # type: ignore[override]
     """What the codecs of autoencoders share: the network, and that its weights are written once."""
 
-    fitted: ClassVar[bool] = False
     file: ClassVar[str]
     """Name of the files of the codec, without ending."""
 
@@ -135,34 +131,22 @@ class WanVaeCodec(AutoencoderCodec):
     def load(cls, folder: Path) -> "WanVaeCodec":
         """Read vae.safetensors and vae.json."""
         stored = read_json(folder / "vae.json")
-        if isinstance(stored, dict):  # a training has written its record beside it
-            stored = {name: stored[name] for name in stored.keys() & {field.name for field in fields(_KeptVae)}}
         kept = parse(_KeptVae, stored, str(folder / "vae.json"))
         check_size(kept.size, str(folder / "vae.json"))
         return cls.from_weights(folder / "vae.safetensors", kept.size, kept.dtype, kept.chunk)
 
     @classmethod
-    def check(cls, settings: CodecSettings) -> None:
+    def latent_size(cls, settings: CodecSettings) -> LatentSize:
         size = pick(VAES, settings.vae, "autoencoder")
-        if (settings.spatial_factor, settings.channels) != (size.spatial_factor, size.channels):
-            raise ConfigError(
-                f"codec.spatial_factor is {settings.spatial_factor} and codec.channels {settings.channels}; the autoencoder"
-                f" {settings.vae} has {size.spatial_factor} and {size.channels}: write those."
-            )
         if settings.chunk < 0:
             raise ConfigError(f"codec.chunk is {settings.chunk}; expected latent frames at once, or 0 for all.")
+        return LatentSize(size.spatial_factor, size.channels)
 
     @classmethod
-    def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> "WanVaeCodec":
-        """Read the weights of a config.
-
-        Raises:
-            ConfigError: none are named, or they are missing, broken or of another size.
-        """
+    def open(cls, settings: CodecSettings) -> "WanVaeCodec":
         if settings.weights is None:
             raise ConfigError(
-                "the codec wan_vae needs codec.weights: Wan2.2_VAE.pth, the vae folder of Wan2.2-TI2V-5B-Diffusers, or the"
-                " folder of an autoencoder trained by `python -m xew.model.train_codec CONFIG`."
+                "the codec wan_vae needs codec.weights: Wan2.2_VAE.pth, or the vae folder of Wan2.2-TI2V-5B-Diffusers."
             )
         return cls.from_weights(settings.weights, pick(VAES, settings.vae, "autoencoder"), settings.dtype, settings.chunk)
 
@@ -186,11 +170,11 @@ class WanVaeCodec(AutoencoderCodec):
 class ConvAutoencoderCodec(AutoencoderCodec):
     """The project's own autoencoder of groups of four frames; see `xew.model.codecs.conv_autoencoder`.
 
-    Groups stand alone, so that no latent and no decoded frame depends on the first frame but the first itself.
+    Groups are independent: of the latents and decoded frames, only the first depends on the first frame.
     """
 
     file: ClassVar[str] = "autoencoder"
-    alone: ClassVar[bool] = True
+    groups_independent: ClassVar[bool] = True
 
     params: Any
     """State of a `ConvAutoencoder` with the statistics of its latents."""
@@ -222,34 +206,13 @@ class ConvAutoencoderCodec(AutoencoderCodec):
         return cls.from_weights(folder / "autoencoder.safetensors", stored["dtype"])
 
     @classmethod
-    def check(cls, settings: CodecSettings) -> None:
-        found = settings.spatial_factor, settings.channels
-        if settings.weights is None and found != PACKAGED_SHAPE:
-            raise ConfigError(
-                f"codec.spatial_factor is {found[0]} and codec.channels {found[1]}; the packaged conv_autoencoder has"
-                f" {PACKAGED_SHAPE[0]} and {PACKAGED_SHAPE[1]}: write those, or name others by codec.weights."
-            )
+    def latent_size(cls, settings: CodecSettings) -> LatentSize:
+        size = read_size(settings.weights or PACKAGED_WEIGHTS)
+        return LatentSize(size.spatial_factor, size.channels)
 
     @classmethod
-    def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> "ConvAutoencoderCodec":
-        """Read the weights of a config, or those of the package.
-
-        Raises:
-            ConfigError: they are missing or broken, or have another factor or number of channels.
-        """
-        weights = settings.weights or PACKAGED_WEIGHTS
-        if settings.weights is None and not weights.exists():
-            raise ConfigError(
-                "this copy of the package has no weights for the codec conv_autoencoder; train one by `python -m"
-                " xew.model.train_codec configs/codec.yaml` and name its folder by codec.weights."
-            )
-        codec = cls.from_weights(weights, settings.dtype)
-        if (codec.spatial_factor, codec.channels) != (settings.spatial_factor, settings.channels):
-            raise ConfigError(
-                f"codec.spatial_factor is {settings.spatial_factor} and codec.channels {settings.channels};"
-                f" {find_weights(weights)} has {codec.spatial_factor} and {codec.channels}: write those."
-            )
-        return codec
+    def open(cls, settings: CodecSettings) -> "ConvAutoencoderCodec":
+        return cls.from_weights(settings.weights or PACKAGED_WEIGHTS, settings.dtype)
 
     @classmethod
     def from_weights(cls, weights: Path, dtype: str = "float32") -> "ConvAutoencoderCodec":

@@ -8,11 +8,9 @@ from typing import Any
 
 from xew.config import ConfigError, pick
 from xew.model.codecs.autoencoders import ConvAutoencoderCodec, WanVaeCodec
-from xew.model.codecs.contract import Codec, CodecSettings
-from xew.model.codecs.patches import PatchCodec
+from xew.model.codecs.contract import Codec, CodecSettings, LatentSize
 
 CODECS: dict[str, type[Codec]] = {
-    "patch_pca": PatchCodec,
     "conv_autoencoder": ConvAutoencoderCodec,
     "wan_vae": WanVaeCodec,
 }
@@ -26,6 +24,11 @@ RUN_REMEDY = "copy the whole run again, or train again"
 def codec_class(settings: CodecSettings) -> type[Any]:
     """The class of codec that a config names, with what `Codec` asks. Raises ConfigError if there is none of that name."""
     return pick(CODECS, settings.name, "codec")
+
+
+def latent_size(settings: CodecSettings) -> LatentSize:
+    """Spatial factor and channels of a config's latents. Raises ConfigError if its codec cannot be used."""
+    return codec_class(settings).latent_size(settings)
 
 
 def load_kept_codec(kind: type[Any], folder: Path, remedy: str) -> Codec:

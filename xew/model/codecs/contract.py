@@ -10,7 +10,7 @@ A codec is a JAX pytree of its arrays, so that it is passed to compiled function
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -30,36 +30,33 @@ LatentBatch = Float[Array, "b k y x c"]
 class CodecSettings:
     """The `codec` section of a config."""
 
-    name: str = "patch_pca"
+    name: str = "conv_autoencoder"
     """One of CODECS."""
-    spatial_factor: int = 8
-    """Number of pixels a side of a latent."""
-    channels: int = 48
-    """Number of channels of the latents."""
-    fit_clips: int = 64
-    """Number of clips of training episodes from which patch_pca computes its components."""
+    weights: Path | None = None
+    """Weights of conv_autoencoder; the package's own if left out. Of wan_vae: Wan2.2_VAE.pth, or the vae folder of the
+    diffusers layout."""
     vae: str = "wan22"
     """Size of wan_vae, one of VAES."""
-    weights: Path | None = None
-    """Weights of wan_vae: Wan2.2_VAE.pth, the vae folder of the diffusers layout, or what `train_codec` wrote. Of
-    conv_autoencoder: what `train_codec` wrote; those of the package where left out."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the activations of wan_vae and conv_autoencoder."""
     chunk: int = 8
     """Number of latent frames that go through wan_vae at once; more is faster and takes more memory, 0 takes all."""
 
 
+class LatentSize(NamedTuple):
+    """What a network needs to know of its latents."""
+
+    spatial_factor: int
+    """Number of pixels a side of a latent."""
+    channels: int
+
+
 @runtime_checkable
 class Codec(Protocol):
-    """What the rest of the room asks of a codec."""
+    """What the rest of the package asks of a codec."""
 
-    fitted: ClassVar[bool]
-    """Whether it is fitted to the training episodes, and not read from weights."""
-    relative: ClassVar[bool]
-    """Whether later latents are coded relative to the first frame, so that another first frame changes them."""
-
-    alone: ClassVar[bool]
-    """Whether the first frame and each group of four behind it are coded alone, so that a video may be coded in pieces."""
+    groups_independent: ClassVar[bool]
+    """Whether the first frame and each later group of four are coded independently, so a video may be coded in pieces."""
 
     @property
     def spatial_factor(self) -> int:
@@ -91,17 +88,6 @@ class Codec(Protocol):
         It is rounded as if it had been a picture in between, so it is what a rollout begins its next chunk with.
         """
 
-    def replace_reference(self, latents: LatentBatch, reference: Float[Array, "b 1 y x c"]) -> LatentBatch:
-        """Latents of the same later frames behind another first frame; may be traced.
-
-        Args:
-            latents: [b t' h' w' c] of a clip.
-            reference: [b 1 h' w' c], the latent of another first frame.
-
-        Returns:
-            [b t' h' w' c], which begin with the reference and decode to the clip's later frames.
-        """
-
     def save(self, folder: Path) -> None:
         """Write all that `load` needs into a folder, under names of its own."""
 
@@ -110,19 +96,22 @@ class Codec(Protocol):
         """The codec that was saved in a folder."""
 
     @classmethod
-    def check(cls, settings: CodecSettings) -> None:
-        """Raise ConfigError where settings contradict one another; reads no weights."""
+    def latent_size(cls, settings: CodecSettings) -> LatentSize:
+        """Spatial factor and channels of a config's codec; at most the header of its weights is read.
+
+        Raises:
+            ConfigError: the settings or the weights cannot be used.
+        """
 
     @classmethod
-    def prepare(cls, settings: CodecSettings, clips: Callable[[], list[np.ndarray]]) -> "Codec":
-        """The codec of a config; `clips` gives uint8 [t h w 3] of training episodes to one that is fitted to them."""
+    def open(cls, settings: CodecSettings) -> "Codec":
+        """The codec of a config. Raises ConfigError if its weights are missing, broken or of another kind."""
 
 
 class BatchCodec:
     """A codec's functions on pictures and on single clips, from its `encode_batch` and `decode_batch`."""
 
-    relative: ClassVar[bool] = False
-    alone: ClassVar[bool] = False
+    groups_independent: ClassVar[bool] = False
     spatial_factor: int
     encode_batch: Callable[[Array], Array]
     decode_batch: Callable[[Array], Array]
@@ -139,10 +128,6 @@ class BatchCodec:
     def next_reference(self, latents: LatentBatch) -> Float[Array, "b 1 y x c"]:
         """The last decoded frame as a picture, encoded alone: [b t' h' w' c] -> [b 1 h' w' c]."""
         return self.encode_batch(to_signed(to_pictures(self.decode_batch(latents)[:, -1:])))
-
-    def replace_reference(self, latents: LatentBatch, reference: Float[Array, "b 1 y x c"]) -> LatentBatch:
-        """Put another first latent [b 1 h' w' c] before those that follow, which do not depend on it: [b t' h' w' c]."""
-        return jnp.concatenate([reference, latents[:, 1:]], axis=1)
 
 
 @jax.jit

@@ -11,6 +11,7 @@ squares of pixels into the channels and mixing these (Shi et al., arXiv 1609.051
 Shape letters: b batch, n groups, t h w video, i o channels in and out.
 """
 
+import functools
 import itertools
 import json
 from dataclasses import asdict, dataclass
@@ -29,7 +30,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from xew.config import ConfigError, parse
-from xew.files import replacing
+from xew.files import demand_regular, replacing
 from xew.model.codecs.vae import LatentStatistic
 from xew.model.codecs.vae_layers import Conv, Layers, RmsNorm, as_row, patchify, unpatchify
 from xew.model.video.frames import TEMPORAL_FACTOR
@@ -88,7 +89,7 @@ class ConvAutoencoder(nnx.Module):
 
     def __init__(self, size: AutoencoderSize, *, dtype: DTypeLike = jnp.float32, rngs: nnx.Rngs) -> None:
         self.size, self.dtype = size, dtype
-        layers = Layers(jnp.dtype(dtype), "frames", rngs)
+        layers = Layers(jnp.dtype(dtype), rngs)
         self.encoder, self.decoder = Encoder(size, layers), Decoder(size, layers)
         self.latents_mean = LatentStatistic(jnp.zeros(size.channels))
         self.latents_std = LatentStatistic(jnp.ones(size.channels))
@@ -256,18 +257,29 @@ def load_autoencoder(path: Path, dtype: DTypeLike = jnp.float32) -> ConvAutoenco
     Raises:
         ConfigError: there is no such file, it is broken, or it is of another kind.
     """
-    file = find_weights(path)
-    tensors = read_tensors(file)
-    with safe_open(file, framework="numpy") as stored:
-        size = (stored.metadata() or {}).get(SIZE)
-    if size is None:
-        raise ConfigError(
-            f"{file} does not say the size of its autoencoder, so it is none of ours; expected what"
-            " `python -m xew.model.train_codec CONFIG` wrote."
-        )
-    autoencoder = abstract_autoencoder(parse(AutoencoderSize, json.loads(size), str(file)), dtype)
-    fill(autoencoder, tensors, {name: Source((name,)) for name, _ in list_leaves(autoencoder)})
+    autoencoder = abstract_autoencoder(read_size(path), dtype)
+    fill(autoencoder, read_tensors(find_weights(path)), {name: Source((name,)) for name, _ in list_leaves(autoencoder)})
     return autoencoder
+
+
+def read_size(path: Path) -> AutoencoderSize:
+    """The size of an autoencoder, from the header of its weights. Raises ConfigError as `load_autoencoder`."""
+    file = find_weights(path)
+    if not file.is_file():
+        raise ConfigError(f"there are no weights at {file}; name a file or a folder that exists by codec.weights.")
+    return _read_size(file, file.stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=8)
+def _read_size(file: Path, _: int) -> AutoencoderSize:
+    try:
+        with safe_open(demand_regular(file), framework="numpy") as stored:
+            metadata = stored.metadata() or {}
+    except SafetensorError as error:
+        raise ConfigError(f"{file} is no whole safetensors file ({error}); copy it again.") from error
+    if SIZE not in metadata:
+        raise ConfigError(f"{file} does not say the size of its autoencoder; expected weights that xew wrote.")
+    return parse(AutoencoderSize, json.loads(metadata[SIZE]), str(file))
 
 
 def find_weights(path: Path) -> Path:

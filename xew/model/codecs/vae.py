@@ -29,7 +29,6 @@ from xew.model.codecs.vae_layers import (
     Layers,
     ResidualBlock,
     RmsNorm,
-    TimeTaps,
     Upsample,
     as_row,
     average_groups,
@@ -99,7 +98,6 @@ def check_size(size: VaeSize, source: str) -> None:
 
 VAES = {
     "tiny": VaeSize(48, encoder_dim=16, decoder_dim=16, multipliers=(1, 2, 2), halve_time=(True, True), blocks=1),
-    "small": VaeSize(48, encoder_dim=48, decoder_dim=64, multipliers=(1, 2, 4, 4), halve_time=(False, True, True), blocks=1),
     "wan22": VaeSize(48, encoder_dim=160, decoder_dim=256, multipliers=(1, 2, 4, 4), halve_time=(False, True, True)),
 }
 
@@ -114,12 +112,11 @@ class VideoVae(nnx.Module):
     Args:
         size: one of `VAES`.
         dtype: of activations and products; parameters stay float32, norms are computed in it.
-        taps: how three frames are convolved.
     """
 
-    def __init__(self, size: VaeSize, *, dtype: DTypeLike = jnp.float32, taps: TimeTaps = "frames", rngs: nnx.Rngs) -> None:
+    def __init__(self, size: VaeSize, *, dtype: DTypeLike = jnp.float32, rngs: nnx.Rngs) -> None:
         self.size, self.dtype = size, dtype
-        layers = Layers(jnp.dtype(dtype), taps, rngs)
+        layers = Layers(jnp.dtype(dtype), rngs)
         self.encoder = Encoder(size, layers)
         self.quant = layers.pointwise(2 * size.channels, 2 * size.channels)
         self.post_quant = layers.pointwise(size.channels, size.channels)
@@ -162,21 +159,14 @@ class VideoVae(nnx.Module):
         Returns:
             [b t h w 3] float32 in [-1, 1], t = 4 (t' - 1) + 1, or 1.
         """
-        return jnp.clip(self.decode_moments(self.denormalize(latents), chunk, last_only=last_only), -1, 1)
-
-    def decode_moments(self, latents: Latents, chunk: int = 0, *, last_only: bool = False) -> Video:
-        """Frames [b t h w 3] float32, not clipped, of latents [b t' h' w' c] as `moments` gives them: what training takes.
-
-        Other arguments are those of `decode`.
-        """
 
         def step(part: Array, history: History) -> Array:
             frames = unpatchify(self.decoder(part, history), self.size.patch)
             return frames[:, -1:] if last_only else frames
 
         chunk = even_chunk(latents.shape[1] - 1, chunk)
-        decoded = apply_in_chunks(step, self.post_quant(latents.astype(self.dtype)), chunk)
-        return (decoded[:, -1:] if last_only else decoded).astype(jnp.float32)
+        decoded = apply_in_chunks(step, self.post_quant(self.denormalize(latents).astype(self.dtype)), chunk)
+        return jnp.clip((decoded[:, -1:] if last_only else decoded).astype(jnp.float32), -1, 1)
 
     def normalize(self, mean: Latents) -> Latents:
         """Latents [b t' h' w' c] of about unit size, from those that `moments` gives."""
@@ -192,9 +182,9 @@ class VideoVae(nnx.Module):
             raise ValueError(f"frames are {shape}; expected [b t h w 3] with t = 4 k + 1 and sides in {factor}s")
 
 
-def abstract_vae(size: VaeSize, dtype: DTypeLike = jnp.float32, taps: TimeTaps = "frames") -> VideoVae:
+def abstract_vae(size: VaeSize, dtype: DTypeLike = jnp.float32) -> VideoVae:
     """An autoencoder of which only the statistics have values yet; weights are loaded into it."""
-    vae = nnx.eval_shape(lambda: VideoVae(size, dtype=dtype, taps=taps, rngs=nnx.Rngs(0)))
+    vae = nnx.eval_shape(lambda: VideoVae(size, dtype=dtype, rngs=nnx.Rngs(0)))
     mean, std = initial_statistics(size)
     vae.latents_mean.set_value(mean)
     vae.latents_std.set_value(std)

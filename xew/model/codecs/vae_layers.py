@@ -8,7 +8,6 @@ Shape letters: b batch, t h w c video, i o channels in and out, n frames of all 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +20,6 @@ from xew.model.codecs.vae_chunks import WINDOW, History
 
 SMALLEST_NORM = 1e-12
 """Root of the sum of squares below which a norm does not scale up."""
-TimeTaps = Literal["frames", "volume"]
-"""Way in which three frames are convolved.
-
-frames  side by side in the channels, by a 2-D convolution: the same products. XLA hands 2-D convolutions to cuDNN channels
-        last, as tensor cores want them, and transposes around 3-D ones; on a CPU this is five times as fast as
-volume  a 3-D convolution, which needs less memory.
-"""
 
 
 @dataclass(frozen=True)
@@ -35,7 +27,6 @@ class Layers:
     """Maker of layers that compute in one type."""
 
     dtype: jnp.dtype
-    taps: TimeTaps
     rngs: nnx.Rngs
 
     def causal(self, i: int, o: int) -> "Conv":
@@ -148,7 +139,7 @@ class Conv(nnx.Module):
     """A convolution [*kernel i o] with bias, channels last: causal over three frames, pointwise, or of single frames."""
 
     def __init__(self, shape: tuple[int, ...], layers: Layers, *, zero: bool = False) -> None:
-        self.dtype, self.taps = layers.dtype, layers.taps
+        self.dtype = layers.dtype
         init = nnx.initializers.zeros if zero else nnx.initializers.lecun_normal()
         self.kernel = nnx.Param(init(layers.rngs.params(), shape, jnp.float32))
         self.bias = nnx.Param(jnp.zeros(shape[-1]))
@@ -159,7 +150,7 @@ class Conv(nnx.Module):
             kernel = self.kernel[...].reshape(self.kernel.shape[-2:])
             return self.add_bias(x.astype(self.dtype) @ kernel.astype(self.dtype))
         extended, kernel = history.extend(x.astype(self.dtype)), self.kernel[...].astype(self.dtype)
-        return self.add_bias((_as_volume if self.taps == "volume" else _as_frames)(extended, kernel))
+        return self.add_bias(_convolve_frames(extended, kernel))
 
     def apply(
         self, frames: Float[Array, "n h w i"], stride: int, padding: Sequence[tuple[int, int]]
@@ -177,13 +168,12 @@ class Conv(nnx.Module):
         return x + as_row(self.bias[...], x.ndim).astype(x.dtype)
 
 
-def _as_volume(x: Array, kernel: Array) -> Array:
-    """[b t+2 h w i] -> [b t h w o] by one 3-D convolution."""
-    return _conv(x, kernel, (1, 1, 1), ((0, 0), (1, 1), (1, 1)))
+def _convolve_frames(x: Array, kernel: Array) -> Array:
+    """[b t+2 h w i] -> [b t h w o] by a 2-D convolution of frames that have their two predecessors in their channels.
 
-
-def _as_frames(x: Array, kernel: Array) -> Array:
-    """[b t+2 h w i] -> [b t h w o] by a 2-D convolution of frames that have their two predecessors in their channels."""
+    XLA hands 2-D convolutions to cuDNN channels last, as tensor cores want them, and transposes around 3-D ones. On a CPU this
+    is five times as fast as a 3-D convolution.
+    """
     i, o = kernel.shape[-2:]
     flat = jnp.moveaxis(kernel, 0, 2).reshape(3, 3, WINDOW * i, o)
     return apply_to_frames(concatenate_windows(x), lambda frames: _conv(frames, flat, (1, 1), ((1, 1), (1, 1))))

@@ -4,7 +4,6 @@ x_sigma = (1 - sigma) x_0 + sigma n; the network predicts the velocity n - x_0. 
 clean in training but for a small perturbation, put back after every sampling step, and never in the loss.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -22,8 +21,6 @@ GUESS_SPREAD = 0.7
 episodes it is .67 round the pasted render and 1.0 round the first frame."""
 SMALLEST_LEVEL = 0.05
 """Noise level under which a prediction of clean latents is divided by no less."""
-ReplaceReference = Callable[[Array, Array], Array]
-"""Function (latents [b t h w c], another reference [b 1 h w c]) -> latents [b t h w c] of the same later frames behind it."""
 
 
 class TrainingPair(NamedTuple):
@@ -38,22 +35,19 @@ class TrainingPair(NamedTuple):
 
 
 def put_first(latents: Float[Array, "b t h w c"], reference: Float[Array, "b 1 h w c"]) -> Float[Array, "b t h w c"]:
-    """Latents [b t h w c] whose first frame is the given one [b 1 h w c], of a codec whose later latents stand alone."""
+    """Latents [b t h w c] whose first frame is replaced by the given one [b 1 h w c]."""
     return jnp.concatenate([reference, latents[:, 1:]], axis=1)
 
 
-def training_pair(
-    key: Key[Array, ""], latents: Float[Array, "b t h w c"], shift: float, replace_reference: ReplaceReference = put_first
-) -> TrainingPair:
+def training_pair(key: Key[Array, ""], latents: Float[Array, "b t h w c"], shift: float) -> TrainingPair:
     """Noisy latents and their velocity, at a level drawn for each sample.
 
-    What is to be predicted is the same video behind the reference that is shown, which is perturbed.
+    The reference, latent frame 0, is perturbed.
 
     Args:
         key: of the random numbers.
         latents: [b t h w c] float32, clean.
         shift: moves the `TRAIN_LEVELS` levels, which are drawn uniformly, toward noise.
-        replace_reference: the codec's `replace_reference`, where its later latents depend on the first.
     """
     key_level, key_noise, key_strength, key_reference = jax.random.split(key, 4)
     batch = latents.shape[0]
@@ -62,7 +56,7 @@ def training_pair(
     noise = jax.random.normal(key_noise, latents.shape, jnp.float32)
     strength = jax.random.uniform(key_strength, (batch, 1, 1, 1, 1), maxval=REFERENCE_NOISE)
     reference = latents[:, :1] + strength * jax.random.normal(key_reference, latents[:, :1].shape, jnp.float32)
-    level, latents = sigma[:, None, None, None, None], replace_reference(latents, reference)
+    level, latents = sigma[:, None, None, None, None], put_first(latents, reference)
     noisy = (1 - level) * latents + level * noise
     return TrainingPair(jnp.concatenate([reference, noisy[:, 1:]], axis=1), noise - latents, sigma)
 

@@ -5,10 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from xew.dataset import read_dataset
 from xew.model.cache.codecs import load_codec
 from xew.model.codecs.contract import Codec
-from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.folder import load_run
 from xew.model.video.frames import to_camera_size, to_model_size
@@ -39,13 +37,13 @@ class RunRoundtrip:
         """Video [t h w 3] uint8 to what the codec leaves of it, [t h w 3] uint8.
 
         Videos of all lengths share compiled programs. They are filled up to a multiple of LENGTH_BLOCK frames behind the first,
-        which changes no frame before; a codec of groups that stand alone takes so many at a time.
+        which changes no frame before; a codec of independent groups takes so many at a time.
         """
         clip = self.experiment.clip
         filled = np.concatenate([video, np.repeat(video[-1:], -(len(video) - 1) % LENGTH_BLOCK, axis=0)])
         small = to_model_size(filled, clip.height, clip.width)
         first, later = small[:1], small[1:]
-        ends = range(LENGTH_BLOCK, len(later), LENGTH_BLOCK) if self.codec.alone else ()
+        ends = range(LENGTH_BLOCK, len(later), LENGTH_BLOCK) if self.codec.groups_independent else ()
         pieces = [np.concatenate([first, piece]) for piece in np.split(later, ends)]
         coded = [self.codec.decode(self.codec.encode(piece)) for piece in pieces]
         return to_camera_size(np.concatenate([coded[0][:1], *(piece[1:] for piece in coded)])[: len(video)])
@@ -55,7 +53,7 @@ def open_roundtrip(run: Path) -> RunRoundtrip:
     """The codec of a run as a function of video to video.
 
     Args:
-        run: folder of the run; or the config of one that has not been trained, whose latents have been made.
+        run: folder of the run; or the config of one that has not been trained.
 
     Raises:
         ConfigError: there is no such run, or it has lost its codec; of a config, see `load_codec`.
@@ -63,11 +61,4 @@ def open_roundtrip(run: Path) -> RunRoundtrip:
     if run.suffix != ".yaml":
         return RunRoundtrip(*load_run(run))
     experiment = load_experiment(run)
-    return RunRoundtrip(experiment, load_untrained_codec(experiment))
-
-
-def load_untrained_codec(experiment: Experiment) -> Codec:
-    """The codec of an experiment that has not been trained. Raises ConfigError as `load_codec`."""
-    encoding, choice = experiment.encoding, experiment.choice
-    episodes = training_episodes(read_dataset(experiment.data), choice) if encoding.kind.fitted else ()
-    return load_codec(encoding, episodes)
+    return RunRoundtrip(experiment, load_codec(experiment.encoding))

@@ -5,7 +5,7 @@ from operator import attrgetter
 from typing import Any, Protocol
 
 from xew.config import ConfigError, pick
-from xew.model.codecs.codec import codec_class
+from xew.model.codecs.codec import latent_size
 from xew.model.codecs.contract import CodecSettings
 from xew.model.conditions import Condition
 from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES
@@ -92,7 +92,6 @@ def check_experiment(experiment: Settings, source: str) -> None:
 
 def _check_choices(experiment: Settings, source: str) -> None:
     check_least(LEAST, experiment, source)
-    codec_class(experiment.codec).check(experiment.codec)
     pick(SAMPLERS, experiment.rollout.sampler, "sampler")
     pick(SCHEDULES, experiment.rollout.grid, "noise schedule")
     _ = experiment.size, experiment.robots
@@ -138,7 +137,7 @@ def _check_conditions(conditions: Sequence[Condition], source: str) -> None:
 
 
 def _check_sizes(experiment: Settings, source: str) -> None:
-    clip, factor = experiment.clip, experiment.codec.spatial_factor * experiment.size.patch[1]
+    clip, factor = experiment.clip, latent_size(experiment.codec).spatial_factor * experiment.size.patch[1]
     if clip.frames < 5 or clip.frames % TEMPORAL_FACTOR != 1:
         near = max(5, clip.frames // TEMPORAL_FACTOR * TEMPORAL_FACTOR + 1)
         raise ConfigError(f"{source}: clip.frames is {clip.frames}; it must be 4 k + 1 and at least 5, for example {near}.")

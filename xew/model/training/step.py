@@ -25,7 +25,6 @@ from jax.sharding import Mesh
 from xew.model.codecs.contract import Codec
 from xew.model.devices.sharding import gather_parameters, place_shapes
 from xew.model.diffusion.flow_matching import (
-    ReplaceReference,
     TrainingPair,
     moving_weights,
     put_first,
@@ -102,8 +101,7 @@ class Learner:
         A resumed run therefore repeats it.
 
         Args:
-            codec: needed where `train.chunks` is 2, to decode and encode the first chunk's prediction, and where its later
-                latents are relative to the first frame, to say what is to be predicted behind the one that is shown.
+            codec: needed where `train.chunks` is 2, to decode and encode the first chunk's prediction.
         """
         settings, graph, optimizer = self.learning.settings, self.graph, self.learning.optimizer
         places = list_shardings(self.network_shapes)
@@ -127,8 +125,7 @@ class Learner:
 
         everywhere = self.shapes.step.sharding
         jitted = jax.jit(step, donate_argnums=0, out_shardings=(list_shardings(self.shapes), everywhere))
-        needed = codec is not None and (settings.chunks == 2 or codec.relative)
-        copies = jax.device_put(jax.tree.map(np.asarray, codec), everywhere) if needed else None
+        copies = jax.device_put(jax.tree.map(np.asarray, codec), everywhere) if settings.chunks == 2 else None
         return TrainStep(jitted, self.mesh, copies)
 
 
@@ -230,10 +227,9 @@ class Objective:
     def _part_gradients(self, params: Any, samples: Samples, codec: Codec | None, size: int) -> tuple[Any, Array, Array]:
         """Gradients, losses and noise levels of one part; `size` is the number of samples of the whole batch."""
         gradients, losses, sigmas, chunk = None, [], [], samples.batch
-        replace_reference = put_first if codec is None else codec.replace_reference
         for number in range(samples.weights.shape[1]):
             keys = jax.vmap(jax.random.fold_in, (0, None))(samples.keys, number)
-            pair = sample_pairs(keys, chunk.latents, self.shift, replace_reference)
+            pair = sample_pairs(keys, chunk.latents, self.shift)
             chunk = add_history_noise(keys, chunk, self.history_noise)
             own, loss, predicted = self._chunk_gradients(params, chunk, pair, samples.weights[:, number] / size)
             gradients = own if gradients is None else self.place(_sum(gradients, own))
@@ -241,8 +237,9 @@ class Objective:
             sigmas.append(pair.sigma)
             if chunk.following is not None:
                 assert codec is not None, "two chunks need the codec"
-                clean = estimate_clean(chunk.latents, pair, predicted, replace_reference)
-                chunk = behind_reference(chunk.following, codec.next_reference(clean), replace_reference)
+                clean = estimate_clean(chunk.latents, pair, predicted)
+                latents = put_first(chunk.following.latents, codec.next_reference(clean))
+                chunk = replace(chunk.following, latents=latents)
         return gradients, jnp.stack(losses, axis=1), jnp.stack(sigmas, axis=1)
 
     def _chunk_gradients(self, params: Any, chunk: Batch, pair: TrainingPair, shares: Array) -> tuple[Any, Array, Array]:
@@ -259,9 +256,9 @@ class Objective:
         return self.place(gradients), losses, predicted
 
 
-def sample_pairs(keys: Array, latents: Array, shift: float, replace_reference: ReplaceReference = put_first) -> TrainingPair:
+def sample_pairs(keys: Array, latents: Array, shift: float) -> TrainingPair:
     """Make the `training_pair` of each sample of latents [b t h w c], with its own key [b]."""
-    pairs = jax.vmap(lambda key, sample: training_pair(key, sample[None], shift, replace_reference))(keys, latents)
+    pairs = jax.vmap(lambda key, sample: training_pair(key, sample[None], shift))(keys, latents)
     return jax.tree.map(lambda leaf: leaf[:, 0], pairs)
 
 
@@ -275,20 +272,13 @@ def add_history_noise(keys: Array, chunk: Batch, strength: float) -> Batch:
     return replace(chunk, conditions={**chunk.conditions, "history": history + strength * noise})
 
 
-def estimate_clean(
-    latents: Array, pair: TrainingPair, predicted: Array, replace_reference: ReplaceReference = put_first
-) -> Array:
+def estimate_clean(latents: Array, pair: TrainingPair, predicted: Array) -> Array:
     """Estimate the clean latents [b t h w c] in one step from a predicted velocity [b t h w c].
 
-    The prediction is of the video behind the perturbed reference; frame 0 of the estimate is the given one [b t h w c].
+    Frame 0 of the estimate is the given one [b t h w c].
     """
     clean = pair.noisy - pair.sigma[:, None, None, None, None] * predicted
-    return replace_reference(put_first(clean, pair.noisy[:, :1]), latents[:, :1])
-
-
-def behind_reference(chunk: Batch, reference: Array, replace_reference: ReplaceReference) -> Batch:
-    """The same chunk behind another first latent frame [b 1 h w c]."""
-    return replace(chunk, latents=replace_reference(chunk.latents, reference))
+    return put_first(clean, latents[:, :1])
 
 
 def chunk_weights(batch: Batch) -> Array:

@@ -16,10 +16,10 @@ from flax import nnx
 from jax import Array, lax
 from jaxtyping import Float, Key, UInt8
 
-from xew.model.codec_training.kinds import Kind
-from xew.model.codec_training.sampling import Batch
-from xew.model.codec_training.settings import CodecExperiment, CodecTrainSettings
+from lab.codec.sampling import Batch
+from lab.codec.settings import CodecExperiment, CodecTrainSettings
 from xew.model.codecs.contract import to_signed
+from xew.model.codecs.conv_autoencoder import ConvAutoencoder
 from xew.model.codecs.vae import LatentStatistic
 from xew.model.runs.checkpoint import TrainState
 
@@ -56,14 +56,8 @@ def augment(
 
 
 def _augment_one(settings: CodecTrainSettings, key: Array, clip: Array, region: Array) -> tuple[Array, Array]:
-    crop_key, still_key, permute_key, flip_key, jitter_key = jax.random.split(key, 5)
+    still_key, permute_key, flip_key, jitter_key = jax.random.split(key, 4)
     both = jnp.concatenate([clip, region], axis=-1)
-    if settings.crop:
-        sides = [min(settings.crop, side) for side in both.shape[1:3]]
-        keys, room = jax.random.split(crop_key), [side - part + 1 for side, part in zip(both.shape[1:3], sides, strict=True)]
-        top, left = (jax.random.randint(key, (), 0, places) for key, places in zip(keys, room, strict=True))
-        zero = jnp.int32(0)
-        both = lax.dynamic_slice(both, (zero, top, left, zero), (both.shape[0], *sides, 4))
     if settings.still:
         one, two = jax.random.split(still_key)
         frame = lax.dynamic_index_in_dim(both, jax.random.randint(two, (), 0, len(both)), 0, keepdims=True)
@@ -84,14 +78,21 @@ def _augment_one(settings: CodecTrainSettings, key: Array, clip: Array, region: 
     return clip, region
 
 
+def reconstruct_groups(module: ConvAutoencoder, groups: Clips, key: Key[Array, ""], noise: float) -> tuple[Clips, Array]:
+    """Groups [b 4 h w 3] after noise on their latents, not clipped, and the latents' mean square."""
+    latents = module.encode_groups(groups)
+    noisy = latents + noise * jax.random.normal(key, latents.shape, latents.dtype)
+    return module.decode_groups(noisy), jnp.square(latents).mean()
+
+
 def codec_losses(
-    kind: Kind, module: Any, clips: Clips, weights: Float[Array, "b t h w 1"], key: Key[Array, ""], settings: CodecTrainSettings
+    module: ConvAutoencoder, clips: Clips, weights: Float[Array, "b t h w 1"], key: Key[Array, ""], settings: CodecTrainSettings
 ) -> Losses:
     """The loss of clips [b t h w 3] in [-1, 1], whose pixels have these weights [b t h w 1] in l1 and mse."""
-    from xew.metrics import lpips  # only here: the model room does without metrics
+    from xew.metrics import lpips  # imported here: metrics are needed for the loss alone
 
     latent_key, frame_key = jax.random.split(key)
-    decoded, penalty = kind.reconstruct(module, clips, latent_key, settings.noise)
+    decoded, penalty = reconstruct_groups(module, clips, latent_key, settings.noise)
     difference = decoded - clips
     norm = 3 * weights.sum()
     l1, mse = (weights * jnp.abs(difference)).sum() / norm, (weights * jnp.square(difference)).sum() / norm
@@ -126,7 +127,7 @@ def make_codec_step(
     graph: nnx.GraphDef, statistics: Any, experiment: CodecExperiment
 ) -> Callable[[TrainState, Batch], tuple[TrainState, Losses]]:
     """The compiled step; its noise depends on the seed and the step alone, so that a resumed run repeats it."""
-    settings, kind, optimizer = experiment.train, experiment.autoencoder, make_codec_optimizer(experiment.train)
+    settings, optimizer = experiment.train, make_codec_optimizer(experiment.train)
 
     @functools.partial(jax.jit, donate_argnums=0)
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, Losses]:
@@ -141,7 +142,7 @@ def make_codec_step(
         weights = 1 + settings.region * regions
 
         def loss(params: Any) -> tuple[jax.Array, Losses]:
-            losses = codec_losses(kind, nnx.merge(graph, params, statistics), clips, weights, loss_key, settings)
+            losses = codec_losses(nnx.merge(graph, params, statistics), clips, weights, loss_key, settings)
             return losses.total, losses
 
         (_, losses), gradients = jax.value_and_grad(loss, has_aux=True)(state.params)
@@ -162,7 +163,7 @@ def init_codec_state(experiment: CodecExperiment) -> tuple[nnx.GraphDef, Any, Tr
     key = jax.random.key(experiment.train.seed, impl="unsafe_rbg")  # the other kinds take a minute to compile
 
     def create() -> nnx.Module:
-        return experiment.autoencoder.create(experiment.dtype, nnx.Rngs(key))
+        return ConvAutoencoder(experiment.autoencoder, dtype=jnp.dtype(experiment.dtype), rngs=nnx.Rngs(key))
 
     graph: nnx.GraphDef = nnx.split(nnx.eval_shape(create))[0]
     optimizer = make_codec_optimizer(experiment.train)

@@ -1,6 +1,6 @@
 """The shipped codec beside Wan2.2's autoencoder: encoding and decoding the same clips of 320x256, in one run on one device.
 
-    python benchmarks/codec.py [--frames 33] [--clips 4] [--rounds 5] [--dtype bfloat16] [--wan wan22]
+    python -m lab.codec.speed [--frames 33] [--clips 4] [--rounds 5] [--dtype bfloat16] [--wan wan22]
 
 Weights are random on both sides: time does not depend on them. Exits with 1 where a ratio is under the limit (3).
 """

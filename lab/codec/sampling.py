@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lab.codec.pictures import Pictures
+from lab.codec.settings import CodecTrainSettings
 from xew.concurrency import map_in_order
-from xew.model.codec_training.pictures import Pictures
-from xew.model.codec_training.settings import CodecTrainSettings
 
 THREADS = 4
 """Number of threads that pick clips in the host's memory."""

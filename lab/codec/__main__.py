@@ -1,11 +1,11 @@
-"""Training an autoencoder on the project's own frames: episodes to a file of weights that a codec reads.
+"""Train the codec, an autoencoder, on the project's own frames: episodes to a file of weights that a codec reads.
 
 Reads  episodes of training seeds; test seeds only where `report.test_seeds` asks for them
-Writes <out>/autoencoder.safetensors and autoencoder.json (of wan_vae: vae.*), which `codec.weights: <out>` reads;
+Writes <out>/autoencoder.safetensors and autoencoder.json, which `codec.weights: <out>` reads;
        report.md and pictures of what the codec leaves, config, checkpoints, metrics
 
 The loss is L1 + MSE + LPIPS + a small penalty on latents, without an adversary: frames are rendered, and sharp edges are few.
-Command: python -m xew.model.train_codec CONFIG [--resume | --overwrite] [--train.seconds … and other overrides]
+Command: python -m lab.codec CONFIG [--resume | --overwrite] [--train.seconds … and other overrides]
 """
 
 import functools
@@ -21,23 +21,24 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from lab.codec.pictures import Pictures, gather_pictures, read_frames
+from lab.codec.report import measure_codec, report_rows, report_scalars, write_report
+from lab.codec.sampling import Batches, place_pictures
+from lab.codec.settings import (
+    CodecExperiment,
+    check_codec_experiment,
+    load_codec_experiment,
+)
+from lab.codec.step import init_codec_state, make_codec_step, summarize
 from xew.command_line import parse_command
 from xew.compilation import keep_compiled_programs
 from xew.config import load, user_errors
 from xew.dataset import Dataset, Episode, read_dataset
 from xew.files import file_digest, hold_lock, write_text
-from xew.model.codec_training.kinds import Kind
-from xew.model.codec_training.pictures import Pictures, gather_pictures, read_frames
-from xew.model.codec_training.report import measure_codec, report_rows, report_scalars, write_report
-from xew.model.codec_training.sampling import Batches, place_pictures
-from xew.model.codec_training.settings import (
-    CodecExperiment,
-    check_codec_experiment,
-    load_codec_experiment,
-)
-from xew.model.codec_training.step import init_codec_state, make_codec_step, summarize
+from xew.model.codecs.autoencoders import ConvAutoencoderCodec
 from xew.model.codecs.ceiling import check_lpips
 from xew.model.codecs.contract import to_pictures, to_signed
+from xew.model.codecs.conv_autoencoder import ConvAutoencoder, save_autoencoder
 from xew.model.episodes.unpaired import unpaired_training_episodes
 from xew.model.runs.begin import check_one_of, claim_run
 from xew.model.runs.checkpoint import TrainState, restore_state
@@ -64,7 +65,7 @@ class Flags:
 
 
 @user_errors
-def main(arguments: Sequence[str] | None = None, prog: str = "python -m xew.model.train_codec") -> None:
+def main(arguments: Sequence[str] | None = None, prog: str = "python -m lab.codec") -> None:
     """Train an autoencoder."""
     read = functools.partial(load, CodecExperiment)
     command = parse_command(Flags, CodecExperiment, read, arguments, prog=prog, description=__doc__.splitlines()[0])
@@ -102,7 +103,7 @@ def train_codec(experiment: CodecExperiment, *, resume: bool = False, overwrite:
 
         def draw_samples(state: TrainState, step: int) -> None:
             module = nnx.merge(graph, state.ema, statistics)
-            log.image(step, "sample", sample_picture(experiment.autoencoder, module, episodes[0], experiment))
+            log.image(step, "sample", sample_picture(module, episodes[0], experiment))
 
         if not batches.is_over(int(state.step)):
             steps = settings.steps or ENDLESS
@@ -134,36 +135,36 @@ def load_pictures(experiment: CodecExperiment, episodes: Sequence[Episode]) -> P
     return placed
 
 
-def sample_picture(kind: Kind, module: Any, episode: Episode, experiment: CodecExperiment) -> np.ndarray:
+def sample_picture(module: ConvAutoencoder, episode: Episode, experiment: CodecExperiment) -> np.ndarray:
     """A strip [2h w 3] uint8 of one training clip of an episode's scene, true above decoded."""
     folder, record = episode
     cut = experiment.cut
     times = np.minimum(np.arange(cut.frames), record.frame_count - 1)
     frames = read_frames(folder / "rgb.mkv", set(times.tolist()))
     clip = to_model_size(np.stack([frames[int(time)] for time in times]), cut.height, cut.width)
-    return strip(clip, np.asarray(reconstruct_clip(kind, module, clip)))
+    return strip(clip, np.asarray(reconstruct_clip(module, clip)))
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def reconstruct_clip(kind: Kind, module: Any, clip: jax.Array) -> jax.Array:
+@jax.jit
+def reconstruct_clip(module: ConvAutoencoder, clip: jax.Array) -> jax.Array:
     """What the autoencoder leaves of one clip [t h w 3] uint8, without noise."""
-    return to_pictures(kind.reconstruct(module, to_signed(clip[None]), jax.random.key(0), 0.0)[0][0])
+    return to_pictures(module.decode_groups(module.encode_groups(to_signed(clip[None])))[0])
 
 
-def finish(experiment: CodecExperiment, module: Any, batches: Batches, dataset: Dataset, step: int, log: RunLog) -> None:
+def finish(
+    experiment: CodecExperiment, module: ConvAutoencoder, batches: Batches, dataset: Dataset, step: int, log: RunLog
+) -> None:
     """Compute the statistics of the latents, write the weights with them, measure what they leave, and write the report."""
-    kind, out = experiment.autoencoder, experiment.out
-    mean, std = latent_statistics(kind, module, batches, experiment.train.statistics_clips)
+    out = experiment.out
+    mean, std = latent_statistics(module, batches, experiment.train.statistics_clips)
     module.latents_mean.set_value(mean)
     module.latents_std.set_value(std)
-    weights = out / f"{kind.file}.safetensors"
-    kind.save(module, weights)
-    codec = kind.open(weights, experiment.dtype)
+    weights = out / "autoencoder.safetensors"
+    save_autoencoder(module, weights)
+    codec = ConvAutoencoderCodec.from_weights(weights, experiment.dtype)
     description = {
-        "kind": experiment.kind,
-        "size": asdict(kind.size),
+        "size": asdict(experiment.autoencoder),
         "dtype": experiment.dtype,
-        **kind.describe(codec),
         "hash": codec.hash,
         "file": file_digest(weights),
         "bytes": weights.stat().st_size,
@@ -178,21 +179,21 @@ def finish(experiment: CodecExperiment, module: Any, batches: Batches, dataset: 
     if qualities:
         log.scalars(step, report_scalars(qualities))
         print(write_report(qualities, experiment))
-    print(f"{weights} ({weights.stat().st_size / 1e6:.2f} MB): use it by {kind.options(out)}")
+    print(f"{weights} ({weights.stat().st_size / 1e6:.2f} MB): use it by --codec.weights {out}")
 
 
 def write_description(experiment: CodecExperiment, description: dict[str, Any]) -> None:
     """Write the file beside the weights."""
-    path = experiment.out / f"{experiment.autoencoder.file}.json"
+    path = experiment.out / "autoencoder.json"
     write_text(path, json.dumps(description, indent=1) + "\n")
 
 
-def latent_statistics(kind: Kind, module: Any, batches: Batches, count: int) -> tuple[jax.Array, jax.Array]:
+def latent_statistics(module: ConvAutoencoder, batches: Batches, count: int) -> tuple[jax.Array, jax.Array]:
     """Mean and standard deviation [c] of the latents of about `count` clips, drawn as in training and shown as they are."""
 
     @jax.jit
-    def moments(module: Any, clips: jax.Array) -> tuple[jax.Array, jax.Array]:
-        latents = kind.latents(module, to_signed(clips))
+    def moments(module: ConvAutoencoder, clips: jax.Array) -> tuple[jax.Array, jax.Array]:
+        latents = module.encode_groups(to_signed(clips))
         return latents.mean(axis=(0, 1, 2)), jnp.square(latents).mean(axis=(0, 1, 2))
 
     rounds = max(1, count // batches.settings.batch)

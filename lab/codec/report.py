@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from tqdm import tqdm
 
+from lab.codec.pictures import ALIGNED, differs_from_corner, draw_descriptions, read_aligned
+from lab.codec.settings import CodecExperiment
 from xew.dataset import Dataset, Episode
 from xew.episode import encode_png
 from xew.files import write_bytes, write_text
-from xew.model.codec_training.pictures import ALIGNED, differs_from_corner, draw_descriptions, read_aligned
-from xew.model.codec_training.settings import CodecExperiment
 from xew.model.codecs.ceiling import LPIPS_EVERY, choose_evenly, reconstruct
 from xew.model.codecs.contract import Codec
 from xew.model.episodes.unpaired import select_unpaired

@@ -5,12 +5,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from lab.codec.pictures import ALIGNED, UNALIGNED, Cut
 from xew.config import ConfigError, load, pick
-from xew.model.codec_training.kinds import KINDS, Kind
-from xew.model.codec_training.pictures import ALIGNED, UNALIGNED, Cut
+from xew.model.codecs.conv_autoencoder import AUTOENCODERS, AutoencoderSize
 from xew.model.episodes.unpaired import Seeds
 from xew.model.settings.checks import LEAST_OF_STEPS, check_least, check_steps
 from xew.model.settings.settings import Clip, StepSettings
+from xew.model.video.frames import TEMPORAL_FACTOR
 from xew.protocol import SPLITS, expand_robots
 
 SMALLEST_SIDE = 32
@@ -25,9 +26,6 @@ class PictureSettings:
     """Clips are taken one after another, each `every`-th of them; 1 takes all of a video."""
     drawn_every: int = 1
     """Number of episodes of which one's drawn streams (optical flow, mask, ray map) are taken; drawing is slow."""
-    frames: int = 17
-    """Number of frames of a clip of wan_vae, 4 k + 1; conv_autoencoder takes groups of four. Latents further on than any that
-    were trained lose 5 dB with clips of 5 frames."""
     device_share: float = 0.4
     """Largest share of an accelerator's memory that the pictures may take; where they take more, they stay in the host's."""
     host_gb: float = 64.0
@@ -58,9 +56,9 @@ class CodecTrainSettings(StepSettings):
     lpips_frames: int = 1
     """Number of frames of each clip that LPIPS is taken on, drawn anew each step; 0 takes all."""
     penalty: float = 1e-3
-    """Weight of what keeps latents small: their mean square, of wan_vae the divergence from the unit normal distribution."""
+    """Weight of the latents' mean square."""
     noise: float = 0.1
-    """Standard deviation of the noise on latents before they are decoded; wan_vae draws its own."""
+    """Standard deviation of the noise on latents before they are decoded."""
     region: float = 0.0
     """Weight of the robot's pixels beyond that of the others, in l1 and mse."""
     still: float = 0.1
@@ -71,8 +69,6 @@ class CodecTrainSettings(StepSettings):
     """Whether half of the samples are mirrored."""
     jitter: float = 0.0
     """Largest change of a color channel's gain and offset, in half of the samples, on a scale of -1 to 1."""
-    crop: int = 0
-    """Side [pixels] of the squares that are cut out at random; 0 takes whole pictures."""
     statistics_clips: int = 2048
     """Number of clips from which the mean and deviation of the latents are computed at the end."""
 
@@ -100,7 +96,7 @@ class ReportSettings:
 
 @dataclass(frozen=True)
 class CodecExperiment:
-    """What configs/codec*.yaml and configs/vae_*.yaml hold."""
+    """What lab/codec/*.yaml hold."""
 
     data: Path
     """Episodes, made by `python -m xew.sim_warp.generate`."""
@@ -108,10 +104,8 @@ class CodecExperiment:
     clip: Clip
     """Clip of the world model that is to use it: the size of the pictures, and what the report is measured on."""
     train: CodecTrainSettings
-    kind: str = "conv_autoencoder"
-    """One of KINDS."""
     size: str = "base"
-    """Size of the autoencoder: tiny or base, of wan_vae tiny, small or wan22."""
+    """Size of the autoencoder, one of AUTOENCODERS."""
     robots: tuple[str, ...] = ()
     """Robots that are learned from, by name (`body:0-63` names 64 procedural bodies); those of `split` where left out."""
     split: str = "fixed"
@@ -125,9 +119,9 @@ class CodecExperiment:
     report: ReportSettings = field(default_factory=ReportSettings)
 
     @property
-    def autoencoder(self) -> Kind:
-        """The kind of autoencoder at its size."""
-        return pick(KINDS, self.kind, "kind of autoencoder").of_size(self.size)
+    def autoencoder(self) -> AutoencoderSize:
+        """The autoencoder's size."""
+        return pick(AUTOENCODERS, self.size, "size of the autoencoder")
 
     @property
     def train_robots(self) -> tuple[str, ...]:
@@ -142,8 +136,7 @@ class CodecExperiment:
     @property
     def cut(self) -> Cut:
         """What is cut out of a video."""
-        frames = self.autoencoder.clip_frames(self.pictures.frames)
-        return Cut(frames, self.pictures.every, self.clip.height, self.clip.width, self.pictures.drawn_every)
+        return Cut(TEMPORAL_FACTOR, self.pictures.every, self.clip.height, self.clip.width, self.pictures.drawn_every)
 
 
 LEAST = LEAST_OF_STEPS | {
@@ -159,7 +152,6 @@ LEAST = LEAST_OF_STEPS | {
     "train.still": 0,
     "train.permute": 0,
     "train.jitter": 0,
-    "train.crop": 0,
     "train.statistics_clips": 1,
     "pictures.every": 1,
     "pictures.drawn_every": 1,
@@ -183,14 +175,14 @@ def check_codec_experiment(experiment: CodecExperiment, path: Path | str) -> Cod
     _ = experiment.train_robots
     factor, clip, train = experiment.autoencoder.spatial_factor, experiment.clip, experiment.train
     check_steps(train, "seconds", str(path))
-    for name, frames in (("clip.frames", clip.frames), ("pictures.frames", experiment.pictures.frames)):
-        if frames % 4 != 1:
-            raise ConfigError(f"{path}: {name} is {frames}; it must be 4 k + 1, for example {max(5, frames // 4 * 4 + 1)}.")
-    for name, side in (("clip.height", clip.height), ("clip.width", clip.width), ("train.crop", train.crop)):
-        if (side or name != "train.crop") and (side % factor or side < SMALLEST_SIDE):
+    if clip.frames % 4 != 1:
+        near = max(5, clip.frames // 4 * 4 + 1)
+        raise ConfigError(f"{path}: clip.frames is {clip.frames}; it must be 4 k + 1, for example {near}.")
+    for name, side in (("clip.height", clip.height), ("clip.width", clip.width)):
+        if side % factor or side < SMALLEST_SIDE:
             raise ConfigError(
-                f"{path}: {name} is {side}; it must be a multiple of {factor} (the factor of {experiment.kind}"
-                f" {experiment.size}) and at least {SMALLEST_SIDE} (for LPIPS)."
+                f"{path}: {name} is {side}; it must be a multiple of {factor} (the factor of {experiment.size}) and at least"
+                f" {SMALLEST_SIDE} (for LPIPS)."
             )
     return experiment
 

@@ -1,0 +1,9 @@
+"""Training of the shipped codec: pictures decoded once into memory, the step, and a report.
+
+    python -m lab.codec lab/codec/codec.yaml --data DATA
+
+
+A step's samples and noise depend on the seed and the number of the step alone, so that a resumed training repeats them.
+"""
+
+__all__ = ["pictures", "report", "sampling", "settings", "step"]
