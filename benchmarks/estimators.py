@@ -2,7 +2,6 @@
 
     python -m benchmarks.estimators [--frames 100]                     # both on the CPU
     python -m benchmarks.estimators --device cuda --kernels            # Warp on the GPU, and which kernels take how long
-    python -m benchmarks.estimators --device cuda --threads 1 4 8      # and videos a second of threads that share the GPU
 
 The videos are those of benchmarks/metrics.py, an arm of five links before a wall, 320x240: late, blurred and grainy, as a model
 errs; the first frame frozen; the frames shuffled; the truth softened. Each is found masks and 16 points along the links for,
@@ -15,7 +14,6 @@ and of the process's time. The first call, which compiles kernels, is told by it
 import platform
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
@@ -27,8 +25,8 @@ import tyro
 import warp as wp
 
 from benchmarks.metrics import Pair, make_pair
+from lab.calibration.predictors import delay, shuffle, soften
 from xew.metrics.backends import ReferenceMasker
-from xew.metrics.calibration.predictors import delay, shuffle, soften
 from xew.metrics.estimators.batched.masks import BatchedMasker
 from xew.metrics.estimators.batched.tracks import BatchedTracker
 from xew.metrics.estimators.tracks import ReferenceTracker
@@ -46,8 +44,6 @@ class Args:
     """Turns of each contender."""
     kernels: bool = False
     """Also tell which kernels take how long on the GPU."""
-    threads: tuple[int, ...] = ()
-    """Also tell the videos a second of so many threads, each with estimators of its own and an episode of four videos."""
 
 
 @dataclass(frozen=True)
@@ -123,21 +119,6 @@ def tell_kernels(contender: Contender, video: np.ndarray, pair: Pair) -> None:
         print(f"| {name} | {len(elapsed)} | {sum(elapsed):.2f} |")
 
 
-def share(open_: Callable[[], Contender], videos: dict[str, np.ndarray], pair: Pair, count: int) -> None:
-    """Print the videos a second of threads that each find masks and points in an episode of their own."""
-
-    def work(contender: Contender) -> None:
-        episode = Pair(pair.prediction, pair.target.copy(), pair.predicted_mask, pair.mask, pair.predicted_points, pair.points)
-        for video in videos.values():
-            contender.run(video.copy(), episode)
-
-    contenders = [open_() for _ in range(count)]
-    with ThreadPoolExecutor(count) as pool:
-        wall, busy = clock(lambda: list(pool.map(work, contenders)))
-    total = count * len(videos)
-    print(f"{count} threads: {total / wall:.2f} videos/s, {busy / wall:.1f} cores busy, learning an episode's looks included")
-
-
 def main(args: Args) -> None:
     cv2.setNumThreads(1)
     wp.config.log_level = wp.LOG_ERROR
@@ -147,19 +128,14 @@ def main(args: Args) -> None:
     pair = make_pair(args.frames)
     videos = make_videos(pair)
 
-    def open_warp() -> Contender:
-        return Contender(BatchedMasker(device.alias), BatchedTracker(device.alias))
-
-    contenders = {"opencv": Contender(ReferenceMasker(), ReferenceTracker()), f"warp, {args.device}": open_warp()}
-    ours = contenders[f"warp, {args.device}"]
+    ours = Contender(BatchedMasker(device.alias), BatchedTracker(device.alias))
+    contenders = {"opencv": Contender(ReferenceMasker(), ReferenceTracker()), f"warp, {args.device}": ours}
     print(f"first video, with compiling and learning: {clock(lambda: ours.run(pair.prediction, pair))[0]:.1f} s")
     for name, video in videos.items():
         compare(name, pair, ours.run(video, pair), contenders["opencv"].run(video, pair))
     measure(contenders, videos, pair, args.rounds)
     if args.kernels and device.is_cuda:
         tell_kernels(ours, pair.prediction, pair)
-    for count in args.threads:
-        share(open_warp, videos, pair, count)
 
 
 if __name__ == "__main__":

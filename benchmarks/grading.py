@@ -1,8 +1,8 @@
 """How long `python -m xew.metrics.evaluate` takes for a model's rollouts and all baselines, by OpenCV and in Warp kernels.
 
-    python benchmarks/grading.py --data data                                  # 40 test episodes, on this machine's GPU
-    python benchmarks/grading.py --data data --codec configs/fixed.yaml      # and the truth through a codec
-    python benchmarks/grading.py --data data --episodes 10 --ways opencv:2 warp:2
+    python -m benchmarks.grading --data data                                  # 40 test episodes, on this machine's GPU
+    python -m benchmarks.grading --data data --codec configs/fixed.yaml      # and the truth through a codec
+    python -m benchmarks.grading --data data --episodes 10 --ways default:2 opencv:2
 
 Needs a data set with test seeds, of several robots where another robot's episode is to be graded too. The model's rollouts
 are made here: the true video, four frames late and softened, as a model errs. The command is run as users run it, in a
@@ -28,9 +28,10 @@ import numpy as np
 import pandas as pd
 import tyro
 
+from lab.calibration.predictors import delay, soften
 from xew.dataset import read_dataset
 from xew.episode import read_video
-from xew.metrics.calibration.predictors import delay, soften
+from xew.metrics.grading.open_graders import PROCESSES
 from xew.rollout import write_rollout
 
 LATE = 4
@@ -50,8 +51,8 @@ class Args:
     episodes: int = 40
     codec: Path | None = None
     """Run of `xew.model.train`, or its config, whose codec the truth goes through."""
-    ways: tuple[str, ...] = ("warp:1", "warp:8", "opencv:16")
-    """Estimators and numbers of processes; one process has a thread for each processor core."""
+    ways: tuple[str, ...] = ("default:0", "default:1", "opencv:16")
+    """Estimators and numbers of processes; 0: as many as the command chooses."""
 
 
 def main(args: Args) -> None:
@@ -108,20 +109,21 @@ def grade(args: Args, estimators: str, processes: str) -> tuple[float, float]:
     """Seconds of the command from no scores, by the clock and of the processors of its own process."""
     for path in (*args.out.glob("scores*"), args.out / "data-baselines"):
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-    command = [sys.executable, "-m", "xew.metrics.evaluate", "rollouts", "--data", "data", "--processes", processes]
+    command = [sys.executable, "-m", "xew.metrics.evaluate", "rollouts", "--data", "data"]
     command += ["--masks", estimators, "--tracks", estimators]
     command += ["--codec", str(args.codec.resolve())] if args.codec else []
     start, before = time.perf_counter(), busy_seconds()
     with (args.out / "log.txt").open("a") as log:
-        done = subprocess.run(command, cwd=args.out, stdout=log, stderr=subprocess.STDOUT, env=environment())
+        done = subprocess.run(command, cwd=args.out, stdout=log, stderr=subprocess.STDOUT, env=environment(processes))
     assert done.returncode == 0, f"{' '.join(command)} failed; see {args.out}/log.txt"
     return time.perf_counter() - start, busy_seconds() - before
 
 
-def environment() -> dict[str, str]:
-    """This one, in which modules are found from another folder as from this."""
+def environment(processes: str) -> dict[str, str]:
+    """This one, in which modules are found from another folder as from this, and which says how many processes grade."""
     paths = [str(Path(__file__).resolve().parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+    chosen = {} if processes == "0" else {PROCESSES: processes}
+    return os.environ | {"PYTHONPATH": os.pathsep.join(paths)} | chosen
 
 
 def busy_seconds() -> float:

@@ -31,7 +31,7 @@ import jax
 import numpy as np
 import tyro
 
-from xew.metrics import METRICS, lpips, lpips_features, lpips_from_features, mask_scores, ndtw, psnr, ssim
+from xew.metrics import METRICS, boundary_f1, lpips, mask_iou, ndtw, psnr, ssim
 from xew.metrics.networks.alexnet import read_alexnet
 
 HEIGHT, WIDTH, LINKS, POINTS = 240, 320, 5, 16
@@ -304,27 +304,28 @@ def whole_suite(pair: Pair) -> list[Any]:
     return [metric.function(*inputs[metric.inputs]) for metric in METRICS.values() if metric.inputs in inputs]
 
 
+def mask_scores(prediction: Any, target: Any) -> tuple[Any, Any]:
+    return mask_iou(prediction, target), boundary_f1(prediction, target)
+
+
 def on_cpu(pair: Pair, rounds: int) -> None:
     import fastdtw
 
     network, video = torch_lpips("cpu"), (pair.prediction, pair.target)
     valid = np.ones(pair.points.shape[:2], bool)
     p, t = jax.device_put(video)
-    features = lpips_features(t)
     tracks = (pair.predicted_points, pair.points, valid)
     theirs_psnr, theirs_ssim = scikit_image(pair)
     theirs_lpips = by_batch(video, 8, "cpu", (network, True))[0]
     compare("PSNR and scikit-image [dB]", psnr(p, t), theirs_psnr, 1e-4)
     compare("SSIM and scikit-image", ssim(p, t), theirs_ssim, 1e-6)
     compare("LPIPS and lpips", lpips(p, t), theirs_lpips, 1e-6)
-    compare("LPIPS of cached features and lpips", lpips_from_features(p, features), theirs_lpips, 1e-6)
     compare("masks and OpenCV", mask_scores(pair.predicted_mask, pair.mask), opencv(pair), 1e-6)
     compare("nDTW and fastdtw's exact table", ndtw(*tracks), time_warping(pair, fastdtw.dtw), 1e-5)
     name, torch_best = best("lpips", {batch: lambda b=batch: by_batch(video, b, "cpu", (network, True)) for batch in BATCHES})
     turn = functools.partial(race, rounds=rounds)
     tell("PSNR and SSIM", turn({"ours": lambda: (psnr(p, t), ssim(p, t)), "scikit-image": lambda: scikit_image(pair)}))
     tell("LPIPS", turn({"ours": lambda: lpips(p, t), name: torch_best}))
-    tell("LPIPS of a target seen before", turn({"ours": lambda: lpips_from_features(p, features), name: torch_best}))
     masks = jax.device_put((pair.predicted_mask, pair.mask))
     tell("IoU and boundary F1", turn({"ours": lambda: mask_scores(*masks), "OpenCV": lambda: opencv(pair)}))
     warp = {"ours": lambda: ndtw(*tracks), "fastdtw (approximate)": lambda: time_warping(pair, fastdtw.fastdtw)}

@@ -68,6 +68,7 @@ def annotated_modules() -> list[str]:
 
 for pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(pool, "1")  # before NumPy loads: two workers with a pool of threads each only wait for one another
+os.environ.setdefault("XEW_EVALUATE_PROCESSES", "1")  # evaluate grades in the test's own process, on any machine
 os.environ.setdefault("XLA_FLAGS", " ".join(XLA_FLAGS))  # before JAX compiles anything
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(PROGRAMS))  # before JAX is imported, which reads it once
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # so is this: hundreds of small programs count, too

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from xew.concurrency import call_in_processes, free_gpu_memory, leave_with_parent, map_in_order, map_in_processes
+from xew.concurrency import free_gpu_memory, leave_with_parent, map_in_order, map_in_processes
 
 
 def test_free_memory_of_gpus_is_asked_of_nvidias_tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -179,31 +179,19 @@ def processes_of(folder: Path) -> list[int]:
     return [int(file.name) for file in folder.iterdir()]
 
 
-def test_processes_open_before_there_are_items_and_leave_after_the_last(tmp_path: Path) -> None:
-    with call_in_processes(functools.partial(open_square, tmp_path, 0.5), 3) as call:
-        assert wait_for(lambda: len(processes_of(tmp_path)) == 3), "each opens, though nothing is called yet"
-        assert list(call([2, 3])) == [4, 9], "fewer items than processes"
-        assert wait_for(lambda: all(map(is_gone, processes_of(tmp_path)))), "they leave while the block goes on"
-    assert len(processes_of(tmp_path)) == 3, "none was started beside them"
+def test_processes_open_at_once_and_leave_after_the_last_item(tmp_path: Path) -> None:
+    results = map_in_processes(functools.partial(open_square, tmp_path, 0.5), [2, 3, 4], 2)
+    assert next(results) == 4
+    assert wait_for(lambda: len(processes_of(tmp_path)) == 2), "each opens, also before there is an item for it"
+    assert list(results) == [9, 16]
+    assert len(processes_of(tmp_path)) == 2 and all(map(is_gone, processes_of(tmp_path)))
 
 
-def test_no_process_is_left_behind_the_block(tmp_path: Path) -> None:
-    with call_in_processes(functools.partial(open_square, tmp_path, 0.5), 2) as call:
-        assert wait_for(lambda: len(processes_of(tmp_path)) == 2)
-        assert next(call([2, 3, 4])) == 4
+def test_no_process_is_left_behind_who_takes_no_more_results(tmp_path: Path) -> None:
+    results = map_in_processes(functools.partial(open_square, tmp_path), [2, 3, 4], 2)
+    assert next(results) == 4
+    results.close()
     assert all(map(is_gone, processes_of(tmp_path)))
-    with call_in_processes(functools.partial(open_square, tmp_path), 2):
-        assert wait_for(lambda: len(processes_of(tmp_path)) > 2)
-    assert all(map(is_gone, processes_of(tmp_path))), "nor where nothing was called"
-
-
-@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_an_error_before_there_are_items_ends_processes_that_are_opening(error: type[BaseException], tmp_path: Path) -> None:
-    begun = time.monotonic()
-    with pytest.raises(error), call_in_processes(functools.partial(open_square, tmp_path, 600), 2):
-        assert wait_for(lambda: len(processes_of(tmp_path)) == 2)
-        raise error
-    assert all(map(is_gone, processes_of(tmp_path))) and time.monotonic() - begun < 300
 
 
 def open_nothing() -> Callable[[int], int]:
@@ -211,8 +199,6 @@ def open_nothing() -> Callable[[int], int]:
 
 
 def test_the_first_item_gets_what_the_opener_raises() -> None:
-    with call_in_processes(open_nothing, 2) as call, pytest.raises(FileNotFoundError, match="no weights"):
-        next(call([1, 2, 3]))
     with pytest.raises(FileNotFoundError, match="no weights"):
         list(map_in_processes(open_nothing, [1, 2, 3], 2))
     assert list(map_in_processes(open_nothing, [], 2)) == []

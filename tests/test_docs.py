@@ -24,7 +24,9 @@ from tests.synthetic import write_synthetic_data
 from xew.episode import read_video
 from xew.metrics import METRICS, evaluate
 from xew.metrics.backends import open_masker, open_tracker
+from xew.metrics.episode_cache import EpisodeCache
 from xew.metrics.grade import Comparison, grade, input_kind
+from xew.metrics.grading.settings import resolve
 from xew.metrics.truth import read_truth
 from xew.model.experiment import load_experiment
 from xew.model.runs import folder as run_folder
@@ -131,11 +133,11 @@ def test_the_page_on_a_metric_grades_with_it(with_data: Path, monkeypatch: pytes
     monkeypatch.setattr(evaluate, "main", given.append)
     monkeypatch.setattr(sys, "argv", shlex.split(command)[1:])
     runpy.run_path("my_metrics.py", run_name="__main__")
-    names = evaluate.choose_metrics(given[0])
+    names = resolve(given[0]).metrics
     assert names == ("psnr", "robot_color")
     truth = read_truth(with_data / "data/place_empty_cup/1000000/piper", 5, {input_kind("robot_color")})
     darker = truth.rgb - np.minimum(truth.rgb, 20)
-    graded = grade(Comparison(darker, truth, open_masker("default"), open_tracker("default")), names[1:])
+    graded = grade(Comparison(darker, EpisodeCache(truth), open_masker("default"), open_tracker("default")), names[1:])
     assert graded.values["robot_color"] == pytest.approx(20, abs=0.5)
 
 

@@ -35,7 +35,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 LAZILY = {
     ("model", "sim_warp"): ("conditions", "latents", "cache", "episodes", "video"),
     ("model", "metrics"): ("codec_training", "codecs.ceiling", "conditions"),
-    ("metrics", "sim_warp"): ("calibrate", "calibration", "truth"),
+    ("metrics", "sim_warp"): ("truth",),
 }
 """Modules and packages of the first room that may import the second, and inside functions alone: the room loads without it."""
 FORBIDDEN = {
@@ -57,7 +57,7 @@ REGISTRIES = {"analysis": "xew.model.conditions"}
 JAX_GROUND = "xew.compilation"
 """The one file at the root that imports JAX; only rooms that import JAX anyway may import it."""
 STATISTICS_STANDS_ON = ("xew.statistics", "xew.protocol", "xew.config")
-METRIC_READERS = {"evaluate", "backends", "grade", "truth", "calibrate"}
+METRIC_READERS = {"evaluate", "backends", "grade", "truth"}
 """Files at the root of `metrics` that may touch the disk or anything of ours outside the room; the others are pure."""
 
 Sources = Iterable[Source]
@@ -339,7 +339,7 @@ def test_a_planted_violation_is_found(name: str, tmp_path: Path) -> None:
 
 def test_commands_stand_for_themselves_among_packages_and_rooms(tmp_path: Path) -> None:
     command = 'from xew.model.conditions import b\n\n\nif __name__ == "__main__":\n    b()\n'
-    sources = planted(tmp_path, {"metrics/calibrate.py": command, "model/a.py": "from xew.metrics.mask import b\n"})
+    sources = planted(tmp_path, {"metrics/evaluate.py": command, "model/a.py": "from xew.metrics.mask import b\n"})
     assert circle_failures(sources) == []
 
 
@@ -362,7 +362,6 @@ def test_the_registry_of_metrics_is_complete() -> None:
     assert set(metrics.METRICS) >= set(importlib.import_module("xew.analysis.paper").read_paper().metrics)
     registered = {metric.function for metric in metrics.METRICS.values()}
     registered |= {metric.curve for metric in metrics.METRICS.values()}
-    registered |= set(importlib.import_module("xew.metrics.grade").DIAGNOSTICS.values())
     for name in metrics.__all__:
         function = getattr(metrics, name)
         signature = inspect.signature(function) if callable(function) else None

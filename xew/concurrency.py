@@ -9,9 +9,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import contextmanager
 from itertools import cycle, islice
-from multiprocessing import forkserver
 from multiprocessing.queues import SimpleQueue
 from typing import Any, TypeVar
 
@@ -81,15 +79,6 @@ def map_in_order(
                 stop.set()
 
 
-def begin_importing(modules: Sequence[str]) -> None:
-    """Start the process that others are forked from, which imports these modules while this one gets their work ready.
-
-    `open_processes` starts it otherwise. Where it runs already it keeps what it has imported.
-    """
-    multiprocessing.set_forkserver_preload(list(modules))
-    forkserver.ensure_running()
-
-
 def open_processes(
     count: int,
     imported: Sequence[str],
@@ -135,61 +124,26 @@ def map_in_processes(
     imported: Sequence[str] = (),
     gpus: Sequence[str] = (),
 ) -> Iterator[Result]:
-    """Results of a function over items, in their order, computed by processes of their own.
+    """Results of a function over items, in their order, computed by other processes.
+
+    With the last result the processes leave, while this one goes on.
 
     Args:
-        opener: gives the function, see `call_in_processes`.
+        opener: gives the function; called early in each process, and again by its first item where it has raised, so that the
+            item gets what it raises.
         items: sent to the processes, as results and exceptions are sent back: all of them can be pickled.
         processes: their number; no more are started than there are items.
         imported: modules that the processes need; see `open_processes`.
         gpus: of which each process sees one, in turn, as CUDA_VISIBLE_DEVICES names them; where left out all see all.
     """
-    with call_in_processes(opener, min(processes, len(items)), imported, gpus) as call:
-        yield from call(items)
-
-
-@contextmanager
-def call_in_processes(
-    opener: Callable[[], Callable[[Any], Any]], count: int, imported: Sequence[str] = (), gpus: Sequence[str] = ()
-) -> Iterator[Callable[[Iterable[Any]], Iterator[Any]]]:
-    """Start processes that open a function, while this one finds out what it is to be called with.
-
-    What is given is called once, with items, and yields the function's results in their order. With the last one the processes
-    leave, while this one goes on with what came; the block's end waits until all have left. Where an error ends the block
-    before there were items, it ends the processes as well, whatever they are opening.
-
-    Args:
-        opener: gives the function; called early in each process, and again by its first item where it has raised, so that the
-            item gets what it raises.
-        count: number of processes, each of which is started at once.
-        imported: modules that the processes need; see `open_processes`.
-        gpus: as of `map_in_processes`.
-    """
+    count = min(processes, len(items))
     pool = open_processes(count, imported, _open_function, (opener,), gpus)
-    leaving = threading.Thread(target=pool.shutdown, kwargs={"cancel_futures": True})
-    called = False
-
-    def call(items: Iterable[Any]) -> Iterator[Any]:
-        nonlocal called
-        called = True
-        try:
-            yield from pool.map(_call_function, items)
-        finally:
-            leaving.start()
-
     try:
         for _ in range(count):
             pool.submit(_open_early)
-        yield call
-    except BaseException:
-        if not called:
-            for process in list(pool._processes.values()):
-                process.terminate()
-        raise
+        yield from pool.map(_call_function, items)
     finally:
-        if leaving.ident is None:
-            leaving.start()
-        leaving.join()
+        pool.shutdown(cancel_futures=True)
 
 
 _opened: list[Callable[[], Any]] = []

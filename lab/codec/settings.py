@@ -143,7 +143,7 @@ class CodecExperiment:
 
     @property
     def motion(self) -> str:
-        """Kind of motion of the episodes that are learned from, or MIXED_MOTION, as the split names it."""
+        """Kind of motion of the episodes that are learned from, as the split names it."""
         return pick(SPLITS, self.split, "split").motion
 
     @property

@@ -38,8 +38,7 @@ PARAGRAPHS = ("Task", "Randomization", "Success", "After")
 """Words with which the paragraphs of a task's module docstring begin."""
 COMMAND = "python -m lab.seeds.yields"
 YIELDS = "## How often the experts succeed"
-"""Heading of the last section that this command writes. It keeps those that follow: `inspect --visibility-page` and
-`xew.metrics.evaluate --power-page` write them."""
+"""Heading of the last section that this command writes. It keeps the sections that follow."""
 
 
 @dataclass(frozen=True)

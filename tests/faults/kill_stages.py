@@ -141,7 +141,7 @@ STAGES: dict[str, Stage] = {
     "rollout": Stage(command("xew.model.rollout", "run", "--robots", *ROLLED_OUT, "--out", "rollouts"), "rollouts", "train"),
     "evaluate": Stage(
         command(
-            *("xew.metrics.evaluate", "rollouts", "--data", "data", "--out", "scores/scores.parquet", "--workers", "1"),
+            *("xew.metrics.evaluate", "rollouts", "--data", "data", "--out", "scores/scores.parquet"),
             *("--metrics", "psnr", "mask_iou", "--masks", QUICK, "--tracks", QUICK_TRACKS),
         ),
         "scores",

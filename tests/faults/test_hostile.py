@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 import yaml
 
+from lab.calibration.perturbations import render_perturbation
 from tests import synthetic
 from tests.exchange import robotwin_file
 from tests.faults import reading
@@ -27,7 +28,6 @@ from xew.dataset import read_dataset
 from xew.episode import EpisodeError, complete_folder, episode_folder, place_episode, read_record, read_video
 from xew.exchange import robotwin
 from xew.exchange.hdf5 import read_robotwin
-from xew.metrics.calibration.perturbations import render_perturbation
 from xew.model import outside, rollout
 from xew.model.experiment import load_experiment
 from xew.model.runs.begin import claim_run

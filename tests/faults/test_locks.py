@@ -29,7 +29,6 @@ WRITERS: tuple[tuple[str, str, str], ...] = (
     ("analysis.study_analyse", "study", "study/scores.parquet"),
     ("exchange.lerobot", "data --out out", "out"),
     ("exchange.robotwin", "data --out out", "out"),
-    ("metrics.calibrate", "--data data --out out", "out"),
     ("metrics.evaluate", "rollouts --data data --out out.parquet", "out.parquet"),
     ("model.export", "run --out out", "out"),
     ("model.outside", "examples.own_model:freeze --data data --out out", "out"),
@@ -40,16 +39,13 @@ WRITERS: tuple[tuple[str, str, str], ...] = (
     ("sim_warp.inspect", "data --pictures out", "out"),
     ("sim_warp.inspect", "data --grid out.png", "out.png"),
     ("sim_warp.inspect", "data --page out", "out"),
-    ("sim_warp.manifest", "data --out out.json", "out.json"),
     ("sim_warp.robots.adopt", "mine.urdf --out out", "out/mine"),
-    ("sim_warp.yields", "--tasks lift_pot --page out.md", "out.md"),
 )
 """Commands with options, and what they write, whose lock they take."""
 OTHERS = {
     "model.latents": "waits: see below",
     "model.rollout": "needs a trained run: see below",
-    "sim_warp.motions": "prints",
-    "sim_warp.production.warm_up": "writes Warp's cache, whose folders Warp itself renames into place",
+    "__main__": "runs the others",
 }
 """Other commands, with why they are none of WRITERS."""
 
@@ -107,7 +103,26 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(("module", "options", "held"), WRITERS, ids=lambda value: str(value).rpartition("/")[2])
+LAB = (
+    ("lab.calibration", "--data data --out out", "out"),
+    ("lab.robots.bodies", "--count 1 --out out.npz", "out.npz"),
+    ("lab.robots.sheet", "--robots piper --out out", "out"),
+    ("lab.robots.sheet", "--robots piper --references out", "out"),
+    ("lab.robots.sheet", "--robots piper --grid out.png", "out.png"),
+    ("lab.seeds.manifest", "data --out out.json", "out.json"),
+    ("lab.seeds.yields", "--tasks lift_pot --page out.md", "out.md"),
+)
+"""The same of the laboratory's commands."""
+
+
+@pytest.mark.parametrize(
+    ("module", "options", "held"),
+    [
+        *((f"xew.{module}", options, held) for module, options, held in WRITERS),
+        *(pytest.param(*one, marks=pytest.mark.lab) for one in LAB),
+    ],
+    ids=lambda value: str(value).rpartition("/")[2],
+)
 def test_who_writes_what_another_writes_ends_in_one_line(
     module: str, options: str, held: str, world: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -120,7 +135,7 @@ def test_who_writes_what_another_writes_ends_in_one_line(
             AssertionError, match=rf"(?s)ended with 2:.*{held} is being written by process {process.pid} on "
         ) as told,
     ):
-        run_command(f"xew.{module}", *options.split())
+        run_command(module, *options.split())
     assert "Traceback" not in str(told.value)
     (world / held).with_name(f".{Path(held).name}.lock").unlink()  # its holder was killed
     for path in reversed(sorted(world.rglob("*"))):

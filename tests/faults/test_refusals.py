@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 import yaml
 
+from lab.calibration import calibrate
+from lab.seeds import yields
 from tests import synthetic
 from tests.commands import run_command
 from xew.analysis.studies.config import load_study
 from xew.config import ConfigError, check_finite, user_errors
 from xew.episode import EpisodeError, read_record, read_states, read_video, write_episode
 from xew.files import write_text
-from xew.metrics import calibrate
 from xew.model import outside
 from xew.model.episodes.choice import select_episodes
 from xew.model.experiment import load_experiment
 from xew.model.runs.begin import claim_run
-from lab.seeds import yields
 from xew.sim_warp import generate
 
 REPOSITORY = Path(__file__).parents[2]
@@ -128,7 +128,7 @@ def test_workers_that_are_none_are_refused(number: int, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "command",
     [
-        "xew.metrics.evaluate rollouts --data data --out scores.parquet --processes 0",
+        "lab.robots.bodies --count 1 --out bodies.npz --workers 0",
     ],
 )
 def test_commands_without_workers_end_in_one_line(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

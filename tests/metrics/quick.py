@@ -41,7 +41,7 @@ def mean_change(
     target: np.ndarray,
     robot: np.ndarray | None = None,
     box: object = None,
-    cut: object = None,
+    blocks: object = None,
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """For `SharedFeatures.distances`: mean change of a frame's levels, and of the robot's, both [t] float32 in [0, 1]."""
     change = np.abs(prediction.astype(np.float32) - target).mean(axis=-1) / 255

@@ -1,5 +1,7 @@
 """IoU and boundary F1 against plain loops, SciPy's exact distance transform and OpenCV's morphology."""
 
+from collections.abc import Callable
+
 import cv2
 import jax
 import numpy as np
@@ -7,7 +9,6 @@ import pytest
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from xew.metrics import boundary_f1, mask_iou
-from xew.metrics.mask import mask_scores
 
 rng = np.random.default_rng(1)
 
@@ -62,13 +63,12 @@ def test_both_equal_opencv(size: tuple[int, int]) -> None:
     np.testing.assert_allclose(boundary_f1(prediction, target), f1, atol=1e-6)
 
 
-def test_both_at_once_and_inside_a_jit_are_the_same_numbers() -> None:
+@pytest.mark.parametrize("metric", [mask_iou, boundary_f1])
+def test_inside_a_jit_and_a_vmap_are_the_same_numbers(metric: Callable[..., jax.Array]) -> None:
     prediction, target = blobs(), blobs()
-    alone = mask_iou(prediction, target), boundary_f1(prediction, target)
-    for found in (mask_scores(prediction, target), jax.jit(mask_scores)(prediction, target)):
-        np.testing.assert_array_equal(found, alone)
-    stacked = jax.vmap(mask_scores)(np.stack([prediction, target]), np.stack([target, target]))
-    np.testing.assert_array_equal([scores[0] for scores in stacked], alone)
+    alone = metric(prediction, target)
+    np.testing.assert_array_equal(jax.jit(metric)(prediction, target), alone)
+    np.testing.assert_array_equal(jax.vmap(metric)(np.stack([prediction, target]), np.stack([target, target]))[0], alone)
 
 
 def test_frames_do_not_depend_on_their_neighbors() -> None:

@@ -1,6 +1,5 @@
 """LPIPS: published and measured numbers, the `lpips` package where it is installed, and what a region means."""
 
-import functools
 import io
 import pickle
 from pathlib import Path
@@ -14,21 +13,28 @@ from tests.golden import golden
 from tests.metrics.reference_lpips import reference_lpips
 from xew.config import ConfigError
 from xew.metrics import (
+    episode_cache,
     lpips,
     lpips_embedding,
-    lpips_features,
-    lpips_from_features,
     region_lpips,
     region_lpips_frames,
     robot_lpips,
     robot_lpips_frames,
 )
-from xew.metrics.grade import _cut
 from xew.metrics.grading.weights import check_weights
 from xew.metrics.networks import alexnet
 from xew.metrics.networks.alexnet import ADMITTED, _package_file, read_alexnet
 from xew.metrics.networks.pickles import read_arrays
-from xew.metrics.perceptual import SMALLEST_SIDE, SharedFeatures, _covered_share, _receptive_fields, _weights, union_box
+from xew.metrics.perceptual import (
+    SMALLEST_SIDE,
+    SharedFeatures,
+    _box_features,
+    _covered_share,
+    _receptive_fields,
+    _weights,
+    _whole_box,
+    union_box,
+)
 
 rng = np.random.default_rng(3)
 
@@ -137,17 +143,6 @@ def test_the_region_equals_lpips_of_the_crop(box: tuple[int, int, int, int]) -> 
     assert region_lpips(prediction, target, mask) == pytest.approx(expected, abs=1e-6)
 
 
-def test_features_of_a_target_serve_all_its_predictions() -> None:
-    target, mask = noise(2), np.zeros((2, 40, 56), bool)
-    mask[:, 3:37, 9:50] = True
-    whole, region = lpips_features(target), lpips_features(target, mask)
-    for prediction in (noise(2), noise(2), 255 - target):
-        np.testing.assert_allclose(lpips_from_features(prediction, whole), lpips(prediction, target), atol=1e-6)
-        expected = region_lpips_frames(prediction, target, mask)
-        np.testing.assert_allclose(lpips_from_features(prediction, region), expected, atol=1e-6)
-    np.testing.assert_allclose(lpips_from_features(target, whole), 0, atol=1e-7)
-
-
 def test_embeddings_are_as_far_apart_as_frames() -> None:
     a, b = noise(3), noise(3)
     b[1] = a[1]
@@ -162,17 +157,20 @@ def test_embeddings_are_as_far_apart_as_frames() -> None:
 
 @pytest.mark.parametrize("most_bytes", [10**9, 0])
 @pytest.mark.parametrize("block", [1, 3])
-def test_features_shared_by_three_metrics_and_all_predictions_change_no_value(most_bytes: int, block: int) -> None:
+def test_features_shared_by_three_metrics_and_all_predictions_change_no_value(
+    most_bytes: int, block: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Frame by frame as on a CPU, and in blocks as on a GPU, of which the last is filled up."""
-    cut = None if block == 1 else functools.partial(_cut, block=block, whole=False)
+    monkeypatch.setattr(episode_cache, "FRAME_BLOCK", block)
     target, mask = noise(4), np.zeros((4, 40, 56), bool)
     mask[:3, 3:37, 9:50] = True
     moving, standing = noise(4), np.repeat(noise(1), 4, axis=0)
     moving[1], moving[3] = target[1], target[3]
     features = SharedFeatures(most_bytes)
     for prediction in (moving, standing, moving):
-        whole, robot = features.distances(prediction, target, mask, cut=cut)
-        region, none = features.distances(prediction, target, box=union_box(mask), cut=cut)
+        blocks = None if block == 1 else [episode_cache.cut_blocks(array) for array in (prediction, target, mask)]
+        whole, robot = features.distances(prediction, target, mask, blocks=blocks)
+        region, none = features.distances(prediction, target, box=union_box(mask), blocks=blocks and blocks[:2])
         assert robot is not None and none is None
         np.testing.assert_array_equal(whole == 0, np.all(prediction == target, axis=(1, 2, 3)))
         for found, expected in (
@@ -181,11 +179,6 @@ def test_features_shared_by_three_metrics_and_all_predictions_change_no_value(mo
             (region, region_lpips_frames(prediction, target, mask)),
         ):
             np.testing.assert_allclose(found, expected, rtol=1e-6 if block == 1 else 1e-5, atol=0)
-
-
-def test_features_of_another_video_are_an_error() -> None:
-    with pytest.raises(ValueError, match=r"\(1, 40, 57, 3\), the features are of a target \(1, 40, 56, 3\)"):
-        lpips_from_features(noise(1, 40, 57), lpips_features(noise()))
 
 
 def test_a_part_of_a_video_is_compared_in_the_whole_videos_box() -> None:
@@ -211,7 +204,9 @@ def test_receptive_fields_are_those_of_the_network() -> None:
     video = np.full((1, 96, 128, 3), 100, np.uint8)
     changed = video.copy()
     changed[0, 40, 70] = 255
-    layers = zip(lpips_features(video).layers, lpips_features(changed).layers, fields, strict=True)
+    box = _whole_box(video)
+    features = [_box_features(_weights(), frames, box, None) for frames in (video, changed)]
+    layers = zip(*features, fields, strict=True)
     mask = (video != changed).any(axis=-1)
     for before, after, field in layers:
         differs = np.abs(np.asarray(before - after)).max(axis=-1)[0] > 1e-6

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from xew.metrics import (
-    contact_f1,
     coverage,
     keypoint_error,
     keypoint_error_strict,
@@ -96,32 +95,6 @@ def test_the_order_of_points_does_not_matter() -> None:
     for metric in (pck, pck_05, coverage, keypoint_error, ndtw, trajectory_error):
         shuffled = metric(prediction[:, order], target[:, order], valid[:, order])
         assert shuffled == pytest.approx(float(metric(prediction, target, valid)), rel=1e-6)
-
-
-def brute_contact_f1(prediction: np.ndarray, target: np.ndarray, tolerance: int) -> float:
-    def share(contacts: np.ndarray, others: np.ndarray) -> float:
-        near = [others[max(t - tolerance, 0) : t + tolerance + 1, c].any() for t, c in np.argwhere(contacts)]
-        return float(np.mean(near)) if near else 0.0
-
-    precision, recall = share(prediction, target), share(target, prediction)
-    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
-
-
-@pytest.mark.parametrize("tolerance", [0, 1, 3])
-def test_contact_f1_equals_counting(tolerance: int) -> None:
-    prediction, target = rng.random((20, 3)) < 0.3, rng.random((20, 3)) < 0.3
-    expected = brute_contact_f1(prediction, target, tolerance)
-    assert contact_f1(prediction, target, tolerance) == pytest.approx(expected, abs=1e-6)
-    assert contact_f1(target, target, tolerance) == 1
-
-
-def test_contact_f1_of_nothing() -> None:
-    none, some = np.zeros((5, 2), bool), np.eye(5, 2, dtype=bool)
-    assert contact_f1(none, none) == 1 and contact_f1(none, some) == contact_f1(some, none) == 0
-    with pytest.raises(TypeError, match="bool"):
-        contact_f1(none.astype(int), some)
-    with pytest.raises(ValueError, match="one shape"):
-        contact_f1(none[1:], some)
 
 
 def test_errors_equal_their_definitions() -> None:

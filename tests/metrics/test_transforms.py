@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from jax.sharding import PartitionSpec
 
-from xew.metrics import METRICS, boundary_f1, contact_f1, mask_iou, pck, psnr, region_lpips, ssim
-from xew.metrics.states import STATES
+from xew.metrics import METRICS, boundary_f1, mask_iou, pck, psnr, region_lpips, ssim
 
 rng = np.random.default_rng(8)
 T, SIDE, K = 2, 31, 3
@@ -115,11 +114,11 @@ def test_every_metric_goes_through_every_transformation(name: str, mode: Callabl
 
 @pytest.mark.parametrize("mode", [traced_shard_map, traced_x64])
 @pytest.mark.parametrize("name", [name for name in ALONE if name != "trajectory_error"])
-def test_states_too(name: str, mode: Callable) -> None:
-    def by_states(*arrays: jax.Array) -> jax.Array:
-        return STATES[name].compute(STATES[name].update(STATES[name].init(), *arrays))
+def test_totals_too(name: str, mode: Callable) -> None:
+    def by_total(*arrays: jax.Array) -> jax.Array:
+        return METRICS[name].total(*arrays).mean
 
-    assert jax.tree.leaves(mode(by_states, inputs(METRICS[name].inputs)))[0].dtype == jnp.float32
+    assert jax.tree.leaves(mode(by_total, inputs(METRICS[name].inputs)))[0].dtype == jnp.float32
 
 
 @pytest.mark.parametrize("name", [name for name in ALONE if METRICS[name].inputs == "track" or name in ("psnr", "ssim")])
@@ -136,8 +135,7 @@ def test_nan_goes_through(name: str) -> None:
     arrays = inputs(kind)
     arrays[1 if kind == "track" else 0][(1, 1, 0) if kind == "track" else (1, -1, -1, 2)] = np.nan
     assert np.isnan(np.mean(metric.function(*arrays)))
-    state = STATES[name].init(K) if name == "trajectory_error" else STATES[name].init()
-    assert np.isnan(STATES[name].compute(STATES[name].update(state, *arrays)))
+    assert name == "trajectory_error" or np.isnan(metric.total(*arrays).mean)
     if metric.curve is not None:
         np.testing.assert_array_equal(np.isnan(metric.curve(*arrays)), [False, True])
         prediction, target, *rest = arrays
@@ -182,12 +180,11 @@ def test_lists_and_tensors_are_one_clear_message(name: str) -> None:
         (psnr, (T, SIDE, SIDE, 4), "drop alpha"),
         (mask_iou, (2, T, SIDE, SIDE), "jax.vmap"),
         (boundary_f1, (2, T, SIDE, SIDE), "jax.vmap"),
-        (contact_f1, (2, T, 1), "jax.vmap"),
         (lambda a, b: pck(a, b, np.ones(a.shape[:-1], bool)), (2, T, K, 2), "jax.vmap"),
     ],
 )
 def test_shapes_of_other_tools_get_a_remedy(metric: Callable, shape: tuple[int, ...], remedy: str) -> None:
-    array = np.zeros(shape, bool if metric in (mask_iou, boundary_f1, contact_f1) else np.float32)
+    array = np.zeros(shape, bool if metric in (mask_iou, boundary_f1) else np.float32)
     with pytest.raises(ValueError, match=remedy):
         metric(array, array)
 

@@ -3,21 +3,19 @@
     from xew.metrics import psnr, METRICS
     psnr(prediction, target)          # uint8 [t h w 3] -> float32 [t]
 
-docs/metrics.md shows each by an example. `xew.metrics.states` takes video in parts. To add a metric, write a function in the
-file of its family and one entry in METRICS.
+docs/metrics.md shows each by an example. `Metric.total` takes video in parts. To add a metric, write a function in the file of
+its family and one entry in METRICS.
 """
 
 import functools
 import math
 
-from xew.metrics.image import PSNR_STATE, exact_frames, psnr, ssim
-from xew.metrics.mask import boundary_f1, mask_iou, mask_scores
+from xew.metrics.image import exact_frames, psnr, ssim
+from xew.metrics.mask import boundary_f1, mask_iou
 from xew.metrics.metric import Metric
 from xew.metrics.perceptual import (
     lpips,
     lpips_embedding,
-    lpips_features,
-    lpips_from_features,
     region_lpips,
     region_lpips_frames,
     robot_lpips,
@@ -25,8 +23,6 @@ from xew.metrics.perceptual import (
     robot_lpips_parts,
 )
 from xew.metrics.track import (
-    TRAJECTORY_STATE,
-    contact_f1,
     coverage,
     distances,
     hits,
@@ -51,7 +47,7 @@ PAPER, STRICT = ("paper",), ("strict",)
 METRICS = {
     "psnr": Metric(
         psnr, psnr, "visual", "dB", (0, INF), True, "video", "of RGB; exact frames capped as in the paper",
-        "PSNR", whole=True, state=PSNR_STATE),
+        "PSNR", whole=True),
     "ssim": Metric(
         ssim, ssim, "visual", "", (-1, 1), True, "video", "Wang et al. 2004, as scikit-image: uniform 7x7 windows", "SSIM"),
     "lpips": Metric(lpips, lpips, "visual", "", (0, INF), False, "video", "Zhang et al. 2018, AlexNet v0.1", "LPIPS"),
@@ -99,7 +95,7 @@ METRICS = {
         "Robot points found", reported=False, parts=presence, suites=STRICT, counterpart="coverage", points="surfaces"),
     "trajectory_error": Metric(
         trajectory_error, None, "objects", "px", (0, INF), False, "track", "mean object distance",
-        "Object error", state=TRAJECTORY_STATE, suites=PAPER),
+        "Object error", suites=PAPER),
     "trajectory_error_strict": Metric(
         trajectory_error_strict, None, "objects", "px", (0, INF), False, "track",
         "mean distance of points on objects that move; lost ones have 50 px of 256, PointOdyssey's failure",
@@ -118,17 +114,13 @@ __all__ = [
     "METRICS",
     "Metric",
     "boundary_f1",
-    "contact_f1",
     "coverage",
     "exact_frames",
     "keypoint_error",
     "keypoint_error_strict",
     "lpips",
     "lpips_embedding",
-    "lpips_features",
-    "lpips_from_features",
     "mask_iou",
-    "mask_scores",
     "ndtw",
     "ndtw_strict",
     "pck",

@@ -55,23 +55,23 @@ class Tracker(Protocol):
 
 @runtime_checkable
 class Confirmer(Protocol):
-    """A tracker that also says where what it found does not show a point's body, as `presence.confirm_tracks`."""
+    """A tracker that also confirms that its tracks show the points' bodies, as `presence.confirm_tracks` does."""
 
     def confirm(
         self,
-        found: np.ndarray,
+        tracks: np.ndarray,
         prediction: np.ndarray,
         target: np.ndarray,
         points: np.ndarray,
         visible: np.ndarray,
-        shown: np.ndarray,
+        body_id: np.ndarray,
         body: np.ndarray,
     ) -> np.ndarray:
         """Tracks [t k 2] without the places that do not show the point's body.
 
         Args:
-            found: [t k 2] float32 pixels, as the tracker gave them for the same videos and points.
-            prediction, target, points, visible, shown, body: as of `presence.confirm_tracks`.
+            tracks: [t k 2] float32 pixels, as the tracker gave them for the same videos and points.
+            prediction, target, points, visible, body_id, body: as of `presence.confirm_tracks`.
         """
 
 
@@ -148,39 +148,37 @@ class ReferenceMasker:
         return estimate_masks(prediction, target, target_mask, self._episode)
 
 
-def _find_gpu() -> str | None:
-    # Only here and in what follows: the metrics load without Warp, whose kernels are parsed as they are imported.
+def _open_default_masker() -> Masker:
+    # Only in these two functions: the metrics load without Warp, whose kernels are parsed as they are imported.
     with PARSING:
         from xew.metrics.estimators.batched.devices import find_gpu
 
-        return find_gpu()
+        if gpu := find_gpu():
+            from xew.metrics.estimators.batched.masks import BatchedMasker
+
+            return BatchedMasker(gpu)
+    return ReferenceMasker()
 
 
-def open_batched_masker() -> Masker:
-    """The default masker in Warp kernels, on the calling thread's GPU, or on the CPU where there is none."""
+def _open_default_tracker() -> Tracker:
     with PARSING:
-        from xew.metrics.estimators.batched.masks import BatchedMasker
+        from xew.metrics.estimators.batched.devices import find_gpu
 
-        return BatchedMasker(_find_gpu() or "cpu")
+        if gpu := find_gpu():
+            from xew.metrics.estimators.batched.tracks import BatchedTracker
 
-
-def open_batched_tracker() -> Tracker:
-    """The default tracker in Warp kernels, on the calling thread's GPU, or on the CPU where there is none."""
-    with PARSING:
-        from xew.metrics.estimators.batched.tracks import BatchedTracker
-
-        return BatchedTracker(_find_gpu() or "cpu")
+            return BatchedTracker(gpu)
+    return ReferenceTracker()
 
 
 MASKERS: Mapping[str, Backend[Masker]] = {
     "default": Backend(
-        lambda: open_batched_masker() if _find_gpu() else ReferenceMasker(),
+        _open_default_masker,
         None,
-        "color, background and gated flow against the true video (xew.metrics.estimators.masks); warp where there is a GPU, "
-        "else opencv",
+        "color, background and gated flow against the true video (xew.metrics.estimators.masks); in Warp kernels "
+        "where there is a GPU, else opencv",
     ),
     "opencv": Backend(ReferenceMasker, None, "the default masker frame by frame, on the CPU"),
-    "warp": Backend(open_batched_masker, None, "the default masker for all frames at once, in Warp kernels"),
     "sam2": Backend(
         open_sam2,
         "sam2.1_hiera_{tiny,small,base_plus,large}.pt of github.com/facebookresearch/sam2, or a folder of Hugging Face's "
@@ -190,12 +188,12 @@ MASKERS: Mapping[str, Backend[Masker]] = {
 }
 TRACKERS: Mapping[str, Backend[Tracker]] = {
     "default": Backend(
-        lambda: open_batched_tracker() if _find_gpu() else ReferenceTracker(),
+        _open_default_tracker,
         None,
-        "template search against the true video (xew.metrics.estimators.tracks); warp where there is a GPU, else opencv",
+        "template search against the true video (xew.metrics.estimators.tracks); in Warp kernels where there is a GPU, "
+        "else opencv",
     ),
     "opencv": Backend(ReferenceTracker, None, "the default tracker frame by frame, on the CPU"),
-    "warp": Backend(open_batched_tracker, None, "the default tracker for all points and frames at once, in Warp kernels"),
     "cotracker3": Backend(
         open_cotracker,
         "scaled_offline.pth of Hugging Face's facebook/cotracker3; CC-BY-NC 4.0: not for commercial use",

@@ -1,45 +1,30 @@
 """The scores of one video: a prediction is compared with the episode that it predicts, by estimators and then by metrics.
 
-Frames and points go through the compiler in blocks of one size, so that a few programs serve episodes of all lengths.
+grades = grade(Comparison(video, EpisodeCache(truth), masker, tracker), ("psnr", "mask_iou"))
 """
 
 import functools
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import jax
 import numpy as np
 
-from xew.metrics import METRICS, contact_f1
+from xew.metrics import METRICS
 from xew.metrics.backends import Confirmer, Masker, Tracker
-from xew.metrics.estimators.contact import predicted_contact
+from xew.metrics.episode_cache import EpisodeCache, GradedVideo, cut_blocks, fill_up, is_on_cpu
 from xew.metrics.estimators.presence import confirm_tracks
-from xew.metrics.metric import ACCELERATOR_CHUNK
-from xew.metrics.perceptual import (
-    KEPT_FEATURES,
-    SMALLEST_SIDE,
-    SharedFeatures,
-    lpips,
-    region_lpips_frames,
-    robot_lpips_frames,
-    union_box,
-)
-from xew.metrics.truth import Points, Truth, is_inside
+from xew.metrics.perceptual import SMALLEST_SIDE, Box, lpips, region_lpips_frames, robot_lpips_frames, union_box
+from xew.metrics.truth import Points, Truth
 
-FRAME_BLOCK = 4
-"""Number of frames graded at once on a CPU; on a GPU it is `ACCELERATOR_CHUNK`. A video's last block is filled up: a short one
-costs little."""
-WHOLE_BLOCK = 16
-"""Number of frames that a video is filled up to a multiple of on a CPU for metrics that need all of it."""
 TRACK_BLOCK, POINT_BLOCK = 64, 32
 """Numbers of frames and points that tracks are filled up to multiples of, so that videos of all lengths and robots share a few
 programs: compiling one takes seconds, running it milliseconds."""
-OF_WHOLE_FRAMES = {"region_lpips": "lpips"}
-"""Metrics of the robot's box by name, each with the metric that it equals where the box is the whole frame, as it often is."""
-DIAGNOSTICS = {"contact_f1": contact_f1}
-"""Functions by name that are computed where asked for and are no part of the reported suite."""
+ON_SURFACES = ("robot_points", "object_points")
+"""Kinds of points that are tracked in one pass, by any tracker."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +40,7 @@ class Grades:
 
 
 def input_kind(name: str) -> str:
-    """The kind of arrays that a metric or a diagnostic compares, a key of `truth.NEEDS`."""
-    if name in DIAGNOSTICS:
-        return "contact"
+    """The kind of arrays that a metric compares, a key of `truth.NEEDS`."""
     metric = METRICS[name]
     if metric.inputs != "track":
         return metric.inputs
@@ -68,29 +51,27 @@ def input_kind(name: str) -> str:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A prediction, the truth, and the estimators that find robot and points in the prediction (they see all frames)."""
+    """A prediction, the episode that it predicts, and the estimators of the robot and its points, which see all frames."""
 
     prediction: np.ndarray
-    """[t h w 3] uint8, of the truth's shape."""
-    truth: Truth
+    """[t h w 3] uint8, of the true video's shape."""
+    episode: EpisodeCache
+    """The episode, the same object for all predictions of it."""
     masker: Masker
     tracker: Tracker
-    first: int = 1
-    """The first graded frame; those before it were given to the model."""
-    shown: np.ndarray | None = None
-    """[t h w 3] uint8, what the estimators see of the prediction; the prediction itself where left out."""
-    _found: dict[str, np.ndarray] = field(default_factory=dict, init=False, repr=False, compare=False)
+    estimator_video: np.ndarray | None = None
+    """[t h w 3] uint8, the video that the estimators see; the prediction where left out."""
+    _tracks: dict[str, np.ndarray] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
-    def seen(self) -> np.ndarray:
-        """Video [t h w 3] uint8 that the estimators see."""
-        return self.prediction if self.shown is None else self.shown
+    def truth(self) -> Truth:
+        """The episode's truth."""
+        return self.episode.truth
 
     @cached_property
-    def video(self) -> tuple[np.ndarray, np.ndarray]:
-        """The graded frames [t h w 3] uint8 of the prediction and of the truth, whose array all predictions share."""
-        target = self.truth.notes.setdefault(f"frames from {self.first}", self.truth.rgb[self.first :])
-        return self.prediction[self.first :], target
+    def video(self) -> GradedVideo:
+        """The graded frames of the prediction."""
+        return GradedVideo(self.prediction[self.episode.first :])
 
     @property
     def side(self) -> float:
@@ -109,44 +90,48 @@ class Comparison:
             known |= {"robot_points": truth.surfaces.robot, "object_points": truth.surfaces.objects}
         return known
 
-    def find(self, kind: str) -> np.ndarray:
+    def estimate_masks(self) -> np.ndarray:
+        """Robot masks [t h w] bool of all frames of the prediction."""
+        return self.masker(self._estimator_input, self.truth.rgb, self.truth.mask)
+
+    def track(self, kind: str) -> np.ndarray:
         """Where the tracker finds the points of a kind [t k 2] pixels, NaN where lost or hidden in the truth.
 
         Raises ValueError where the truth was read without them.
         """
         if kind not in self.points:
             raise ValueError("the truth has no points on surfaces; ask read_truth for 'robot_points' and 'object_points'.")
-        if kind not in self._found:
-            self._found.update(_find_points(self, kind))
-        return self._found[kind]
+        if kind not in self._tracks:
+            kinds = ON_SURFACES if kind in ON_SURFACES else (kind,)
+            self._tracks.update(self._track(tuple(self.points) if getattr(self.tracker, "pointwise", False) else kinds))
+        return self._tracks[kind]
 
+    @property
+    def _estimator_input(self) -> np.ndarray:
+        return self.prediction if self.estimator_video is None else self.estimator_video
 
-ON_SURFACES = ("robot_points", "object_points")
-"""Kinds of points that are found in one pass, whoever the tracker is."""
+    def _track(self, kinds: tuple[str, ...]) -> dict[str, np.ndarray]:
+        """Tracks [t k 2] by kind, all found in one pass.
 
-
-def _find_points(c: Comparison, kind: str) -> dict[str, np.ndarray]:
-    """Tracks [t k 2] by kind: of the kind that is asked for, and of those that the tracker finds in the same pass.
-
-    A place on a surface that does not have the color of the point's body is none, so that an object is not found by what is
-    round it.
-    """
-    alone = ON_SURFACES if kind in ON_SURFACES else (kind,)
-    kinds = tuple(c.points) if getattr(c.tracker, "pointwise", False) else alone
-    pixels, visible = (np.concatenate([getattr(c.points[k], name) for k in kinds], axis=1) for name in ("pixels", "visible"))
-    seen = visible.any(axis=0)
-    found = np.full(pixels.shape, np.nan, np.float32)
-    if seen.any():
-        found[:, seen] = c.tracker(c.seen, c.truth.rgb, np.nan_to_num(pixels[:, seen]), visible[:, seen])
-    if c.truth.surfaces is not None and c.truth.surfaces.shown is not None:
-        body = np.concatenate([_bodies(c.points[k]) for k in kinds])
-        some = seen & (body >= 0)
-        if some.any():
-            confirm = c.tracker.confirm if isinstance(c.tracker, Confirmer) else confirm_tracks
-            known = c.seen, c.truth.rgb, np.nan_to_num(pixels[:, some]), visible[:, some], c.truth.surfaces.shown, body[some]
-            found[:, some] = confirm(found[:, some], *known)
-    ends = np.cumsum([c.points[k].visible.shape[1] for k in kinds])
-    return dict(zip(kinds, np.split(found, ends[:-1], axis=1), strict=True))
+        A place on a surface that does not have the color of the point's body is none, so that an object is not found by what is
+        round it.
+        """
+        points = [self.points[kind] for kind in kinds]
+        pixels, visible = (np.concatenate([getattr(some, name) for some in points], axis=1) for name in ("pixels", "visible"))
+        seen = visible.any(axis=0)
+        tracks = np.full(pixels.shape, np.nan, np.float32)
+        videos = self._estimator_input, self.truth.rgb
+        if seen.any():
+            tracks[:, seen] = self.tracker(*videos, np.nan_to_num(pixels[:, seen]), visible[:, seen])
+        if self.truth.surfaces is not None and self.truth.surfaces.body_id is not None:
+            body = np.concatenate([_bodies(some) for some in points])
+            on_body = seen & (body >= 0)
+            places = np.nan_to_num(pixels[:, on_body]), visible[:, on_body]
+            confirm = self.tracker.confirm if isinstance(self.tracker, Confirmer) else confirm_tracks
+            body_id = self.truth.surfaces.body_id
+            tracks[:, on_body] = confirm(tracks[:, on_body], *videos, *places, body_id, body[on_body])
+        ends = np.cumsum([some.visible.shape[1] for some in points])
+        return dict(zip(kinds, np.split(tracks, ends[:-1], axis=1), strict=True))
 
 
 def _bodies(points: Points) -> np.ndarray:
@@ -155,84 +140,62 @@ def _bodies(points: Points) -> np.ndarray:
 
 
 def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
-    """Scores of one predicted video by the metrics and diagnostics of these names."""
+    """Scores of one predicted video by the metrics of these names."""
     inputs = {kind: INPUTS[kind](comparison) for kind in sorted({input_kind(name) for name in metrics})}
     values: dict[str, float] = {}
     curves: dict[str, np.ndarray] = {}
-    blocks = Blocks(comparison)
-    shared = _curves_by_shared_features(comparison, metrics, inputs, blocks)
+    of_features = _curves_of_features(comparison, metrics, inputs)
     of_tracks = _grade_tracks(comparison, metrics, inputs)
     for name in metrics:
         arrays = inputs[input_kind(name)]
         if arrays is None:
-            values[name] = float("nan")
-        elif name in DIAGNOSTICS:
-            values[name] = float(DIAGNOSTICS[name](*arrays))
+            values[name] = math.nan
         elif name in of_tracks:
             values[name], curve = of_tracks[name]
             curves |= {} if curve is None else {name: curve}
         else:
-            whole = OF_WHOLE_FRAMES.get(name)
-            known = curves.get(whole) if whole and _touches_all_borders(arrays[-1][0]) else None
-            if known is None:
-                known = shared[name] if name in shared else _curve(name, arrays, blocks)
-            curves[name] = known
+            curves[name] = of_features[name] if name in of_features else _curve(comparison, name, arrays)
             values[name] = _mean_of_known(curves[name])
-    prediction, target = comparison.video
+    prediction, target = _video(comparison)
     return Grades(values, curves, int(np.all(prediction == target, axis=(1, 2, 3)).sum()))
 
 
 Arrays = tuple[np.ndarray, ...]
+Inputs = Mapping[str, Arrays | None]
 
 
 def _video(c: Comparison) -> Arrays:
-    return c.video
+    return c.video.frames, c.episode.target.frames
 
 
 def _mask(c: Comparison) -> Arrays:
-    return c.masker(c.seen, c.truth.rgb, c.truth.mask)[c.first :], c.truth.mask[c.first :]
+    return c.estimate_masks()[c.episode.first :], c.truth.mask[c.episode.first :]
 
 
 def _region(c: Comparison) -> Arrays | None:
     """The two videos and, for each frame, all pixels that show the robot at any time; None where its box is too small."""
-    covered = np.any(c.truth.mask[c.first :], axis=0)
+    mask = c.truth.mask[c.episode.first :]
+    covered = np.any(mask, axis=0)
     _, _, height, width = union_box(np.expand_dims(covered, 0))
     if min(int(height), int(width)) < SMALLEST_SIDE:
         return None
-    return *c.video, np.broadcast_to(covered, c.truth.mask[c.first :].shape)
+    return *_video(c), np.broadcast_to(covered, mask.shape)
 
 
 def _robot(c: Comparison) -> Arrays | None:
     """The two videos and the robot's true masks, frame by frame; None where no frame shows the robot."""
-    mask = c.truth.mask[c.first :]
+    mask = c.truth.mask[c.episode.first :]
     if not mask.any() or min(mask.shape[1:]) < SMALLEST_SIDE:
         return None
-    return *c.video, mask
+    return *_video(c), mask
 
 
 def _tracks(kind: str, c: Comparison) -> Arrays | None:
     """Tracked points, true points and visibility of those that are ever seen; None where none is, whatever the prediction."""
-    found, points = c.find(kind), c.points[kind]
-    pixels, visible = np.nan_to_num(points.pixels[c.first :]), points.visible[c.first :]
+    first, tracks, points = c.episode.first, c.track(kind), c.points[kind]
+    pixels, visible = np.nan_to_num(points.pixels[first:]), points.visible[first:]
     seen = visible.any(axis=0)
-    return (found[c.first :, seen], pixels[:, seen], visible[:, seen]) if seen.any() else None
-
-
-def _contact(c: Comparison) -> Arrays | None:
-    """Predicted and true contact [t, pairs of a hand and an object that touch at some time]; None where none does.
-
-    What a hand holds is mostly behind it; so the tracker is asked for all that is in the image, also where it is covered.
-    """
-    arms, objects = np.nonzero(np.any(c.truth.contact, axis=0))
-    points = np.concatenate([c.truth.hands, c.truth.objects], axis=1)
-    within = is_inside(points, c.truth.rgb.shape)
-    if not within[:, 2 + objects].any():
-        return None
-    true = np.where(within[..., None], points, np.nan)
-    found = c.tracker(c.seen, c.truth.rgb, np.nan_to_num(points), within)
-    apart, true_apart = (np.linalg.norm(some[:, arms] - some[:, 2 + objects], axis=-1) for some in (found, true))
-    contact = c.truth.contact[:, arms, objects]
-    return predicted_contact(apart, true_apart, contact)[c.first :], contact[c.first :]
+    return (tracks[first:, seen], pixels[:, seen], visible[:, seen]) if seen.any() else None
 
 
 INPUTS: dict[str, Callable[[Comparison], Arrays | None]] = {
@@ -241,32 +204,54 @@ INPUTS: dict[str, Callable[[Comparison], Arrays | None]] = {
     "region": _region,
     "robot": _robot,
     **{kind: functools.partial(_tracks, kind) for kind in ("keypoints", "objects", *ON_SURFACES)},
-    "contact": _contact,
 }
 """Arrays that the functions of metrics take, by `input_kind`; None where the truth has nothing to compare."""
 
 
-def _curves_by_shared_features(
-    comparison: Comparison, metrics: Collection[str], inputs: dict[str, Arrays | None], blocks: "Blocks"
-) -> dict[str, np.ndarray]:
+def _curve(comparison: Comparison, name: str, arrays: Arrays) -> np.ndarray:
+    """[t] float32, the values by frame of a metric of frames."""
+    metric = METRICS[name]
+    assert metric.curve is not None, "metrics of frames have one"
+    if metric.inputs == "mask":
+        blocks = [cut_blocks(array, metric.whole) for array in arrays]
+    else:
+        blocks = _video_blocks(comparison, arrays, metric.whole)
+    curves = [metric.curve(*parts) for parts in zip(*blocks, strict=True)]
+    return np.concatenate(jax.device_get(curves))[: len(arrays[0])].astype(np.float32)
+
+
+def _video_blocks(comparison: Comparison, arrays: Arrays, whole: bool = False) -> list[list[Any]]:
+    """The two videos of a comparison, and the masks that follow them in the arrays, each in blocks."""
+    videos = comparison.video, comparison.episode.target
+    return [*(video.blocks(whole) for video in videos), *(cut_blocks(array, whole) for array in arrays[2:])]
+
+
+def _curves_of_features(comparison: Comparison, metrics: Collection[str], inputs: Inputs) -> dict[str, np.ndarray]:
     """Curves [t] float32 by metric, of those that LPIPS's network makes: it sees each video once for all of them."""
-    by_function = {METRICS[name].curve: name for name in metrics if name in METRICS and inputs[input_kind(name)] is not None}
-    device = "cpu" if jax.default_backend() == "cpu" else "gpu"
-    features = comparison.truth.notes.setdefault(
-        f"features from frame {comparison.first}", SharedFeatures(KEPT_FEATURES[device])
-    )
-    curves: dict[str, np.ndarray] = {}
+    by_function = {METRICS[name].curve: name for name in metrics if inputs[input_kind(name)] is not None}
     whole, robot, region = (by_function.get(curve) for curve in (lpips, robot_lpips_frames, region_lpips_frames))
-    video, cut = comparison.video, None if device == "cpu" else functools.partial(blocks.cut, whole=False)
+    curves: dict[str, np.ndarray] = {}
     if whole or robot:
-        mask = comparison.truth.mask[comparison.first :] if robot else None
-        plain, weighted = features.distances(*video, mask, cut=cut)
+        plain, weighted = _feature_distances(comparison, inputs["robot"] if robot else _video(comparison))
         curves |= {whole: plain} if whole else {}
         curves |= {robot: weighted} if robot and weighted is not None else {}
     arrays = inputs["region"] if region else None
-    if region and arrays is not None and not (OF_WHOLE_FRAMES.get(region) in curves and _touches_all_borders(arrays[-1][0])):
-        curves[region] = features.distances(*video, box=union_box(arrays[-1]), cut=cut)[0]
+    if region and arrays is not None:
+        if whole and _touches_all_borders(arrays[2][0]):  # the box is the whole frame, as it often is
+            curves[region] = curves[whole]
+        else:
+            curves[region], _ = _feature_distances(comparison, arrays[:2], union_box(arrays[2]))
     return curves
+
+
+def _feature_distances(
+    comparison: Comparison, arrays: Arrays | None, box: Box | None = None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """`SharedFeatures.distances` of a comparison's videos, and of the robot's masks where they follow in the arrays."""
+    assert arrays is not None, "asked for what the truth has"
+    blocks = None if is_on_cpu() else _video_blocks(comparison, arrays)
+    prediction, target, *robot = arrays
+    return comparison.episode.features.distances(prediction, target, robot[0] if robot else None, box, blocks)
 
 
 def _touches_all_borders(mask: np.ndarray) -> bool:
@@ -275,23 +260,23 @@ def _touches_all_borders(mask: np.ndarray) -> bool:
 
 
 def _grade_tracks(
-    comparison: Comparison, metrics: Collection[str], inputs: dict[str, Arrays | None]
+    comparison: Comparison, metrics: Collection[str], inputs: Inputs
 ) -> dict[str, tuple[float, np.ndarray | None]]:
     """Scores and curves [t], if any, of all metrics of tracks. What is filled up is not valid, which none of them looks at.
 
-    Tracks are small, so that a GPU has nothing to gain: they are compared where they are.
+    Tracks are small, so that a GPU has nothing to gain: they are compared on the CPU.
     """
-    found: dict[str, tuple[float, np.ndarray | None]] = {}
-    kinds = {name: input_kind(name) for name in metrics if name in METRICS and METRICS[name].inputs == "track"}
+    scores: dict[str, tuple[float, np.ndarray | None]] = {}
+    kinds = {name: input_kind(name) for name in metrics if METRICS[name].inputs == "track"}
     for kind in dict.fromkeys(kinds.values()):
         names, arrays = tuple(name for name in kinds if kinds[name] == kind), inputs[kind]
         if arrays is not None:
-            padded = [_fill(_fill(array, 0, TRACK_BLOCK, 0), 1, POINT_BLOCK, 0) for array in arrays]
+            padded = [fill_up(fill_up(array, 0, TRACK_BLOCK, 0), 1, POINT_BLOCK, 0) for array in arrays]
             with jax.default_device(jax.local_devices(backend="cpu")[0]):
                 values, curves = jax.device_get(_compare_tracks(names, padded, np.float32(comparison.side)))
             count = len(arrays[0])
-            found |= {name: (float(values[name]), curves[name][:count] if name in curves else None) for name in names}
-    return found
+            scores |= {name: (float(values[name]), curves[name][:count] if name in curves else None) for name in names}
+    return scores
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -306,56 +291,7 @@ def _compare_tracks(
     return values, {name: jax.vmap(functions[name])(*frames) for name, m in chosen.items() if not m.whole}
 
 
-Block = tuple[np.ndarray, list[jax.Array]]
-"""An array, which is kept so that no other has its identity, and its blocks on a device."""
-
-
-class Blocks:
-    """Arrays of a comparison as metrics of frames take them: in blocks of one size, the last filled up with its last frame.
-
-    On a GPU a video is put there once for all its metrics, and the truth's once for all its predictions.
-    """
-
-    def __init__(self, comparison: Comparison) -> None:
-        self._target = comparison.video[1]
-        self._of_truth: dict[tuple[int, bool], Block] = comparison.truth.notes.setdefault("blocks", {})
-        self._of_prediction: dict[tuple[int, bool], Block] = {}
-
-    def cut(self, array: np.ndarray, whole: bool) -> list[np.ndarray] | list[jax.Array]:
-        """Blocks [n ...] of an array [t ...]; a single one where it is asked for whole."""
-        if jax.default_backend() == "cpu":
-            return _cut(array, WHOLE_BLOCK if whole else FRAME_BLOCK, whole)
-        kept = self._of_truth if array is self._target else self._of_prediction
-        if (id(array), whole) not in kept:
-            kept[id(array), whole] = array, [jax.device_put(part) for part in _cut(array, ACCELERATOR_CHUNK, whole)]
-        return kept[id(array), whole][1]
-
-
-def _cut(array: np.ndarray, block: int, whole: bool) -> list[np.ndarray]:
-    if whole:
-        return [_fill(array, 0, block, "last")]
-    parts = [array[first : first + block] for first in range(0, len(array), block)]
-    return [*parts[:-1], _fill(parts[-1], 0, block, "last")]
-
-
-def _curve(name: str, arrays: Arrays, blocks: Blocks) -> np.ndarray:
-    """[t] float32."""
-    curve = METRICS[name].curve
-    assert curve is not None, "metrics of frames have one"
-    count = len(arrays[0])
-    parts = zip(*(blocks.cut(array, METRICS[name].whole) for array in arrays), strict=True)
-    curves = [curve(*part) for part in parts]
-    return np.concatenate(jax.device_get(curves))[:count].astype(np.float32)
-
-
 def _mean_of_known(curve: np.ndarray) -> float:
     """Mean of the values of a curve [t] that are not NaN; NaN where there is none."""
     known = curve[~np.isnan(curve)]
     return float(np.mean(known, dtype=np.float64)) if len(known) else math.nan
-
-
-def _fill(array: np.ndarray, axis: int, block: int, value: str | int) -> np.ndarray:
-    """Up to a multiple of `block` along an axis, with a value or with what is last."""
-    missing = -array.shape[axis] % block
-    widths = [(0, missing if i == axis else 0) for i in range(array.ndim)]
-    return np.pad(array, widths, mode="edge") if value == "last" else np.pad(array, widths, constant_values=value)

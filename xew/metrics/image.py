@@ -6,7 +6,6 @@ float32 and results agree with a float64 reference to about 1e-7. Floating input
 
 import functools
 import math
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Bool
 
-from xew.metrics.mergeable.sums import Mean, Mergeable, empty_mean, mean_of, merge_means, to_float
-from xew.metrics.metric import ByFrame, Scalar, Video, check_first, check_videos, map_frames
+from xew.metrics.metric import ByFrame, Video, check_first, check_videos, map_frames
 
 SSIM_WINDOW = 7
 SSIM_C1, SSIM_C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
@@ -29,8 +27,8 @@ def psnr(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFra
     Exact frames have no finite PSNR. As in the paper they are capped at the largest finite value among the frames they
     are mixed with, which are here those of the same call: one video, so that no score depends on what else is graded.
     The paper says nothing of videos that are exact throughout; they get the most that an inexact frame of this size can
-    have: one channel of one pixel off by one level (101.76 dB at 320x240). `exact_frames` tells which frames these are;
-    their count belongs beside the mean, which one cap can move.
+    have: one channel of one pixel off by one level (101.76 dB at 320x240). `exact_frames` says which frames these are;
+    their count belongs with the mean, which one cap can move.
 
     Args:
         prediction, target: [t h w 3] uint8, or floating in [0, 1].
@@ -40,20 +38,11 @@ def psnr(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFra
         [t] float32; NaN where a pixel of either frame is NaN.
     """
     error = mean_squared_error(prediction, target, chunk)
-    finite = finite_psnr(error)
+    finite = -10 * jnp.log10(jnp.where(error == 0, 1, error) / 255**2)
     largest = jnp.max(jnp.where(error > 0, finite, -jnp.inf))
-    cap = jnp.where(jnp.isfinite(largest), largest, attainable_psnr(np.shape(target)))
+    attainable = 10 * jnp.log10(jnp.float32(255**2 * math.prod(np.shape(target)[1:])))
+    cap = jnp.where(jnp.isfinite(largest), largest, attainable)
     return jnp.where(error == 0, cap, finite)
-
-
-def finite_psnr(error: ByFrame) -> ByFrame:
-    """[t] float32 [dB] of mean squared errors [t] in levels of 255; 48.13, of an error of 1, where there is none."""
-    return -10 * jnp.log10(jnp.where(error == 0, 1, error) / 255**2)
-
-
-def attainable_psnr(shape: tuple[int, ...]) -> Scalar:
-    """Scalar float32 [dB], the most that an inexact frame of [t h w 3] can have: one channel of one pixel off by one level."""
-    return 10 * jnp.log10(jnp.float32(255**2 * math.prod(shape[1:])))
 
 
 @check_first(check_videos)
@@ -135,66 +124,9 @@ def _levels(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, int | flo
 def _window_sum(image: jax.Array) -> jax.Array:
     """Sums over all 7x7 windows inside an image [h w*3]; along a row the pixels of a channel are three apart.
 
-    Channels beside each other in one long row are almost three times as fast on a CPU as an axis of their own.
+    Channels side by side in one long row are almost three times as fast on a CPU as an axis of their own.
     """
     zero = np.zeros((), image.dtype)  # a constant, else JAX does not see that this is a sum and has no gradient
     for window, dilation in (((SSIM_WINDOW, 1), (1, 1)), ((1, SSIM_WINDOW), (1, 3))):
         image = lax.reduce_window(image, zero, lax.add, window, (1, 1), "valid", window_dilation=dilation)
     return image
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class CappedMean:
-    """The mean of PSNR: exact frames count as the largest finite value, which is not known before all parts are there."""
-
-    finite: Mean
-    """Mean of the finite values, in dB."""
-    exact: jax.Array
-    """int32, number of exact frames."""
-    largest: jax.Array
-    """float32 [dB], the largest finite value; -inf where there is none."""
-    attainable: jax.Array
-    """float32 [dB], what exact frames count as where no frame is inexact."""
-
-    @property
-    def value(self) -> jax.Array:
-        """Mean of `psnr` over the frames [t] of the video, a float32 scalar [dB]; NaN if one frame's is."""
-        cap = jnp.where(self.finite.count > 0, self.largest, self.attainable)
-        finite = jnp.where(self.finite.count > 0, to_float(self.finite.total), 0)
-        exact = self.exact.astype(jnp.float32)
-        mean = (finite + jnp.where(self.exact > 0, exact * cap, 0)) / (self.finite.count.astype(jnp.float32) + exact)
-        return jnp.where(self.finite.undefined > 0, jnp.nan, mean)
-
-
-def _empty_capped() -> CappedMean:
-    nothing = jnp.float32(-jnp.inf)
-    return CappedMean(empty_mean(), jnp.int32(0), nothing, nothing)
-
-
-@check_first(check_videos)
-def _update_capped(state: CappedMean, prediction: Video, target: Video, *, chunk: int | None = None) -> CappedMean:
-    error = mean_squared_error(prediction, target, chunk)
-    values = finite_psnr(error)
-    return _merge_capped(
-        state,
-        CappedMean(
-            finite=mean_of(values, error != 0),
-            exact=jnp.sum(error == 0, dtype=jnp.int32),
-            largest=jnp.max(jnp.where(error > 0, values, -jnp.inf)),
-            attainable=attainable_psnr(np.shape(target)),
-        ),
-    )
-
-
-def _merge_capped(a: CappedMean, b: CappedMean) -> CappedMean:
-    return CappedMean(
-        finite=merge_means(a.finite, b.finite),
-        exact=a.exact + b.exact,
-        largest=jnp.maximum(a.largest, b.largest),
-        attainable=jnp.maximum(a.attainable, b.attainable),
-    )
-
-
-PSNR_STATE = Mergeable(_empty_capped, _update_capped, _merge_capped, lambda state: state.value)
-"""States of `psnr`."""

@@ -2,7 +2,7 @@
 
 Masks are packed, eight pixels of a column in a byte: contours and discs are then a few dozen operations on bytes, and
 counting is population count. All counts are integers, so the scores do not depend on the machine. Each step is a program
-of its own, and what is counted is an array, not an expression: in one program XLA would do the first steps anew for each
+of its own, and what is counted is an array, not an expression: in one program XLA would do the first steps again for each
 use, and count without vector instructions (three times the time on a CPU).
 """
 
@@ -57,13 +57,6 @@ def boundary_f1(prediction: Masks, target: Masks, tolerance: int | float = 2) ->
     """
     p, t = _pack(prediction), _pack(target)
     return _f1(p, t, np.shape(target)[1], _disc(tolerance))
-
-
-@check_first(check_masks)
-def mask_scores(prediction: Masks, target: Masks, tolerance: int | float = 2) -> tuple[ByFrame, ByFrame]:
-    """`mask_iou` and `boundary_f1`, [t] float32 each, of the same masks [t h w] bool, each of which is packed once."""
-    p, t = _pack(prediction), _pack(target)
-    return _iou(p, t, p & t), _f1(p, t, np.shape(target)[1], _disc(tolerance))
 
 
 @jax.jit

@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from xew.metrics.mergeable.sums import Mergeable
+from xew.metrics.total import Total, total_of
 
 AnyArray: TypeAlias = jax.Array | np.ndarray
 Video: TypeAlias = UInt8[AnyArray, "t h w 3"] | Float[AnyArray, "t h w 3"]
@@ -27,8 +27,6 @@ Tracks: TypeAlias = Float[AnyArray, "t k 2"]
 the score is NaN."""
 Valid: TypeAlias = Bool[AnyArray, "t k"]
 """Flags of the points that can be seen in the target."""
-Contacts: TypeAlias = Bool[AnyArray, "t c"]
-"""Flags of the pairs of bodies that touch."""
 ByFrame: TypeAlias = Float32[jax.Array, " t"]
 """One value for each frame."""
 Scalar: TypeAlias = Float32[jax.Array, ""]
@@ -42,7 +40,7 @@ target's masks. robot: two videos and the target's masks frame by frame. track: 
 ESTIMATED_INPUTS = ("mask", "track")
 """Inputs that have to be estimated in a prediction."""
 SUITES = {
-    "paper": "the paper's definitions, so that its tables can be set beside ours",
+    "paper": "the paper's definitions, so its tables compare with ours",
     "strict": "what is lost is an error, points lie on surfaces, and one tolerance holds for all robots",
 }
 """Suites of metrics by name, each with what it promises."""
@@ -85,7 +83,8 @@ class Metric:
     """Whether its values by frame need the whole video, so that frames are never graded in blocks (PSNR, by its cap); of a
     metric of tracks, whether a frame has no value of its own (nDTW)."""
     parts: Callable[..., tuple[jax.Array, jax.Array]] | None = None
-    """Function of the same inputs to the values that the metric is the mean of, and which of them count."""
+    """Function of the same inputs to the values that the metric is the mean of, and which of them count; None where these are
+    the values by frame, or where it is a mean of means (`trajectory_error`)."""
     suites: tuple[str, ...] = tuple(SUITES)
     """Suites that it belongs to, keys of `SUITES`."""
     counterpart: str = ""
@@ -94,8 +93,6 @@ class Metric:
     """Points that a metric of tracks compares, one of `POINTS`."""
     by_image: bool = False
     """Whether its functions take the option `side`, the square root of the image's area [pixels]."""
-    state: Mergeable | None = None
-    """Mergeable states; left out, they are the mean of `parts`, or else of the values by frame."""
 
     @property
     def estimated(self) -> bool:
@@ -111,6 +108,22 @@ class Metric:
     def leaves_tasks(self) -> bool:
         """Do tasks without power leave its mean (`xew.statistics.find_power`)?"""
         return self.estimated and "strict" in self.suites
+
+    def total(self, *inputs: AnyArray, **options: Any) -> Total:
+        """Sum and number of the values that the metric is the mean of: those of a video's parts, or of several videos, add up.
+
+        Args:
+            inputs, options: those of `function`, of all frames or of a part of them. A path cannot be cut (nDTW), and PSNR caps
+                exact frames by the frames that it is given with.
+
+        Raises:
+            ValueError: the metric is no mean over frames or points.
+        """
+        if self.parts is not None:
+            return total_of(*self.parts(*inputs, **options))
+        if self.curve is None:
+            raise ValueError(f"{self.title or self.function} is a mean of means; call it with all frames of a video.")
+        return total_of(self.curve(*inputs, **options))
 
 
 def check_first(check: Callable[..., None], **options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -159,8 +172,8 @@ def check_videos(prediction: Any, target: Any, smallest_side: int = 1) -> None:
         raise ValueError(f"frames are {np.shape(target)[1:3]}, this metric needs sides of at least {smallest_side} pixels.")
     kinds = {jnp.result_type(video) for video in (prediction, target)}
     if len(kinds) != 1 or not all(kind == jnp.uint8 or jnp.issubdtype(kind, jnp.floating) for kind in kinds):
-        found = sorted(str(kind) for kind in kinds)
-        raise TypeError(f"videos have dtype {' and '.join(found)}, expected both uint8, or both floating in [0, 1].")
+        dtypes = sorted(str(kind) for kind in kinds)
+        raise TypeError(f"videos have dtype {' and '.join(dtypes)}, expected both uint8, or both floating in [0, 1].")
     for name, video in (("prediction", prediction), ("target", target)):
         _check_range(name, video)
 
@@ -232,14 +245,6 @@ def check_tracks(prediction: Any, target: Any, valid: Any) -> None:
         if not jnp.issubdtype(jnp.result_type(points), jnp.floating):
             raise TypeError(f"{name} has dtype {jnp.result_type(points)}, expected floating pixels; use .astype(np.float32).")
     check_bool("valid", valid)
-
-
-def check_contacts(prediction: Any, target: Any) -> None:
-    """Raise ValueError or TypeError unless both are bool [t c] of one shape."""
-    check_arrays(prediction=prediction, target=target)
-    _check_shapes("contacts", prediction, target, "[t c]", np.ndim(target) == 2)
-    for name, contact in (("prediction", prediction), ("target", target)):
-        check_bool(name, contact)
 
 
 def map_frames(function: Callable[..., Any], frames: Any, chunk: int | None) -> Any:

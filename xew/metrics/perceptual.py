@@ -5,9 +5,7 @@ float32 everywhere: TF32, the default of some GPUs, changes the fourth digit (`n
 """
 
 import functools
-import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -46,27 +44,11 @@ Box = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 """top, left, height, width; int32 [pixels]."""
 Layers = tuple[tuple[jax.Array, jax.Array, jax.Array], ...]
 """Five layers of frames [n h w d] float32, each with the height and width that are valid."""
-Cut = Callable[[np.ndarray], Sequence[AnyArray]]
-"""Function that cuts an array [t ...] into blocks [n ...] of one size, on the device where they are needed."""
+Blocks = Sequence[AnyArray]
+"""An array [t ...] in blocks [n ...] of one size, on the device where they are needed; the last is filled up."""
 KEPT_FEATURES = {"cpu": 512_000_000, "gpu": 1_024_000_000}
 """Size [bytes] up to which `SharedFeatures` keeps features of a true video on a device: 170 or 340 frames of 320x240, whose box
 is the whole image in three of four episodes."""
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Features:
-    """What LPIPS knows of a video: make it once of a target that several predictions are compared with.
-
-    3.0 MB a frame of 320x240.
-    """
-
-    layers: tuple[jax.Array, ...]
-    """Five of [t h w d] float32: unit vectors, zero outside the box."""
-    box: Box
-    """The part of the frames that is compared."""
-    shape: tuple[int, ...] = field(metadata={"static": True})
-    """Shape of the video, [t h w 3]."""
 
 
 @check_first(check_videos, smallest_side=SMALLEST_SIDE)
@@ -104,7 +86,7 @@ def region_lpips(
     """LPIPS inside the bounding box of the union over time of the target's robot masks, mean over frames.
 
     The box is one for the whole video, and is cut out before the network, as if the video were no larger. Under a jit of
-    the caller's, where its size is not known beforehand, a box too small gives NaN in place of the error.
+    the caller's, where its size is not known beforehand, a box too small gives NaN instead of the error.
 
     Args:
         prediction, target: [t h w 3] RGB, uint8, or floating in [0, 1].
@@ -164,7 +146,7 @@ def robot_lpips_frames(prediction: Video, target: Video, target_mask: Masks, *, 
 def robot_lpips_parts(
     prediction: Video, target: Video, target_mask: Masks, *, chunk: int | None = None
 ) -> tuple[ByFrame, Bool[jax.Array, " t"]]:
-    """What `robot_lpips` of videos [t h w 3] and masks [t h w] is the mean of: [t] float32, and [t] bool, which count."""
+    """Values [t] float32 that `robot_lpips` of videos [t h w 3] and masks [t h w] is the mean of, and [t] bool, which count."""
     mask = jnp.asarray(target_mask)
     return _weighted_distance(_weights(), prediction, target, mask, chunk), jnp.any(mask, axis=(1, 2))
 
@@ -172,55 +154,6 @@ def robot_lpips_parts(
 def check_video(video: Any) -> None:
     """Raise ValueError or TypeError unless a video is [t h w 3] with sides that LPIPS takes."""
     check_videos(video, video, SMALLEST_SIDE)
-
-
-def check_target(target: Any, target_mask: Any = None) -> None:
-    """Raise ValueError or TypeError unless a video is [t h w 3] and large enough, and its mask None or bool [t h w]."""
-    check_video(target)
-    if target_mask is not None:
-        _check_mask(target, target_mask)
-
-
-@check_first(check_target)
-def lpips_features(target: Video, target_mask: Masks | None = None, *, chunk: int | None = None) -> Features:
-    """What `lpips_from_features` needs of a target; half of the work of `lpips`, done once for all predictions.
-
-    Args:
-        target: [t h w 3] RGB, uint8, or floating in [0, 1]; sides of at least 31 pixels.
-        target_mask: [t h w] bool, to compare as `region_lpips` does; None for whole frames.
-        chunk: as in `lpips`.
-
-    Raises:
-        ValueError: as in `lpips` and `region_lpips`.
-        FileNotFoundError: the weights are not installed.
-    """
-    box = _whole_box(target) if target_mask is None else _mask_box(target_mask)
-    return Features(_box_features(_weights(), target, box, chunk), box, np.shape(target))
-
-
-def check_with_features(prediction: Any, target: Features) -> None:
-    """Raise ValueError or TypeError unless a video is [t h w 3], of the shape that the features are of."""
-    check_videos(prediction, prediction, SMALLEST_SIDE)
-    if np.shape(prediction) != target.shape:
-        raise ValueError(f"prediction is {np.shape(prediction)}, the features are of a target {target.shape}.")
-
-
-@check_first(check_with_features)
-def lpips_from_features(prediction: Video, target: Features, *, chunk: int | None = None) -> ByFrame:
-    """`lpips`, or `region_lpips_frames`, of a prediction and a target that is given by its features.
-
-    Args:
-        prediction: [t h w 3] RGB, uint8, or floating in [0, 1], of the target's size.
-        target: by `lpips_features`.
-        chunk: as in `lpips`.
-
-    Returns:
-        [t] float32; within 1e-6 of what the two videos give.
-
-    Raises:
-        ValueError: the prediction has another size than the target.
-    """
-    return _distance_from_features(_weights(), prediction, target.layers, target.box, chunk)
 
 
 @check_first(check_video)
@@ -245,13 +178,13 @@ class SharedFeatures:
     """Features of a true video's frames, made once for the LPIPS of whole frames, of the robot and of its box, and for all
     predictions that are graded after one another.
 
-    On a CPU, where frames come one by one, a frame's features have the same bits alone and beside another's, so that the
+    On a CPU, where frames come one by one, a frame's features have the same bits alone and with another's, so the
     numbers are those of `lpips` and `region_lpips_frames`. Those of `robot_lpips_frames` may differ in the last bit: the
     compiler adds what is weighted in another order. In blocks of frames all are within 1e-6.
     """
 
     def __init__(self, most_bytes: int) -> None:
-        """Keep features of the true video up to this size [bytes]; those of further frames are made anew each time."""
+        """Keep features of the true video up to this size [bytes]; those of further frames are made again each time."""
         self._left = most_bytes
         self._true: dict[tuple[int, tuple[int, ...]], Layers] = {}
 
@@ -261,7 +194,7 @@ class SharedFeatures:
         target: np.ndarray,
         robot: np.ndarray | None = None,
         box: Box | None = None,
-        cut: Cut | None = None,
+        blocks: Sequence[Blocks] | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """LPIPS [t] float32 inside a box, and weighted by the robot as `robot_lpips_frames` has it.
 
@@ -270,18 +203,18 @@ class SharedFeatures:
             target: [t h w 3] uint8, the same video in every call.
             robot: [t h w] bool, of whole frames only; None where the second answer is not asked for.
             box: `union_box` of the region; whole frames where left out.
-            cut: cuts an array [t ...] into the blocks [n ...] that are computed at once, the last filled up to the size of the
-                others; frame by frame where left out, which is fastest on a CPU.
+            blocks: prediction, target and, if given, robot, each in the blocks that are computed at once; frame by frame where
+                left out, which is fastest on a CPU.
         """
-        cut = _frame_by_frame if cut is None else cut
+        arrays = (prediction, target) if robot is None else (prediction, target, robot)
+        blocks = [_frame_by_frame(array) for array in arrays] if blocks is None else blocks
         box = _whole_box(target) if box is None else box
         equal = np.all(prediction == target, axis=(1, 2, 3))
         plain: list[Any] = []
         weighted: list[Any] = []
         layers: Layers | None = None
         own = made_of = np.s_[0:0]
-        masks = itertools.repeat(None) if robot is None else cut(robot)
-        for frames, true, mask in zip(cut(prediction), cut(target), masks, strict=False):
+        for frames, true, *masks in zip(*blocks, strict=True):
             own = np.s_[own.stop : own.stop + len(frames)]
             if equal[own].all():
                 plain.append(np.zeros(len(frames), np.float32))
@@ -291,8 +224,7 @@ class SharedFeatures:
                 layers, made_of = _layers(_weights(), frames, box), own
             true_layers = self._of_target(own.start, true, box)
             plain.append(_distance_of_layers(_weights(), layers, true_layers))
-            if mask is not None:
-                weighted.append(_weighted_distance_of_layers(_weights(), layers, true_layers, mask))
+            weighted += [_weighted_distance_of_layers(_weights(), layers, true_layers, mask) for mask in masks]
         # A convolution may round the two images of a pair differently.
         whole = np.where(equal, np.float32(0), _join(plain, len(target)))
         if robot is None:
@@ -393,8 +325,8 @@ def _box_distance(
     def distances(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
         image, count = _input(jnp.concatenate(pair), box), len(pair[0])
         units = ((_unit(x), h, w) for x, h, w in _features(weights, image, *box[2:], exact=exact))
-        found = _sum_of_layers(weights, [(both[:count], both[count:], h, w) for both, h, w in units])
-        return jnp.where(_is_broken(image[:count], image[count:]), jnp.nan, found)
+        values = _sum_of_layers(weights, [(both[:count], both[count:], h, w) for both, h, w in units])
+        return jnp.where(_is_broken(image[:count], image[count:]), jnp.nan, values)
 
     return map_chunks(lambda pair: _zero_where_equal(distances, pair), (prediction, target), chunk)
 
@@ -424,8 +356,8 @@ def _weighted_distance(
     def distances(frames: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
         image, count = _input(jnp.concatenate(frames[:2]), box), len(frames[0])
         units = [_unit(x) for x, _, _ in _features(weights, image, *box[2:])]
-        found = _weighted_sum_of_layers(weights, [(both[:count], both[count:]) for both in units], frames[2])
-        return jnp.where(_is_broken(image[:count], image[count:]), jnp.nan, found)
+        values = _weighted_sum_of_layers(weights, [(both[:count], both[count:]) for both in units], frames[2])
+        return jnp.where(_is_broken(image[:count], image[count:]), jnp.nan, values)
 
     return map_chunks(lambda frames: _zero_where_equal(distances, frames), (prediction, target, mask), chunk)
 
@@ -475,19 +407,6 @@ def _box_features(weights: Weights, video: jax.Array, box: Box, chunk: int | Non
         return tuple(_unit(x) for x, _, _ in _features(weights, _input(frames, box), *box[2:]))
 
     return map_chunks(of_frames, video, chunk)
-
-
-@functools.partial(jax.jit, static_argnames="chunk")
-def _distance_from_features(
-    weights: Weights, prediction: jax.Array, target: tuple[jax.Array, ...], box: Box, chunk: int | None
-) -> jax.Array:
-    def of_frames(pair: tuple[jax.Array, tuple[jax.Array, ...]]) -> jax.Array:
-        image = _input(pair[0], box)
-        units = zip(_features(weights, image, *box[2:]), pair[1], strict=True)
-        found = _sum_of_layers(weights, [(_unit(x), y, h, w) for (x, h, w), y in units])
-        return jnp.where(_is_broken(image), jnp.nan, found)
-
-    return map_chunks(of_frames, (prediction, target), chunk)
 
 
 @functools.partial(jax.jit, static_argnames="chunk")

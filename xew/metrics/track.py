@@ -2,7 +2,7 @@
 
 Tracks are float [t k 2] pixels (x right, y down), validity bool [t k]: the point is visible in the target. A prediction
 that lost a point holds NaN there. In the paper's definitions it is a miss for PCK and left out of the errors, so look at
-coverage beside them. In the strict ones, whose names end so, it is an error like the largest that any point can have, and one
+coverage with them. In the strict ones, whose names end so, it is an error like the largest that any point can have, and one
 tolerance holds for all robots.
 """
 
@@ -15,8 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Bool, Float32
 
-from xew.metrics.mergeable.sums import Mean, Mergeable, empty_mean, mean_of, merge_means
-from xew.metrics.metric import AnyArray, ByFrame, Contacts, Scalar, Tracks, Valid, check_contacts, check_first, check_tracks
+from xew.metrics.metric import AnyArray, ByFrame, Scalar, Tracks, Valid, check_first, check_tracks
 
 PointValues: TypeAlias = Float32[jax.Array, "t k"]
 Known: TypeAlias = tuple[jax.Array, jax.Array, jax.Array]
@@ -70,7 +69,7 @@ def pck_05(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
 def coverage(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
     """Share in [0, 1] of the valid points that the prediction has, higher is better.
 
-    Stands beside every error: an error over few points that were found says little.
+    Belongs to every error: an error over few points that were found says little.
 
     Args:
         prediction, target: [t k 2] pixels. valid: [t k] bool.
@@ -108,36 +107,6 @@ def trajectory_error(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar
     """
     distance, tracked = distances(prediction, target, valid)
     return _masked_mean(_masked_mean(distance, tracked, axis=0), jnp.any(tracked, axis=0))
-
-
-@check_first(check_contacts)
-@functools.partial(jax.jit, static_argnames="tolerance")
-def contact_f1(prediction: Contacts, target: Contacts, tolerance: int = 0) -> Scalar:
-    """F1 of frames in contact, over all pairs of bodies; a diagnostic outside the suite, higher is better.
-
-    The paper computes one and does not report it, because its calibration found contact timing in predicted video too
-    unreliable. Precision is the share of the predicted contacts (frame and pair) with a true one of the same pair within
-    the tolerance, recall the share of true ones with a predicted one.
-
-    Args:
-        prediction, target: [t c] bool, which of c pairs touch.
-        tolerance: frames.
-
-    Returns:
-        Scalar float32 in [0, 1]; 1 where neither has any contact, 0 where one has none.
-    """
-    counts = jnp.sum(prediction), jnp.sum(target)
-    hits = jnp.sum(prediction & _widen(target, tolerance)), jnp.sum(target & _widen(prediction, tolerance))
-    precision, recall = (hit / jnp.maximum(count, 1) for hit, count in zip(hits, counts, strict=True))
-    total = precision + recall
-    score = jnp.where(total > 0, 2 * precision * recall / jnp.where(total > 0, total, 1), 0)
-    return jnp.where(counts[0] + counts[1] > 0, score, 1).astype(jnp.float32)
-
-
-def _widen(contact: AnyArray, frames: int) -> jax.Array:
-    """[t c] true within so many frames of a true one."""
-    shifted = jnp.pad(contact, ((frames, frames), (0, 0)))
-    return functools.reduce(jnp.logical_or, (shifted[i : i + len(contact)] for i in range(2 * frames + 1)))
 
 
 @check_first(check_tracks)
@@ -266,7 +235,7 @@ def warpings(prediction: Tracks, target: Tracks, valid: Valid) -> tuple[Float32[
 @check_first(check_tracks)
 @jax.jit
 def strict_hits(prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE) -> tuple[PointValues, Valid]:
-    """What `pck_strict` of tracks [t k 2] is the mean of: [t k] float32, share of the tolerances kept, and [t k] bool."""
+    """What `pck_strict` of tracks [t k 2] is the mean of: [t k] float32, share of the tolerances met, and [t k] bool."""
     tolerances = jnp.asarray(TOLERANCES, jnp.float32) / TAPVID_SIDE * side
     near = _distance(prediction, target)[..., None] < tolerances.reshape(1, 1, -1)
     return _break(jnp.mean(near.astype(jnp.float32), axis=-1), valid, target, valid)
@@ -330,8 +299,8 @@ def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray, most: 
     order = jnp.argsort(~tracked, stable=True)
     keep = tracked[order][:, None]
     a, b = (jnp.where(keep, _in_float32(path)[order], 0) for path in (prediction, target))
-    found = _is_found(a)
-    a = jnp.where(found[:, None], a, 0)
+    has_place = _is_found(a)
+    a = jnp.where(has_place[:, None], a, 0)
     t = len(a)
     rows, end = jnp.arange(t), jnp.maximum(jnp.sum(tracked) - 1, 0)
     x, y = a.T
@@ -339,7 +308,7 @@ def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray, most: 
     def fill(known: Known, d: jax.Array) -> tuple[Known, None]:
         diagonal, last, total = known
         facing_x, facing_y = b[jnp.clip(d - rows, 0, t - 1)].T
-        cost = jnp.where(found, jnp.minimum(_root(jnp.square(x - facing_x) + jnp.square(y - facing_y)), most), most)
+        cost = jnp.where(has_place, jnp.minimum(_root(jnp.square(x - facing_x) + jnp.square(y - facing_y)), most), most)
         up = jnp.concatenate([jnp.full(1, jnp.inf, jnp.float32), last[:-1]])
         cells = cost + jnp.where(d == 0, 0, jnp.minimum(jnp.minimum(up, last), diagonal))
         cells = jnp.where((rows <= d) & (rows > d - t), cells, jnp.inf)
@@ -347,16 +316,16 @@ def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray, most: 
         return (up, cells, jnp.where(d == 2 * end, cells[end], total)), None
 
     # Infinity that is made of the data lies where the data lie, as shard_map wants it of what a scan carries.
-    nothing = lax.stop_gradient(jnp.maximum(jnp.where(found, jnp.minimum(_norm(a - b), most), most), jnp.inf))
+    nothing = lax.stop_gradient(jnp.maximum(jnp.where(has_place, jnp.minimum(_norm(a - b), most), most), jnp.inf))
     (_, _, total), _ = lax.scan(fill, (nothing, nothing, nothing[0]), jnp.arange(2 * t - 1))
     return total
 
 
 def _distance(prediction: AnyArray, target: AnyArray) -> jax.Array:
     """[t k] Euclidean distance; infinite where the prediction has no point."""
-    found = _is_found(prediction)
+    has_place = _is_found(prediction)
     prediction, target = _in_float32(prediction), _in_float32(target)
-    return jnp.where(found, _norm(jnp.where(found[..., None], prediction, target) - target), jnp.inf)
+    return jnp.where(has_place, _norm(jnp.where(has_place[..., None], prediction, target) - target), jnp.inf)
 
 
 def _is_found(points: AnyArray) -> jax.Array:
@@ -379,18 +348,5 @@ def _root(square: jax.Array) -> jax.Array:
 
 
 def _masked_mean(values: jax.Array, keep: AnyArray, axis: int | None = None) -> jax.Array:
-    """Mean of the kept values; NaN where none is."""
+    """Mean of the values to keep; NaN where none is."""
     return jnp.sum(jnp.where(keep, values, 0), axis=axis) / jnp.sum(keep, axis=axis).astype(jnp.float32)
-
-
-def _update_objects(state: Mean, prediction: Tracks, target: Tracks, valid: Valid) -> Mean:
-    return merge_means(state, mean_of(*distances(prediction, target, valid)))
-
-
-def _mean_over_objects(state: Mean) -> jax.Array:
-    seen = state.count > 0
-    return jnp.sum(jnp.where(seen, state.value, 0)) / jnp.sum(seen, dtype=jnp.float32)
-
-
-TRAJECTORY_STATE = Mergeable(lambda objects: empty_mean((objects,)), _update_objects, merge_means, _mean_over_objects)
-"""States of `trajectory_error`: one mean for each object."""

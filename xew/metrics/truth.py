@@ -4,14 +4,12 @@ Reads  <data>/<task>/<seed>/<robot>/ (xew.episode)
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from xew.episode import EpisodeError, demand_known, read_states, read_video
-from xew.projection import project
+from xew.episode import EpisodeError, demand_known, project, read_states, read_video
 
 NEEDS = {
     "video": (),
@@ -22,7 +20,6 @@ NEEDS = {
     "objects": ("object_pose", "extrinsics", "intrinsics"),
     "robot_points": ("keypoints", "keypoint_visible"),
     "object_points": ("object_pose", "extrinsics", "intrinsics"),
-    "contact": ("object_pose", "tool_pose", "contact", "extrinsics", "intrinsics"),
 }
 """Arrays of an episode that each kind of comparison rests on; imported episodes may not know some."""
 
@@ -46,7 +43,7 @@ class Points:
     visible: np.ndarray
     """[t k] bool."""
     body: np.ndarray | None = None
-    """[k] int, index of the body that each point lies on, as in `Surfaces.shown`; None where bodies are not known."""
+    """[k] int, index of the body that each point lies on, as in `Surfaces.body_id`; None where bodies are not known."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +52,7 @@ class Surfaces:
 
     robot: Points
     objects: Points
-    shown: np.ndarray | None
+    body_id: np.ndarray | None
     """[t h w] int16, index of the body that a pixel shows, -1 for any other; None where the shapes are not known."""
     known: bool
     """False where the episode's shapes are not known, as of an imported one: the points are then links' and objects'
@@ -79,24 +76,18 @@ class Truth:
     object_visible: np.ndarray
     """[t o] bool: in the image, not behind the robot, and, where the object rests, not behind another (`_has_changed_at_rest`).
     A moving object that is behind another counts as visible: episodes hold no depth."""
-    hands: np.ndarray
-    """[t 2 2] float32 pixels, the tool frames of the left and right arm, projected; NaN behind the camera."""
-    contact: np.ndarray
-    """[t 2 o] bool, does any finger of the left, right arm touch the object."""
     surfaces: Surfaces | None = None
     """Points on surfaces; None where they were not asked for."""
-    notes: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """Notes of what all predictions of the episode share, by who keeps them (`grade`); a replaced truth begins with none."""
 
 
-def read_truth(folder: Path, frames: int, compared: Collection[str], keep: Path | None = None) -> Truth:
+def read_truth(folder: Path, frames: int, compared: Collection[str], cache: Path | None = None) -> Truth:
     """The first frames of an episode.
 
     Args:
         folder: of the episode.
         frames: how many are asked for.
         compared: keys of NEEDS; an array that none of them rests on may be unknown.
-        keep: folder that keeps points on surfaces, so that they are rendered once; None renders them anew.
+        cache: folder of points on surfaces, which are rendered once and kept there; None renders them again.
 
     Raises:
         EpisodeError: a file is missing or damaged, files contradict each other, or the episode does not know what is compared.
@@ -105,18 +96,15 @@ def read_truth(folder: Path, frames: int, compared: Collection[str], keep: Path 
     states = read_states(folder)
     rgb = read_video(folder / "rgb.mkv")
     if rgb.shape[:3] != states.robot_mask.shape:
-        raise EpisodeError(f"{folder}: video {rgb.shape[:3]} and masks {states.robot_mask.shape} differ; generate it anew.")
-    objects, hands = (
-        project(pose[..., :3], states.intrinsics, states.extrinsics)[0].astype(np.float32)
-        for pose in (states.object_pose, states.tool_pose)
-    )
+        raise EpisodeError(f"{folder}: video {rgb.shape[:3]} and masks {states.robot_mask.shape} differ; generate it again.")
+    objects = project(states.object_pose[..., :3], states.intrinsics, states.extrinsics)[0].astype(np.float32)
     visible = _find_visible(objects, rgb, states.robot_mask)
     surfaces = None
     if {"robot_points", "object_points"} & set(compared):
-        surfaces = _find_surfaces(folder, frames, keep) or Surfaces(
+        surfaces = _find_surfaces(folder, frames, cache) or Surfaces(
             Points(states.keypoints[:frames], states.keypoint_visible[:frames]),
             _of_moving(states.object_pose[..., :3], Points(objects, visible), frames),
-            shown=None,
+            body_id=None,
             known=False,
         )
     return Truth(
@@ -126,18 +114,16 @@ def read_truth(folder: Path, frames: int, compared: Collection[str], keep: Path 
         keypoint_visible=states.keypoint_visible[:frames],
         objects=objects[:frames],
         object_visible=visible[:frames],
-        hands=hands[:frames],
-        contact=states.contact[:frames],
         surfaces=surfaces,
     )
 
 
-def _find_surfaces(folder: Path, frames: int, keep: Path | None) -> Surfaces | None:
+def _find_surfaces(folder: Path, frames: int, cache: Path | None) -> Surfaces | None:
     """Points on surfaces in an episode's first frames; None where its shapes are not known."""
     # Only here: the metrics load without Warp.
     from xew.sim_warp.production.surfaces import read_surfaces
 
-    tracks = read_surfaces(folder, keep=keep)
+    tracks = read_surfaces(folder, keep=cache)
     if tracks is None:
         return None
     of_robot = tracks.is_robot[tracks.body]
@@ -150,7 +136,7 @@ def _find_surfaces(folder: Path, frames: int, keep: Path | None) -> Surfaces | N
 
 
 def _of_moving(places: np.ndarray, points: Points, frames: int) -> Points:
-    """The first frames of the points [t o] of objects that move, told by their origins' places [t o 3] m."""
+    """The first frames of the points [t o] of objects that move, by their origins' places [t o 3] m."""
     moves = np.linalg.norm(places[:frames] - places[:1], axis=-1).max(axis=0, initial=0) > MOVED
     return Points(points.pixels[:frames, moves], points.visible[:frames, moves])
 
@@ -164,7 +150,7 @@ def _find_visible(points: np.ndarray, rgb: np.ndarray, mask: np.ndarray) -> np.n
 def _has_changed_at_rest(points: np.ndarray, free: np.ndarray, rgb: np.ndarray) -> np.ndarray:
     """[t o] bool: the object is where it was when it was first free, and its place has another color since.
 
-    So is what a robot puts on something, a cup on its coaster, told from the coaster.
+    This distinguishes what a robot puts on something, a cup on its coaster, from what lies under it.
     """
     t, o = free.shape
     first, objects = free.argmax(axis=0), np.arange(o)

@@ -7,13 +7,15 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from lab.power import HEADING as POWER
 from lab.seeds.yields import YIELDS, Args, describe_task, find_kept, markdown, page, task_section, write_page
 from tests.sim_warp.small import CLOSE, TASK, plan, success
 from xew.episode import EpisodeError, Record
-from xew.metrics.grading.power import HEADING as POWER
-from xew.sim_warp.inspection.visibility import HEADING as SEEN
 from xew.sim_warp.scene import Scene
 from xew.sim_warp.tasks import Task
+
+SEEN = "## How much of robots and objects is seen"
+"""Heading of another section of the page."""
 
 
 def record(seed: int, robot: str, failure: str | None = None, task: str = "grab_roller") -> Record:

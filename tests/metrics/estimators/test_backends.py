@@ -21,8 +21,8 @@ MINE: Backend = Backend(lambda: lambda prediction, target, mask: mask, None, "gi
 
 
 def test_the_registries_hold_what_the_documents_name() -> None:
-    assert list(MASKERS) == ["default", "opencv", "warp", "sam2"] and list(FLOWS) == ["dis", "raft"]
-    assert list(TRACKERS) == ["default", "opencv", "warp", "cotracker3", "tapir"]
+    assert list(MASKERS) == ["default", "opencv", "sam2"] and list(FLOWS) == ["dis", "raft"]
+    assert list(TRACKERS) == ["default", "opencv", "cotracker3", "tapir"]
     assert {name for _, name in NEEDY} == {"sam2", "cotracker3", "tapir", "raft"}
     for registry, _ in REGISTRIES.values():
         for backend in registry.values():

@@ -23,7 +23,7 @@ def late(video: np.ndarray) -> np.ndarray:
 
 def grade(rollouts: Path, data: Path, **settings: object) -> pd.DataFrame:
     out = settings.pop("out", rollouts.parent / "scores.parquet")
-    main(Args((rollouts,), data, out, **{"metrics": CHEAP, "baselines": False, "workers": 2} | settings))
+    main(Args((rollouts,), data, out, **{"metrics": CHEAP, "baselines": False} | settings))
     return pd.read_parquet(out)
 
 

@@ -20,12 +20,12 @@ METRICS = ("psnr", "mask_iou")
 def world(tmp_path: Path) -> Path:
     """Three graded episodes."""
     write_many(tmp_path, 3)
-    main(Args((tmp_path / "rollouts",), tmp_path / "data", tmp_path / "scores.parquet", METRICS, workers=1))
+    main(Args((tmp_path / "rollouts",), tmp_path / "data", tmp_path / "scores.parquet", METRICS))
     return tmp_path
 
 
 def check(world: Path, **settings: object) -> None:
-    arguments = {"rollouts": (world / "rollouts",), "data": world / "data", "metrics": METRICS, "workers": 1} | settings
+    arguments = {"rollouts": (world / "rollouts",), "data": world / "data", "metrics": METRICS} | settings
     main(Args(check=world / "scores.bundle.json", **arguments))
 
 
@@ -44,7 +44,7 @@ def test_it_is_checked_against_itself_the_videos_and_scores_graded_anew(world: P
     check(world, rollouts=())
     assert "12 videos" in capsys.readouterr().out
     check(world, regrade=4)
-    assert "4 videos graded anew: the same scores" in capsys.readouterr().out
+    assert "4 videos graded again: the same scores" in capsys.readouterr().out
 
 
 def raised_value(bundle: dict) -> None:

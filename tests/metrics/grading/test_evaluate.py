@@ -12,18 +12,18 @@ import pandas as pd
 import pytest
 
 from tests.metrics.grading.graded import ASKED, CHEAP, FRAMES, ROBOTS, SEED, TASK, grade, late, truth, value
-from xew.episode import episode_folder, read_record, read_states, read_video, write_episode
+from xew.episode import episode_folder, project, read_record, read_states, read_video, write_episode
 from xew.metrics import METRICS, keypoint_error, mask_iou, perceptual, psnr, ssim
 from xew.metrics.backends import Backend, estimate_masks
-from xew.metrics.estimators.contact import predicted_contact, touching_distance
+from xew.metrics.episode_cache import EpisodeCache
 from xew.metrics.evaluate import Args, main
 from xew.metrics.grade import Comparison
 from xew.metrics.grade import grade as grade_one
+from xew.metrics.grading import codecs
 from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.summary import summarize_robots
 from xew.metrics.track import failure_distance
 from xew.metrics.truth import Truth, _find_visible, read_truth
-from xew.projection import project
 from xew.protocol import CODEC_TRUTH, OTHER_ROBOT
 from xew.rollout import write_rollout
 from xew.statistics import describe_floors
@@ -62,11 +62,11 @@ def test_every_score_is_the_mean_of_the_functions_without_the_given_frame(rollou
 def test_points_on_surfaces_are_kept_beside_the_data(rollouts: Path, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folders = []
 
-    def read(folder: Path, frames: int, compared: set[str], keep: Path) -> Truth:
-        folders.append(keep)
+    def read(folder: Path, frames: int, compared: set[str], cache: Path) -> Truth:
+        folders.append(cache)
         return read_truth(folder, frames, compared)
 
-    monkeypatch.setattr("xew.metrics.grading.grader.read_truth", read)
+    monkeypatch.setattr("xew.metrics.grading.grade_episodes.read_truth", read)
     grade(rollouts, data, metrics=("psnr",))
     assert folders == [data.with_name(f"{data.name}-surfaces")] * len(ROBOTS)
 
@@ -82,9 +82,10 @@ class Halved:
 
 
 def test_the_floor_of_a_model_is_the_truth_through_its_codec(
-    rollouts: Path, data: Path, capsys: pytest.CaptureFixture[str]
+    rollouts: Path, data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    codec = {"codec_opener": f"{__name__}:Halved", "metrics": ("psnr", "mask_iou"), "baselines": True}
+    monkeypatch.setattr(codecs, "OPENER", f"{__name__}:Halved")
+    codec = {"metrics": ("psnr", "mask_iou"), "baselines": True}
     scores = grade(rollouts, data, codec=(Path("runs/late"),), **codec)
     through = scores[scores["model"] == CODEC_TRUTH]
     (key,) = set(through["condition"])
@@ -112,8 +113,11 @@ def test_the_floor_of_a_model_is_the_truth_through_its_codec(
     assert "of 'early', of which no rollout is graded; graded are late" in capsys.readouterr().err
 
 
-def test_baselines_are_graded_before_there_is_a_model(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    codec = {"codec_opener": f"{__name__}:Halved", "metrics": ("psnr",), "workers": 2}
+def test_baselines_are_graded_before_there_is_a_model(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(codecs, "OPENER", f"{__name__}:Halved")
+    codec = {"metrics": ("psnr",)}
     alone = tmp_path / "baselines.parquet"
     main(Args((), data, alone, baselines_of="test", codec=(Path("configs/any"),), max_frames=ASKED, **codec))
     scores = pd.read_parquet(alone)
@@ -130,7 +134,7 @@ def test_baselines_are_graded_before_there_is_a_model(data: Path, tmp_path: Path
 
 def test_all_four_dimensions_with_baselines_by_default(rollouts: Path, data: Path) -> None:
     """A model that is a frame late lies between the frozen first frame and the truth, by every metric that says how far."""
-    main(Args((rollouts,), data, rollouts.parent / "scores.parquet", workers=2))
+    main(Args((rollouts,), data, rollouts.parent / "scores.parquet"))
     scores = pd.read_parquet(rollouts.parent / "scores.parquet")
     assert set(scores["model"]) == {"late", *BASELINES}
     whole = scores[scores["model"] != OTHER_ROBOT]  # of which no keypoint may be found where this robot's are
@@ -155,7 +159,8 @@ def test_all_four_dimensions_with_baselines_by_default(rollouts: Path, data: Pat
 
 def test_tracks_are_compared_with_what_the_episode_holds(rollouts: Path, data: Path) -> None:
     """With a tracker from outside whose error is known. The last keypoint, and the only object, it never finds."""
-    settings = {"metrics": Args.metrics, "dimensions": ("kinematics", "objects"), "tracks": f"{__name__}:SHIFTED"}
+    names = tuple(name for name in METRICS if METRICS[name].inputs == "track")
+    settings = {"metrics": names, "tracks": f"{__name__}:SHIFTED"}
     scores = grade(rollouts, data, baselines=True, **settings)
     assert scores.attrs["estimators"]["tracks"] == settings["tracks"]
     for robot in ROBOTS:
@@ -214,10 +219,12 @@ def test_only_what_moves_counts_among_objects(data: Path, tmp_path: Path) -> Non
     write_episode(tmp_path, read_record(folder), still, read.rgb, read_video(folder / "robot.mkv"))
     read = read_truth(episode_folder(tmp_path, TASK, SEED, "piper"), FRAMES, ("object_points",))
     assert read.surfaces is not None and read.surfaces.objects.visible.shape == (FRAMES, 0)
-    grades = grade_one(Comparison(late(read.rgb), read, estimate_masks, exact), ("trajectory_error_strict", "pck_strict"))
+    grades = grade_one(
+        Comparison(late(read.rgb), EpisodeCache(read), estimate_masks, exact), ("trajectory_error_strict", "pck_strict")
+    )
     assert np.isnan(grades.values["trajectory_error_strict"]) and grades.values["pck_strict"] == 1
     with pytest.raises(ValueError, match="no points on surfaces; ask read_truth"):
-        grade_one(Comparison(read.rgb, replace(read, surfaces=None), estimate_masks, exact), ("pck_strict",))
+        grade_one(Comparison(read.rgb, EpisodeCache(replace(read, surfaces=None)), estimate_masks, exact), ("pck_strict",))
 
 
 def test_on_a_gpu_a_video_is_put_once_for_all_metrics_and_the_truth_once_for_all_predictions(
@@ -227,47 +234,22 @@ def test_on_a_gpu_a_video_is_put_once_for_all_metrics_and_the_truth_once_for_all
     names = ("psnr", "ssim", "lpips", "robot_lpips")
     read = read_truth(folder, FRAMES, {"video", "robot"})
     videos = late(read.rgb), late(late(read.rgb))
-    expected = [grade_one(Comparison(video, read, estimate_masks, exact), names).values for video in videos]
+    episode = EpisodeCache(read)
+    expected = [grade_one(Comparison(video, episode, estimate_masks, exact), names).values for video in videos]
     put: list[tuple[int, ...]] = []
     passes: list[bool] = []
     on_device, layers = jax.device_put, perceptual._layers
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr("xew.metrics.grade.ACCELERATOR_CHUNK", FRAMES)  # a CPU takes long for 64
+    monkeypatch.setattr("xew.metrics.episode_cache.ACCELERATOR_CHUNK", FRAMES)  # a CPU takes long for 64
     monkeypatch.setattr(jax, "device_put", lambda array: put.append(array.shape) or on_device(array))
     monkeypatch.setattr(perceptual, "_layers", lambda *given: passes.append(True) or layers(*given))
-    read = read_truth(folder, FRAMES, {"video", "robot"})
+    episode = EpisodeCache(read)
     for video, values, puts, through in zip(videos, expected, (4, 2), (2, 1), strict=True):
         put.clear()
         passes.clear()
-        assert grade_one(Comparison(video, read, estimate_masks, exact), names).values == pytest.approx(values, rel=1e-4)
+        assert grade_one(Comparison(video, episode, estimate_masks, exact), names).values == pytest.approx(values, rel=1e-4)
         assert len([shape for shape in put if len(shape) == 4]) == puts, "whole for PSNR, in blocks for the others"
         assert len(passes) == through, "through LPIPS's network, for two metrics"
-
-
-def test_contact_is_a_diagnostic_and_no_part_of_the_suite(rollouts: Path, data: Path) -> None:
-    """The tracker never finds the object (it is the last point), which then touches nothing; where it does, all is found."""
-    scores = grade(rollouts, data, metrics=("psnr",), diagnostics=True, baselines=True, tracks=f"{__name__}:SHIFTED")
-    assert set(scores["metric"]) == {"psnr"} and "contact_f1" not in scores.attrs["metrics"]
-    rows = pd.read_parquet(rollouts.parent / "scores.diagnostics.parquet")
-    assert set(rows["metric"]) == {"contact_f1"} and set(rows["value"]) == {0.0} and len(rows) == 2 * (1 + len(BASELINES))
-    grade(rollouts, data, metrics=("psnr",), diagnostics=True, baselines=True, tracks=f"{__name__}:EXACT")
-    rows = pd.read_parquet(rollouts.parent / "scores.diagnostics.parquet").set_index(["robot", "model"])["value"]
-    for robot in ROBOTS:
-        states = read_states(episode_folder(data, TASK, SEED, robot))
-        assert states.contact[1:ASKED].any() and not states.contact[1:ASKED].all(axis=0).any()
-        assert rows[robot, "ground_truth"] > 0.8
-
-
-def test_touching_is_told_by_the_distance_that_tells_it_best_in_the_truth() -> None:
-    distance = np.array([9.0, 5.0, 5.0, 2.0, np.nan, 1.0])
-    assert touching_distance(distance, np.array([0, 0, 1, 1, 1, 1], bool)) == 5
-    assert touching_distance(distance, np.array([1, 0, 0, 1, 0, 1], bool)) == 2
-    assert touching_distance(distance, np.zeros(6, bool)) == -1
-    assert touching_distance(np.full(3, np.nan), np.ones(3, bool)) == -1
-    true = np.array([[0, 1], [0, 0], [1, 0]], bool)
-    apart = np.array([[8.0, 3.0], [7.0, 9.0], [2.0, 9.0]])
-    assert (predicted_contact(apart, apart, true) == true).all()
-    assert not predicted_contact(np.full_like(apart, np.nan), apart, true).any()
 
 
 def test_projected_objects_lie_where_they_are_drawn(data: Path) -> None:
@@ -312,7 +294,7 @@ def test_the_region_of_a_robot_all_over_the_frame_is_the_frame(data: Path) -> No
     corners = read.mask.copy()
     corners[1, 0, 0] = corners[2, -1, -1] = True
     for mask, same in ((corners, True), (read.mask & (np.arange(240) > 90)[:, None], False)):
-        comparison = Comparison(late(read.rgb), replace(read, mask=mask), estimate_masks, shifted)
+        comparison = Comparison(late(read.rgb), EpisodeCache(replace(read, mask=mask)), estimate_masks, shifted)
         both = grade_one(comparison, ("lpips", "region_lpips")).curves
         alone = grade_one(comparison, ("region_lpips",)).curves["region_lpips"]
         assert both["region_lpips"].tobytes() == alone.tobytes()
@@ -354,15 +336,13 @@ def test_missing_episodes_trees_and_metrics_are_named(
     for settings, word in (
         ({"data": tmp_path / "nowhere"}, "does not hold"),
         ({"metrics": ("psrn",)}, "did you mean 'psnr'"),
-        ({"dimensions": ("kinematic",)}, "did you mean 'kinematics'"),
-        ({"dimensions": ("objects",)}, "no metric of psnr, ssim, mask_iou"),
+        ({"metrics": ("pck",), "suite": ("strict",)}, "no metric of pck is of the suites strict"),
         ({"suite": ("stric",)}, "did you mean 'strict'"),
         ({"masks": "sam3"}, "did you mean 'sam2'"),
         ({"masks": "sam2"}, "--masks-checkpoint"),
         ({"tracks_checkpoint": tmp_path / "none.pth"}, "does not exist"),
         ({"frame_zero": "predicted", "baselines": True}, "--no-baselines"),
         ({"baselines_of": "test", "baselines": True}, "leave out the rollouts"),
-        ({"workers": -1}, "--workers"),
         ({"out": tmp_path / "scores.csv"}, ".parquet"),
     ):
         arguments = {"rollouts": rollouts, "data": data} | settings

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-import types
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.commands import on_devices
 from tests.metrics.quick import QUICK
 from tests.metrics.small import write_many
 from tests.synthetic import write_synthetic_data
@@ -25,9 +23,10 @@ from xew.dataset import find_accepted
 from xew.episode import EpisodeError, read_video
 from xew.metrics import evaluate
 from xew.metrics.evaluate import Args, main
-from xew.metrics.grading import grader, outcome
+from xew.metrics.grading import grade_episodes, open_graders, settings, write_scores
 from xew.metrics.grading.baselines import BASELINES
-from xew.metrics.grading.workers import Bench
+from xew.metrics.grading.grade_episodes import ThreadResources
+from xew.metrics.grading.open_graders import PROCESSES, choose_processes, take_turns
 from xew.rollout import write_rollout
 
 ROOT = Path(__file__).parents[3]
@@ -60,7 +59,7 @@ def no_baselines_are_kept(world: Path, whole: dict[str, bytes]) -> None:
 
 
 def arguments(world: Path, out: Path) -> Args:
-    return Args((world / "rollouts",), world / "data", out, METRICS, masks=QUICK, workers=2)
+    return Args((world / "rollouts",), world / "data", out, METRICS, masks=QUICK)
 
 
 def read_all(out: Path) -> dict[str, bytes]:
@@ -87,14 +86,14 @@ def dying(function: Callable, at: int) -> Callable:
 
 
 PLACES = [
-    (grader, "grade", 1),
-    (grader, "grade", 8),
+    (grade_episodes, "grade", 1),
+    (grade_episodes, "grade", 8),
     (files.os, "replace", 1),  # a cell that is written but does not have its name yet
     (files.os, "replace", 11),
     (files.os, "replace", CELLS + 1),  # the curves
     (files.os, "replace", CELLS + 2),  # the scores, whose curves are there
-    (outcome, "write_bundle", 1),
-    (outcome, "summarize", 1),
+    (write_scores, "write_bundle", 1),
+    (write_scores, "summarize", 1),
 ]
 
 
@@ -111,14 +110,11 @@ def test_stopped_anywhere_it_ends_in_the_same_bytes(
     assert not list(tmp_path.glob(".*.partial"))
 
 
-def test_killed_at_random_on_two_devices_it_ends_in_the_same_bytes(
-    world: Path, whole: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_killed_at_random_it_ends_in_the_same_bytes(world: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
     out = tmp_path / "scores.parquet"
     command = [sys.executable, "-m", "xew.metrics.evaluate", world / "rollouts", "--data", world / "data", "--out", out]
-    command += ["--metrics", *METRICS, "--masks", QUICK, "--workers", "2"]
-    environment = os.environ | on_devices(2)
-    environment["PYTHONPATH"] = str(ROOT)  # the masker
+    command += ["--metrics", *METRICS, "--masks", QUICK]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}  # the masker
     run = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wanted = random.randrange(1, CELLS - 2)
     deadline = time.monotonic() + 120
@@ -137,76 +133,49 @@ def graded(out: Path, data: Path) -> list[Path]:
     return [path for folder in folders for path in folder.glob("*/*/*/[!.]*.json")]
 
 
-def test_workers_are_shared_out_to_the_devices() -> None:
-    """Each thread takes the next device; one that has an estimator of its own keeps it."""
-    first, second = (types.SimpleNamespace(local_hardware_id=number) for number in range(2))
-    bench = Bench(lambda _: object(), lambda _: object(), iter([first, second, first]))  # who opens it takes one too
-    found = []
-    threads = [threading.Thread(target=lambda: found.append((bench.device, bench.masker is bench.masker))) for _ in range(2)]
+def test_each_thread_has_estimators_of_its_own_and_a_network_serves_one_at_a_time() -> None:
+    resources = ThreadResources(lambda: object(), lambda: object())
+    maskers, overlaps, busy = [], [], []
+
+    def slow(number: int) -> int:
+        overlaps.append(bool(busy))
+        busy.append(number)
+        time.sleep(0.01)
+        busy.remove(number)
+        return number
+
+    network = take_turns(slow)
+
+    def work() -> None:
+        maskers.append((resources.masker, resources.masker is resources.masker))
+        network(threading.get_ident())
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
     for thread in threads:
         thread.start()
+    for thread in threads:
         thread.join()
-    assert [kept for _, kept in found] == [True, True] and {device.local_hardware_id for device, _ in found} == {0, 1}
-
-
-SHARING = """
-import threading, time
-from pathlib import Path
-import jax
-from xew.metrics.backends import Backend
-from xew.metrics.grading.workers import make_opener
-
-opened, busy, overlaps = [], set(), []
-
-def open_network(name, checkpoint):
-    number = len(opened)
-    opened.append(jax.numpy.zeros(1).devices())
-    def call():
-        overlaps.append(number in busy)
-        busy.add(number)
-        time.sleep(0.01)
-        busy.discard(number)
-        return number
-    return call
-
-network = make_opener("mine", {"mine": Backend(open_network, "weights", "")}, open_network, Path("x"))
-found = []
-
-def work(device):
-    for _ in range(3):
-        found.append((device.id, network(device)()))
-
-threads = [threading.Thread(target=work, args=(device,)) for device in (*jax.devices(), *jax.devices())]
-for thread in threads: thread.start()
-for thread in threads: thread.join()
-assert len(opened) == 2 and opened[0] != opened[1] and len(found) == 12 and len(set(found)) == 2, (opened, found)
-assert not any(overlaps)
-"""
-
-
-def test_a_network_is_opened_once_on_each_device_and_used_in_turn() -> None:
-    environment = os.environ | on_devices(2)
-    run = subprocess.run([sys.executable, "-c", SHARING], env=environment, capture_output=True, text=True, timeout=120)
-    assert run.returncode == 0, run.stderr
+    assert len({id(masker) for masker, _ in maskers}) == 4 and all(kept for _, kept in maskers)
+    assert overlaps == [False] * 4
 
 
 def test_a_second_run_grades_nothing_anew_and_metrics_come_beside_those_that_are_there(
     world: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     asked: list[tuple[str, ...]] = []
-    real = grader.grade
+    real = grade_episodes.grade
 
     def notes(comparison: object, metrics: tuple[str, ...]) -> object:
         asked.append(tuple(metrics))
         return real(comparison, metrics)
 
-    monkeypatch.setattr(grader, "grade", notes)
+    monkeypatch.setattr(grade_episodes, "grade", notes)
     out = tmp_path / "scores.parquet"
     for metrics in (("psnr",), METRICS, METRICS):
-        main(Args((world / "rollouts",), world / "data", out, metrics, masks=QUICK, workers=1))
+        main(Args((world / "rollouts",), world / "data", out, metrics, masks=QUICK))
     assert asked == [("psnr",)] * CELLS + [("mask_iou",)] * CELLS
     assert read_all(out) == whole
-    main(Args((world / "rollouts",), world / "data", out, METRICS, masks=QUICK, workers=1, overwrite=True))
+    main(Args((world / "rollouts",), world / "data", out, METRICS, masks=QUICK, overwrite=True))
     assert len(asked) == 3 * CELLS and read_all(out) == whole
 
 
@@ -215,8 +184,8 @@ def test_baselines_are_graded_once_a_data_set(
 ) -> None:
     main(arguments(world, tmp_path / "first.parquet"))
     asked: list[object] = []
-    real = grader.grade
-    monkeypatch.setattr(grader, "grade", lambda comparison, metrics: asked.append(metrics) or real(comparison, metrics))
+    real = grade_episodes.grade
+    monkeypatch.setattr(grade_episodes, "grade", lambda comparison, metrics: asked.append(metrics) or real(comparison, metrics))
     main(arguments(world, tmp_path / "scores.parquet"))
     assert len(asked) == EPISODES
     assert read_all(tmp_path / "scores.parquet") == whole
@@ -226,10 +195,10 @@ def test_other_settings_are_graded_anew(world: Path, tmp_path: Path, monkeypatch
     out = tmp_path / "scores.parquet"
     main(Args((world / "rollouts",), world / "data", out, ("psnr",), baselines=False))
     before = out.read_bytes()
-    monkeypatch.setattr(grader, "grade", lambda *_: pytest.fail("graded anew"))
+    monkeypatch.setattr(grade_episodes, "grade", lambda *_: pytest.fail("graded anew"))
     main(Args((world / "rollouts",), world / "data", out, ("psnr",), baselines=False))
     assert out.read_bytes() == before
-    monkeypatch.setattr(evaluate, "GRADING_PROTOCOL", evaluate.GRADING_PROTOCOL + 1)
+    monkeypatch.setattr(settings, "GRADING_PROTOCOL", settings.GRADING_PROTOCOL + 1)
     with pytest.raises(pytest.fail.Exception, match="graded anew"):
         main(Args((world / "rollouts",), world / "data", out, ("psnr",), baselines=False))
 
@@ -244,50 +213,60 @@ def test_a_damaged_cell_is_graded_anew(world: Path, whole: dict[str, bytes], tmp
     assert read_all(args.out) == whole
 
 
-def test_processes_write_the_same_bytes_and_tell_mistakes(world: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
-    several = replace(arguments(world, tmp_path / "scores.parquet"), processes=2)
-    main(several)
-    assert read_all(several.out) == whole
-    jobs = evaluate.find_jobs(several, ())
-    gone = [(replace(job, episode=tmp_path / "gone"), ("psnr",)) for job in jobs[:2]]
-    store = evaluate.CellStore(tmp_path / "cells", tmp_path / "baselines")
-    with evaluate.open_graders(several, ("psnr",), store) as (_, grade_groups), pytest.raises(EpisodeError, match="gone"):
-        list(grade_groups([[job] for job in gone]))
-
-
-def test_processes_begin_before_the_jobs_are_known_where_there_is_no_table(
+def test_processes_write_the_same_bytes_and_raise_mistakes(
     world: Path, whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where there is one, they begin with what is to be graded, and not at all where that is nothing."""
-    events: list[str | int] = []
-    begin, find = evaluate.call_in_processes, evaluate.find_jobs
-    monkeypatch.setattr(evaluate, "call_in_processes", lambda *given: events.append(given[1]) or begin(*given))
-    monkeypatch.setattr(evaluate, "find_jobs", lambda *given: events.append("list") or find(*given))
-    args = replace(arguments(world, tmp_path / "scores.parquet"), processes=EPISODES + 2)
-    main(args)
-    assert events == [EPISODES, "list"], "no more of them than there are episodes"
-    events.clear()
-    main(args)
-    assert events == ["list"]
-    for cell in sorted(args.out.with_suffix(".cells").glob("*/*/*/*.json"))[:2]:
-        cell.unlink()  # the model's, of two episodes
-    events.clear()
-    main(args)
-    assert events == ["list", 2] and read_all(args.out) == whole
+    monkeypatch.setenv(PROCESSES, "2")
+    several = arguments(world, tmp_path / "scores.parquet")
+    main(several)
+    assert read_all(several.out) == whole
+    resolved = settings.resolve(replace(several, out=tmp_path / "other.parquet", metrics=("psnr",)))
+    listing = evaluate.list_jobs(resolved, ())
+    gone = [(replace(job, episode=tmp_path / "gone"), ("psnr",)) for job in listing.jobs[:2]]
+    with pytest.raises(EpisodeError, match="gone"):
+        list(evaluate.grade_groups(resolved, {}, [[job] for job in gone]))
+
+
+@pytest.mark.parametrize(
+    ("cores", "free", "videos", "expected"),
+    [
+        (2, (), 600, 1),  # threads of this process
+        (6, (), 600, 1),
+        (16, (), 600, 16),
+        (16, (), 20, 1),  # processes take longer to start
+        (64, (), 600, 32),
+        (16, (84.0,), 600, 9),  # by the memory of the GPU
+        (16, (160.0,), 600, 12),
+        (8, (160.0,), 600, 7),
+        (32, (160.0, 44.0), 600, 8),  # there may be as many on either
+        (16, (4.0,), 600, 1),
+        (1, (160.0,), 600, 1),
+    ],
+)
+def test_the_number_of_processes_follows_from_the_machine(
+    cores: int, free: tuple[float, ...], videos: int, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(PROCESSES)
+    monkeypatch.setattr(open_graders, "usable_cores", lambda: cores)
+    monkeypatch.setattr(open_graders, "visible_gpus", lambda: tuple(map(str, range(len(free)))))
+    monkeypatch.setattr(open_graders, "free_gpu_memory", lambda gpus: free)
+    monkeypatch.setattr(open_graders.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096}.get(name, 2**26))
+    assert choose_processes(100, videos) == expected
+    assert choose_processes(1, videos) == 1, "no more than there are episodes"
 
 
 def test_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """160 episodes; what the process holds after 60 of them is what it holds after all, but for a few megabytes."""
     write_many(tmp_path, 160)
     held: list[float] = []
-    real = grader.Grader.__call__
+    real = grade_episodes.Grader.__call__
 
     def notes(*args: object, **settings: object) -> object:
         held.append(resident())
         return real(*args, **settings)
 
-    monkeypatch.setattr(grader.Grader, "__call__", notes)
-    args = Args((tmp_path / "rollouts",), tmp_path / "data", tmp_path / "scores.parquet", ("psnr", "mask_iou"), workers=2)
+    monkeypatch.setattr(grade_episodes.Grader, "__call__", notes)
+    args = Args((tmp_path / "rollouts",), tmp_path / "data", tmp_path / "scores.parquet", ("psnr", "mask_iou"))
     main(args)
     assert len(held) == 160 and len(graded(args.out, args.data)) == 640, "with three baselines: there is no other robot"
     assert np.median(held[-30:]) - np.median(held[60:90]) < 4, "megabytes: 40 kB an episode"

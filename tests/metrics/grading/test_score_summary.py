@@ -1,15 +1,9 @@
 """The summary of a score table: means with intervals, differences with a verdict, and what must not be claimed."""
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
 
-from xew.config import ConfigError
-from xew.episode import EpisodeError
-from xew.metrics.grading.outcome import write_power
-from xew.metrics.grading.power import power_section
 from xew.metrics.grading.summary import summarize_robots, to_markdown
 
 ROBOTS = ("aloha_agilex", "piper")
@@ -89,24 +83,3 @@ def test_many_models_leave_the_pairs_to_their_file() -> None:
     assert few.count("paired:") == 2 * 3
     many = to_markdown(summarize_robots(table({f"m{i}": {"ssim": 0.1 * i} for i in range(5)}, scenes=4)))
     assert "paired:" not in many and many.count("10 pairs of models") == 2
-
-
-def test_the_power_of_tasks_is_a_section_of_a_page(tmp_path: Path) -> None:
-    """Of the frozen frame and the true video on two tasks, one of which tells them apart."""
-    rows = pd.DataFrame(
-        {"model": model, "condition": "", "task": task, "seed": 800000, "robot": robot, "metric": "pck_strict", "value": value}
-        for task, scores in {"lift": (0.2, 0.9), "rest": (0.85, 0.9), "best": (0.5, 1.0), "both": (1.0, 1.0)}.items()
-        for model, value in zip(("copy_first_frame", "ground_truth"), scores, strict=True)
-        for robot in ROBOTS
-    )
-    text = power_section(summarize_robots(rows).power, rows)
-    assert "8 episodes of `aloha_agilex`, `piper`, seed 800000 of each task" in text
-    assert "leave the mean of pck_strict: both, rest. The least power, 1.5 times, is that of `rest` for `pck_strict`." in text
-    assert "| `both` | none |" in text and "| `best` | over 10,000 |" in text
-    assert "| `lift` | 8 |" in text and "| `lift` | 0.2 (0.9) |" in text and "| `rest` | 0.85 (0.9) |" in text
-    write_power(tmp_path / "page.md", summarize_robots(rows).power, rows)
-    assert (tmp_path / "page.md").read_text().endswith(f"{text}\n")
-    with pytest.raises(ConfigError, match="--power-page needs the frozen first frame and the true video"):
-        write_power(tmp_path / "page.md", summarize_robots(rows[rows["model"] == "ground_truth"]).power, rows)
-    with pytest.raises(EpisodeError, match="Choose another file with --power-page"):
-        write_power(tmp_path, summarize_robots(rows).power, rows)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from lab import compile_kernels as compile_command
 from tests.sim_warp.small import TASK, InlineWorkers, launched_modules, produce
 from xew.sim_warp.devices.kernels import Variant, compile_for, compile_together, noted_launches, watched_launches
 from xew.sim_warp.physics.kernels import set_targets
@@ -109,8 +110,8 @@ def test_kernels_are_compiled_for_a_gpu_that_is_not_here(tmp_path: Path, monkeyp
 def test_the_pieces_compiled_for_a_gpu_are_all_that_episodes_launch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found: dict[str, list[Variant]] = {}
     for part in warm_up.PARTS:
-        monkeypatch.setattr(warm_up, "compile_for", lambda variants, arch, part=part: found.update({part: [*variants]}))
-        warm_up.compile_piece(part, arch=90, batch=2)
+        monkeypatch.setattr(compile_command, "compile_for", lambda variants, arch, part=part: found.update({part: [*variants]}))
+        compile_command.compile_piece(part, arch=90, batch=2)
     names = {module.name for variants in found.values() for module, _ in variants}
     assert (set_targets.module, 256) in found["physics"] and len(found["physics"]) > 50
     assert any(block_dim == 32 for _, block_dim in found["kinematics"]), "products of small matrices, by a warp"
@@ -122,6 +123,6 @@ def test_the_pieces_compiled_for_a_gpu_are_all_that_episodes_launch(tmp_path: Pa
 
 def test_an_architecture_that_warp_does_not_know_is_refused_in_a_line(capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(SystemExit) as left:
-        warm_up.main(warm_up.Args(arch=13))
+        compile_command.main(compile_command.Args(arch=13))
     assert left.value.code == 2
     assert "--arch is 13; Warp's compiler knows" in capsys.readouterr().err

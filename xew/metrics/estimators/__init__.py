@@ -4,4 +4,4 @@ Two estimators need no weights, and `presence` confirms what any of them found; 
 projects.
 """
 
-__all__ = ["adapters", "contact", "cotracker", "flow", "masks", "presence", "sam2", "similarity", "tapir", "tracks"]
+__all__ = ["adapters", "cotracker", "flow", "images", "masks", "presence", "sam2", "similarity", "tapir", "tracks"]

@@ -6,8 +6,6 @@ is unpickled freely.
 
 import importlib
 import pickle
-import sys
-import threading
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
@@ -61,25 +59,8 @@ def load_state_dict(network: Any, state: Mapping[str, Any], path: Path, user: st
         raise ConfigError(f"{path} is no checkpoint of {user}: {' '.join(faults)[:300]}") from error
 
 
-_chosen = threading.local()
-"""Number of the calling thread's GPU, once `use_gpu` has said it."""
-
-
-def use_gpu(number: int) -> None:
-    """Make this GPU the calling thread's own, for PyTorch, where it is in use and sees GPUs, and for Warp's kernels."""
-    _chosen.number = number
-    torch = sys.modules.get("torch")
-    if torch is not None and torch.cuda.is_available():
-        torch.cuda.set_device(number % torch.cuda.device_count())
-
-
-def gpu_number() -> int:
-    """Number of the calling thread's GPU, the first unless `use_gpu` chose another."""
-    return getattr(_chosen, "number", 0)
-
-
 def torch_device() -> str:
-    """The calling thread's GPU, which is the first unless `use_gpu` chose another; the CPU where there is none."""
+    """The first GPU that this process sees; the CPU where there is none."""
     return "cuda" if importlib.import_module("torch").cuda.is_available() else "cpu"
 
 
@@ -101,8 +82,8 @@ class PointTracker(ABC):
         asked = np.flatnonzero(frames >= 0)
         if len(asked) == 0:
             return tracks
-        found, seen = self.follow(prediction, frames[asked], points[frames[asked], asked])
-        tracks[:, asked] = np.where(seen[..., None], found, np.nan)
+        followed, holds = self.follow(prediction, frames[asked], points[frames[asked], asked])
+        tracks[:, asked] = np.where(holds[..., None], followed, np.nan)
         return tracks
 
     @abstractmethod

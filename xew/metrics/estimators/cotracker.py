@@ -30,7 +30,7 @@ SHORTEST_OFFLINE = 17
 
 
 def open_cotracker(checkpoint: Path) -> "CoTracker":
-    """CoTracker3 offline from a local `scaled_offline.pth`, on the thread's GPU or else the CPU; says its license on stderr.
+    """CoTracker3 offline from a local `scaled_offline.pth`, on a GPU or else the CPU; says its license on stderr.
 
     Raises:
         ConfigError: PyTorch or the package `cotracker` is absent, or the file is damaged or of another network.
@@ -58,10 +58,10 @@ class CoTracker(PointTracker):
         device = torch_device()
         images = self._torch.from_numpy(np.ascontiguousarray(video.transpose(0, 3, 1, 2))).to(device).float()
         with self._torch.inference_mode():
-            found, seen = self._predictor(
+            tracks, seen = self._predictor(
                 images[None], queries=self._torch.from_numpy(queries)[None].to(device), backward_tracking=True
             )
-        return found[0].cpu().numpy(), seen[0].cpu().numpy()
+        return tracks[0].cpu().numpy(), seen[0].cpu().numpy()
 
 
 def _window(checkpoint: Path) -> int:

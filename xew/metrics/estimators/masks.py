@@ -10,7 +10,7 @@ log-likelihood ratios learnt from the true video itself:
 Shape counts only where flow explains the pixel (small residual, flow there and back closes), and there it counts for more
 than looks. Without these gates a video that stands still would be given the true masks for nothing; with them it is judged
 by what it shows.
-Its error on true video is published beside every score: the row `ground_truth` of `evaluate`.
+Its error on true video is published with every score: the row `ground_truth` of `evaluate`.
 """
 
 import functools
@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from xew.metrics.estimators.images import sample, soften
 from xew.metrics.estimators.similarity import find_most_similar
 
 COLOR_BINS = 24
@@ -129,7 +130,7 @@ def learn_appearance(video: np.ndarray, mask: np.ndarray) -> Appearance:
     """
     picked = np.unique(np.linspace(0, len(video) - 1, LEARNING_FRAMES).round().astype(int))
     background, uncovered = _background(video[picked], mask[picked])
-    video = np.concatenate([video[picked], *([_soften(frame, s) for frame in video[picked]] for s in SOFTNESS)])
+    video = np.concatenate([video[picked], *([soften(frame, s) for frame in video[picked]] for s in SOFTNESS)])
     mask = np.tile(mask[picked], (1 + len(SOFTNESS), 1, 1))
     everywhere = np.ones_like(uncovered)
     lab = (cv2.cvtColor(frame, cv2.COLOR_RGB2LAB) for frame in video)
@@ -157,7 +158,7 @@ class Carrier:
 
     def carry(self, distance: np.ndarray) -> Shape:
         """The shape of the other frame's mask, of which this is the `_signed_distance` [h w]."""
-        return self.gate, np.tanh(_sample(distance, self.source) / SHAPE_REACH)
+        return self.gate, np.tanh(sample(distance, self.source) / SHAPE_REACH)
 
 
 def _estimate_frame(appearance: Appearance, frame: np.ndarray, shapes: list[Shape], before: Shape | None) -> np.ndarray:
@@ -218,7 +219,7 @@ class _Frames:
     def soft(self, t: int) -> np.ndarray:
         """[h w 3] uint8, softened."""
         if t not in self._soft:
-            self._soft[t] = _soften(self.video[t], RESIDUAL_SOFTNESS)
+            self._soft[t] = soften(self.video[t], RESIDUAL_SOFTNESS)
         return self._soft[t]
 
     def forget(self, t: int) -> None:
@@ -232,14 +233,10 @@ def _find_carrier(seen: _Frames, t: int, others: _Frames, other: int) -> Carrier
     gray, gray_other = seen.gray(t), others.gray(other)
     there, back = _flow(gray, gray_other), _flow(gray_other, gray)
     source = _grid(gray.shape) + there
-    closure = cv2.magnitude(*cv2.split(there + _sample(back, source)))
-    residual = _difference(seen.soft(t).astype(np.float32), _sample(others.soft(other).astype(np.float32), source))
+    closure = cv2.magnitude(*cv2.split(there + sample(back, source)))
+    residual = _difference(seen.soft(t).astype(np.float32), sample(others.soft(other).astype(np.float32), source))
     gate = np.exp(-((residual / RESIDUAL_SCALE) ** 2) - (closure / CLOSURE_SCALE) ** 2)
     return Carrier(gate, source)
-
-
-def _soften(image: np.ndarray, sigma: float) -> np.ndarray:
-    return cv2.GaussianBlur(image, (0, 0), sigma)
 
 
 def _flow(start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -263,11 +260,6 @@ def _grid(shape: tuple[int, ...]) -> np.ndarray:
     return grid
 
 
-def _sample(image: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The image read at points [h w 2] between its pixels."""
-    return cv2.remap(image, points[..., 0], points[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-
 def _signed_distance(mask: np.ndarray) -> np.ndarray:
     """[h w] float32, distance to the contour [pixels], positive inside."""
     inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
@@ -279,10 +271,10 @@ def _background(video: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.nda
     """Median over time of the frames that show each pixel without the robot; [h w 3] uint8, and where there are any."""
     level = np.where(mask[..., None], np.int16(256), video)
     rank = np.sort(np.ascontiguousarray(np.moveaxis(level, 0, -1)), axis=-1)  # sorting what lies side by side is quicker
-    shown = np.count_nonzero(~mask, axis=0)
-    middle = np.maximum(shown - 1, 0) // 2
+    free_frames = np.count_nonzero(~mask, axis=0)
+    middle = np.maximum(free_frames - 1, 0) // 2
     median = np.take_along_axis(rank, middle[:, :, None, None], axis=-1)[..., 0]
-    uncovered = shown > 0
+    uncovered = free_frames > 0
     plate = np.where(uncovered[..., None], median, 0).astype(np.uint8)
     return cv2.inpaint(plate, (~uncovered).astype(np.uint8), 3, cv2.INPAINT_TELEA), uncovered
 

@@ -5,8 +5,9 @@ video in which the object is gone looks much like the true one there. Here only 
 ground truth tells.
 """
 
-import cv2
 import numpy as np
+
+from xew.metrics.estimators.images import is_inside, sample, soften
 
 REACH = 8
 """Half the side of the square round a point [pixels] in which pixels of its body are compared."""
@@ -19,12 +20,12 @@ SAME_COLOR = 20
 
 
 def confirm_tracks(
-    found: np.ndarray,
+    tracks: np.ndarray,
     prediction: np.ndarray,
     target: np.ndarray,
     points: np.ndarray,
     visible: np.ndarray,
-    shown: np.ndarray,
+    body_id: np.ndarray,
     body: np.ndarray,
 ) -> np.ndarray:
     """Tracks without the places that do not show the point's body.
@@ -34,49 +35,38 @@ def confirm_tracks(
     there what the true frame shows there, of something else: then that is what was found.
 
     Args:
-        found: [t k 2] float32 pixels, NaN where lost.
+        tracks: [t k 2] float32 pixels, NaN where lost.
         prediction, target: [t h w 3] uint8, predicted and true video.
         points: [t k 2] float32 pixels, where the points truly are.
         visible: [t k] bool, where they are seen.
-        shown: [t h w] int, the body that a pixel of the target shows.
+        body_id: [t h w] int, the body that a pixel of the target shows.
         body: [k] int, the body that each point lies on.
 
     Returns:
         [t k 2] float32, NaN where nothing was found or what was found is something else.
     """
-    confirmed = found.copy()
+    confirmed = tracks.copy()
     reach = np.arange(-REACH, REACH + 1)
     around = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(1, -1, 2).astype(np.float32)
     for t, (frame, true_frame) in enumerate(zip(prediction, target, strict=True)):
-        index = np.flatnonzero(visible[t] & np.isfinite(found[t]).all(axis=-1))
+        index = np.flatnonzero(visible[t] & np.isfinite(tracks[t]).all(axis=-1))
         if not len(index):
             continue
-        places, true_places = (array[t, index, None] + around for array in (found, points))
-        own, same_body = (_read_body(shown[t], at) == body[index, None] for at in (true_places, places))
-        counted = own & _inside(places, frame) & _inside(true_places, frame)
-        soft, true_soft = (cv2.GaussianBlur(image, (0, 0), SOFTNESS).astype(np.float32) for image in (frame, true_frame))
-        seen = _read(soft, places)
-        differs = np.abs(seen - _read(true_soft, true_places)).max(axis=-1) > OTHER_COLOR
-        stands = ~same_body & (np.abs(seen - _read(true_soft, places)).max(axis=-1) <= SAME_COLOR)
+        places, true_places = (array[t, index, None] + around for array in (tracks, points))
+        own, same_body = (_read_body(body_id[t], at) == body[index, None] for at in (true_places, places))
+        counted = own & is_inside(places, frame) & is_inside(true_places, frame)
+        soft, true_soft = (soften(image, SOFTNESS).astype(np.float32) for image in (frame, true_frame))
+        seen = sample(soft, places)
+        differs = np.abs(seen - sample(true_soft, true_places)).max(axis=-1) > OTHER_COLOR
+        stands = ~same_body & (np.abs(seen - sample(true_soft, places)).max(axis=-1) <= SAME_COLOR)
         most = counted.sum(axis=1) / 2
         wrong = ((counted & differs).sum(axis=1) > most) | ((counted & stands).sum(axis=1) > most)
         confirmed[t, index[wrong]] = np.nan
     return confirmed
 
 
-def _read_body(shown: np.ndarray, places: np.ndarray) -> np.ndarray:
+def _read_body(body_id: np.ndarray, places: np.ndarray) -> np.ndarray:
     """[n p] the body that the pixel of each place [n p 2] shows in one frame; of places outside, the nearest pixel's."""
     column, row = np.moveaxis(np.round(places).astype(int), -1, 0)
-    height, width = shown.shape
-    return shown[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-
-
-def _read(image: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Colors [n p 3] float32 of an image at places [n p 2], between its pixels."""
-    return cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-
-def _inside(places: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """[n p] whether places [n p 2] lie in an image."""
-    height, width = image.shape[:2]
-    return np.all((places > -0.5) & (places < (width - 0.5, height - 0.5)), axis=-1)
+    height, width = body_id.shape
+    return body_id[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]

@@ -32,7 +32,7 @@ Propagate = Callable[["Frames", int, np.ndarray, bool], dict[int, np.ndarray]]
 
 
 def open_sam2(checkpoint: Path, side: int | None = None) -> "Sam2":
-    """SAM 2 or 2.1 from a local checkpoint, on the thread's GPU or else the CPU.
+    """SAM 2 or 2.1 from a local checkpoint, on a GPU or else the CPU.
 
     Args:
         checkpoint: a .pt of the authors (needs the package `sam2`), or a folder with config.json and model.safetensors of
@@ -73,8 +73,8 @@ class Sam2:
         start = int(target_mask.sum(axis=(1, 2)).argmax())
         frames = Frames(prediction, self._side)
         for backwards, ahead in ((False, start < len(masks) - 1), (True, start > 0)):
-            found = self._propagate(frames, start, target_mask[start], backwards) if ahead else {}
-            for frame, mask in found.items():
+            found_masks = self._propagate(frames, start, target_mask[start], backwards) if ahead else {}
+            for frame, mask in found_masks.items():
                 masks[frame] = mask
         masks[start] = target_mask[start]  # SAM 2 takes a mask that it is given as the answer
         return masks
@@ -120,14 +120,14 @@ def _open_authors(checkpoint: Path, side: int) -> Sam2:
                 predictor.add_new_mask(session, frame_idx=start, obj_id=ROBOT, mask=mask)
                 order = predictor.propagate_in_video(session, start_frame_idx=start, reverse=backwards)
                 first = next(order)  # by now it has its progress bar; the rest needs no turn
-            found = itertools.chain([first], order)
-            return {frame: (logits[0, 0] > 0).cpu().numpy() for frame, _, logits in found}
+            outputs = itertools.chain([first], order)
+            return {frame: (logits[0, 0] > 0).cpu().numpy() for frame, _, logits in outputs}
 
     return Sam2(propagate, side)
 
 
 def _config_name(state: Mapping[str, Any], checkpoint: Path) -> str:
-    """Which of the authors' configs a state dict belongs to, told by its tensors and not by the file's name."""
+    """Which of the authors' configs a state dict belongs to, by its tensors and not by the file's name."""
     first = state.get("image_encoder.trunk.patch_embed.proj.weight")
     blocks = {key.split(".")[3] for key in state if key.startswith("image_encoder.trunk.blocks.")}
     size = SIZES.get((0 if first is None else len(first), len(blocks)))
@@ -162,7 +162,7 @@ def _open_folder(folder: Path) -> Sam2:
     side = int(network.config.image_size)
 
     def propagate(frames: Frames, start: int, mask: np.ndarray, backwards: bool) -> dict[int, np.ndarray]:
-        found = {}
+        masks = {}
         with torch.inference_mode(), _autocast():
             session = transformers.Sam2VideoInferenceSession(
                 video_height=mask.shape[0], video_width=mask.shape[1], inference_device=network.device,
@@ -174,10 +174,10 @@ def _open_folder(folder: Path) -> Sam2:
             network(inference_session=session, frame_idx=start)
             for output in network.propagate_in_video_iterator(session, start_frame_idx=start, reverse=backwards):
                 logits = torch.nn.functional.interpolate(output.pred_masks.float(), mask.shape, mode="bilinear")
-                found[output.frame_idx] = (logits[0, 0] > 0).cpu().numpy()
+                masks[output.frame_idx] = (logits[0, 0] > 0).cpu().numpy()
                 # Kept for every frame and read by none: 4 MB each.
                 session.output_dict_per_obj[0]["non_cond_frame_outputs"].get(output.frame_idx, {}).pop("high_res_masks", None)
-        return found
+        return masks
 
     return Sam2(propagate, side)
 

@@ -1,6 +1,6 @@
 """Similarity of frames: the moment of the true video that a predicted frame shows.
 
-Both estimators read a predicted frame beside two true frames: that of the same time, and the one found here.
+Both estimators compare a predicted frame with two true frames: that of the same time, and the one found here.
 """
 
 import threading

@@ -63,8 +63,8 @@ class Tapir(PointTracker):
         # Its pixels' centers are at halves, ours at whole numbers.
         x, y = ((points + 0.5) * scale).T
         queries = np.column_stack([frames, y, x]).astype(np.float32)
-        found, seen = (np.asarray(array) for array in self._run(self._weights, _resize(video), queries))
-        return (found / scale - 0.5).swapaxes(0, 1), seen.swapaxes(0, 1)
+        tracks, seen = (np.asarray(array) for array in self._run(self._weights, _resize(video), queries))
+        return (tracks / scale - 0.5).swapaxes(0, 1), seen.swapaxes(0, 1)
 
 
 def _run(
@@ -75,8 +75,8 @@ def _run(
     output = network(*weights, options)(
         video=signed[None], is_training=False, query_points=queries[None], query_chunk_size=CHUNK
     )
-    shown, near = (jax.nn.sigmoid(-output[name][0]) for name in ("occlusion", "expected_dist"))
-    return output["tracks"][0], shown * near > 0.5
+    visible, near = (jax.nn.sigmoid(-output[name][0]) for name in ("occlusion", "expected_dist"))
+    return output["tracks"][0], visible * near > 0.5
 
 
 def _resize(video: np.ndarray) -> np.ndarray:

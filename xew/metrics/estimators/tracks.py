@@ -9,7 +9,7 @@ of the same time, and the one that looks most like it, which is another where a 
     motion      how far a proposal lies from where the predicted video's flow carries the one before
 The cheapest path through all frames wins (Viterbi). Where nothing looks like the point it is lost (NaN), not left where
 the truth has it: a video that stands still is measured as standing still.
-Its error on true video is published beside every score: the row `ground_truth` of `evaluate`.
+Its error on true video is published with every score: the row `ground_truth` of `evaluate`.
 """
 
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from xew.metrics.estimators.images import is_inside, sample, soften
 from xew.metrics.estimators.similarity import find_most_similar
 
 PATCH = 12
@@ -89,7 +90,7 @@ def estimate_tracks(prediction: np.ndarray, target: np.ndarray, points: np.ndarr
 class ReferenceTracker:
     """`estimate_tracks`; what it knows of two videos is computed once while the same arrays follow each other.
 
-    A prediction is asked for several kinds of points, and an episode's true video stands beside several predictions.
+    A prediction is asked for several kinds of points, and an episode's true video is compared with several predictions.
     """
 
     pointwise = True
@@ -126,7 +127,7 @@ class _Video:
     def soft(self, t: int) -> np.ndarray:
         """[h w 3] uint8, frame t softened."""
         if t not in self._soft:
-            self._soft[t] = _soften(self.frames[t])
+            self._soft[t] = soften(self.frames[t], SOFTNESS)
         return self._soft[t]
 
     def follow(self, places: np.ndarray, t: int) -> np.ndarray:
@@ -134,7 +135,7 @@ class _Video:
         if t not in self._flow:
             flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
             self._flow[t] = flow.calc(self.grays[t - 1], self.grays[t], None)
-        return places + _sample(self._flow[t], places.reshape(1, -1, 2)).reshape(places.shape)
+        return places + sample(self._flow[t], places.reshape(1, -1, 2)).reshape(places.shape)
 
 
 def _track(
@@ -202,7 +203,7 @@ def _improve(
     near = np.linalg.norm(fitted - start, axis=-1) < REFINEMENT
     fitted = np.where(near[:, None], fitted, start)
     like = likeness(frame, fitted, source.soft, source.points[point])
-    possible = _inside(fitted, frame) & ~_is_in_true_frame(frame, fitted, source.soft, source.points[point], like)
+    possible = is_inside(fitted, frame) & ~_is_in_true_frame(frame, fitted, source.soft, source.points[point], like)
     price = np.where(possible, np.clip(1 - like, 0, 1), GIVEN_UP)
     better = price < cost[point, column]
     place[point[better], column[better]] = fitted[better]
@@ -213,10 +214,10 @@ def _is_in_true_frame(
     frame: np.ndarray, places: np.ndarray, true_frame: np.ndarray, points: np.ndarray, like: np.ndarray
 ) -> np.ndarray:
     """[n] is what a frame shows far from the true point there in the true frame too? Then it is no point that came there."""
-    found = np.linalg.norm(places - points, axis=-1) > PATCH
-    if found.any():
-        found[found] = likeness(frame, places[found], true_frame, places[found]) > like[found] - STANDING
-    return found
+    stands = np.linalg.norm(places - points, axis=-1) > PATCH
+    if stands.any():
+        stands[stands] = likeness(frame, places[stands], true_frame, places[stands]) > like[stands] - STANDING
+    return stands
 
 
 def likeness(image: np.ndarray, places: np.ndarray, true_image: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -239,7 +240,7 @@ def likeness(image: np.ndarray, places: np.ndarray, true_image: np.ndarray, poin
 
 def _patches(image: np.ndarray, points: np.ndarray) -> np.ndarray:
     """[n p 3] float32 colors round points [n 2], read between the pixels."""
-    return _sample(image, points[:, None] + OFFSETS).astype(np.float32)
+    return sample(image, points[:, None] + OFFSETS).astype(np.float32)
 
 
 def _patch_inside(points: np.ndarray, image: np.ndarray) -> np.ndarray:
@@ -251,12 +252,6 @@ def _patch_inside(points: np.ndarray, image: np.ndarray) -> np.ndarray:
     return (inside[1][:, :, None] & inside[0][:, None, :]).reshape(len(points), -1)
 
 
-def _inside(points: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """[...] is each point [... 2] in a pixel of the image?"""
-    height, width = image.shape[:2]
-    return np.all((points > -0.5) & (points < (width - 0.5, height - 0.5)), axis=-1)
-
-
 def _flow_points(
     source: _TrueFrame, gray: np.ndarray, index: np.ndarray | None = None, start: np.ndarray | None = None
 ) -> np.ndarray:
@@ -264,11 +259,11 @@ def _flow_points(
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.03)
     points = source.points if index is None else source.points[index]
     if start is None:
-        found, _, _ = cv2.calcOpticalFlowPyrLK(
+        places, _, _ = cv2.calcOpticalFlowPyrLK(
             source.gray, gray, points[:, None], None, winSize=(15, 15), maxLevel=3, criteria=criteria
         )
     else:
-        found, _, _ = cv2.calcOpticalFlowPyrLK(
+        places, _, _ = cv2.calcOpticalFlowPyrLK(
             source.gray,
             gray,
             points[:, None],
@@ -278,7 +273,7 @@ def _flow_points(
             criteria=criteria,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
-    return found[:, 0]
+    return places[:, 0]
 
 
 def _search(frame: np.ndarray, true_frame: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -287,7 +282,7 @@ def _search(frame: np.ndarray, true_frame: np.ndarray, points: np.ndarray) -> np
     margin = half + reach
     small, true_small = (_halve(image, margin) for image in (frame, true_frame))
     variance = _local_variance(small, 2 * half + 1)
-    found = np.full((len(points), PEAKS, 2), np.nan, np.float32)
+    best = np.full((len(points), PEAKS, 2), np.nan, np.float32)
     for i, point in enumerate(points):
         x, y = np.round((point - 0.5) / 2).astype(int)  # the center of small pixel i is at 2 i + 0.5
         patch = true_small[y + reach : y + reach + 2 * half + 1, x + reach : x + reach + 2 * half + 1]
@@ -300,8 +295,8 @@ def _search(frame: np.ndarray, true_frame: np.ndarray, points: np.ndarray) -> np
             + variance[y + half : y + margin + reach + 1, x + half : x + margin + reach + 1]
         )
         peaks = _peaks(1 - difference / (spread + FLATNESS))
-        found[i, : len(peaks)] = point + 2 * (peaks - reach)
-    return found
+        best[i, : len(peaks)] = point + 2 * (peaks - reach)
+    return best
 
 
 def _peaks(likeness: np.ndarray) -> np.ndarray:
@@ -310,10 +305,6 @@ def _peaks(likeness: np.ndarray) -> np.ndarray:
     y, x = np.nonzero(likeness >= cv2.dilate(likeness, np.ones((side, side), np.uint8)))
     order = np.argsort(-likeness[y, x], kind="stable")[:PEAKS]
     return np.stack([x[order], y[order]], axis=-1)
-
-
-def _soften(image: np.ndarray) -> np.ndarray:
-    return cv2.GaussianBlur(image, (0, 0), SOFTNESS)
 
 
 def _halve(image: np.ndarray, margin: int) -> np.ndarray:
@@ -341,11 +332,6 @@ def _straying(place: np.ndarray, carried: np.ndarray, inner: np.ndarray) -> np.n
     offset = place[:, None] - carried[:, :, None]
     square = np.minimum(np.sum(offset**2, axis=-1), np.sum((offset - inner[:, None, None]) ** 2, axis=-1))
     return square / (square + STRAYING**2)
-
-
-def _sample(image: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The image read at points [a b 2] between its pixels; beyond its border it goes on as it ended."""
-    return cv2.remap(image, points[..., 0], points[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 class _Paths:

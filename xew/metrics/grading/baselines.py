@@ -32,7 +32,7 @@ class Baseline:
     make: Callable[[Path, Truth], np.ndarray]
     """Function of an episode's folder and truth to the video, uint8 [t h w 3] of the truth's shape."""
     source: Callable[[Path, Record], str | None] = lambda folder, record: ""
-    """Function of an episode's folder and header to the digest of what the video is made from beside the truth; None where
+    """Function of an episode's folder and header to the digest of what the video is made from besides the truth; None where
     the data set does not hold that, and the baseline is left out."""
 
 
@@ -49,7 +49,7 @@ def pasted_render(folder: Path, truth: Truth) -> np.ndarray:
 def paste_render(first: np.ndarray, render: np.ndarray) -> np.ndarray:
     """The first frame with its robot filled in and the render of the robot's commands pasted on.
 
-    Both are what every model may be told. What the arm hid in the first frame is filled in from around by Telea's
+    Every model may be given both. What the arm hid in the first frame is filled in from around by Telea's
     inpainting (2004).
 
     Args:
@@ -92,8 +92,8 @@ def find_other_robot(folder: Path) -> Path | None:
     place = names.index(folder.name)
     for name in names[place + 1 :] + names[:place]:
         other = folder.parent / name
-        found = read_record(other)
-        if found.success and found.videos and found.scene_hash == record.scene_hash:
+        candidate = read_record(other)
+        if candidate.success and candidate.videos and candidate.scene_hash == record.scene_hash:
             return other
     return None
 
@@ -113,4 +113,4 @@ BASELINES: dict[str, Baseline] = {
     OTHER_ROBOT: Baseline(other_robot, _other_digest),
     GROUND_TRUTH: Baseline(lambda folder, truth: truth.rgb),
 }
-"""Baselines by name. The ground truth's scores tell the noise floors."""
+"""Baselines by name. The ground truth's scores are the noise floors."""

@@ -2,7 +2,7 @@
 
 It holds the protocol, versions and estimators, the digest of the score table, every graded video with the digests of
 the prediction and of the truth and its values, the means over them, and a digest of all this. Checking it needs the bundle
-alone (is it whole, are the means those of its values, is it of the table beside it?), or also the videos and the data
+alone (is it whole, are the means those of its values, is it of the table next to it?), or also the videos and the data
 (was it made from them?).
 """
 
@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from xew.config import ConfigError, parse
-from xew.files import digest_files, read_json
-from xew.metrics.grading.scores import KEY, Cell, write_whole
+from xew.files import digest_files, read_json, write_text
+from xew.metrics.grading.scores import KEY, Cell
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 FORMAT = 1
 DIGESTS = ("prediction", "rgb", "states")
 CHOICES = ("protocol", "estimators", "frame_zero", "allowed")
-SHOWN = 5
+MOST_NAMED = 5
 """Number of differences that a message names."""
 AGREEMENT = 1e-3
-"""Largest relative difference (of numbers below 1: absolute) of scores that are graded anew on another machine."""
+"""Largest relative difference (of numbers below 1: absolute) of scores that are graded again on another machine."""
 
 Bundle = dict[str, Any]
 
 
 def write_bundle(path: Path, table: Path, rows: "pd.DataFrame", cells: Sequence[Cell]) -> None:
-    """Write the bundle of a score table. Raises ConfigError if the disk does not take it.
+    """Write the bundle of a score table.
 
     Args:
         path: of the bundle.
@@ -59,11 +59,11 @@ def write_bundle(path: Path, table: Path, rows: "pd.DataFrame", cells: Sequence[
     ]
     bundle: Bundle = {"format": FORMAT, "table": table.name, "table_sha256": digest_files([table])}
     bundle |= {str(name): value for name, value in rows.attrs.items()} | {"samples": samples, "means": means(samples)}
-    write_whole(path, (json.dumps(bundle | {"digest": digest(bundle)}, indent=1) + "\n").encode())
+    write_text(path, json.dumps(bundle | {"digest": digest(bundle)}, indent=1) + "\n")
 
 
 def read_bundle(path: Path) -> Bundle:
-    """A bundle that is whole and consistent in itself and with the table beside it, where there is one.
+    """A bundle that is whole and consistent in itself and with the table next to it, where there is one.
 
     Raises:
         ConfigError: it is not; the message says what does not hold.
@@ -129,10 +129,10 @@ class _Types:
 def _check_types(path: Path, bundle: Any) -> None:
     """Raise ConfigError for what is missing or of another type than a bundle has; ValueError if its table lies elsewhere."""
     known = {entry.name for entry in fields(_Types)}
-    found = {name: value for name, value in bundle.items() if name in known} if isinstance(bundle, dict) else bundle
-    read = parse(_Types, found, f"{path} is no bundle of xew, or is damaged")
+    known_values = {name: value for name, value in bundle.items() if name in known} if isinstance(bundle, dict) else bundle
+    read = parse(_Types, known_values, f"{path} is no bundle of xew, or is damaged")
     if Path(read.table).name != read.table:
-        raise ValueError(f"its table {read.table!r} does not lie beside it")
+        raise ValueError(f"its table {read.table!r} does not lie next to it")
 
 
 def differences(bundle: Bundle, choices: dict[str, Any], cells: Iterable[Cell]) -> list[str]:
@@ -143,33 +143,33 @@ def differences(bundle: Bundle, choices: dict[str, Any], cells: Iterable[Cell]) 
         choices: protocol, estimators, frame_zero and allowed, as they are now.
         cells: the videos and truths as they are now.
     """
-    found = [f"{name} is {bundle[name]!r}, here {choices[name]!r}" for name in CHOICES if bundle[name] != choices[name]]
+    differing = [f"{name} is {bundle[name]!r}, here {choices[name]!r}" for name in CHOICES if bundle[name] != choices[name]]
     here = {cell.key: cell for cell in cells}
     there = {_key(sample): sample for sample in bundle["samples"]}
-    found += [f"{_text(key)} is in the bundle and not here" for key in there.keys() - here.keys()]
-    found += [f"{_text(key)} is here and not in the bundle" for key in here.keys() - there.keys()]
+    differing += [f"{_text(key)} is in the bundle and not here" for key in there.keys() - here.keys()]
+    differing += [f"{_text(key)} is here and not in the bundle" for key in here.keys() - there.keys()]
     for key in sorted(there.keys() & here.keys()):
         changed = [name for name in (*DIGESTS, "frames") if there[key][name] != getattr(here[key], name)]
-        found += [f"{_text(key)} has another {', '.join(changed)}"] if changed else []
-    return found
+        differing += [f"{_text(key)} has another {', '.join(changed)}"] if changed else []
+    return differing
 
 
 def disagreements(bundle: Bundle, key: tuple[Any, ...], values: dict[str, float]) -> list[str]:
-    """Where values of a video that were graded anew are not those of the bundle, one line each."""
+    """Where values of a video that were graded again are not those of the bundle, one line each."""
     sample = next(sample for sample in bundle["samples"] if _key(sample) == key)
-    found = []
+    disagreeing = []
     for metric in bundle["metrics"]:
         then, now = (some.get(metric, math.nan) for some in (sample["values"], values))
         if not np.isclose(now, then, rtol=AGREEMENT, atol=AGREEMENT, equal_nan=True):
-            found.append(f"{_text(key)}: {metric} is {now:.6g}, the bundle says {then:.6g}")
-    return found
+            disagreeing.append(f"{_text(key)}: {metric} is {now:.6g}, the bundle says {then:.6g}")
+    return disagreeing
 
 
-def raise_if_any(path: Path, found: Sequence[str]) -> None:
+def raise_if_any(path: Path, differences: Sequence[str]) -> None:
     """Raise ConfigError that names the first few differences, if there are any."""
-    if found:
-        more = f"\n  and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
-        raise ConfigError(f"{path} does not hold here:\n  " + "\n  ".join(found[:SHOWN]) + more)
+    if differences:
+        more = f"\n  and {len(differences) - MOST_NAMED} more" if len(differences) > MOST_NAMED else ""
+        raise ConfigError(f"{path} does not hold here:\n  " + "\n  ".join(differences[:MOST_NAMED]) + more)
 
 
 def means(samples: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

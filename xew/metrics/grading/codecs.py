@@ -1,7 +1,7 @@
 """Codecs of the models that are graded: what is left of true video after a model's codec is the floor of its scores.
 
-The room of metrics does not know the model: a function that opens a run's codec is named as module:NAME, and what it gives is
-a `Roundtrip`. The truth through a codec is graded like a prediction, as the baseline CODEC_TRUTH, once a codec and episode.
+The metrics import nothing of the model: the function that opens a run's codec is named as module:NAME, and it gives a
+`Roundtrip`. The truth through a codec is graded like a prediction, as the baseline CODEC_TRUTH, once a codec and episode.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ import numpy as np
 from xew.config import ConfigError
 
 OPENER = "xew.model.runs.roundtrip:open_roundtrip"
-"""Function that opens the codec of a run of this project."""
+"""Function of a run's folder that opens its codec."""
 
 
 class Roundtrip(Protocol):
@@ -54,31 +54,18 @@ class ModelCodec:
             return self.roundtrip(video)
 
 
-def open_codec(run: Path, opener: str = OPENER) -> Roundtrip:
-    """The codec of a run.
-
-    Args:
-        run: folder of the run.
-        opener: function that opens it, as module:NAME, of the folder to a `Roundtrip`; anybody's can be named.
-
-    Raises:
-        ConfigError: the run or the opener does not exist.
-    """
-    module, _, name = opener.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"cannot import the opener of codecs {opener!r}: {error}; expected module:NAME.") from error
-    roundtrip: Roundtrip = found(run)
+def open_codec(run: Path) -> Roundtrip:
+    """The codec of the run in a folder. Raises ConfigError where there is none."""
+    module, _, name = OPENER.partition(":")
+    roundtrip: Roundtrip = getattr(importlib.import_module(module), name)(run)
     return roundtrip
 
 
-def open_codecs(runs: Sequence[Path], opener: str, models: Collection[str] | None) -> dict[str, ModelCodec]:
+def open_codecs(runs: Sequence[Path], models: Collection[str] | None = None) -> dict[str, ModelCodec]:
     """The codecs of runs by the names of the models that they are of.
 
     Args:
         runs: folders of the runs.
-        opener: as of `open_codec`.
         models: names of all models that are graded; None where codecs may be of others, too.
 
     Raises:
@@ -86,7 +73,7 @@ def open_codecs(runs: Sequence[Path], opener: str, models: Collection[str] | Non
     """
     codecs: dict[str, ModelCodec] = {}
     for run in runs:
-        roundtrip = open_codec(run, opener)
+        roundtrip = open_codec(run)
         if models is not None and roundtrip.model not in models:
             raise ConfigError(
                 f"--codec {run} is the run of {roundtrip.model!r}, of which no rollout is graded; graded are "

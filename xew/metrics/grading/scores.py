@@ -1,12 +1,12 @@
-"""Scores on disk: a tidy table with a description of its metrics in it, and the per-frame curves beside it.
+"""Scores on disk: a tidy table with a description of its metrics in it, and the per-frame curves next to it.
 
 scores.parquet         model condition task seed robot metric value | frames exact_frames content
 scores.curves.parquet  model condition task seed robot metric frame value
 scores.cells/          one small file for each graded video, from which the tables are put together
-<data>-baselines/      the same for the baselines, beside the data set and for all tables
+<data>-baselines/      the same for the baselines, next to the data set and for all tables
 A metric that a video has no value of has no row. The tables' attributes (pandas `attrs`) hold protocol, versions,
 estimators, what became of frame 0, and each metric's title, unit, direction, range and source, so that the analysis needs no
-import of this room. The tables are a function of what was graded alone: the same bytes whatever was done first, in how
+import of this package. The tables are a function of what was graded alone: the same bytes whatever was done first, in how
 many threads, and how often it was stopped on the way.
 """
 
@@ -28,7 +28,7 @@ import pyarrow.parquet as pq
 import xew
 from xew.config import ConfigError
 from xew.episode import place_episode
-from xew.files import read_json, replacing
+from xew.files import read_json, replacing, write_bytes
 from xew.metrics import METRICS
 from xew.metrics.grade import Grades
 from xew.protocol import BASELINES
@@ -104,7 +104,7 @@ class CellStore:
         return tuple(name for name in metrics if grades is None or name not in grades.values)
 
     def write(self, cell: Cell, grades: Grades) -> None:
-        """Enter grades, beside those that a cell already has. Raises ConfigError if the disk does not take them."""
+        """Add grades to those that a cell already has."""
         before = self.read(cell)
         values = (before.values if before else {}) | grades.values
         curves = (before.curves if before else {}) | grades.curves
@@ -114,7 +114,7 @@ class CellStore:
             "values": {name: _finite_or_none(value) for name, value in values.items()},
             "curves": {name: [_finite_or_none(value) for value in curve.tolist()] for name, curve in curves.items()},
         }
-        write_whole(self._path(cell), json.dumps(content).encode())
+        write_bytes(self._path(cell), json.dumps(content).encode())
 
     def _path(self, cell: Cell) -> Path:
         if cell.model in BASELINES:
@@ -140,36 +140,24 @@ def surfaces_folder(data: Path, out: Path) -> Path:
 
 
 def folder_beside_data(data: Path, out: Path, name: str) -> Path:
-    """Folder for what is made of a data set once, for all score tables: beside the data, or beside the table where the former
+    """Folder for what is made of a data set once, for all score tables: next to the data, or next to the table where that
     cannot be written to."""
-    beside = data.absolute().with_name(f"{data.absolute().name}-{name}")
-    writable = os.access(beside if beside.exists() else beside.parent, os.W_OK)
-    return beside if writable else path_beside(out, name)
+    folder = data.absolute().with_name(f"{data.absolute().name}-{name}")
+    writable = os.access(folder if folder.exists() else folder.parent, os.W_OK)
+    return folder if writable else path_beside(out, name)
 
 
 def path_beside(path: Path, ending: str) -> Path:
-    """The name of what lies beside a score table, such as scores.curves.parquet."""
+    """The name of a file next to a score table, such as scores.curves.parquet."""
     return path.with_suffix(f".{ending}")
 
 
 def write_tables(path: Path, attributes: dict[str, Any], cells: Sequence[Cell], store: CellStore) -> None:
-    """Write both tables of the cells that are graded, sorted, so that the order of work leaves no trace.
-
-    Raises:
-        ConfigError: the disk does not take them; what stood there before still stands.
-    """
+    """Write both tables of the cells that are graded, sorted, so that the order of work leaves no trace."""
     metrics = list(attributes["metrics"])
     # The curves first: what is in the table always has its curves.
     _write_table(path_beside(path, "curves.parquet"), CURVES, _curve_table, attributes, metrics, cells, store)
     _write_table(path, ROWS, _row_table, attributes, metrics, cells, store)
-
-
-def write_diagnostics(
-    path: Path, attributes: dict[str, Any], names: Sequence[str], cells: Sequence[Cell], store: CellStore
-) -> None:
-    """Write a table like the score table of what is no part of the suite. Raises ConfigError as `write_tables`."""
-    attributes = {key: value for key, value in attributes.items() if key != "metrics"}
-    _write_table(path, ROWS, _row_table, attributes, names, cells, store)
 
 
 def _write_table(
@@ -212,12 +200,9 @@ def _repeat_key(cell: Cell, count: int) -> list[pa.Array]:
 
 
 def _write_parquet(path: Path, schema: pa.Schema, tables: Iterator[pa.Table]) -> None:
-    try:
-        with replacing(path) as temporary, pq.ParquetWriter(temporary, schema) as writer:
-            for group in _groups(tables, ROW_GROUP):
-                writer.write_table(pa.concat_tables(group).replace_schema_metadata(schema.metadata))
-    except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error}. Free some space or choose another --out.") from error
+    with replacing(path) as temporary, pq.ParquetWriter(temporary, schema) as writer:
+        for group in _groups(tables, ROW_GROUP):
+            writer.write_table(pa.concat_tables(group).replace_schema_metadata(schema.metadata))
 
 
 def _groups(items: Iterator[pa.Table], size: int) -> Iterator[list[pa.Table]]:
@@ -229,15 +214,6 @@ def _groups(items: Iterator[pa.Table], size: int) -> Iterator[list[pa.Table]]:
             group = []
     if group:
         yield group
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file that is there complete or not at all. Raises ConfigError if the disk does not take it."""
-    try:
-        with replacing(path) as temporary:
-            temporary.write_bytes(content)
-    except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error}. Free some space or choose another --out.") from error
 
 
 def describe(settings: dict[str, Any], metrics: tuple[str, ...]) -> dict[str, Any]:

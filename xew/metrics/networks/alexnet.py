@@ -33,7 +33,7 @@ Weights = types.MappingProxyType[str, np.ndarray]
 def read_alexnet() -> Weights:
     """Kernels (HWIO) and biases of five convolutions and the five non-negative heads, float32, by name, e.g. 'conv0_kernel'.
 
-    Read at the first call and kept. NumPy and not JAX arrays, so that a call under somebody's jit cannot leak a tracer.
+    Read at the first call and cached. NumPy and not JAX arrays, so that a call under somebody's jit cannot leak a tracer.
 
     Raises:
         FileNotFoundError: the weights are not installed; the message says what would bring them.
@@ -83,5 +83,5 @@ def _package_file(package: str, ending: str) -> Path | None:
         files = metadata.files(package) or []
     except metadata.PackageNotFoundError:
         return None
-    found = [Path(str(file.locate())) for file in files if file.as_posix().endswith(f"/{ending}")]
-    return next((path for path in found if path.is_file()), None)
+    paths = [Path(str(file.locate())) for file in files if file.as_posix().endswith(f"/{ending}")]
+    return next((path for path in paths if path.is_file()), None)

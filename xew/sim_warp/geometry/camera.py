@@ -1,4 +1,4 @@
-"""Cameras as objects: where they stand and what they show, by the convention of `xew.projection`. NumPy only.
+"""Cameras as objects: where they stand and what they show, by the convention of `xew.episode.project`. NumPy only.
 
 All episodes are seen by HEAD_CAMERA; to see them from elsewhere, change it.
 """

@@ -7,4 +7,16 @@ kernels of all that where there are none. Workers are forked with what `preloade
 absent.
 """
 
-__all__ = ["by_robot", "cells", "episodes", "kept_tracks", "outcome", "preloaded", "produce", "rerender", "surfaces", "warm_up"]
+__all__ = [
+    "cells",
+    "episodes",
+    "kept_tracks",
+    "outcome",
+    "preloaded",
+    "produce",
+    "rerender",
+    "seeds",
+    "summary",
+    "surfaces",
+    "warm_up",
+]

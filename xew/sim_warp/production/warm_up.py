@@ -5,25 +5,19 @@ Writes Warp's kernel cache, from which all workers load
 
 Each part is a job of its own, in a process of its own, because some of what Warp compiles (products of small matrices) it
 compiles one at a time in a process.
-
-Command, on a machine without a GPU for one that has one: python -m xew.sim_warp.production.warm_up --arch 90
-    Set WARP_CACHE_PATH to choose the folder, and copy what is in it to the other machine's.
 """
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-import tyro
 import warp as wp
 from tqdm import tqdm
 
-from xew.config import ConfigError, user_errors
 from xew.protocol import ACTION_DIM, ARMS
-from xew.sim_warp.devices.kernels import Variant, compile_for, has_kernels, watched_launches
-from xew.sim_warp.devices.workers import Workers, quiet_warp
+from xew.sim_warp.devices.kernels import has_kernels
+from xew.sim_warp.devices.workers import Workers
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.kinematics.forward import tool_pose
 from xew.sim_warp.kinematics.inverse import arm_solver
@@ -38,46 +32,6 @@ PARTS = ("physics", "kinematics", "rendering")
 """Parts of the work, the one that compiles longest first."""
 ROBOT, TASK = "franka_panda", "open_laptop"
 """The pieces' robot and scene; which they are does not matter, since kernels serve all."""
-
-
-@dataclass(frozen=True)
-class Args:
-    """Compile Warp's kernels for a GPU that need not be in this machine, into Warp's kernel cache."""
-
-    arch: int
-    """Compute capability of the GPU: 90 for an H100 or H200, 80 for an A100, 89 for an L40S or an RTX 4090."""
-    batch: int = 256
-    """Number of worlds that it will step together, as of generate."""
-    workers: int = len(PARTS)
-    """Number of processes; each part of the work is compiled by one of them, in as many threads as there are cores."""
-
-
-@user_errors
-def main(args: Args) -> None:
-    """Compile for another machine's GPU. Raises ConfigError for an architecture that Warp's compiler does not know."""
-    quiet_warp()
-    wp.init()
-    known = wp.get_cuda_supported_archs()
-    if args.arch not in known:
-        raise ConfigError(f"--arch is {args.arch}; Warp's compiler knows {', '.join(map(str, known)) or 'none here'}.")
-    with Workers(args.workers) as workers:
-        compiled = workers.run(partial(compile_piece, arch=args.arch, batch=args.batch), PARTS)
-        modules = sum(tqdm(compiled, desc="compiling kernels", unit="part", total=len(PARTS)))
-    print(f"{wp.config.kernel_cache_dir}: {modules} modules for sm_{args.arch}; copy the folder to the GPU's machine")
-
-
-def compile_piece(part: str, arch: int, batch: int) -> int:
-    """Compile what a part of the work, one of PARTS, launches, for GPUs of an architecture; returns the number of modules.
-
-    The smallest piece of the work is done on the CPU, to see what it launches.
-    """
-    kernels: list[Variant] = []
-    with watched_launches() as found:
-        if part == "physics":
-            kernels = _batch_kernels(batch)
-        else:
-            do_smallest_piece(part, "cpu", batch)
-    return compile_for([*found, *kernels], arch)
 
 
 def compile_kernels(workers: Workers, device: wp.Device, batch: int, parts: Sequence[str] = PARTS) -> None:
@@ -119,13 +73,6 @@ def _solve(robot: RobotSpec, device: wp.Device, batch: int) -> None:
     arm_solver(robot).solve(0, tool_pose(robot, 0, home), home)
 
 
-def _batch_kernels(batch: int) -> list[Variant]:
-    """What a GPU launches to step a batch of worlds."""
-    from xew.sim_warp.physics.gpu import Batch  # MuJoCo Warp is heavy
-
-    return Batch([_stand(ROBOTS[ROBOT])] * batch, wp.get_device("cpu")).list_kernels()
-
-
 def _stand(robot: RobotSpec) -> World:
     return World(robot, TASKS[TASK].sample(scene_rng(TASK, 0), 0), stand_at_home(robot, 2))
 
@@ -156,7 +103,3 @@ def stand_at_home(robot: RobotSpec, frames: int) -> np.ndarray:
         action[:, joints.start : joints.start + robot.arm_joint_count] = arm.home
         action[:, gripper] = 1.0
     return action
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Args))

@@ -1,19 +1,19 @@
 """The default estimators in Warp kernels: the same flow, masks, points and scores as OpenCV's, on a CPU."""
 
-import threading
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
 
+from lab.calibration.matrix import grade_material
+from lab.calibration.predictors import Material, delay, predict
 from xew.metrics import mask_iou
-from xew.metrics.backends import Confirmer, open_masker, open_tracker
-from xew.metrics.calibration.matrix import grade_material
-from xew.metrics.calibration.predictors import Material, delay, predict
+from xew.metrics.backends import Confirmer, ReferenceMasker, Tracker, open_masker, open_tracker
+from xew.metrics.episode_cache import EpisodeCache
+from xew.metrics.estimators.batched import devices
 from xew.metrics.estimators.batched import masks as batched_masks
-from xew.metrics.estimators.batched.devices import find_gpu
 from xew.metrics.estimators.batched.flow import Search, build_pyramid, find_flow, is_large_enough
 from xew.metrics.estimators.batched.masks import SEARCH as MASK_SEARCH
 from xew.metrics.estimators.batched.masks import BatchedMasker
@@ -21,7 +21,7 @@ from xew.metrics.estimators.batched.tracks import SEARCH as TRACK_SEARCH
 from xew.metrics.estimators.batched.tracks import BatchedTracker
 from xew.metrics.estimators.masks import _flow, estimate_masks
 from xew.metrics.estimators.presence import confirm_tracks
-from xew.metrics.estimators.tracks import estimate_tracks
+from xew.metrics.estimators.tracks import ReferenceTracker, estimate_tracks
 from xew.metrics.grade import Comparison
 from xew.metrics.truth import Points, Surfaces, Truth
 
@@ -60,8 +60,7 @@ def truth() -> Truth:
     points = {body: points_on(corners[body], looks.shape, shown, body) for body, looks in ((0, robot), (1, thing))}
     surfaces = Surfaces(points[0], points[1], shown, known=True)
     middle = points[1].pixels[:, 4:5], points[1].visible[:, 4:5]
-    contact = np.zeros((FRAMES, 2, 1), bool)
-    return Truth(video, shown == 0, points[0].pixels, points[0].visible, *middle, points[0].pixels[:, :2], contact, surfaces)
+    return Truth(video, shown == 0, points[0].pixels, points[0].visible, *middle, surfaces)
 
 
 def points_on(corners: np.ndarray, shape: tuple[int, ...], shown: np.ndarray, body: int) -> Points:
@@ -126,9 +125,9 @@ def test_points_are_found_where_opencv_finds_them(truth: Truth) -> None:
 
 def test_places_of_other_things_are_told_as_opencv_tells_them(truth: Truth) -> None:
     surfaces = truth.surfaces
-    assert surfaces is not None and surfaces.shown is not None
+    assert surfaces is not None and surfaces.body_id is not None
     points, visible = surfaces.robot.pixels, surfaces.robot.visible
-    known = truth.rgb, points, visible, surfaces.shown, np.zeros(9, int)
+    known = truth.rgb, points, visible, surfaces.body_id, np.zeros(9, int)
     tracker = BatchedTracker("cpu")
     assert isinstance(tracker, Confirmer)
     video = np.ascontiguousarray(predict("8 frames late", Material(truth.rgb)))
@@ -143,9 +142,10 @@ def test_places_of_other_things_are_told_as_opencv_tells_them(truth: Truth) -> N
 
 
 def test_scores_of_the_predictors_are_the_same(truth: Truth) -> None:
+    opencv, warp = (ReferenceMasker(), ReferenceTracker()), (BatchedMasker("cpu"), BatchedTracker("cpu"))
     graded = {
-        name: pd.DataFrame(grade_material(Material(truth.rgb), truth, open_masker(name), open_tracker(name), SCORES, CASES))
-        for name in ("opencv", "warp")
+        name: pd.DataFrame(grade_material(Material(truth.rgb), truth, *estimators, SCORES, CASES))
+        for name, estimators in (("opencv", opencv), ("warp", warp))
     }
     expected, found = (rows.set_index(["metric", "case"])["value"].unstack() for rows in graded.values())
     assert expected.loc["keypoint_error_strict"].max() > 10 > 1 > expected.loc["keypoint_error_strict"].min()
@@ -154,9 +154,9 @@ def test_scores_of_the_predictors_are_the_same(truth: Truth) -> None:
         np.testing.assert_allclose(found.loc[name], expected.loc[name], rtol=ERRORS, atol=0.02, err_msg=name)
 
 
-@pytest.mark.parametrize("name", ["opencv", "warp"])
-def test_points_of_all_kinds_are_found_in_one_pass_as_one_kind_alone(name: str, truth: Truth) -> None:
-    tracker, asked = open_tracker(name), []
+@pytest.mark.parametrize("open_", [ReferenceTracker, lambda: BatchedTracker("cpu")], ids=["opencv", "warp"])
+def test_points_of_all_kinds_are_found_in_one_pass_as_one_kind_alone(open_: Callable[[], Tracker], truth: Truth) -> None:
+    tracker, asked = open_(), []
 
     def one_kind(*arguments: np.ndarray) -> np.ndarray:
         """The same tracker as one that may not be asked for all at once."""
@@ -165,9 +165,9 @@ def test_points_of_all_kinds_are_found_in_one_pass_as_one_kind_alone(name: str, 
 
     video = np.ascontiguousarray(predict("2 frames late", Material(truth.rgb)))
     assert tracker.pointwise
-    together, alone = (Comparison(video, truth, estimate_masks, some) for some in (tracker, one_kind))
+    together, alone = (Comparison(video, EpisodeCache(truth), estimate_masks, some) for some in (tracker, one_kind))
     for kind in together.points:
-        np.testing.assert_array_equal(together.find(kind), alone.find(kind))
+        np.testing.assert_array_equal(together.track(kind), alone.track(kind))
     assert asked == [9, 1, 18], "links, the object, and points on surfaces"
 
 
@@ -196,53 +196,19 @@ def test_images_that_the_kernels_are_not_made_for_are_left_to_opencv(size: tuple
 
 
 def test_the_default_is_opencv_where_there_is_no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("xew.metrics.backends._find_gpu", lambda: None)
+    monkeypatch.setattr(devices, "find_gpu", lambda: None)
     assert type(open_masker("default")).__name__ == "ReferenceMasker"
     assert type(open_tracker("default")).__name__ == "ReferenceTracker"
-    monkeypatch.setattr("xew.metrics.backends._find_gpu", lambda: "cpu")
+    monkeypatch.setattr(devices, "find_gpu", lambda: "cpu")
     assert isinstance(open_masker("default"), BatchedMasker) and isinstance(open_tracker("default"), BatchedTracker)
 
 
-def test_threads_side_by_side_find_what_one_finds(truth: Truth) -> None:
-    points, visible = truth.keypoints, truth.keypoint_visible
-    videos = [np.ascontiguousarray(predict(case, Material(truth.rgb))) for case in CASES[:3]]
-
-    def find(video: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return BatchedMasker("cpu")(video, truth.rgb, truth.mask), BatchedTracker("cpu")(video, truth.rgb, points, visible)
-
-    with ThreadPoolExecutor(3) as pool:
-        for found, expected in zip(pool.map(find, videos), map(find, videos), strict=True):
-            for ours, theirs in zip(found, expected, strict=True):
-                np.testing.assert_array_equal(ours, theirs)
-
-
-def test_few_videos_are_on_the_device_at_once(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
-    there, lock, third = 0, threading.Lock(), threading.Event()
-
-    def upload_slowly(video: np.ndarray, device: str) -> wp.array:
-        nonlocal there
-        with lock:
-            there += 1
-            if there > 2:
-                third.set()
-        third.wait(0.1)
-        with lock:
-            there -= 1
-        return wp.array(video, dtype=wp.uint8, device=device)
-
-    monkeypatch.setattr(batched_masks, "upload", upload_slowly)
-    with ThreadPoolExecutor(6) as pool:
-        list(pool.map(lambda _: BatchedMasker("cpu")(truth.rgb, truth.rgb, truth.mask), range(6)))
-    assert not third.is_set()
-
-
-def test_threads_take_the_gpu_of_their_own_number(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_takes_the_first_gpu_that_it_sees(monkeypatch: pytest.MonkeyPatch) -> None:
     gpus = [type("Device", (), {"alias": f"cuda:{i}"}) for i in range(2)]
     begun: list[object] = []
     monkeypatch.setattr(wp, "get_cuda_devices", lambda: gpus)
     monkeypatch.setattr(wp, "get_stream", begun.append)
-    monkeypatch.setattr("xew.metrics.estimators.batched.devices.gpu_number", lambda: 3)
-    assert find_gpu() == "cuda:1"
-    assert begun == [gpus[1]], "its context is made while no other thread can find it half made"
+    assert devices.find_gpu() == "cuda:0"
+    assert begun == [gpus[0]], "its context is made while no other thread can find it half made"
     monkeypatch.setattr(wp, "get_cuda_devices", list)
-    assert find_gpu() is None
+    assert devices.find_gpu() is None

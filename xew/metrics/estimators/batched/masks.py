@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 import warp as wp
 
-from xew.concurrency import PARSING
 from xew.metrics.estimators import masks as reference
 from xew.metrics.estimators.batched import mask_kernels as kernels
-from xew.metrics.estimators.batched.devices import download, turn_on, upload
+from xew.metrics.estimators.batched.devices import download
 from xew.metrics.estimators.batched.flow import Array, Search, build_pyramid, find_flow, is_large_enough
 from xew.metrics.estimators.similarity import find_most_similar
 
@@ -41,29 +40,25 @@ class BatchedMasker:
         known = self._known
         if known is None or known.target is not target or known.mask is not target_mask:
             appearance = reference.learn_appearance(target, target_mask)
-            with turn_on(self._device):
-                frames = upload(target, self._device)
-                with PARSING, wp.ScopedDevice(self._device):
-                    self._known = known = _Episode(target, target_mask, frames, appearance)
+            with wp.ScopedDevice(self._device):
+                self._known = known = _Episode(target, target_mask, appearance)
         plan = _plan(prediction, find_most_similar(prediction, target)[0])
-        with turn_on(self._device):
-            frames = upload(prediction, self._device)
-            with PARSING, wp.ScopedDevice(self._device):  # threads take turns at launching, and wait side by side
-                masks = _estimate(frames, known, plan)
-            return download(masks).astype(bool)
+        with wp.ScopedDevice(self._device):
+            masks = _estimate(wp.array(np.ascontiguousarray(prediction), dtype=wp.uint8), known, plan)
+        return download(masks).astype(bool)
 
 
 class _Episode:
     """A true video and its masks as a device has them, with room for a predicted video before them."""
 
-    def __init__(self, target: np.ndarray, mask: np.ndarray, frames: Array, appearance: reference.Appearance) -> None:
+    def __init__(self, target: np.ndarray, mask: np.ndarray, appearance: reference.Appearance) -> None:
         self.target, self.mask = target, mask
         count, *size = mask.shape
         self.frames = wp.empty((2 * count, *size, 3), dtype=wp.uint8)
         self.soft = wp.empty_like(self.frames)
         self.gray = wp.empty((2 * count, *size), dtype=wp.uint8)
         self._blur = wp.array(fixed_kernel(reference.RESIDUAL_SOFTNESS), dtype=int)
-        self.put(frames, slice(count, None))
+        self.put(wp.array(np.ascontiguousarray(target), dtype=wp.uint8), slice(count, None))
         self.distance = wp.empty(mask.shape, dtype=float)
         wp.launch(kernels.measure_distance, mask.shape, [wp.array(mask.astype(np.uint8)), 0], [self.distance])
         self.looks = [
@@ -104,8 +99,8 @@ def _bins_on(device: str) -> Array:
 class _Plan:
     """Which images flow goes between, each pair once. Predicted images are counted first, then true ones."""
 
-    shown: np.ndarray
-    """[t] int, the first frame that looks as each does: a video that stands still shows one image many times."""
+    first_alike: np.ndarray
+    """[t] int, the first frame of those equal to each: a video that stands still has one image many times."""
     alike: np.ndarray
     """[t] int, the true frame that looks most like each."""
 
@@ -113,18 +108,22 @@ class _Plan:
         """[c 2] int, pairs of a predicted image and one that is carried to it, and [t 3] int, for each of these frames the
         pair of the true frame of the same time, that of the most similar true frame, and that of the frame before."""
         now = np.array(frames)
-        others = (len(self.shown) + now, len(self.shown) + self.alike[now], self.shown[np.maximum(now - 1, 0)])
-        pairs = np.concatenate([np.stack([self.shown[now], other], axis=-1) for other in others])
+        others = (
+            len(self.first_alike) + now,
+            len(self.first_alike) + self.alike[now],
+            self.first_alike[np.maximum(now - 1, 0)],
+        )
+        pairs = np.concatenate([np.stack([self.first_alike[now], other], axis=-1) for other in others])
         carriers, index = np.unique(pairs, axis=0, return_inverse=True)
         return carriers, index.reshape(3, -1).T
 
 
 def _plan(prediction: np.ndarray, alike: np.ndarray) -> _Plan:
-    shown = np.arange(len(prediction))
+    first_alike = np.arange(len(prediction))
     for t in range(1, len(prediction)):
         if np.array_equal(prediction[t], prediction[t - 1]):
-            shown[t] = shown[t - 1]
-    return _Plan(shown, alike)
+            first_alike[t] = first_alike[t - 1]
+    return _Plan(first_alike, alike)
 
 
 def _estimate(prediction: Array, known: _Episode, plan: _Plan) -> Array:

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from xew.concurrency import PARSING
 from xew.metrics.estimators import presence
 from xew.metrics.estimators import tracks as reference
 from xew.metrics.estimators.batched import mask_kernels, path_kernels
 from xew.metrics.estimators.batched import track_kernels as kernels
-from xew.metrics.estimators.batched.devices import download, turn_on, upload
+from xew.metrics.estimators.batched.devices import download
 from xew.metrics.estimators.batched.flow import Array, Search, build_pyramid, find_flow, is_large_enough
 from xew.metrics.estimators.batched.masks import fixed_kernel
 from xew.metrics.estimators.similarity import find_most_similar
@@ -60,60 +59,52 @@ class BatchedTracker:
         height, width = target.shape[1:3]
         if not is_large_enough((height, width), SEARCH) or height % 2 or width % 2:
             return reference.estimate_tracks(prediction, target, points, visible)
-        shown = self._videos is not None and self._videos.target is target and self._videos.prediction is prediction
-        similar = None if shown else find_most_similar(prediction, target)
-        with turn_on(self._device):
-            videos = self._open(target)
-            if similar is not None:
-                frames = upload(prediction, self._device)
-                with PARSING, wp.ScopedDevice(self._device):  # threads take turns at launching, and wait side by side
-                    videos.show(prediction, frames, *similar)
-            with PARSING, wp.ScopedDevice(self._device):
-                truth, proposal = _propose(videos, points, visible)
+        with wp.ScopedDevice(self._device):
+            videos = self._open(prediction, target)
+            truth, proposal = _propose(videos, points, visible)
             sure = download(proposal)[..., 2].min(axis=-1) <= 1 - reference.SURE
-            with PARSING, wp.ScopedDevice(self._device):
-                paths = _walk(videos, truth, proposal, points, visible & ~sure)
+            paths = _walk(videos, truth, proposal, points, visible & ~sure)
             place, origin, total = map(download, paths)
         return _follow_back(place, origin, total, visible)
 
-    def _open(self, target: np.ndarray) -> "_Videos":
-        """The true video on the device, put there once while it stays the same."""
+    def _open(self, prediction: np.ndarray, target: np.ndarray) -> "_Videos":
+        """Both videos on the device, each put there once while it stays the same."""
         if self._videos is None or self._videos.target is not target:
-            frames = upload(target, self._device)
-            with PARSING, wp.ScopedDevice(self._device):
-                self._videos = _Videos(target, frames)
+            self._videos = _Videos(target)
+        if self._videos.prediction is not prediction:
+            self._videos.put_prediction(prediction, *find_most_similar(prediction, target))
         return self._videos
 
     def confirm(
         self,
-        found: np.ndarray,
+        tracks: np.ndarray,
         prediction: np.ndarray,
         target: np.ndarray,
         points: np.ndarray,
         visible: np.ndarray,
-        shown: np.ndarray,
+        body_id: np.ndarray,
         body: np.ndarray,
     ) -> np.ndarray:
-        """`confirm_tracks` [t k 2] of places [t k 2] that were found in a prediction [t h w 3] of a target [t h w 3].
+        """`confirm_tracks` [t k 2] of tracks [t k 2] in a prediction [t h w 3] of a target [t h w 3].
 
         Args:
-            found, prediction, target, points, visible, shown, body: as of `presence.confirm_tracks`.
+            tracks, prediction, target, points, visible, body_id, body: as of `presence.confirm_tracks`.
         """
         videos = self._videos
-        if videos is None or videos.target is not target or videos.prediction is not prediction or not found.size:
-            return presence.confirm_tracks(found, prediction, target, points, visible, shown, body)
-        with turn_on(self._device), PARSING, wp.ScopedDevice(self._device):
-            places = [wp.array(np.ascontiguousarray(array, np.float32), dtype=wp.vec2) for array in (found, points)]
-            known = [wp.array(visible.astype(np.uint8)), videos.put_bodies(shown), wp.array(body.astype(np.int32))]
+        if videos is None or videos.target is not target or videos.prediction is not prediction or not tracks.size:
+            return presence.confirm_tracks(tracks, prediction, target, points, visible, body_id, body)
+        with wp.ScopedDevice(self._device):
+            places = [wp.array(np.ascontiguousarray(array, np.float32), dtype=wp.vec2) for array in (tracks, points)]
+            known = [wp.array(visible.astype(np.uint8)), videos.put_bodies(body_id), wp.array(body.astype(np.int32))]
             wrong = wp.empty(visible.shape, dtype=wp.uint8)
             _launch(kernels.confirm, wrong.shape, [videos.images.soft, *places, *known], [wrong])
-        return np.where(download(wrong).astype(bool)[..., None], np.float32(np.nan), found)
+        return np.where(download(wrong).astype(bool)[..., None], np.float32(np.nan), tracks)
 
 
 class _Videos:
     """A true video as a device has it, with room for a predicted video before it."""
 
-    def __init__(self, target: np.ndarray, frames: Array) -> None:
+    def __init__(self, target: np.ndarray) -> None:
         self.target = target
         self.prediction: np.ndarray | None = None
         self._bodies: tuple[np.ndarray, Array] | None = None
@@ -130,29 +121,30 @@ class _Videos:
         self.images.soft = wp.empty((2 * count, height, width, 3), dtype=wp.uint8)
         self.half = wp.empty((2 * count, height // 2, width // 2), dtype=int)
         self._blur = wp.array(fixed_kernel(reference.SOFTNESS), dtype=int)
-        self.true_flow = self._put(frames, slice(count, None))
+        self.true_flow = self._put(target, slice(count, None))
         for first, *side in self._levels:
             inputs = [self.images.pyramid, wp.vec3i(first, *side)]
             _launch(kernels.take_slopes, (2 * count, *side), inputs, [self.images.slope])
 
-    def show(self, prediction: np.ndarray, frames: Array, alike: np.ndarray, difference: np.ndarray) -> None:
-        """Make a video [t h w 3] uint8 the predicted one, which is on the device as `frames`.
+    def put_prediction(self, prediction: np.ndarray, alike: np.ndarray, difference: np.ndarray) -> None:
+        """Put the predicted video [t h w 3] uint8 on the device.
 
         Args:
             alike, difference: its `find_most_similar`.
         """
         self.alike, self.difference = alike, difference
-        self.seen_flow = self._put(frames, slice(0, len(prediction)))
+        self.seen_flow = self._put(prediction, slice(0, len(prediction)))
         self.prediction = prediction
 
-    def put_bodies(self, shown: np.ndarray) -> Array:
+    def put_bodies(self, body_id: np.ndarray) -> Array:
         """[t h w] int16 on the device, the bodies that the true video's pixels show; put there once for the same array."""
-        if self._bodies is None or self._bodies[0] is not shown:
-            self._bodies = shown, wp.array(np.ascontiguousarray(shown, np.int16), dtype=wp.int16)
+        if self._bodies is None or self._bodies[0] is not body_id:
+            self._bodies = body_id, wp.array(np.ascontiguousarray(body_id, np.int16), dtype=wp.int16)
         return self._bodies[1]
 
-    def _put(self, frames: Array, images: slice) -> Array:
-        """Make a video [t h w 3] on the device these images; [t-1 h w 2] float32, its optical flow from frame to frame."""
+    def _put(self, video: np.ndarray, images: slice) -> Array:
+        """Make a video [t h w 3] uint8 these images; [t-1 h w 2] float32, its optical flow from frame to frame."""
+        frames = wp.array(np.ascontiguousarray(video), dtype=wp.uint8)
         count = len(frames)
         soft, half, pyramid = self.images.soft[images], self.half[images], self.images.pyramid[images]
         rows = wp.empty(frames.shape, dtype=wp.uint16)
@@ -221,8 +213,8 @@ def _follow_back(place: np.ndarray, origin: np.ndarray, total: np.ndarray, visib
 
 def _search(videos: _Videos, truth: kernels.Truth, frame: np.ndarray, index: np.ndarray, points: np.ndarray) -> Array:
     """[q PEAKS 3] float32, x, y and cost of the best places for points [q] in frames [q]."""
-    found = wp.zeros((max(len(frame), 1), reference.PEAKS), dtype=wp.vec3)
-    step = SEARCHES_AT_ONCE["cuda" if found.device.is_cuda else "cpu"]
+    best = wp.zeros((max(len(frame), 1), reference.PEAKS), dtype=wp.vec3)
+    step = SEARCHES_AT_ONCE["cuda" if best.device.is_cuda else "cpu"]
     side = 2 * int(kernels.REACH) + 1
     for first in range(0, len(frame), step):
         part = slice(first, min(first + step, len(frame)))
@@ -234,5 +226,5 @@ def _search(videos: _Videos, truth: kernels.Truth, frame: np.ndarray, index: np.
         _launch(kernels.mark_peaks, like.shape, [like], [peak])
         _launch(kernels.take_peaks, len(at), [like, peak, point], [place])
         inputs = [videos.images, truth, at, which, place]
-        _launch_blocks(kernels.improve_peaks, list(place.shape), inputs, [found[part]])
-    return found
+        _launch_blocks(kernels.improve_peaks, list(place.shape), inputs, [best[part]])
+    return best

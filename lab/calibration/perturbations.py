@@ -4,7 +4,7 @@ Reads  an episode's recorded states
 Writes `Perturbation`s: the same scene with robot and objects moved otherwise, as a model that errs would show it
 
 An estimator sees the pixels only; what it says of them can be held against the truth that the renderer knows. The
-simulation is asked to render when a case is made, so that the metrics load without it. Frame 0 is every model's given
+simulation is asked to render when a case is made, so this module loads without Warp. Frame 0 is every model's given
 frame and stays as it was.
 """
 
@@ -35,8 +35,8 @@ class Perturbation:
 
 def delay(states: States, frames: int) -> States:
     """States in which everything happens some frames too late."""
-    shown = np.maximum(np.arange(states.frame_count) - frames, 0)
-    return _replace_motion(states, states.joint_pos[shown], states.object_pose[shown], states.object_joint[shown])
+    late = np.maximum(np.arange(states.frame_count) - frames, 0)
+    return _replace_motion(states, states.joint_pos[late], states.object_pose[late], states.object_joint[late])
 
 
 def freeze(states: States) -> States:
@@ -90,7 +90,6 @@ def render_perturbations(folder: Path) -> Iterator[tuple[str, Perturbation]]:
 
 def render_perturbation(folder: Path, states: States) -> Perturbation:
     """The scene of an episode with its robot and objects where other states have them."""
-    # Only here: the metrics load without Warp.
     from xew.sim_warp.devices.workers import quiet_warp
     from xew.sim_warp.geometry.camera import HEAD_CAMERA, project
     from xew.sim_warp.rendering.observe import observe, scene_recording

@@ -1,15 +1,57 @@
-"""What the metrics can tell on each task, as a section of a Markdown page: their power, and the scores that it comes from."""
+"""Writes the section on the metrics' power on each task into docs/tasks.md.
+
+Reads  a score table with the baselines, such as of `xew.metrics.evaluate --data data --baselines-of validation`
+Writes one section of a Markdown page; the rest of the page stays
+
+    python -m lab.power scores.parquet --page docs/tasks.md
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
+import tyro
 
+from xew.config import ConfigError, user_errors
+from xew.files import write_section
 from xew.metrics import METRICS
+from xew.metrics.grading.summary import summarize
 from xew.statistics import LEAST_POWER, describe_power
 
 HEADING = "## What the metrics can tell"
 """Heading of the section on the page of the tasks."""
 MOST_SHOWN = 10_000
 """Power from which on no number is written; it is infinite where the true video has a metric's best score."""
+
+
+COMMAND = "python -m lab.power scores.parquet --page docs/tasks.md"
+"""Command that the page names."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Write what the metrics can tell on each task into a page."""
+
+    scores: Annotated[Path, tyro.conf.Positional]
+    """Score table with the baselines of some episodes."""
+    page: Path = Path("docs/tasks.md")
+    """Markdown page whose section is written again."""
+
+
+@user_errors
+def main(args: Args) -> None:
+    """Write the section."""
+    rows = pd.read_parquet(args.scores)
+    write_power(args.page, summarize(rows).power, rows)
+
+
+def write_power(page: Path, power: pd.DataFrame, rows: pd.DataFrame) -> None:
+    """Write the section on the metrics' power into a page. Raises ConfigError where the power is not known."""
+    if power.empty:
+        raise ConfigError("the table lacks the frozen first frame or the true video in a metric of the suite strict.")
+    write_section(page, HEADING, f"`{COMMAND}`.\n{power_section(power, rows)}")
 
 
 def power_section(power: pd.DataFrame, rows: pd.DataFrame) -> str:
@@ -52,3 +94,7 @@ def _table(power: pd.DataFrame) -> str:
     lines = [["task", *(f"`{name}`" for name in names)], ["---"] * (len(names) + 1)]
     lines += [[f"`{task}`", *table.loc[task, names].fillna("–")] for task in table.index]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, prog="python -m lab.power"))

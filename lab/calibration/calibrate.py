@@ -1,17 +1,17 @@
 """The command that measures the estimators' error: what metrics say of videos whose truth is known (docs/calibration.md).
 
-Reads  a data set; for the second table its episodes are rendered anew, with robot and objects moved wrongly
+Reads  a data set; for the second table its episodes are rendered again, with robot and objects moved wrongly
 Writes <out>/calibration.md (both tables), references.parquet and wrong.parquet (a row for each episode, case and metric),
        frames.parquet (the second by frame); or, with --predictors, predictors.md and predictors.parquet
 
 References: every metric on the true video itself, on what a codec leaves of it, and on videos that are wrong altogether.
 Wrong motions: where the true mask and the true points of the video are known, so that what a metric makes of the estimators'
-masks and points stands beside what it makes of the true ones.
+masks and points compares with what it makes of the true ones.
 Predictors: videos made on purpose, from the true one to a gray one, and whether every metric puts them in order
 (docs/metrics.md).
 
-    python -m xew.metrics.calibrate --data data --codec runs/fixed --out calibration
-    python -m xew.metrics.calibrate --data data --predictors --out calibration
+    python -m lab.calibration --data data --codec runs/fixed --out calibration
+    python -m lab.calibration --data data --predictors --out calibration
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -22,21 +22,21 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import tyro
 from scipy.stats import spearmanr
 from tqdm import tqdm
 
+from lab.calibration.matrix import grade_predictors, matrix, to_markdown
+from lab.calibration.perturbations import Perturbation, render_perturbations
+from lab.calibration.predictors import PREDICTORS
 from xew.config import ConfigError, admit, suggestion, user_errors
 from xew.dataset import demand_one_motion, find_accepted
 from xew.episode import EpisodeError, Record, read_video
 from xew.files import hold_lock, replacing, write_text
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
-from xew.metrics.calibration.matrix import grade_predictors, matrix, to_markdown
-from xew.metrics.calibration.perturbations import Perturbation, render_perturbations
-from xew.metrics.calibration.predictors import PREDICTORS
+from xew.metrics.episode_cache import EpisodeCache
 from xew.metrics.grade import Comparison, Grades, grade, input_kind
-from xew.metrics.grading.codecs import OPENER, open_codec
+from xew.metrics.grading.codecs import open_codec
 from xew.metrics.truth import NEEDS, Truth, read_truth
 from xew.protocol import seed_split
 
@@ -49,7 +49,7 @@ BY_MOTION = ("mask_iou", "boundary_f1", "keypoint_error")
 """Names of the metrics of the table by motion, frame by frame."""
 MOTION_STEPS = (0, 0.5, 2, 5, 10, 20, 40, 80, np.inf)
 """Edges of the classes of motion: mean distance [pixels] by which the keypoints of a perturbation are off in a frame."""
-TOLD_APART = {"px": 0.5, "": 0.005}
+RESOLVED = {"px": 0.5, "": 0.005}
 """Least difference of two true scores, by unit, at which their order counts."""
 Row = dict[str, Any]
 Episode = tuple[Path, Record]
@@ -65,8 +65,6 @@ class Args:
     """Folder of the tables."""
     codec: Path | None = None
     """A run of `xew.model.train`, through whose codec the true videos go."""
-    codec_opener: str = OPENER
-    """Function that opens it, as module:NAME: of the run's folder to a function of video to video, [t h w 3] uint8."""
     seeds: tuple[int, ...] = ()
     """Only episodes of these seeds; all others serve as another seed's. Left out: those of validation seeds, or where there are
     none of training seeds; never of test seeds, since estimators are chosen and tuned by what comes out."""
@@ -81,7 +79,7 @@ class Args:
     tracks_checkpoint: Path | None = None
     """Its weights, where it has some."""
     predictors: bool = False
-    """Grade predictors made on purpose, in place of both tables."""
+    """Grade predictors made on purpose, instead of both tables."""
     metrics: tuple[str, ...] = tuple(METRICS)
     """Names of the metrics of the predictors' table."""
     cases: tuple[str, ...] = tuple(PREDICTORS)
@@ -99,7 +97,7 @@ class Estimators:
 
     def grade(self, video: np.ndarray, truth: Truth, names: Sequence[str]) -> Grades:
         """Scores of a video [t h w 3] uint8, of the shape of the true video, by the metrics of these names."""
-        return grade(Comparison(video, truth, self.masker, self.tracker), names)
+        return grade(Comparison(video, EpisodeCache(truth), self.masker, self.tracker), names)
 
 
 @user_errors
@@ -110,7 +108,7 @@ def main(args: Args) -> None:
         near = suggestion(unknown[0], PREDICTORS)
         raise ConfigError(f"unknown predictor {unknown[0]!r};{near} known: {', '.join(PREDICTORS)}: --cases.")
     estimators = Estimators(open_masker(args.masks, args.masks_checkpoint), open_tracker(args.tracks, args.tracks_checkpoint))
-    through_codec = None if args.codec is None else open_codec(args.codec, args.codec_opener)
+    through_codec = None if args.codec is None else open_codec(args.codec)
     episodes = find_accepted(args.data)
     demand_one_motion(args.data, (record for _, record in episodes))
     with hold_lock(args.out):
@@ -133,7 +131,7 @@ def grade_references(
         for name, table in calibrate(episode, episodes, estimators, through_codec).items():
             tables[name] = pd.concat([tables[name], table], ignore_index=True)
         text = report(**tables)
-        write(args.out, text, tables)  # each time, so that a run that is stopped has told something
+        write(args.out, text, tables)  # each time, so a stopped run has written something
     return text
 
 
@@ -166,8 +164,8 @@ def calibrate(
     for case, video in reference_videos(episodes, record, truth, through_codec):
         values = estimators.grade(video, truth, tuple(METRICS)).values
         references += [key | {"case": case, "metric": name, "value": value} for name, value in values.items()]
-    for case, shown in render_perturbations(folder):
-        grades, true = estimators.grade(shown.rgb, truth, ESTIMATED), true_grades(shown, truth)
+    for case, wrong_motion in render_perturbations(folder):
+        grades, true = estimators.grade(wrong_motion.rgb, truth, ESTIMATED), true_grades(wrong_motion, truth)
         pairs = {name: {"estimate": grades.values[name], "truth": true.values[name]} for name in ESTIMATED}
         wrong += [key | {"case": case, "metric": name} | pair for name, pair in pairs.items()]
         frames.append(_by_frame(grades, true).assign(**key, case=case))
@@ -231,15 +229,18 @@ def find_another(episodes: Sequence[Episode], record: Record, differs: str) -> P
     return None if following == own else folders[following]
 
 
-def true_grades(shown: Perturbation, truth: Truth) -> Grades:
+def true_grades(wrong_motion: Perturbation, truth: Truth) -> Grades:
     """What the metrics of ESTIMATED say of a wrong video's true mask and true points."""
     values: dict[str, float] = {}
     curves: dict[str, np.ndarray] = {}
-    points = {"keypoints": (shown.keypoints, truth.keypoint_visible), "objects": (shown.objects, truth.object_visible)}
+    points = {
+        "keypoints": (wrong_motion.keypoints, truth.keypoint_visible),
+        "objects": (wrong_motion.objects, truth.object_visible),
+    }
     for name in ESTIMATED:
-        places, visible = points.get(input_kind(name), (shown.keypoints, truth.keypoint_visible))
-        known = Estimators(lambda *_: shown.mask, lambda *_, p=places, v=visible: p[:, v.any(axis=0)])
-        grades = known.grade(shown.rgb, truth, (name,))
+        places, visible = points.get(input_kind(name), (wrong_motion.keypoints, truth.keypoint_visible))
+        known = Estimators(lambda *_: wrong_motion.mask, lambda *_, p=places, v=visible: p[:, v.any(axis=0)])
+        grades = known.grade(wrong_motion.rgb, truth, (name,))
         values |= grades.values
         curves |= grades.curves
     return Grades(values, curves, 0)
@@ -308,8 +309,8 @@ def order_table(wrong: pd.DataFrame) -> pd.DataFrame:
         own = wrong[wrong["metric"] == name].dropna(subset=["estimate", "truth"])
         if len(own) < 3 or own["truth"].nunique() < 2:
             continue
-        apart = TOLD_APART[METRICS[name].unit]
-        pairs = [kept for _, episode in own.groupby(["task", "seed", "robot"]) for kept in _keeps_order(episode, apart)]
+        apart = RESOLVED[METRICS[name].unit]
+        pairs = [in_order for _, episode in own.groupby(["task", "seed", "robot"]) for in_order in _keeps_order(episode, apart)]
         means = list(_keeps_order(own.groupby("case")[["estimate", "truth"]].mean(), apart))
         rows[name] = {
             "Spearman, all videos": f"{spearmanr(own['estimate'], own['truth']).statistic:.3f}",
@@ -343,7 +344,3 @@ def write(out: Path, text: str, tables: dict[str, pd.DataFrame], name: str = "ca
                 table.to_parquet(temporary, index=False)
     except OSError as error:
         raise EpisodeError(f"cannot write the tables to {out}: {error}; choose another --out.") from error
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Args, prog="python -m xew.metrics.calibrate"))

@@ -9,13 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.sim_warp.small import TASK, produce
-from tests.synthetic import write_synthetic_data
-from xew.config import ConfigError
-from xew.dataset import find_accepted
-from xew.episode import Record, read_record, read_states, read_video
-from xew.metrics import METRICS
-from xew.metrics.calibrate import (
+from lab.calibration.calibrate import (
     ESTIMATED,
     Args,
     choose,
@@ -26,7 +20,13 @@ from xew.metrics.calibrate import (
     reference_videos,
     true_grades,
 )
-from xew.metrics.calibration.perturbations import MOTIONS, Perturbation, render_perturbations
+from lab.calibration.perturbations import MOTIONS, Perturbation, render_perturbations
+from tests.sim_warp.small import TASK
+from tests.synthetic import write_synthetic_data
+from xew.config import ConfigError
+from xew.dataset import find_accepted
+from xew.episode import Record, read_record, read_states, read_video
+from xew.metrics import METRICS
 from xew.metrics.truth import NEEDS, read_truth
 
 
@@ -41,6 +41,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An episode of the simulation, twelve frames."""
+    from tests.sim_warp.small import produce
     from xew.sim_warp.production.cells import Job
     from xew.sim_warp.rendering.render import Renderer
 
@@ -168,8 +169,8 @@ def test_the_command_writes_its_tables(data: Path, tmp_path: Path, monkeypatch: 
             ("stopped", Perturbation(video, states.robot_mask[shown], states.keypoints[shown], truth.objects[shown])),
         ]
 
-    monkeypatch.setattr("xew.metrics.calibrate.render_perturbations", stopped)
-    monkeypatch.setattr("xew.metrics.calibrate.METRICS", {name: METRICS[name] for name in METRICS if "lpips" not in name})
+    monkeypatch.setattr("lab.calibration.calibrate.render_perturbations", stopped)
+    monkeypatch.setattr("lab.calibration.calibrate.METRICS", {name: METRICS[name] for name in METRICS if "lpips" not in name})
     main(Args(data=data, out=tmp_path / "out", seeds=(1,), episodes=1))
     text = (tmp_path / "out" / "calibration.md").read_text()
     assert "| stopped |" in text and "| another seed |" in text
@@ -210,5 +211,6 @@ def test_calibration_reads_validation_seeds_and_no_test_seed_unless_it_is_named(
 
 
 def test_the_command_loads_neither_simulation_nor_model() -> None:
-    code = "import sys, xew.metrics.calibrate; sys.exit(any(m in sys.modules for m in ('warp', 'newton', 'flax', 'xew.model')))"
+    code = "import sys, lab.calibration.calibrate; "
+    code += "sys.exit(any(m in sys.modules for m in ('warp', 'newton', 'flax', 'xew.model')))"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from lab.calibration.predictors import PREDICTORS, Material, predict, render_objects
 from xew.episode import Record, read_video
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker
-from xew.metrics.calibration.predictors import PREDICTORS, Material, predict, render_objects
+from xew.metrics.episode_cache import EpisodeCache
 from xew.metrics.grade import Comparison, grade, input_kind
 from xew.metrics.truth import Truth, read_truth
 
@@ -70,12 +71,13 @@ def grade_material(
 ) -> list[Row]:
     """Rows (case metric value) of all predictors that can be made of the material; the truth is graded as by `evaluate`."""
     rows: list[Row] = []
+    episode = EpisodeCache(truth)
     for case in cases:
         video = predict(case, material)
         if video is None:
             continue
-        graded, shown = (truth.rgb, video) if case == "truth" else (video, None)
-        values = grade(Comparison(graded, truth, masker, tracker, shown=shown), metrics).values
+        graded, softened = (truth.rgb, video) if case == "truth" else (video, None)
+        values = grade(Comparison(graded, episode, masker, tracker, softened), metrics).values
         rows += [{"case": case, "metric": name, "value": value} for name, value in values.items()]
     return rows
 
@@ -98,14 +100,14 @@ def order_violations(table: pd.DataFrame) -> dict[str, list[tuple[str, str]]]:
     Args:
         table: values by metric (rows) and predictor (columns), as `matrix` gives them.
     """
-    found = {}
+    violations = {}
     for name in table.index:
         metric = METRICS[str(name)]
         sign = 1 if metric.higher_is_better else -1
         value = sign * table.loc[name]
         pairs = expected_order(metric.dimension == "objects")
-        found[str(name)] = [(a, b) for a, b in pairs if {a, b} <= set(table.columns) and not value[a] > value[b]]
-    return found
+        violations[str(name)] = [(a, b) for a, b in pairs if {a, b} <= set(table.columns) and not value[a] > value[b]]
+    return violations
 
 
 def expected_order(objects: bool) -> list[tuple[str, str]]:
@@ -118,7 +120,7 @@ def expected_order(objects: bool) -> list[tuple[str, str]]:
 
 
 def to_markdown(table: pd.DataFrame) -> str:
-    """The matrix, and beside each metric its suites and the pairs that it does not put in order."""
+    """The matrix, and for each metric its suites and the pairs that it does not put in order."""
     wrong = order_violations(table)
     lines = [["metric", "suites", *map(str, table.columns), "not in order"], ["---"] * (len(table.columns) + 3)]
     for name in map(str, table.index):

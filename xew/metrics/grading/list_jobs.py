@@ -1,4 +1,4 @@
-"""What there is to grade: rollouts, the episodes that they predict, and the baselines on these episodes."""
+"""First step of `evaluate`: list the rollouts, the episodes that they predict, and the baselines on these episodes."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,15 +10,16 @@ from tqdm import tqdm
 
 from xew.concurrency import map_in_order
 from xew.config import ConfigError
-from xew.dataset import Episode
+from xew.dataset import Episode, demand_one_motion, find_accepted
 from xew.episode import EpisodeError, Record, episode_folder, read_record
 from xew.files import digest_files
 from xew.metrics.grading.baselines import BASELINES
-from xew.metrics.grading.codecs import ModelCodec
+from xew.metrics.grading.codecs import ModelCodec, open_codecs
 from xew.metrics.grading.scores import Cell
+from xew.metrics.grading.settings import GradingSettings
 from xew.metrics.truth import Truth
 from xew.protocol import BASELINES as TITLES
-from xew.protocol import CODEC_TRUTH, GROUND_TRUTH
+from xew.protocol import CODEC_TRUTH, GROUND_TRUTH, seed_split
 from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video, resize_video
 
 SOFTNESS = 0.8
@@ -34,54 +35,76 @@ class Job:
     rollout: Rollout | None
     """None: the baseline that the cell names as its model."""
     episode: Path
-    frame_rate: float
-    """The episode's."""
+    record: Record
+    """The episode's header."""
 
     @property
-    def place(self) -> Path:
+    def folder(self) -> Path:
+        """Folder that messages name."""
         return self.rollout.folder if self.rollout else self.episode
 
 
-def list_jobs(
-    rollouts: Sequence[Path],
-    data: Path,
-    settings: str,
-    baselines: Collection[str],
-    workers: int,
-    problems: list[str] | None = None,
-    codecs: Mapping[str, ModelCodec] | None = None,
-) -> list[Job]:
-    """All that is to be graded, each once, jobs of one episode together.
+@dataclass(frozen=True)
+class Listing:
+    """All videos to grade, and what was opened and refused while they were listed."""
+
+    jobs: Sequence[Job]
+    """Each video once, those of one episode together."""
+    codecs: Mapping[str, ModelCodec]
+    """Codecs that the truth goes through, by model."""
+    motion: str
+    """Kind of motion of the episodes (`xew.dataset.demand_one_motion`)."""
+    errors: Sequence[str]
+    """Messages about rollouts that cannot be graded and are left out."""
+
+
+def list_jobs(settings: GradingSettings, baselines: Collection[str] | None = None) -> Listing:
+    """List all videos that are to be graded, and open the codecs that the truth goes through.
 
     Args:
-        rollouts: roots of their trees.
-        data: the data set.
-        settings: what else the scores depend on, as text.
-        baselines: keys of BASELINES to grade too.
-        workers: threads that read.
-        problems: where given, rollouts that cannot be graded are told here and left out.
-        codecs: by the model that each is of; the truth goes through them on the episodes that the model has predicted.
+        settings: of the grading.
+        baselines: keys of BASELINES; all or none, as the settings say, where left out.
 
     Raises:
-        EpisodeError: a rollout cannot be graded. ConfigError: none is named.
+        EpisodeError: a rollout cannot be graded, unless the settings say to keep going.
+        ConfigError: options contradict each other, no rollout is named, or a codec cannot be opened.
     """
-    if not rollouts:
+    args = settings.args
+    if baselines is None:
+        baselines = tuple(BASELINES) if args.baselines else ()
+    if args.baselines_of and (args.rollouts or not baselines):
+        raise ConfigError("--baselines-of grades baselines alone: leave out the rollouts, and --no-baselines.")
+    if args.frame_zero == "predicted" and (baselines or args.codec):
         raise ConfigError(
-            "no rollouts named; give their folder: python -m xew.metrics.evaluate ROLLOUTS --data DATA, or grade the baselines "
-            "alone: --baselines-of test"
+            "frame 0 of the frozen first frame is the truth: with --frame-zero predicted say --no-baselines, and no --codec."
         )
+    errors: list[str] = []
+    problems = errors if args.keep_going else None
+    rollouts = None if args.baselines_of else _find_unique(args.rollouts, problems)
+    codecs = open_codecs(args.codec, None if rollouts is None else {rollout.model for rollout in rollouts})
+    if rollouts is None:
+        jobs = _list_baseline_jobs(settings, baselines, codecs)
+    else:
+        jobs = _list_rollout_jobs(rollouts, settings, baselines, codecs, problems)
+    motion = demand_one_motion(args.data, {job.episode: job.record for job in jobs}.values())
+    return Listing(jobs, codecs, motion, errors)
 
+
+def _list_rollout_jobs(
+    rollouts: Sequence[Rollout],
+    settings: GradingSettings,
+    baselines: Collection[str],
+    codecs: Mapping[str, ModelCodec],
+    problems: list[str] | None,
+) -> list[Job]:
     def try_jobs(rollout: Rollout) -> list[Job] | EpisodeError:
         try:
-            return list(_jobs(rollout, data, settings, baselines, (codecs or {}).get(rollout.model)))
+            return list(_jobs(rollout, settings, baselines, codecs.get(rollout.model)))
         except EpisodeError as error:
             return error
 
-    found = _unique(rollouts, problems)
     jobs: dict[Cell, Job] = {}
-    results = tqdm(
-        map_in_order(try_jobs, found, workers), total=len(found), desc="read", unit="video", disable=None, leave=False
-    )
+    results = tqdm(map_in_order(try_jobs, rollouts), total=len(rollouts), desc="read", unit="video", disable=None, leave=False)
     for result in results:
         if isinstance(result, EpisodeError):
             _raise_or_note(problems, str(result))
@@ -91,10 +114,9 @@ def list_jobs(
     return sorted(jobs.values(), key=lambda job: (job.episode, job.rollout is None, job.cell.key))
 
 
-def _jobs(rollout: Rollout, data: Path, settings: str, baselines: Collection[str], codec: ModelCodec | None) -> Iterator[Job]:
+def _jobs(rollout: Rollout, settings: GradingSettings, baselines: Collection[str], codec: ModelCodec | None) -> Iterator[Job]:
     """The rollout's own job, then its baselines'."""
-    episode = episode_folder(data, rollout.task, rollout.seed, rollout.robot)
-    record = _find_record(rollout, episode, data)
+    episode, record = _find_episode(rollout, settings.args.data)
     frames = rollout.frame_count or record.frame_count
     if not 1 < frames <= record.frame_count:
         raise RolloutError(
@@ -107,8 +129,8 @@ def _jobs(rollout: Rollout, data: Path, settings: str, baselines: Collection[str
         raise RolloutError(f"{rollout.folder} cannot be read: {error}.") from error
     rgb, states = (record.hashes.get(name, "") for name in ("rgb", "states"))
     key = (rollout.model, rollout.condition, rollout.task, rollout.seed, rollout.robot)
-    cell = Cell(*key, frames, digest, rgb, states, settings)
-    yield Job(cell, rollout, episode, record.frame_rate)
+    cell = Cell(*key, frames, digest, rgb, states, str(settings.choices))
+    yield Job(cell, rollout, episode, record)
     yield from _baseline_jobs(cell, (episode, record), baselines, () if codec is None else (codec,))
 
 
@@ -118,39 +140,28 @@ def _baseline_jobs(cell: Cell, episode: Episode, baselines: Collection[str], cod
     for name in baselines:
         source = BASELINES[name].source(folder, record)
         if source is not None:
-            yield Job(replace(cell, model=name, condition="", prediction=source), None, folder, record.frame_rate)
+            yield Job(replace(cell, model=name, condition="", prediction=source), None, folder, record)
     for codec in codecs:
         through = replace(cell, model=CODEC_TRUTH, condition=codec.key, prediction=codec.digest)
-        yield Job(through, None, folder, record.frame_rate)
+        yield Job(through, None, folder, record)
 
 
-def list_baseline_jobs(
-    episodes: Sequence[Episode],
-    settings: str,
-    baselines: Collection[str],
-    codecs: Mapping[str, ModelCodec],
-    max_frames: int = 0,
-) -> list[Job]:
-    """The baselines on episodes that no model has predicted yet, jobs of one episode together.
-
-    Args:
-        episodes: folders and headers.
-        settings: what else the scores depend on, as text.
-        baselines: keys of BASELINES.
-        codecs: what the truth goes through.
-        max_frames: number of frames that are graded; 0 for whole episodes.
+def _list_baseline_jobs(settings: GradingSettings, baselines: Collection[str], codecs: Mapping[str, ModelCodec]) -> list[Job]:
+    """The baselines on episodes that no model has predicted yet.
 
     Raises ConfigError where there is no episode or the number of frames is one that cannot be graded.
     """
+    args = settings.args
+    episodes = [episode for episode in find_accepted(args.data) if seed_split(episode[1].seed) == args.baselines_of]
     if not episodes:
         raise ConfigError("the data set holds no episode of these seeds; generate some, or name others: --baselines-of.")
-    if max_frames < 0 or max_frames == 1:
-        raise ConfigError(f"--max-frames is {max_frames}; expected at least 2 frames, or 0 for whole episodes.")
+    if args.max_frames < 0 or args.max_frames == 1:
+        raise ConfigError(f"--max-frames is {args.max_frames}; expected at least 2 frames, or 0 for whole episodes.")
     jobs: list[Job] = []
     for folder, record in episodes:
         rgb, states = (record.hashes.get(name, "") for name in ("rgb", "states"))
-        frames = min(record.frame_count, max_frames or record.frame_count)
-        cell = Cell("", "", record.task, record.seed, record.robot, frames, "", rgb, states, settings)
+        frames = min(record.frame_count, args.max_frames or record.frame_count)
+        cell = Cell("", "", record.task, record.seed, record.robot, frames, "", rgb, states, str(settings.choices))
         jobs += _baseline_jobs(cell, (folder, record), baselines, codecs.values())
     return sorted(jobs, key=lambda job: (job.episode, job.cell.key))
 
@@ -167,7 +178,9 @@ def _check_horizons(jobs: Iterable[Job]) -> None:
             )
 
 
-def _find_record(rollout: Rollout, folder: Path, data: Path) -> Record:
+def _find_episode(rollout: Rollout, data: Path) -> Episode:
+    """The episode that a rollout predicts. Raises RolloutError where the data set holds no such episode."""
+    folder = episode_folder(data, rollout.task, rollout.seed, rollout.robot)
     if not folder.is_dir():
         raise RolloutError(
             f"{rollout.folder} predicts {rollout.task}, seed {rollout.seed}, {rollout.robot}, which {data} does not hold; name "
@@ -179,23 +192,29 @@ def _find_record(rollout: Rollout, folder: Path, data: Path) -> Record:
     source = rollout.header.get("source_hash")
     if source is not None and source != record.hashes.get("rgb"):
         raise RolloutError(f"{rollout.folder} was made from another video than {folder} now holds; make this rollout again.")
-    return record
+    return folder, record
 
 
-def _unique(roots: Sequence[Path], problems: list[str] | None) -> list[Rollout]:
-    """Rollouts of all trees. Raises RolloutError, or tells, when two claim to be the same model's video of one episode."""
-    seen: dict[tuple[str, str, str, int, str], Rollout] = {}
+def _find_unique(roots: Sequence[Path], problems: list[str] | None) -> list[Rollout]:
+    """Rollouts of all trees, without those that claim to be the same model's video of one episode or a baseline's."""
+    if not roots:
+        raise ConfigError(
+            "no rollouts named; give their folder: python -m xew.metrics.evaluate ROLLOUTS --data DATA, or grade the baselines "
+            "alone: --baselines-of test"
+        )
+    unique: dict[tuple[str, str, str, int, str], Rollout] = {}
     for rollout in (rollout for root in roots for rollout in find_rollouts(root, problems)):
-        first = seen.setdefault((rollout.model, rollout.condition, rollout.task, rollout.seed, rollout.robot), rollout)
         if rollout.model in TITLES:
             _raise_or_note(problems, f"{rollout.folder}: the name {rollout.model} is a baseline's; give the model another.")
-        elif first is not rollout:
+            continue
+        first = unique.setdefault((rollout.model, rollout.condition, rollout.task, rollout.seed, rollout.robot), rollout)
+        if first is not rollout:
             _raise_or_note(
                 problems,
                 f"{first.folder} and {rollout.folder} are both model {rollout.model!r}, condition {rollout.condition!r}; "
                 "give them different names in rollout.json.",
             )
-    return [rollout for rollout in seen.values() if rollout.model not in TITLES]
+    return list(unique.values())
 
 
 def _raise_or_note(problems: list[str] | None, message: str) -> None:
@@ -205,17 +224,14 @@ def _raise_or_note(problems: list[str] | None, message: str) -> None:
     problems.append(message)
 
 
-def read_prediction(
-    job: Job, truth: Truth, codecs: Mapping[str, ModelCodec], allow: Collection[str] = (), frame_zero: str = "given"
-) -> np.ndarray:
+def read_prediction(job: Job, truth: Truth, codecs: Mapping[str, ModelCodec], settings: GradingSettings) -> np.ndarray:
     """The video to grade [t h w 3] uint8, of the truth's shape.
 
     Args:
         job: of a rollout or a baseline.
         truth: of its episode.
         codecs: by the conditions of the baseline CODEC_TRUTH that name them.
-        allow: what else is an error: "resize", "trim", "rate".
-        frame_zero: "absent" where the rollout begins with frame 1.
+        settings: say whether the rollout begins with frame 1, and what else is allowed that is an error without.
 
     Raises:
         RolloutError: the video cannot be read, or is not of the truth's shape, and that is not allowed.
@@ -224,10 +240,11 @@ def read_prediction(
         return codecs[job.cell.condition].reconstruct(truth.rgb)
     if job.rollout is None:
         return BASELINES[job.cell.model].make(job.episode, truth)
-    video = read_rollout_video(job.rollout, None if "rate" in allow else job.frame_rate)
+    allow = settings.args.allow
+    video = read_rollout_video(job.rollout, None if "rate" in allow else job.record.frame_rate)
     if "resize" in allow:
         video = resize_video(video, truth.rgb.shape[1:3])
-    if frame_zero == "absent" and video.shape[1:] == truth.rgb.shape[1:]:
+    if settings.args.frame_zero == "absent" and video.shape[1:] == truth.rgb.shape[1:]:
         video = np.concatenate([truth.rgb[:1], video])
     if "trim" in allow:
         video = video[: len(truth.rgb)]
@@ -240,8 +257,8 @@ def read_prediction(
     return video
 
 
-def estimator_view(job: Job, truth: Truth) -> np.ndarray | None:
-    """The video [t h w 3] uint8 that estimators see in place of a job's own; None where they see the job's.
+def soften_truth(job: Job, truth: Truth) -> np.ndarray | None:
+    """The video [t h w 3] uint8 that estimators see instead of a job's own; None where they see the job's.
 
     For the ground truth it is the true video softened, whose masks and points are still known.
     """

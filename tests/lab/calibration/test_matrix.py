@@ -7,12 +7,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from lab.calibration.matrix import expected_order, grade_material, matrix, order_violations, to_markdown
+from lab.calibration.predictors import BELOW, PREDICTORS, Material, erase_objects, hold_objects, predict, soften
 from tests.synthetic import write_synthetic_data
 from xew.episode import States, read_states
 from xew.metrics import METRICS
 from xew.metrics.backends import open_masker, open_tracker
-from xew.metrics.calibration.matrix import expected_order, grade_material, matrix, order_violations, to_markdown
-from xew.metrics.calibration.predictors import BELOW, PREDICTORS, Material, erase_objects, hold_objects, predict, soften
 from xew.metrics.truth import MOVED, Points, Surfaces, Truth
 from xew.protocol import GRADING_PROTOCOL, HELD_OUT_ROBOTS
 from xew.sim_warp.tasks import TASKS
@@ -75,10 +75,9 @@ def rows() -> pd.DataFrame:
     corners, moving = paths()
     rgb, shown = draw()
     robot, thing = points(corners, ROBOT, 0), points(moving, THING, 1)
-    contact = np.zeros((FRAMES, 2, 1), bool)
     surfaces = Surfaces(robot, thing, shown, known=True)
     middles = thing.pixels[:, 4:5], thing.visible[:, :1]
-    truth = Truth(rgb, shown == 0, robot.pixels, robot.visible, *middles, robot.pixels[:, :2], contact, surfaces)
+    truth = Truth(rgb, shown == 0, robot.pixels, robot.visible, *middles, surfaces)
     at_rest = np.repeat(moving[:1], FRAMES, axis=0)
     gone = np.where((moving != moving[0]).any(axis=-1)[:, None], -1, moving)
     material = Material(rgb, draw("other")[0], draw(thing=at_rest)[0], draw(thing=gone)[0])

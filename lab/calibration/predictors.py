@@ -13,9 +13,9 @@ import av
 import cv2
 import numpy as np
 
+from lab.calibration.perturbations import render_perturbation
 from xew.episode import States, read_states, take_pixels
-from xew.metrics.calibration.perturbations import render_perturbation
-from xew.metrics.grading.jobs import SOFTNESS
+from xew.metrics.grading.list_jobs import SOFTNESS
 from xew.metrics.truth import MOVED
 
 QUALITY = 34

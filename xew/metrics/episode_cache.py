@@ -1,0 +1,73 @@
+"""What all predictions of one episode share while they are graded, and videos in blocks as the metrics of frames take them.
+
+Frames go through the compiler in blocks of one size, so a few programs serve episodes of all lengths.
+"""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from xew.metrics.metric import ACCELERATOR_CHUNK
+from xew.metrics.perceptual import KEPT_FEATURES, SharedFeatures
+from xew.metrics.truth import Truth
+
+FRAME_BLOCK = 4
+"""Number of frames graded at once on a CPU; on a GPU it is `ACCELERATOR_CHUNK`. A video's last block is filled up: a short one
+costs little."""
+WHOLE_BLOCK = 16
+"""Number of frames that a video is filled up to a multiple of on a CPU for metrics that need all of it."""
+
+
+class GradedVideo:
+    """The graded frames of a video. A GPU gets them once for all metrics.
+
+    Args:
+        frames: [t h w 3] uint8.
+    """
+
+    def __init__(self, frames: np.ndarray) -> None:
+        self.frames = frames
+        self._blocks: dict[bool, list[Any]] = {}
+
+    def blocks(self, whole: bool) -> list[Any]:
+        """`cut_blocks` of the frames, on the device."""
+        if whole not in self._blocks:
+            blocks = cut_blocks(self.frames, whole)
+            self._blocks[whole] = blocks if is_on_cpu() else [jax.device_put(block) for block in blocks]
+        return self._blocks[whole]
+
+
+class EpisodeCache:
+    """An episode and what all predictions of it share: the graded frames of its true video, and their LPIPS features.
+
+    Args:
+        truth: the episode.
+        first: the first graded frame; those before it were given to the model.
+    """
+
+    def __init__(self, truth: Truth, first: int = 1) -> None:
+        self.truth, self.first = truth, first
+        self.target = GradedVideo(truth.rgb[first:])
+        self.features = SharedFeatures(KEPT_FEATURES["cpu" if is_on_cpu() else "gpu"])
+
+
+def is_on_cpu() -> bool:
+    """Does JAX compute on a CPU?"""
+    return jax.default_backend() == "cpu"
+
+
+def cut_blocks(array: np.ndarray, whole: bool = False) -> list[np.ndarray]:
+    """An array [t ...] in blocks [n ...] of one size, the last filled up with its last frame; in one block if `whole`."""
+    if whole:
+        return [fill_up(array, 0, WHOLE_BLOCK if is_on_cpu() else ACCELERATOR_CHUNK)]
+    size = FRAME_BLOCK if is_on_cpu() else ACCELERATOR_CHUNK
+    blocks = [array[start : start + size] for start in range(0, len(array), size)]
+    return [*blocks[:-1], fill_up(blocks[-1], 0, size)]
+
+
+def fill_up(array: np.ndarray, axis: int, multiple: int, value: int | None = None) -> np.ndarray:
+    """An array [...] longer along an axis, up to a multiple, by a value or, left out, by what is last."""
+    missing = -array.shape[axis] % multiple
+    widths = [(0, missing if i == axis else 0) for i in range(array.ndim)]
+    return np.pad(array, widths, mode="edge") if value is None else np.pad(array, widths, constant_values=value)

@@ -1,0 +1,142 @@
+"""Second step of `evaluate`: open what grades videos, in threads of this process or in several processes.
+
+Threads share compiled programs, and decoding, OpenCV and XLA release Python's lock, so one process keeps about six cores busy.
+Beyond these, and on a GPU, each of several processes grades with one thread.
+"""
+
+import functools
+import os
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
+
+import cv2
+import jax
+import numpy as np
+
+from xew.compilation import keep_compiled_programs, take_memory_as_needed
+from xew.concurrency import free_gpu_memory, map_in_order, map_in_processes, usable_cores, visible_gpus
+from xew.config import admit, pick
+from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, open_masker, open_tracker
+from xew.metrics.grade import input_kind
+from xew.metrics.grading.codecs import ModelCodec, open_codecs
+from xew.metrics.grading.grade_episodes import Grader, Group, GroupResult, ThreadResources
+from xew.metrics.grading.settings import GradingSettings
+
+PROCESSES = "XEW_EVALUATE_PROCESSES"
+"""Environment variable by which tests set the number of processes."""
+IMPORTED = ("xew.metrics.grading.open_graders", "xew.sim_warp.production.surfaces")
+"""Modules that processes that grade need; the second is imported for points on surfaces, and takes as long as the first."""
+MOST_PROCESSES = {"cpu": 32, "gpu": 12}
+"""Largest number of processes of a machine without a GPU, and of each GPU."""
+GPU_MEMORY_OF_PROCESS = 9.0
+"""Memory of a GPU that a process may come to hold [GB]: with 8 for each of ten processes a card ran out of it
+(docs/performance.md)."""
+MEMORY_OF_PROCESS = 2.0
+"""Memory that a process on a CPU may come to hold [GB]: an episode, a prediction, their optical flow, and features."""
+MOST_THREADS = 6
+"""Number of cores that the threads of one process keep busy, which wait for Python's lock a fifth of their time."""
+FEWEST_VIDEOS = 48
+"""Number of videos from which on processes pay on a CPU, each of which takes some ten seconds to start."""
+POINT_KINDS = {"keypoints", "objects", "robot_points", "object_points"}
+"""Kinds of a metric's input that a tracker finds."""
+
+
+def prepare_process(trust: Sequence[str]) -> None:
+    """Make a process ready to grade; `trust` names modules of your own that data may name."""
+    admit(trust)
+    take_memory_as_needed()
+    keep_compiled_programs()
+    cv2.setNumThreads(1)  # episodes are shared out; OpenCV's own threads would only get in the way
+
+
+def grade_groups(settings: GradingSettings, codecs: Mapping[str, ModelCodec], groups: Sequence[Group]) -> Iterator[GroupResult]:
+    """What comes of grading each group, in their order, by as many processes or threads as suit the machine.
+
+    They are at most a few groups ahead of each other, so memory does not grow with their number.
+
+    Args:
+        settings: of the grading.
+        codecs: that the truth goes through, by model; other processes open them for themselves.
+        groups: each of one episode.
+    """
+    processes = choose_processes(len(groups), sum(map(len, groups)))
+    if processes > 1:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # processes share the cores
+        return map_in_processes(functools.partial(_open_in_process, settings), groups, processes, IMPORTED, visible_gpus())
+    threads = 1 if jax.default_backend() != "cpu" or visible_gpus() else min(usable_cores(), MOST_THREADS)
+    stop = threading.Event()
+    return map_in_order(open_grader(settings, codecs, stop), groups, threads, stop)
+
+
+def choose_processes(episodes: int, videos: int) -> int:
+    """Number of processes for so many episodes with so many videos: by cores and memory; 1 where threads serve."""
+    if asked := os.environ.get(PROCESSES):
+        return min(int(asked), episodes)
+    cores, gpus = usable_cores(), visible_gpus()
+    if gpus:
+        free = min(free_gpu_memory(gpus), default=0.0)
+        of_each = min(MOST_PROCESSES["gpu"], max(1, int(free / GPU_MEMORY_OF_PROCESS)))
+        return min(max(1, cores - 1), len(gpus) * of_each, episodes)
+    if cores <= MOST_THREADS or videos < FEWEST_VIDEOS:
+        return 1
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    return min(cores, MOST_PROCESSES["cpu"], max(1, int(memory / MEMORY_OF_PROCESS)), episodes)
+
+
+def _open_in_process(settings: GradingSettings) -> Grader:
+    """Open a grader in another process."""
+    prepare_process(settings.args.trust)
+    return open_grader(settings, open_codecs(settings.args.codec), threading.Event())
+
+
+def open_grader(settings: GradingSettings, codecs: Mapping[str, ModelCodec], stop: threading.Event) -> Grader:
+    """Open the estimators that the metrics need.
+
+    Args:
+        settings: of the grading.
+        codecs: that the truth goes through, by model.
+        stop: set when no further video is to be begun.
+
+    Raises:
+        ConfigError: weights are missing.
+    """
+    args, kinds = settings.args, {input_kind(name) for name in settings.metrics}
+    masker: Callable[[], Masker] = _open_nothing
+    tracker: Callable[[], Tracker] = _open_nothing
+    if "mask" in kinds:
+        masker = _make_opener(MASKERS, args.masks, functools.partial(open_masker, args.masks, args.masks_checkpoint))
+    if kinds & POINT_KINDS:
+        tracker = _make_opener(TRACKERS, args.tracks, functools.partial(open_tracker, args.tracks, args.tracks_checkpoint))
+    return Grader(settings, ThreadResources(masker, tracker), {codec.key: codec for codec in codecs.values()}, stop)
+
+
+def _open_nothing() -> Any:
+    """Stand in for an estimator that no metric needs."""
+
+    def refuse(*arrays: np.ndarray) -> np.ndarray:
+        raise AssertionError("no metric needs this estimator, so none was opened")
+
+    return refuse
+
+
+E = TypeVar("E", bound=Callable[..., np.ndarray])
+
+
+def _make_opener(registry: Any, name: str, open_: Callable[[], E]) -> Callable[[], E]:
+    """Make what opens an estimator for a thread: its own, or, where it has weights, that of all threads, used in turn."""
+    if pick(registry, name, "estimator").needs is None:
+        return open_
+    estimator = take_turns(open_())
+    return lambda: estimator
+
+
+def take_turns(estimator: E) -> E:
+    """The same estimator, for one thread at a time."""
+    turn = threading.Lock()
+
+    def call(*arrays: np.ndarray) -> np.ndarray:
+        with turn:
+            return estimator(*arrays)
+
+    return call  # type: ignore[return-value]
