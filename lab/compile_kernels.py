@@ -15,7 +15,8 @@ from tqdm import tqdm
 from xew.config import ConfigError, user_errors
 from xew.sim_warp.devices.kernels import Variant, compile_for, watched_launches
 from xew.sim_warp.devices.workers import Workers, quiet_warp
-from xew.sim_warp.production.warm_up import PARTS, do_smallest_piece
+from xew.sim_warp.production.warm_up import PARTS, ROBOT, do_smallest_piece, standing_world
+from xew.sim_warp.robots import ROBOTS
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def _batch_kernels(batch: int) -> list[Variant]:
     """What a GPU launches to step a batch of worlds."""
     from xew.sim_warp.physics.gpu import Batch  # MuJoCo Warp is heavy
 
-    return Batch([_stand(ROBOTS[ROBOT])] * batch, wp.get_device("cpu")).list_kernels()
+    return Batch([standing_world(ROBOTS[ROBOT])] * batch, wp.get_device("cpu")).list_kernels()
 
 
 if __name__ == "__main__":

@@ -52,8 +52,8 @@ WITH_WARP = "xew.metrics.estimators.batched"
 """Package of `metrics` that may import Warp. Others import it inside functions: the room loads without Warp."""
 WITH_TORCH = ("xew.model.weights.reading",)
 """Modules of `model` that may import PyTorch inside functions: files of weights that only it can read."""
-REGISTRIES = {"analysis": "xew.model.conditions"}
-"""Registry of another room that a room may read at once, for titles; it loads without JAX and Warp."""
+REGISTRIES = {"analysis": ("xew.model.conditions", "xew.model.runs.layout")}
+"""Modules of another room that a room may read at once, for titles and the files of runs; they load without JAX and Warp."""
 JAX_GROUND = "xew.compilation"
 """The one file at the root that imports JAX; only rooms that import JAX anyway may import it."""
 STATISTICS_STANDS_ON = ("xew.statistics", "xew.protocol", "xew.config")
@@ -88,7 +88,7 @@ def room_failures(sources: Sources) -> list[str]:
             failures.append(f"{source.name} imports {WITH_WARP} at once; only inside functions")
         libraries |= {JAX_GROUND} if "jax" in libraries else set()
         failures += [f"{source.name} imports {name}" for name in sorted(libraries) if touches(names, name)]
-        names = {name for name in names if not touches([name], REGISTRIES.get(source.room, "none"))}
+        names = {name for name in names if not any(touches([name], module) for module in REGISTRIES.get(source.room, ()))}
         for other in sorted(MAY_IMPORT.keys() - {"", "statistics", source.room}):
             if not touches(names, f"{package}.{other}"):
                 continue

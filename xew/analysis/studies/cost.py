@@ -34,7 +34,7 @@ class Rates:
     machine: str
     """Machine that they were measured on."""
     measured: str
-    """Where and when."""
+    """Place and date of the measurement."""
     episode_s: float
     """Time to make one episode."""
     encode_s: float

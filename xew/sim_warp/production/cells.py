@@ -56,7 +56,7 @@ class Cell:
     tool_pose: np.ndarray | None = None
     """[t 2 7] float32 measured tool poses, xyz [m] and quaternion xyzw, world; None without motion."""
     failure: tuple[str, str] | None = None
-    """Why the cell does not count: one of `episode.FAILURES` and a sentence; None of a simulated cell that succeeded."""
+    """Reason for which the cell does not count, one of `episode.FAILURES`, and a sentence; None if it succeeded."""
 
     @property
     def task(self) -> Task:

@@ -73,12 +73,12 @@ def _solve(robot: RobotSpec, device: wp.Device, batch: int) -> None:
     arm_solver(robot).solve(0, tool_pose(robot, 0, home), home)
 
 
-def _stand(robot: RobotSpec) -> World:
+def standing_world(robot: RobotSpec) -> World:
     return World(robot, TASKS[TASK].sample(scene_rng(TASK, 0), 0), stand_at_home(robot, 2))
 
 
 def _simulate(robot: RobotSpec, device: wp.Device, batch: int) -> None:
-    world = _stand(robot)
+    world = standing_world(robot)
     if not device.is_cuda:
         simulate([world], device.alias)
         return
