@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from xew.projection import project
+from xew.episode import project
 
 INTRINSICS = np.array([[100.0, 0, 20], [0, 50, 10], [0, 0, 1]])
 

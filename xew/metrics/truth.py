@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from xew.episode import EpisodeError, demand_known, read_states, read_video
-from xew.projection import project
+from xew.episode import EpisodeError, demand_known, project, read_states, read_video
 
 NEEDS = {
     "video": (),

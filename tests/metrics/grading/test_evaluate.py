@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from tests.metrics.grading.graded import ASKED, CHEAP, FRAMES, ROBOTS, SEED, TASK, grade, late, truth, value
-from xew.episode import episode_folder, read_record, read_states, read_video, write_episode
+from xew.episode import episode_folder, project, read_record, read_states, read_video, write_episode
 from xew.metrics import METRICS, keypoint_error, mask_iou, perceptual, psnr, ssim
 from xew.metrics.backends import Backend, estimate_masks
 from xew.metrics.estimators.contact import predicted_contact, touching_distance
@@ -23,7 +23,6 @@ from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.summary import summarize
 from xew.metrics.track import failure_distance
 from xew.metrics.truth import Truth, _find_visible, read_truth
-from xew.projection import project
 from xew.protocol import CODEC_TRUTH, OTHER_ROBOT
 from xew.rollout import write_rollout
 from xew.statistics import describe_floors

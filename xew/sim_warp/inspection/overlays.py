@@ -5,8 +5,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from xew.episode import Record, States
-from xew.projection import project
+from xew.episode import Record, States, project
 
 __all__ = ["frame_psnr", "mask_outline", "overlay_data"]
 
