@@ -2,7 +2,7 @@
 
 Reads, writes <out>/checkpoints/STEP, and <out>/sums/STEP.json: SHA-256 of each of its files, once it is complete
 
-A checkpoint whose sums were not written yet, because the run was killed just then, or which an earlier version made, is read
+A checkpoint whose sums were not written yet, because the run was killed just then, is read
 without them.
 """
 
