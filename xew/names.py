@@ -49,7 +49,7 @@ def folder_name(name: str) -> str:
 
 
 def name_of_folder(folder: str) -> str:
-    """The name of a task or robot by its folder's; folders of earlier versions have the colon itself."""
+    """The name of a task or robot by its folder's."""
     return folder.replace("@", ":")
 
 

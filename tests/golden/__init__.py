@@ -33,14 +33,3 @@ def golden(name: str, compute: Callable[[], Mapping[str, np.ndarray]]) -> dict[s
     for key, array in live.items():
         np.testing.assert_allclose(array, stored[key], rtol=RELATIVE, atol=ABSOLUTE, err_msg=f"{path.name}: {key}")
     return live
-
-
-def golden_file(name: str, write: Callable[[Path], None], folder: Path) -> Path:
-    """A file in another library's format: the stored one, or in `folder` a new one that `write` makes with the library."""
-    path = FOLDER / name
-    if MODE == "stored":
-        return path
-    if MODE == "live":
-        path = folder / name
-    write(path)
-    return path

@@ -116,7 +116,8 @@ def _latex_cell(cell: TableCell) -> str:
 
 
 def _latex_line(cells: Sequence[str]) -> str:
-    return " & ".join(cells) + r" \\"
+    line = " & ".join(cells) + r" \\"
+    return f"{{}}{line}" if line.startswith(("[", "*")) else line  # after a line break these would be its options
 
 
 def _escape(text: str) -> str:

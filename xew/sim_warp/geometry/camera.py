@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from xew import projection
+from xew import episode
 from xew.episode import HEIGHT, WIDTH
 
 
@@ -65,7 +65,7 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
     Points at or behind the camera (depth <= 0) have no image; their pixels are NaN.
     """
-    return projection.project(points, camera.intrinsics, camera.extrinsics)
+    return episode.project(points, camera.intrinsics, camera.extrinsics)
 
 
 HEAD_CAMERA = look_at(position=(-0.032, -0.45, 1.35), target=(-0.032, 0.15, 0.55))
