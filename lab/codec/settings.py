@@ -153,6 +153,8 @@ class CodecExperiment:
 
 
 LEAST = LEAST_OF_STEPS | {
+    "train.clip_norm": 0,
+    "train.weight_decay": 0,
     "train.ema_decay": 0,
     "clip.frames": 1,
     "train.seconds": 0,

@@ -104,8 +104,8 @@ def test_later_chunks_continue_the_predicted_and_never_read_the_recorded(
     chunks = predictor.begin([episode], FRAMES).chunks
     assert len(chunks) == 3
     reference = encode_pictures(predictor.codec, np.asarray(chunks[0])[:, -1:])
-    decoded = predictor.codec.decode(np.asarray(encode_pictures(predictor.codec, np.asarray(chunks[1])))[0])
-    assert np.abs(decoded[0].astype(int) - predictor.codec.decode(np.asarray(reference)[0])[0]).mean() < 1
+    expected = predictor.codec.decode(np.asarray(reference)[0])[0]
+    assert np.abs(np.asarray(chunks[1])[0, 0].astype(int) - expected).mean() < 1
 
 
 def test_guidance_of_one_is_none_and_more_goes_away_from_the_negative(predictor: Predictor) -> None:

@@ -159,7 +159,7 @@ def load_recorded(path: Path) -> Experiment:
         ConfigError: as `load_experiment`.
     """
     experiment = load(Experiment, path)
-    if experiment.codec.weights is not None and (path.parent / RUN_CODEC).is_dir():  # a run may have moved without them
+    if experiment.codec.weights is not None and any((path.parent / RUN_CODEC).glob("*")):  # a run may have moved without them
         experiment = replace(experiment, codec=replace(experiment.codec, weights=path.parent / RUN_CODEC))
     demand_admitted(experiment, str(path))
     check_experiment(experiment, str(path))

@@ -22,6 +22,7 @@ from xew.dataset import read_dataset
 from xew.episode import Record
 from xew.files import hold_lock, read_text, write_text
 from xew.model.cache.scales import load_run_scales
+from xew.model.codecs.codec import RUN_CODEC
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment
 from xew.model.runs.begin import prepare_run
@@ -55,7 +56,15 @@ def release(run: Path, out: Path, data: Path | None = None, scores: Path | None 
     data_counts = list_training(replace(experiment, data=data or experiment.data))
     summary = read_text(scores) if scores else ""
     params, step = load_params(run, experiment.network, step)
-    released = replace(experiment, out=out, data=Path("data"), cache=None, adapt=AdaptSettings())
+    weights = Path(RUN_CODEC) if experiment.codec.weights else None  # those in the folder, wherever that lies
+    released = replace(
+        experiment,
+        out=out,
+        data=Path("data"),
+        cache=None,
+        adapt=AdaptSettings(),
+        codec=replace(experiment.codec, weights=weights),
+    )
     prepare_run(released, codec, load_run_scales(experiment.conditions, run), resume=False, overwrite=False)
     with write_checkpoints(out) as checkpoints:
         save_params(checkpoints, step, jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), params))

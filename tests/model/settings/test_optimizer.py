@@ -39,7 +39,7 @@ def test_muon_takes_the_matrices_of_blocks_and_nothing_else(params: dict) -> Non
 
 @pytest.mark.parametrize("mu_dtype", ["float32", "bfloat16"])
 def test_updates_of_muon_are_near_orthogonal_and_as_large_as_those_of_adamw(params: dict, mu_dtype: Any) -> None:
-    settings = TrainSettings(steps=2, warmup_steps=0, learning_rate=1.0, weight_decay=0.0, mu_dtype=mu_dtype)
+    settings = TrainSettings(steps=2, warmup_steps=0, learning_rate=1.0, mu_dtype=mu_dtype)
     optimizer = make_optimizer(settings)
     updates, _ = optimizer.update(params, optimizer.init(params), jax.tree.map(jnp.zeros_like, params))
     for update in np.asarray(updates["blocks"]["first"]["kernel"], np.float32):
@@ -50,7 +50,7 @@ def test_updates_of_muon_are_near_orthogonal_and_as_large_as_those_of_adamw(para
 
 def test_muon_computes_in_the_type_of_its_moments(params: dict) -> None:
     """Its products are in bfloat16 where that is asked for; the updates stay near those of float32."""
-    settings = TrainSettings(steps=2, warmup_steps=0, learning_rate=1.0, weight_decay=0.0)
+    settings = TrainSettings(steps=2, warmup_steps=0, learning_rate=1.0)
     exact, rounded = (make_optimizer(replace(settings, mu_dtype=dtype)) for dtype in ("float32", "bfloat16"))
     kept = rounded.init(params)
     program = str(jax.make_jaxpr(rounded.update)(params, kept, params))

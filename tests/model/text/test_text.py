@@ -24,7 +24,8 @@ data: {root}/data
 out: {root}/run
 clip: {{frames: 5, height: 64, width: 80}}
 codec: {{weights: TINY_CODEC}}
-model: {{size: tiny, history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none,
+model: {{size: tiny, action: none, embodiment: none, history: [], reference: frame, visibility: joint, prediction: velocity,
+  dtype: float32, remat: none,
   {model}}}
 train: {{steps: 1, batch: 1,
   optimizer: adamw, warmup_steps: 0, decay_to: 1, ema: 0, motion_loss_weight: 0}}

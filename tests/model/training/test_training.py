@@ -566,7 +566,7 @@ def test_run_with_corrections_resumes_and_is_read(world: Path, tmp_path: Path, c
     with pytest.raises(ConfigError, match="not there any more or was trained again"):
         network(elsewhere)
     (elsewhere / "start.json").unlink()
-    with pytest.raises(ConfigError, match="does not tell from which checkpoint"):
+    with pytest.raises(ConfigError, match="does not say from which checkpoint"):
         network(elsewhere)
 
 

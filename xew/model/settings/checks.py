@@ -29,8 +29,6 @@ LEAST_OF_STEPS: dict[str, float] = {
     "train.learning_rate": 0,
     "train.warmup_steps": 0,
     "train.decay_to": 0,
-    "train.clip_norm": 0,
-    "train.weight_decay": 0,
     "train.seed": 0,
     "train.log_every": 1,
     "train.save_every": 1,

@@ -13,6 +13,11 @@ from optax.contrib import MuonDimensionNumbers, muon
 from xew.model.devices.sharding import path_names
 from xew.model.settings.settings import TrainSettings, count_replayed
 
+WEIGHT_DECAY = 0.01
+"""Weight decay, as in the paper."""
+CLIP_NORM = 1.0
+"""Largest global norm of the gradients; larger ones are scaled down to it."""
+
 
 def learning_rate(settings: TrainSettings) -> optax.Schedule:
     """Make the schedule, step -> learning rate: optional warm-up, then constant or decaying by a cosine."""
@@ -36,12 +41,12 @@ def make_optimizer(settings: TrainSettings) -> optax.GradientTransformation:
     Muon makes its updates orthogonal in that type too, in bfloat16 as its author does (Jordan 2024): the products take less
     time, and their error is small compared with that of the iteration itself, which ends long before it converges.
     """
-    rate, decay, mu_dtype = learning_rate(settings), settings.weight_decay, jnp.dtype(settings.mu_dtype)
+    rate, mu_dtype = learning_rate(settings), jnp.dtype(settings.mu_dtype)
     if settings.optimizer == "muon":
         update = muon(
             rate,
-            weight_decay=decay,
-            adam_weight_decay=decay,
+            weight_decay=WEIGHT_DECAY,
+            adam_weight_decay=WEIGHT_DECAY,
             mu_dtype=mu_dtype,
             consistent_rms=RMS_OF_ADAM,
             muon_weight_dimension_numbers=find_matrices,
@@ -49,8 +54,8 @@ def make_optimizer(settings: TrainSettings) -> optax.GradientTransformation:
         if mu_dtype != jnp.float32:
             update = optax.chain(round_matrices(mu_dtype), update)
     else:
-        update = optax.adamw(rate, weight_decay=decay, mu_dtype=mu_dtype)
-    return optax.chain(optax.clip_by_global_norm(settings.clip_norm), update)
+        update = optax.adamw(rate, weight_decay=WEIGHT_DECAY, mu_dtype=mu_dtype)
+    return optax.chain(optax.clip_by_global_norm(CLIP_NORM), update)
 
 
 def round_matrices(dtype: DTypeLike) -> optax.GradientTransformation:

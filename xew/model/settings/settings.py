@@ -60,9 +60,6 @@ class TrainSettings:
     """Number of steps in which the learning rate rises to its peak."""
     decay_to: float = 0.05
     """Cosine decay of the learning rate to this part of its peak at the end; 1 keeps it constant."""
-    weight_decay: float = 0.01
-    clip_norm: float = 1.0
-    """Largest global norm of the gradients; larger ones are scaled down to it."""
     ema: float = 0.1
     """Reach of the exponential moving average of the parameters, as a fraction of the run's steps; 0 keeps none. Samples and
     rollouts use the average."""

@@ -75,8 +75,8 @@ class Trainer:
     """
 
     spec: TrainSpec
-    mesh: Mesh | AbstractMesh
-    """The devices; an abstract mesh serves to ask for shapes alone."""
+    mesh: Any
+    """Mesh of the devices; an abstract one serves to ask for shapes alone."""
     graph: nnx.GraphDef
     shapes: TrainState
     """Shapes, types and shardings of the state; its step has a copy on every device."""
