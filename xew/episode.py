@@ -432,24 +432,3 @@ def remove_left_overs(data: Path) -> None:
     """Remove what a run that was killed left half-written: episodes and, one folder up, robots."""
     for folder in [*Path(data).glob(f"*/*/{TEMPORARY}*"), *Path(data).glob(f"*/{TEMPORARY}*")]:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def project(points: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Images of points of the world in a pinhole camera, without distortion or skew.
-
-    Pixels: x right, y down, (0, 0) is the center of the upper left pixel. Camera frame: x right, y down, z forward.
-
-    Args:
-        points: [... 3] m, world frame.
-        intrinsics: [3 3] K [pixels].
-        extrinsics: [4 4] world to camera [m].
-
-    Returns:
-        Pixels [... 2] and depths along the optical axis [...] m, both float64 where an argument is. A point at or behind the
-        camera (depth <= 0) has no image; its pixels are NaN.
-    """
-    in_camera = points @ extrinsics[:3, :3].T + extrinsics[:3, 3]
-    depth = in_camera[..., 2]
-    focal = intrinsics[[0, 1], [0, 1]]
-    front = np.where(depth > 0, depth, np.nan)
-    return focal * in_camera[..., :2] / front[..., None] + intrinsics[:2, 2], depth
