@@ -22,7 +22,7 @@ from tests.exchange import robotwin_file
 from tests.faults import reading
 from xew import config
 from xew.analysis.scores import read_scores
-from xew.config import ConfigError, UntrustedError
+from xew.config import ConfigError, UntrustedError, read_yaml
 from xew.dataset import read_dataset
 from xew.episode import EpisodeError, complete_folder, episode_folder, place_episode, read_record, read_video
 from xew.exchange import robotwin
@@ -229,7 +229,7 @@ def test_no_module_that_data_name_is_imported(own: Path, evil: Path) -> None:
 
 
 def test_no_module_that_a_run_names_is_imported(evil: Path, tmp_path: Path) -> None:
-    plain = yaml.safe_load((REPOSITORY / "configs/debug.yaml").read_text())
+    plain = read_yaml(REPOSITORY / "configs/debug.yaml")
     run = tmp_path / "run"
     run.mkdir()
     for place in (("split",), ("model", "size"), ("model", "action"), ("codec", "name"), ("rollout", "sampler")):
