@@ -141,6 +141,7 @@ def sums(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
 
 def config(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
     """A config that the user names; YAML reads JSON."""
+    from xew.config import read_yaml
     from xew.model.experiment import load_experiment
 
     content = read_yaml(REPOSITORY / "configs/debug.yaml")
