@@ -395,14 +395,5 @@ def test_overwrite_removes_a_run_and_nothing_else(tmp_path: Path) -> None:
     assert (run / "notes.md").read_text() == "what I saw" and (out / "thesis.tex").exists()
 
 
-def test_a_run_of_an_earlier_version_is_still_replaced(tmp_path: Path) -> None:
-    experiment = load_experiment(REPOSITORY / "configs/debug.yaml")
-    (tmp_path / "codec").mkdir()
-    (tmp_path / "codec/codec.npz").touch()
-    config.save(experiment, tmp_path / "config.yaml")
-    claim_run(tmp_path, experiment, load_experiment, resume=False, overwrite=True)
-    assert not (tmp_path / "codec").exists() and (tmp_path / "config.yaml").exists()
-
-
 def test_data_as_they_were_still_open(own: Path) -> None:
     assert [record.robot for _, record in read_dataset(own.parents[2]).accepted] == ["piper"]
