@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow.parquet as parquet
-import yaml
 
 from xew.analysis.scores import read_scores
 from xew.analysis.studies.ledger import Ledger
@@ -150,9 +149,10 @@ def sums(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
 
 def config(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
     """A config that the user names; YAML reads JSON."""
+    from xew.config import read_yaml
     from xew.model.experiment import load_experiment
 
-    content = yaml.safe_load((REPOSITORY / "configs/debug.yaml").read_text())
+    content = read_yaml(REPOSITORY / "configs/debug.yaml")
     return folder / "config.yaml", content, lambda: load_experiment(folder / "config.yaml")
 
 

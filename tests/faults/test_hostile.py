@@ -23,7 +23,7 @@ from tests.exchange import robotwin_file
 from tests.faults import reading
 from xew import config
 from xew.analysis.scores import read_scores
-from xew.config import ConfigError, UntrustedError
+from xew.config import ConfigError, UntrustedError, read_yaml
 from xew.dataset import read_dataset
 from xew.episode import EpisodeError, complete_folder, episode_folder, place_episode, read_record, read_video
 from xew.exchange import robotwin
@@ -239,7 +239,7 @@ def test_no_module_that_data_name_is_imported(own: Path, evil: Path) -> None:
 
 
 def test_no_module_that_a_run_names_is_imported(evil: Path, tmp_path: Path) -> None:
-    plain = yaml.safe_load((REPOSITORY / "configs/debug.yaml").read_text())
+    plain = read_yaml(REPOSITORY / "configs/debug.yaml")
     run = tmp_path / "run"
     run.mkdir()
     for place in (("split",), ("model", "size"), ("model", "action"), ("codec", "name"), ("rollout", "sampler")):
@@ -403,15 +403,6 @@ def test_overwrite_removes_a_run_and_nothing_else(tmp_path: Path) -> None:
     claim_run(run, experiment, load_experiment, resume=False, overwrite=True)
     assert sorted(path.name for path in run.iterdir() if not path.name.startswith(".")) == ["codec", "config.yaml", "notes.md"]
     assert (run / "notes.md").read_text() == "what I saw" and (out / "thesis.tex").exists()
-
-
-def test_a_run_of_an_earlier_version_is_still_replaced(tmp_path: Path) -> None:
-    experiment = load_experiment(REPOSITORY / "configs/debug.yaml")
-    (tmp_path / "codec").mkdir()
-    (tmp_path / "codec/codec.npz").touch()
-    config.save(experiment, tmp_path / "config.yaml")
-    claim_run(tmp_path, experiment, load_experiment, resume=False, overwrite=True)
-    assert not (tmp_path / "codec").exists() and (tmp_path / "config.yaml").exists()
 
 
 def test_data_as_they_were_still_open(own: Path) -> None:

@@ -15,7 +15,7 @@ from lab.seeds import yields
 from tests import synthetic
 from tests.commands import run_command
 from xew.analysis.studies.config import load_study
-from xew.config import ConfigError, check_finite, user_errors
+from xew.config import ConfigError, check_finite, read_yaml, user_errors
 from xew.episode import EpisodeError, read_record, read_states, read_video, write_episode
 from xew.files import write_text
 from xew.model import outside
@@ -159,7 +159,7 @@ MEANINGLESS = yaml.safe_load((Path(__file__).parent / "inputs/numbers.yaml").rea
 
 @pytest.mark.parametrize("change", MEANINGLESS["config"], ids=str)
 def test_numbers_of_a_config_that_mean_nothing_are_refused_with_its_name(change: dict[str, object], tmp_path: Path) -> None:
-    content = yaml.safe_load((REPOSITORY / "configs/debug.yaml").read_text())
+    content = read_yaml(REPOSITORY / "configs/debug.yaml")
     ((name, value),) = change.items()
     *sections, key = name.split(".")
     inner = content
