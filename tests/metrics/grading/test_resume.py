@@ -93,7 +93,7 @@ PLACES = [
     (files.os, "replace", CELLS + 1),  # the curves
     (files.os, "replace", CELLS + 2),  # the scores, whose curves are there
     (write_scores, "write_bundle", 1),
-    (write_scores, "summarize", 1),
+    (write_scores, "summarize_robots", 1),
 ]
 
 
