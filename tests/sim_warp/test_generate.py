@@ -30,7 +30,7 @@ from xew.sim_warp.inspection.checks import find_problem
 from xew.sim_warp.manifest import Manifest
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import Production
-from xew.sim_warp.production.seeds import MOST_UNPAIRED, SEEDS_OF_ROBOT, Family
+from xew.sim_warp.production.seeds import MOST_UNPAIRED, SEEDS_OF_ROBOT, Family, demand_enough
 from xew.sim_warp.production.summary import yield_table
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import RobotSpec
@@ -357,7 +357,7 @@ def test_a_hopeless_task_gives_up_and_says_so() -> None:
             hopeless.add(outcome(job.seed, "b", pictures=False))
     assert rounds == len(hopeless.tries) == 23
     with pytest.raises(EpisodeError, match="task with a, b: only 0 of 1 seeds were accepted in 23 tries"):
-        command._demand_enough([family(0), hopeless])
+        demand_enough([family(0), hopeless])
 
 
 # --- Worker processes.
