@@ -50,10 +50,10 @@ LAB = (
 )
 """Beginnings of the names of tests that `make test-lab` runs and `make test` does not; single tests bear the mark `lab`."""
 LONG_FILES = (
+    "tests/test_wheel.py",
     "tests/lab/",
     "tests/test_adding.py",
     "tests/test_docs.py",
-    "tests/test_wheel.py",
     "tests/model/training/test_training.py",
     "tests/model/test_pipeline.py",
     "tests/model/test_rollout.py",
@@ -67,7 +67,7 @@ LONG_FILES = (
     "tests/analysis/",
     "tests/faults/",
 )
-"""Files and folders that are run first, so no worker begins a long file when the other has finished."""
+"""Files and folders that are run first and in this order, so no worker begins a long file when the other has finished."""
 XLA_FLAGS = (
     "--xla_cpu_use_fusion_emitters=false",
     "--xla_backend_optimization_level=0",
@@ -125,7 +125,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if missing:
         config.hook.pytest_deselected(items=missing)
         items[:] = [item for item in items if item not in missing]
-    items.sort(key=lambda item: not item.nodeid.startswith(LONG_FILES))
+    items.sort(key=lambda item: next((n for n, long in enumerate(LONG_FILES) if item.nodeid.startswith(long)), len(LONG_FILES)))
 
 
 @pytest.fixture(scope="session", autouse=True)
