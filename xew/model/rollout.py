@@ -29,8 +29,8 @@ from xew.config import CONVERTER, ConfigError, admit, find_config, is_packaged, 
 from xew.dataset import Episode
 from xew.episode import Record, episode_folder, remove_left_overs
 from xew.files import hold_lock, read_json
-from xew.model.cache.codecs import load_codec
 from xew.model.cache.scales import Scale, load_run_scales
+from xew.model.cache.store import load_codec
 from xew.model.codecs.contract import Codec
 from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
 from xew.model.episodes.choice import select_episodes

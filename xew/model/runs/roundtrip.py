@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from xew.model.cache.codecs import load_codec
+from xew.model.cache.store import load_codec
 from xew.model.codecs.contract import Codec
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.folder import load_run

@@ -3,12 +3,11 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import optax
 
 from xew.config import pick
-from xew.model.codecs.contract import CodecSettings
+from xew.model.codecs.contract import Codec, CodecSettings
 from xew.model.codecs.vae import VaeSize
 from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition, list_conditions
 from xew.model.network.dit import STREAMS, token_grid
@@ -54,8 +53,8 @@ class Encoding:
 
     inputs: ClipInputs
     codec: CodecSettings
-    kind: type[Any]
-    """Class of codec that the settings name, with what `Codec` asks."""
+    kind: type[Codec]
+    """Class of codec that the settings name."""
     folder: Path
     data: Path
     start_from: Path | None
