@@ -221,11 +221,7 @@ def admit(names: Iterable[str]) -> None:
 
 
 def admit_named(content: Any) -> None:
-    """Admit every module that a config names as `module:NAME`: the user named the config.
-
-    Args:
-        content: a config, as a dataclass or as plain content.
-    """
+    """Admit every module that a config, or its plain content, names as `module:NAME`: the user named the config."""
     admit(find_import_paths(content))
 
 

@@ -67,12 +67,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixels, batch: int = 4, processes: int = 1) -> None:
-    """Encode all that the training of an experiment reads, and print what was made.
+    """Encode all that the training of an experiment reads, as `encode_episodes`, and print what was made.
 
-    Args:
-        source: where the episodes' pixels come from; several processes need one that can be pickled.
-        batch: clips that the codec encodes at once.
-        processes: number of processes that share the work.
+    Several processes need a source that can be pickled.
     """
     check_lpips()
     encoding, choice, dataset = experiment.encoding, experiment.choice, read_dataset(experiment.data)

@@ -53,7 +53,8 @@ def release(run: Path, out: Path, data: Path | None = None, scores: Path | None 
         experiment = replace(experiment, out=run)
     if scores and not scores.is_file():
         raise ConfigError(f"{scores} is no file; expected scores.summary.md of `python -m xew.metrics.evaluate`: --scores.")
-    data_counts = list_training(replace(experiment, data=data or experiment.data))
+    episodes = training_episodes(read_dataset(data or experiment.data), experiment.choice)
+    data_counts = count_by_task(record for _, record in episodes)
     summary = read_text(scores) if scores else ""
     params, step = load_params(run, experiment.network, step)
     weights = Path(RUN_CODEC) if experiment.codec.weights else None  # those in the folder, wherever that lies
@@ -73,12 +74,6 @@ def release(run: Path, out: Path, data: Path | None = None, scores: Path | None 
     return step
 
 
-def list_training(experiment: Experiment) -> dict[str, tuple[int, int]]:
-    """Numbers of training seeds and episodes of each task that an experiment reads, robots together, in order of tasks."""
-    episodes = training_episodes(read_dataset(experiment.data), experiment.choice)
-    return count_by_task(record for _, record in episodes)
-
-
 def count_by_task(records: Iterable[Record]) -> dict[str, tuple[int, int]]:
     """Numbers of distinct seeds and of episodes of each task, in order of tasks."""
     seeds: dict[str, list[int]] = defaultdict(list)
@@ -88,13 +83,9 @@ def count_by_task(records: Iterable[Record]) -> dict[str, tuple[int, int]]:
 
 
 def write_card(experiment: Experiment, step: int, size: int, seen: dict[str, tuple[int, int]], summary: str) -> str:
-    """The model card in Markdown: what the model is, what it was trained on, how good it is and what it is not for.
+    """The model card in Markdown: what the model of so many parameters is, what it was trained on, and how good it is.
 
-    Args:
-        step: number of training steps.
-        size: number of parameters.
-        seen: numbers of seeds and episodes by task.
-        summary: table of scores in Markdown, '' where there is none.
+    `seen` are numbers of seeds and episodes by task; `summary` is the table of scores, '' where there is none.
     """
     loader = PackageLoader("xew.model", "templates")
     template = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
