@@ -226,11 +226,7 @@ def admit_named(content: Any) -> None:
 
 
 def demand_admitted(content: Any, source: str) -> None:
-    """Check what a file says of itself before anything that it names is looked up.
-
-    Args:
-        content: a name, a config as a dataclass, or plain content.
-        source: what says so, for the message.
+    """Check what a file says of itself (a name, a config or plain content) before anything that it names is looked up.
 
     Raises:
         UntrustedError: it names a module that the user has not admitted.

@@ -100,10 +100,8 @@ def sweep(path: Path, prefix: str = ".", ending: str = "") -> None:
     A process of another machine does not exist here; of folders, which take longer than SETTLED_S, the lock of what is written
     keeps it away.
 
-    Args:
-        path: of the file or folder.
-        prefix: what the names of temporaries begin with, before its own name, a dot and the number of the process.
-        ending: regular expression of what follows.
+    Names of temporaries begin with `prefix`, then its own name, a dot and the number of the process; the regular expression
+    `ending` says what follows.
     """
     form = re.compile(rf"{re.escape(prefix + path.name)}\.(\d+){ending}")
     for left in path.parent.glob(f"{prefix}{glob.escape(path.name)}.*"):

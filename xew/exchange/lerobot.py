@@ -254,9 +254,6 @@ class _VideoFiles:
         }
 
 
-# --- Statistics: of every feature, an episode's and all.
-
-
 @dataclass
 class _Totals:
     """What the statistics of the whole set need."""
@@ -303,9 +300,6 @@ def _color_statistics(counts: np.ndarray, frames: int) -> dict[str, list[Any]]:
     below = counts.cumsum(1) / total[:, None]
     statistics |= {name: value[(below >= share).argmax(1)] for name, share in QUANTILES.items()}
     return {name: numbers.reshape(3, 1, 1).tolist() for name, numbers in statistics.items()} | {"count": [frames]}
-
-
-# --- meta/.
 
 
 def _features(vectors: Vectors, videos: Iterable[str]) -> dict[str, dict[str, Any]]:

@@ -37,12 +37,7 @@ CARD = "README.md"
 def release(run: Path, out: Path, data: Path | None = None, scores: Path | None = None, step: int | None = None) -> int:
     """Write the network of a run in bfloat16 as a new run, with its card, and return the step that it is of.
 
-    Args:
-        run: folder of the run; corrections of an adaptation are added to its network.
-        out: folder to write.
-        data: the episodes that it was trained on; those of its config where left out.
-        scores: a summary in Markdown that `xew.metrics.evaluate` wrote; the card has it whole.
-        step: of the checkpoint; the latest where left out.
+    Arguments are as of the command (`Args`). Corrections of an adaptation are added to its network.
 
     Raises:
         ConfigError: there is no such run, checkpoint or summary, or the place is taken.

@@ -193,15 +193,9 @@ class WorldModel(nnx.Module):
     def embed_streams(
         self, latents: Latents, conditions: Conditions, cached: bool = False
     ) -> tuple[Float[Array, "b s d"], Levels, Rotary]:
-        """Tokens of all streams, their noise levels and their rotations.
+        """Tokens [b s d] of all streams, or of RGB's latents alone where the others are cached.
 
-        Args:
-            latents: [b t h w c] of RGB.
-            conditions: as of `__call__`.
-            cached: leave the condition streams out.
-
-        Returns:
-            Tokens [b s d], the index of each one's noise level [s], cosine and sine of its angles [s head_dim/2].
+        With them come the index of each one's noise level [s], and cosine and sine of its angles [s head_dim/2].
         """
         streams = {name: conditions[name] for name in self.condition_streams if not cached}
         tokens, levels, rotary = self._join({"rgb": latents} | streams)

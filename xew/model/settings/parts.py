@@ -114,12 +114,7 @@ def pick_conditions(settings: ModelSettings) -> list[Condition]:
 
 
 def sample_roles(split: Split, targets: Iterable[str] = ()) -> dict[str, str]:
-    """Roles of the robots that samples are drawn of: those by which choices are made (`validation_split`), and their targets.
-
-    Args:
-        split: of the training; of an adapted run's, that of the run that it started from.
-        targets: robots that are adapted to.
-    """
+    """Roles of the robots that samples are drawn of: those that choices are made by (`validation_split`), and targets."""
     chosen = validation_split(split)
     roles = dict.fromkeys(chosen.train_robots, "seen") | dict.fromkeys(chosen.held_out_robots, "unseen")
     return roles | dict.fromkeys(targets, "target")

@@ -53,12 +53,7 @@ class Memory:
 
 
 def estimate_memory(trainer: Trainer, encoding: Encoding) -> Memory:
-    """Estimate what each device of the trainer's mesh needs to train.
-
-    Args:
-        trainer: its devices need not be there.
-        encoding: the codec, which works between two chunks.
-    """
+    """Estimate what each device of the trainer's mesh needs to train, and the codec between two chunks; none need be there."""
     spec, state, params = trainer.spec, trainer.shapes, trainer.network_shapes
     settings, network = spec.settings, spec.network
     devices, fsdp = trainer.mesh.size, trainer.mesh.shape["fsdp"]
