@@ -18,8 +18,7 @@ import tyro
 from xew.config import ConfigError, user_errors
 from xew.files import read_text, write_text
 from xew.metrics import METRICS
-from xew.metrics.grading.summary import summarize
-from xew.statistics import LEAST_POWER, describe_power
+from xew.statistics import LEAST_POWER, describe_power, measure_power
 
 HEADING = "## What the metrics can tell"
 """Heading of the section on the page of the tasks."""
@@ -45,7 +44,7 @@ class Args:
 def main(args: Args) -> None:
     """Write the section."""
     rows = pd.read_parquet(args.scores)
-    write_power(args.page, summarize(rows).power, rows)
+    write_power(args.page, measure_power(rows, METRICS), rows)
 
 
 def write_power(page: Path, power: pd.DataFrame, rows: pd.DataFrame) -> None:

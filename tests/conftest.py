@@ -24,6 +24,31 @@ CHECK_SHAPES = os.environ.get("XEW_CHECK_SHAPES", "1") != "0"
 """Whether shapes and types of arrays are checked at every call; benchmarks of tests turn it off by XEW_CHECK_SHAPES=0."""
 LOOSE = (("loose_types", "jax_numpy_dtype_promotion", "standard"), ("loose_ranks", "jax_numpy_rank_promotion", "allow"))
 """Mark, option of JAX, and its value under the mark."""
+LAB = (
+    "tests/lab/",
+    "tests/analysis/studies/test_machines.py::test_cells_run_as_tasks_on_a_ray_cluster",
+    "tests/analysis/studies/test_study_debug.py",
+    "tests/analysis/test_results.py::test_published_tables_and_sentences_are_those_of_the_scores[bodies]",
+    "tests/analysis/test_results.py::test_published_tables_and_sentences_are_those_of_the_scores[remedies]",
+    "tests/analysis/test_results.py::test_published_tables_and_sentences_are_those_of_the_scores[six_tasks]",
+    "tests/metrics/estimators/batched/test_batched.py::test_scores_of_the_predictors_are_the_same",
+    "tests/metrics/grading/test_resume.py::test_memory_does_not_grow_with_the_number_of_episodes",
+    "tests/metrics/test_perceptual.py::test_features_shared_by_three_metrics_and_all_predictions_change_no_value[1-",
+    "tests/metrics/test_perceptual.py::test_features_shared_by_three_metrics_and_all_predictions_change_no_value[3-1000",
+    "tests/model/devices/test_many_devices.py::test_killed_runs_repeat_the_straight_ones_on_any_devices",
+    "tests/model/devices/test_many_devices.py::test_the_same_config_gives_the_same_numbers",
+    "tests/model/devices/test_many_devices.py::test_two_processes_are_as_one",
+    "tests/model/test_rollout.py::test_two_devices_share_a_batch_and_give_the_same",
+    "tests/model/test_systems.py::test_a_system_is_trained_and_rolled_out[bwm]",
+    "tests/model/test_systems.py::test_a_system_is_trained_and_rolled_out[enerverse_ac]",
+    "tests/model/test_systems.py::test_a_system_is_trained_and_rolled_out[irasim]",
+    "tests/sim_warp/devices/test_compiling.py::test_the_pieces_compiled_for_a_gpu_are_all_that_episodes_launch",
+    "tests/sim_warp/rendering/test_render.py::test_kernels_compile_for_cuda_without_fused_or_approximate_arithmetic",
+    "tests/sim_warp/test_generate.py::test_a_run_killed_in_the_middle_is_taken_up_again",
+    "tests/test_docs.py::test_a_page_does_what_it_says[add_a_robot]",
+    "tests/test_docs.py::test_a_page_does_what_it_says[add_a_task]",
+)
+"""Beginnings of the names of tests that `make test-lab` runs and `make test` does not; single tests bear the mark `lab`."""
 LONG_FILES = (
     "tests/lab/",
     "tests/test_adding.py",
@@ -94,7 +119,7 @@ def remove_old_files(folder: Path) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark the tests of lab/, deselect those whose package is not installed, and put long files first."""
     for item in items:
-        if item.nodeid.startswith("tests/lab/"):
+        if item.nodeid.startswith(LAB):
             item.add_marker(pytest.mark.lab)
     missing = [item for item in items if any(not find_spec(mark.args[0]) for mark in item.iter_markers("needs"))]
     if missing:

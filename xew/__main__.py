@@ -1,6 +1,6 @@
-"""The front door: `python -m xew`, or `xew`, lists the commands; `xew train CONFIG` is `python -m xew.model.train CONFIG`.
+"""The front door: `python -m xew` lists all commands (COMMANDS), and `xew train CONFIG` is `python -m xew.model.train CONFIG`.
 
-To add a command: one line in COMMANDS, in the order of the pipeline.
+`xew` is the same as `python -m xew`. To add a command: one line in COMMANDS, in the order of the pipeline.
 """
 
 import runpy

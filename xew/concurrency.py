@@ -1,4 +1,4 @@
-"""Threads and processes, for all rooms: work done ahead in order, one parser at a time, processes that end with others."""
+"""Threads and processes: work done ahead and in order, and worker processes that end with their parent."""
 
 import functools
 import multiprocessing

@@ -297,7 +297,7 @@ def test_a_robot_in_data_reads_no_file_outside_of_its_folder(how: str, tmp_path:
         shutil.copy(urdf, tmp_path / "secret.urdf")
         (robot / "robot.yaml").write_text((robot / "robot.yaml").read_text().replace(urdf.name, "../../../secret.urdf"))
     elif how == "mesh":
-        mesh = next((robot / "meshes").rglob("*.stl"))
+        mesh = next((robot / "files").rglob("*.stl"))
         shutil.move(mesh, tmp_path / "secret.stl")
         urdf.write_text(urdf.read_text().replace(str(mesh.relative_to(urdf.parent)), str(tmp_path / "secret.stl")))
     else:

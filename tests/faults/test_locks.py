@@ -180,7 +180,11 @@ def test_encoding_waits_for_others_of_the_same_streams(tmp_path: Path, monkeypat
     monkeypatch.setattr(latents, "hold_lock", note)
     synthetic.write_synthetic_data(tmp_path / "data", seeds=(0,), robots=SEEN_ROBOTS, frames=5)
     content = {"data": str(tmp_path / "data"), "out": str(tmp_path / "run"), "clip": {"frames": 5, "height": 32, "width": 48}}
-    content |= {"codec": {"weights": str(TINY_CODEC)}, "model": {"size": "tiny"}, "train": {"steps": 1, "batch": 1}}
+    content |= {
+        "codec": {"weights": str(TINY_CODEC)},
+        "model": {"size": "tiny", "history": []},
+        "train": {"steps": 1, "batch": 1},
+    }
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(content))
     for embodiment in ("none", "reference_image", "nine_views"):
         latents.main([str(tmp_path / "config.yaml"), "--model.action", "optical_flow", "--model.embodiment", embodiment])

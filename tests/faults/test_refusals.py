@@ -140,7 +140,7 @@ def test_commands_without_workers_end_in_one_line(command: str, tmp_path: Path, 
 
 
 def test_a_quote_that_is_not_closed_is_told_with_its_config(tmp_path: Path) -> None:
-    content = yaml.safe_load((REPOSITORY / "configs/study_debug.yaml").read_text())
+    content = read_yaml(REPOSITORY / "configs/study_debug.yaml")
     content["machine"] = content.get("machine", {}) | {"train_launcher": "srun --comment='my study"}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(content))
     with pytest.raises(ConfigError, match=r"mine\.yaml: machine\.train_launcher is .*: No closing quotation"):

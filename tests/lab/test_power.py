@@ -7,7 +7,8 @@ import pytest
 
 from lab.power import power_section, write_power, write_section
 from xew.config import ConfigError
-from xew.metrics.grading.summary import summarize
+from xew.metrics import METRICS
+from xew.statistics import measure_power
 
 ROBOTS = ("aloha_agilex", "piper")
 
@@ -20,15 +21,15 @@ def test_the_power_of_tasks_is_a_section_of_a_page(tmp_path: Path) -> None:
         for model, value in zip(("copy_first_frame", "ground_truth"), scores, strict=True)
         for robot in ROBOTS
     )
-    text = power_section(summarize(rows).power, rows)
+    text = power_section(measure_power(rows, METRICS), rows)
     assert "8 episodes of `aloha_agilex`, `piper`, seed 800000 of each task" in text
     assert "leave the mean of pck_strict: both, rest. The least power, 1.5 times, is that of `rest` for `pck_strict`." in text
     assert "| `both` | none |" in text and "| `best` | over 10,000 |" in text
     assert "| `lift` | 8 |" in text and "| `lift` | 0.2 (0.9) |" in text and "| `rest` | 0.85 (0.9) |" in text
-    write_power(tmp_path / "page.md", summarize(rows).power, rows)
+    write_power(tmp_path / "page.md", measure_power(rows, METRICS), rows)
     assert (tmp_path / "page.md").read_text().endswith(f"{text}\n")
     with pytest.raises(ConfigError, match="lacks the frozen first frame or the true video"):
-        write_power(tmp_path / "page.md", summarize(rows[rows["model"] == "ground_truth"]).power, rows)
+        write_power(tmp_path / "page.md", measure_power(rows[rows["model"] == "ground_truth"], METRICS), rows)
 
 
 def test_a_section_is_written_anew_and_all_else_stays(tmp_path: Path) -> None:

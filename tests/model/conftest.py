@@ -1,12 +1,11 @@
 """What the tests of the model room share: exceptions from strict types for two libraries, and programs of alike trainings."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
-import jax
-import optax
 import pytest
 
+from tests.promotion import promotion_of_libraries
 from xew.model import train
 from xew.model.settings.parts import TrainSpec
 from xew.model.training import step
@@ -15,20 +14,7 @@ from xew.model.training.step import Trainer
 
 @pytest.fixture(scope="session", autouse=True)
 def libraries_may_promote() -> Iterator[None]:
-    """What strict types forbid but libraries do.
-
-    Optax raises float decays to the power of its int32 count of steps (bias correction); JAX's attention adds up bfloat16
-    products in float32.
-    """
-    chain = optax.chain
-
-    def loose_chain(*transformations: optax.GradientTransformation) -> optax.GradientTransformation:
-        chained = chain(*transformations)
-        return optax.GradientTransformation(chained.init, loosely(chained.update))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(optax, "chain", loose_chain)
-        patch.setattr(jax.nn, "dot_product_attention", loosely(jax.nn.dot_product_attention))
+    with promotion_of_libraries():
         yield
 
 
@@ -51,13 +37,3 @@ def alike_trainings_share_programs() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(train, "make_trainer", make_trainer)
         yield
-
-
-def loosely(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function with JAX's default promotion of types."""
-
-    def call(*arguments: Any, **named: Any) -> Any:
-        with jax.numpy_dtype_promotion("standard"):
-            return function(*arguments, **named)
-
-    return call

@@ -150,7 +150,7 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
     """
     command = EVALUATE.format(path=path)
     rows, by_frame = _read(path, command), path.with_suffix(".curves.parquet")
-    curves = _read(by_frame, command) if by_frame.exists() else pd.DataFrame(columns=[*rows.columns, "frame"])
+    curves = _read(by_frame, command) if by_frame.exists() else rows.iloc[:0].assign(frame=0)
     missing = [column for column in COLUMNS if column not in rows]
     missing += [key for key in ("protocol", "metrics") if key not in rows.attrs]
     if missing:

@@ -1,4 +1,4 @@
-"""Metrics of predicted video: jitted JAX functions of a prediction and its target; only `evaluate` reads files.
+"""Metrics of predicted video, jitted JAX functions of a prediction and its target, and the list of them all (METRICS).
 
     from xew.metrics import psnr, METRICS
     psnr(prediction, target)          # uint8 [t h w 3] -> float32 [t]

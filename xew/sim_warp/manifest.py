@@ -1,4 +1,4 @@
-"""The manifest: which seeds make the data set, found once in physics so that no user has to search again.
+"""The manifest: seeds that are known to fail, found once in physics, so `generate` does not try them.
 
 Reads  seeds.json in this folder, or a file of the same form (lab/seeds/manifest.py makes one)
 

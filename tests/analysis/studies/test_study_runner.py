@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 
 from tests.analysis.studies.chains import ROOT, STEPS, begun, chain, run
 from tests.synthetic import write_synthetic_data
@@ -23,7 +24,7 @@ from xew.analysis.studies.plan import Step, plan
 from xew.analysis.studies.processes import last_lines, start_step
 from xew.analysis.studies.runner import Budget, StudyRunner, complete_command
 from xew.analysis.studies.status import exit_with_failures
-from xew.config import ConfigError
+from xew.config import ConfigError, read_yaml
 from xew.episode import EpisodeError
 
 pytestmark = pytest.mark.usefixtures("cheap_steps")
@@ -421,8 +422,9 @@ def test_experiments_that_the_model_does_not_take_are_said_before_anything_start
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = tmp_path / "study.yaml"
-    text = (ROOT / "configs" / "study_debug.yaml").read_text()
-    config.write_text(text.replace("epochs: 2,", "epoch: 2,"))
+    content = read_yaml(ROOT / "configs" / "study_debug.yaml")
+    content["adaptation"]["train"]["epoch"] = content["adaptation"]["train"].pop("epochs")
+    config.write_text(yaml.safe_dump(content))
     with pytest.raises(SystemExit) as stop:
         runner.main([str(config), "--out", str(tmp_path / "study")])
     assert stop.value.code == 2

@@ -398,7 +398,7 @@ def fails(command: Callable[[list[str]], None], arguments: list[str], capsys: py
         (["--clip.frames", "8"], "4 k + 1"),
         (["--pictures.every", "0"], "pictures.every is 0; it must be at least 1"),
         (["--train.seconds", "5"], "train.steps is 4, train.seconds 5; give one of them"),
-        (["--train.steps", "0"], "give one of them, over 0"),
+        (["--train.steps", "0"], "train.steps is 0, train.seconds 0; give one of them"),
         (["--size", "bas"], "did you mean 'base'"),
         (["--split", "fixd"], "did you mean 'fixed'"),
         (["--streams.rgb", "-1"], "must be at least 0"),

@@ -106,7 +106,7 @@ def test_a_page_is_written_with_its_folder_or_the_option_is_named(tmp_path: Path
     measured = "\n## How much is seen\nof surfaces\n\n## What the metrics can tell\nof metrics\n"
     write_page(tmp_path / "tasks.md", f"# Tasks\nold\n\n{YIELDS}\nold, too\n" + measured)
     assert find_kept(tmp_path / "tasks.md") == measured and find_kept(tmp_path / "new" / "tasks.md") == ""
-    kept = find_kept(Path(__file__).parents[2] / "docs" / "tasks.md")
+    kept = find_kept(Path(__file__).parents[3] / "docs" / "tasks.md")
     assert [line for line in kept.splitlines() if line.startswith("## ")] == [SEEN, POWER], "the page keeps what others write"
     assert find_kept(tmp_path / "none.md") == ""
     with pytest.raises(EpisodeError, match="Choose another file with --page"):

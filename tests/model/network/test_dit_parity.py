@@ -15,6 +15,7 @@ from tests.torch_ops import make_torchvision_importable
 from xew.model.network import dit
 from xew.model.network.dit import ModelSize, WorldModel
 from xew.model.network.dit_layouts import load_dit, save_dit
+from xew.model.network.spec import Visibility
 
 CHANNELS, TEXT, WORDS = 8, 24, 5
 TOLERANCE = 1e-4
@@ -122,7 +123,7 @@ def test_whole_network(exact: bool, head_dim: int, grid: tuple[int, int, int], t
 @pytest.mark.parametrize("streams", [("action",), ("action", "embodiment")])
 @pytest.mark.parametrize("visibility", ["joint", "one_way"])
 def test_streams_are_plain_blocks_on_concatenated_tokens(
-    streams: tuple[str, ...], visibility: dit.Visibility, tmp_path: Path
+    streams: tuple[str, ...], visibility: Visibility, tmp_path: Path
 ) -> None:
     """Two and three streams, by diffusers' own blocks; seen one way, with a mask that forbids looking back at RGB."""
     size, grid, text = size_of(16), (3, 4, 6), padded_text()

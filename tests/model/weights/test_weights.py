@@ -197,7 +197,7 @@ def test_broken_indexes_are_told(arrays: Arrays, tmp_path: Path) -> None:
     whole = json.loads(index.read_text())
     for name in ("../elsewhere.safetensors", str(tmp_path / "elsewhere.safetensors"), "..\\elsewhere.safetensors", "x.pth"):
         index.write_text(json.dumps({"weight_map": whole["weight_map"] | {"conv": name}}))
-        assert "names files that are no .safetensors beside it" in refusal(index)
+        assert "names files that are no .safetensors next to it" in refusal(index)
     first = "model-00001-of-00002.safetensors"
     index.write_text(json.dumps({"weight_map": {"a.weight": first, "other": first}}))
     assert "names tensors that its shards lack: other" in refusal(index)

@@ -209,7 +209,7 @@ def test_data_keep_their_robot(embodiment: Path, tmp_path: Path, monkeypatch: py
     work_inline(monkeypatch)
     source, data = tmp_path / "my-arm", tmp_path / "data"
     shutil.copytree(embodiment, source)
-    args = Args(tasks=(TASK,), robot=source, train_seeds=1, test_seeds=0, out=data, workers=1, device="cpu")
+    args = Args(tasks=(TASK,), robots=(str(source),), train_seeds=1, test_seeds=0, out=data, workers=1, device="cpu")
     assert [family.accepted for family in generate(args)] == [1, 0]
     assert [record.robot for _, record in find_accepted(data)] == ["my-arm"]
     assert [family.accepted for family in generate(args)] == [1, 0], "again, with what is kept"
@@ -284,7 +284,7 @@ def test_a_data_set_s_robot_goes_before_those_of_the_environment(
 def refused(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> str:
     """What `generate --robot` says: one line and exit code 2, without a traceback, and nothing is made."""
     out = tmp_path / "data"
-    flags = ["--robot", str(path), "--out", str(out), "--tasks", TASK, "--device", "cpu", "--workers", "1"]
+    flags = ["--robots", str(path), "--out", str(out), "--tasks", TASK, "--device", "cpu", "--workers", "1"]
     monkeypatch.setattr(sys, "argv", ["generate", *flags])
     with pytest.raises(SystemExit) as left:
         command.main()

@@ -1,4 +1,4 @@
-"""The means that tables and findings are made of, with other values that they could as well have had.
+"""Means of scores for tables and findings, each with its bootstrap draws.
 
 A mean has an address that is the same for our study and for the paper: (part, row, robots, metric), such as
 ("actions", "optical_flow", "franka_panda", "lpips"). Parts and rows are named as in `paper.py`; robots are one robot, or

@@ -1,4 +1,4 @@
-"""Codecs of learned autoencoders with trained weights: Wan2.2's kind (`wan_vae`) and the project's own (`conv_autoencoder`)."""
+"""Codecs of trained autoencoders: the project's own (`conv_autoencoder`, the default) and Wan2.2's (`wan_vae`)."""
 
 import functools
 import hashlib

@@ -1,4 +1,6 @@
-"""The diffusion transformer: Wan2.2-TI2V-5B's block stack over a list of token streams (Flax NNX).
+"""The diffusion transformer over token streams (Flax NNX), with the lists of its sizes (MODELS) and streams (STREAMS).
+
+It has Wan2.2-TI2V-5B's block stack.
 
 Reads  latents [b t h w c] of each stream, noise level, text embeddings [b l e]
 Writes velocity [b t h w c] of the RGB stream

@@ -1,4 +1,4 @@
-"""Run folders: what they hold, the config and codec that they were made with, and the checkpoints that a network comes from.
+"""Opening a run: the config and codec that it was trained with, and the checkpoint that its network comes from.
 
 <out>/config.yaml       the resolved config, itself a valid input
 <out>/codec/            the codec that the latents were made with

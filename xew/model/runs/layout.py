@@ -1,6 +1,6 @@
-"""The folder of a trained run: its mark, its files, and its checkpoints' times. It loads without JAX, for `xew.analysis.study`.
+"""What a run folder holds: names of its files and checkpoints, and the file that marks it as a run.
 
-folder.py says what each file holds.
+It loads without JAX, for `xew.analysis.study`. folder.py says what each file holds, and reads them.
 """
 
 from pathlib import Path

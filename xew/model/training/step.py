@@ -1,4 +1,4 @@
-"""One step of training: noise, prediction, loss, gradients, update; compiled for the mesh.
+"""One step of training, compiled for the mesh: noise, prediction, the loss (of flow_matching.py), gradients, update.
 
 Reads  `TrainState`, `Batch`
 Writes the next `TrainState`, `StepResult`
