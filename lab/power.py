@@ -6,6 +6,7 @@ Writes one section of a Markdown page; the rest of the page stays
     python -m lab.power scores.parquet --page docs/tasks.md
 """
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +16,7 @@ import pandas as pd
 import tyro
 
 from xew.config import ConfigError, user_errors
-from xew.files import write_section
+from xew.files import read_text, write_text
 from xew.metrics import METRICS
 from xew.statistics import LEAST_POWER, describe_power, measure_power
 
@@ -93,6 +94,26 @@ def _table(power: pd.DataFrame) -> str:
     lines = [["task", *(f"`{name}`" for name in names)], ["---"] * (len(names) + 1)]
     lines += [[f"`{task}`", *table.loc[task, names].fillna("–")] for task in table.index]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def write_section(path: Path, heading: str, text: str) -> None:
+    """Write one section of a Markdown page anew; all else on the page stays, and a page that is not there begins with it.
+
+    Args:
+        path: of the page.
+        heading: of the section, such as '## Results', which ends before the next heading of its level or above. Where there
+            is no such section, it comes to the page's end.
+        text: what stands below the heading.
+
+    Raises:
+        OSError: the page cannot be read or written, or the disk is full.
+    """
+    page = read_text(path) if path.exists() else ""
+    section, most = f"{heading}\n{text.strip()}\n\n", len(heading) - len(heading.lstrip("#"))
+    old = re.search(rf"^{re.escape(heading)}\n.*?(?=^#{{1,{most}}} |\Z)", page, re.MULTILINE | re.DOTALL)
+    start, end = old.span() if old else (len(page), len(page))
+    before = f"{page[:start].rstrip()}\n\n" if page[:start].strip() else ""
+    write_text(path, f"{before}{section}{page[end:]}".rstrip() + "\n")
 
 
 if __name__ == "__main__":

@@ -168,9 +168,7 @@ def _call_function(item: Any) -> Any:
 def leave_with_parent(leave: Callable[[], object]) -> None:
     """Have this process leave when the process that started it has ended, so that none works on unwatched.
 
-    Args:
-        leave: ends this process; a thread of this process calls it. Nothing happens in a process that multiprocessing did
-            not start.
+    A thread of this process calls `leave`. Nothing happens in a process that multiprocessing did not start.
     """
     parent = multiprocessing.parent_process()
     if parent is None:

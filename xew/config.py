@@ -221,20 +221,12 @@ def admit(names: Iterable[str]) -> None:
 
 
 def admit_named(content: Any) -> None:
-    """Admit every module that a config names as `module:NAME`: the user named the config.
-
-    Args:
-        content: a config, as a dataclass or as plain content.
-    """
+    """Admit every module that a config, or its plain content, names as `module:NAME`: the user named the config."""
     admit(find_import_paths(content))
 
 
 def demand_admitted(content: Any, source: str) -> None:
-    """Check what a file says of itself before anything that it names is looked up.
-
-    Args:
-        content: a name, a config as a dataclass, or plain content.
-        source: what says so, for the message.
+    """Check what a file says of itself (a name, a config or plain content) before anything that it names is looked up.
 
     Raises:
         UntrustedError: it names a module that the user has not admitted.

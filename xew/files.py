@@ -88,26 +88,6 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_section(path: Path, heading: str, text: str) -> None:
-    """Write one section of a Markdown page anew; all else on the page stays, and a page that is not there begins with it.
-
-    Args:
-        path: of the page.
-        heading: of the section, such as '## Results', which ends before the next heading of its level or above. Where there
-            is no such section, it comes to the page's end.
-        text: what stands below the heading.
-
-    Raises:
-        OSError: the page cannot be read or written, or the disk is full.
-    """
-    page = read_text(path) if path.exists() else ""
-    section, most = f"{heading}\n{text.strip()}\n\n", len(heading) - len(heading.lstrip("#"))
-    old = re.search(rf"^{re.escape(heading)}\n.*?(?=^#{{1,{most}}} |\Z)", page, re.MULTILINE | re.DOTALL)
-    start, end = old.span() if old else (len(page), len(page))
-    before = f"{page[:start].rstrip()}\n\n" if page[:start].strip() else ""
-    write_text(path, f"{before}{section}{page[end:]}".rstrip() + "\n")
-
-
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file whole or not at all. Raises OSError as `replacing`."""
     with replacing(path) as temporary:
@@ -120,10 +100,8 @@ def sweep(path: Path, prefix: str = ".", ending: str = "") -> None:
     A process of another machine does not exist here; of folders, which take longer than SETTLED_S, the lock of what is written
     keeps it away.
 
-    Args:
-        path: of the file or folder.
-        prefix: what the names of temporaries begin with, before its own name, a dot and the number of the process.
-        ending: regular expression of what follows.
+    Names of temporaries begin with `prefix`, then its own name, a dot and the number of the process; the regular expression
+    `ending` says what follows.
     """
     form = re.compile(rf"{re.escape(prefix + path.name)}\.(\d+){ending}")
     for left in path.parent.glob(f"{prefix}{glob.escape(path.name)}.*"):

@@ -28,10 +28,6 @@ class EpisodeError(Exception):
 def check_name(name: object, what: str) -> str:
     """The name of a task or robot, as a file gives it, where it is fit to be a folder's name.
 
-    Args:
-        name: as found.
-        what: it names, for the message.
-
     Raises:
         EpisodeError: it is no text, too long, or has other characters than `NAME`; a path is refused so.
     """

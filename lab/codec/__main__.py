@@ -30,6 +30,7 @@ from lab.codec.settings import (
     load_codec_experiment,
 )
 from lab.codec.step import init_codec_state, make_codec_step, summarize
+from lab.codec.unpaired import unpaired_training_episodes
 from xew.command_line import parse_command
 from xew.compilation import keep_compiled_programs
 from xew.config import load, user_errors
@@ -39,7 +40,6 @@ from xew.model.codecs.autoencoders import ConvAutoencoderCodec
 from xew.model.codecs.ceiling import check_lpips
 from xew.model.codecs.contract import to_pictures, to_signed
 from xew.model.codecs.conv_autoencoder import ConvAutoencoder, save_autoencoder
-from xew.model.episodes.unpaired import unpaired_training_episodes
 from xew.model.runs.begin import check_one_of, claim_run
 from xew.model.runs.checkpoint import TrainState, restore_state
 from xew.model.runs.log import RunLog

@@ -19,12 +19,12 @@ from tqdm import tqdm
 
 from lab.codec.pictures import ALIGNED, differs_from_corner, draw_descriptions, read_aligned
 from lab.codec.settings import CodecExperiment
+from lab.codec.unpaired import select_unpaired
 from xew.dataset import Dataset, Episode
 from xew.episode import encode_png
 from xew.files import write_bytes, write_text
 from xew.model.codecs.ceiling import LPIPS_EVERY, choose_evenly, reconstruct
 from xew.model.codecs.contract import Codec
-from xew.model.episodes.unpaired import select_unpaired
 from xew.model.settings.settings import Clip
 from xew.model.video.comparison import strip
 from xew.model.video.frames import TEMPORAL_FACTOR

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Literal
 
 from lab.codec.pictures import ALIGNED, UNALIGNED, Cut
+from lab.codec.unpaired import Seeds
 from xew.config import ConfigError, load, pick
 from xew.model.codecs.conv_autoencoder import AUTOENCODERS, AutoencoderSize
-from xew.model.episodes.unpaired import Seeds
 from xew.model.settings.checks import LEAST_OF_STEPS, check_least, check_steps
 from xew.model.settings.settings import Clip
 from xew.model.video.frames import TEMPORAL_FACTOR

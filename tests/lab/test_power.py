@@ -5,7 +5,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from lab.power import power_section, write_power
+from lab.power import power_section, write_power, write_section
 from xew.config import ConfigError
 from xew.metrics import METRICS
 from xew.statistics import measure_power
@@ -30,3 +30,15 @@ def test_the_power_of_tasks_is_a_section_of_a_page(tmp_path: Path) -> None:
     assert (tmp_path / "page.md").read_text().endswith(f"{text}\n")
     with pytest.raises(ConfigError, match="lacks the frozen first frame or the true video"):
         write_power(tmp_path / "page.md", measure_power(rows[rows["model"] == "ground_truth"], METRICS), rows)
+
+
+def test_a_section_is_written_anew_and_all_else_stays(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    write_section(page, "## One", "first")
+    assert page.read_text() == "## One\nfirst\n"
+    write_section(page, "## Two", "second\n\n### Part\nof it")
+    write_section(page, "## One", "other\n")
+    assert page.read_text() == "## One\nother\n\n## Two\nsecond\n\n### Part\nof it\n"
+    page.write_text(f"# Page\nhead\n{page.read_text()}\n# Next\n")
+    write_section(page, "## Two", "last")
+    assert page.read_text() == "# Page\nhead\n## One\nother\n\n## Two\nlast\n\n# Next\n"

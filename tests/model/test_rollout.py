@@ -19,7 +19,7 @@ from tests.networks import TINY_CODEC
 from xew.dataset import Episode, read_dataset
 from xew.episode import EpisodeError, read_video
 from xew.model import latents, rollout
-from xew.model.cache.codecs import load_codec
+from xew.model.cache.store import load_codec
 from xew.model.codecs.contract import encode_pictures
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.network.dit import WorldModel

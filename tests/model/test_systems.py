@@ -15,9 +15,9 @@ from xew.config import ConfigError
 from xew.dataset import find_accepted, read_dataset
 from xew.episode import read_record, read_states, read_video, write_episode
 from xew.model import latents, rollout, train
-from xew.model.cache.codecs import load_codec
 from xew.model.cache.keys import scales_path
 from xew.model.cache.scales import load_scales
+from xew.model.cache.store import load_codec
 from xew.model.conditions import ACTIONS, list_conditions
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import load_experiment

@@ -171,7 +171,7 @@ def _read(reader: "_Reader", layout: Layout) -> Recorded:
         np.stack(arms, 1),
         np.stack(grippers, 1),
         np.stack([tool_center(pose) for pose in poses], 1) if poses else None,
-        np.stack([_resize(image) for image in rgb]) if scale != 1 else rgb,
+        np.stack([cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for image in rgb]) if scale != 1 else rgb,
         _center_pixels(matrix, scale),
         _world_to_camera(reader, extrinsics),
         reader.instruction(),
@@ -193,10 +193,6 @@ def decode_picture(encoded: bytes) -> np.ndarray | None:
         return None
     is_ordinary = RGB_MARK in encoded[:4096]
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if is_ordinary else image
-
-
-def _resize(image: np.ndarray) -> np.ndarray:
-    return cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
 
 
 def _center_pixels(intrinsics: np.ndarray, scale: float) -> np.ndarray:

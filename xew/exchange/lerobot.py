@@ -159,7 +159,7 @@ def _write(root: Path, chosen: Sequence[tuple[Path, Record]], vectors: Vectors, 
                 row |= video_files[key].add(video)
                 counts = color_counts(video)
                 statistics[key] = _color_statistics(counts, len(video))
-                totals.add_colors(key, counts)
+                totals.colors[key] = totals.colors.get(key, 0) + counts
             totals.add(columns)
             row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
             row |= {"xew/robot": record.robot, "xew/task": record.task, "xew/seed": record.seed, "xew/motion": record.motion}
@@ -241,7 +241,9 @@ class _VideoFiles:
             stream = container.add_stream("libx264", rate=RATE, options=ENCODER)
             stream.height, stream.width, stream.pix_fmt = *video.shape[1:3], "yuv420p"
             for number, image in enumerate(video):
-                container.mux(stream.encode(_frame(image, number)))
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+                frame.pts, frame.time_base = number, 1 / RATE
+                container.mux(stream.encode(frame))
             container.mux(stream.encode(None))
         key = f"videos/{self.root.name}"
         return {
@@ -252,21 +254,13 @@ class _VideoFiles:
         }
 
 
-def _frame(image: np.ndarray, number: int) -> Any:
-    frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
-    frame.pts, frame.time_base = number, 1 / RATE
-    return frame
-
-
-# --- Statistics: of every feature, an episode's and all.
-
-
 @dataclass
 class _Totals:
     """What the statistics of the whole set need."""
 
     columns: dict[str, list[np.ndarray]] = field(default_factory=dict)
     colors: dict[str, np.ndarray] = field(default_factory=dict)
+    """Numbers of how often each value occurs in the videos [3 256]."""
     frames: int = 0
 
     def add(self, columns: dict[str, np.ndarray]) -> None:
@@ -274,10 +268,6 @@ class _Totals:
         for name, values in columns.items():
             self.columns.setdefault(name, []).append(values)
         self.frames += len(columns["index"])
-
-    def add_colors(self, key: str, counts: np.ndarray) -> None:
-        """Take in how often each value occurs in a video [3 256]."""
-        self.colors[key] = self.colors.get(key, 0) + counts
 
     def statistics(self) -> dict[str, dict[str, Any]]:
         vectors = {name: _statistics(np.concatenate(values)) for name, values in self.columns.items()}
@@ -310,9 +300,6 @@ def _color_statistics(counts: np.ndarray, frames: int) -> dict[str, list[Any]]:
     below = counts.cumsum(1) / total[:, None]
     statistics |= {name: value[(below >= share).argmax(1)] for name, share in QUANTILES.items()}
     return {name: numbers.reshape(3, 1, 1).tolist() for name, numbers in statistics.items()} | {"count": [frames]}
-
-
-# --- meta/.
 
 
 def _features(vectors: Vectors, videos: Iterable[str]) -> dict[str, dict[str, Any]]:

@@ -177,15 +177,7 @@ def clip_numbers(
 def make_command(
     folder: Path, record: Record, states: States, rendered: Video | None = None, scene: Video | None = None
 ) -> Command:
-    """The part of an episode that conditions may see.
-
-    Args:
-        folder: of the episode.
-        record: its header.
-        states: its arrays.
-        rendered: its robot-only video [t h w 3] uint8, where it is in memory.
-        scene: its video [t h w 3] uint8, where it is in memory; conditions can reach its first frame alone.
-    """
+    """The part of an episode that conditions may see; its videos [t h w 3] as of `episodes.commands.episode_command`."""
     render, data = folder / "robot.mkv", data_folder(folder)
     first = partial(read_video, folder / "rgb.mkv", most=1) if scene is None else partial(np.copy, scene[:1])
     return Command(record.robot, states.action, states.intrinsics, states.extrinsics, render, rendered, data, first)

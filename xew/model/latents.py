@@ -21,11 +21,10 @@ from xew.compilation import keep_compiled_programs, take_memory_as_needed
 from xew.config import ConfigError, user_errors
 from xew.dataset import Dataset, Episode, read_dataset
 from xew.files import hold_lock, read_json, write_text
-from xew.model.cache.codecs import load_codec
 from xew.model.cache.encode import default_processes, encode_episodes
 from xew.model.cache.keys import CACHE_VERSION
 from xew.model.cache.scales import keep_scales
-from xew.model.cache.store import LatentCache
+from xew.model.cache.store import LatentCache, load_codec
 from xew.model.codecs.ceiling import check_lpips, choose_evenly, measure_ceiling
 from xew.model.episodes.choice import replay_episodes, training_episodes
 from xew.model.experiment import Experiment, parse_experiment
@@ -68,12 +67,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixels, batch: int = 4, processes: int = 1) -> None:
-    """Encode all that the training of an experiment reads, and print what was made.
+    """Encode all that the training of an experiment reads, as `encode_episodes`, and print what was made.
 
-    Args:
-        source: where the episodes' pixels come from; several processes need one that can be pickled.
-        batch: clips that the codec encodes at once.
-        processes: number of processes that share the work.
+    Several processes need a source that can be pickled.
     """
     check_lpips()
     encoding, choice, dataset = experiment.encoding, experiment.choice, read_dataset(experiment.data)

@@ -25,7 +25,6 @@ from xew.config import ConfigError, admit, user_errors
 from xew.dataset import Episode
 from xew.episode import read_video, remove_left_overs
 from xew.files import hold_lock
-from xew.model.conditions import Command
 from xew.model.episodes.choice import select_episodes
 from xew.model.episodes.commands import episode_command
 from xew.model.rollout import RolloutWriter, check_out, common_header, is_done
@@ -110,13 +109,7 @@ def load_model(name: str) -> OutsideModel:
 
 
 def read_inputs(episode: Episode, max_frames: int = 0, streams: bool = False) -> EpisodeInputs:
-    """What a model may know of an episode, or of its first `max_frames` frames.
-
-    Args:
-        episode: folder and header.
-        max_frames: number of frames; 0 for all.
-        streams: whether mask and optical flow are rendered too (needs Warp).
-    """
+    """What a model may know of an episode, or of its first `max_frames` frames; with `streams`, which need Warp."""
     folder, record = episode
     frames = min(record.frame_count, max_frames) if max_frames else record.frame_count
     command = episode_command(folder, record)
@@ -134,12 +127,8 @@ def read_inputs(episode: Episode, max_frames: int = 0, streams: bool = False) ->
         intrinsics=np.array(command.intrinsics),
         extrinsics=np.array(command.extrinsics),
         robot_render=np.array(command.render[:frames]),
-        streams=_render_streams(command, frames) if streams else None,
+        streams=(np.array(command.streams.mask[:frames]), np.array(command.streams.optical_flow[:frames])) if streams else None,
     )
-
-
-def _render_streams(command: Command, frames: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.array(command.streams.mask[:frames]), np.array(command.streams.optical_flow[:frames])
 
 
 def predict(model: OutsideModel, name: str, inputs: EpisodeInputs) -> np.ndarray:

@@ -37,12 +37,7 @@ CARD = "README.md"
 def release(run: Path, out: Path, data: Path | None = None, scores: Path | None = None, step: int | None = None) -> int:
     """Write the network of a run in bfloat16 as a new run, with its card, and return the step that it is of.
 
-    Args:
-        run: folder of the run; corrections of an adaptation are added to its network.
-        out: folder to write.
-        data: the episodes that it was trained on; those of its config where left out.
-        scores: a summary in Markdown that `xew.metrics.evaluate` wrote; the card has it whole.
-        step: of the checkpoint; the latest where left out.
+    Arguments are as of the command (`Args`). Corrections of an adaptation are added to its network.
 
     Raises:
         ConfigError: there is no such run, checkpoint or summary, or the place is taken.
@@ -53,7 +48,8 @@ def release(run: Path, out: Path, data: Path | None = None, scores: Path | None 
         experiment = replace(experiment, out=run)
     if scores and not scores.is_file():
         raise ConfigError(f"{scores} is no file; expected scores.summary.md of `python -m xew.metrics.evaluate`: --scores.")
-    data_counts = list_training(replace(experiment, data=data or experiment.data))
+    episodes = training_episodes(read_dataset(data or experiment.data), experiment.choice)
+    data_counts = count_by_task(record for _, record in episodes)
     summary = read_text(scores) if scores else ""
     params, step = load_params(run, experiment.network, step)
     weights = Path(RUN_CODEC) if experiment.codec.weights else None  # those in the folder, wherever that lies
@@ -73,12 +69,6 @@ def release(run: Path, out: Path, data: Path | None = None, scores: Path | None 
     return step
 
 
-def list_training(experiment: Experiment) -> dict[str, tuple[int, int]]:
-    """Numbers of training seeds and episodes of each task that an experiment reads, robots together, in order of tasks."""
-    episodes = training_episodes(read_dataset(experiment.data), experiment.choice)
-    return count_by_task(record for _, record in episodes)
-
-
 def count_by_task(records: Iterable[Record]) -> dict[str, tuple[int, int]]:
     """Numbers of distinct seeds and of episodes of each task, in order of tasks."""
     seeds: dict[str, list[int]] = defaultdict(list)
@@ -88,13 +78,9 @@ def count_by_task(records: Iterable[Record]) -> dict[str, tuple[int, int]]:
 
 
 def write_card(experiment: Experiment, step: int, size: int, seen: dict[str, tuple[int, int]], summary: str) -> str:
-    """The model card in Markdown: what the model is, what it was trained on, how good it is and what it is not for.
+    """The model card in Markdown: what the model of so many parameters is, what it was trained on, and how good it is.
 
-    Args:
-        step: number of training steps.
-        size: number of parameters.
-        seen: numbers of seeds and episodes by task.
-        summary: table of scores in Markdown, '' where there is none.
+    `seen` are numbers of seeds and episodes by task; `summary` is the table of scores, '' where there is none.
     """
     loader = PackageLoader("xew.model", "templates")
     template = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)

@@ -29,8 +29,8 @@ from xew.config import CONVERTER, ConfigError, admit, find_config, is_packaged, 
 from xew.dataset import Episode
 from xew.episode import Record, episode_folder, remove_left_overs
 from xew.files import hold_lock, read_json
-from xew.model.cache.codecs import load_codec
 from xew.model.cache.scales import Scale, load_run_scales
+from xew.model.cache.store import load_codec
 from xew.model.codecs.contract import Codec
 from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
 from xew.model.episodes.choice import select_episodes
@@ -58,10 +58,8 @@ WAITING = 16
 def load_predictor(run: Path, experiment: Experiment, step: int | None = None) -> tuple[Predictor, int | None]:
     """Load a model, with a copy of it on each device, and the step of its checkpoint.
 
-    Args:
-        run: folder of a trained run; or a config, whose `model.weights` are then taken as they are (the step is None).
-        experiment: the config of the run, with the sampling settings that were changed.
-        step: of the run's checkpoint; the latest where left out.
+    Of a config the `model.weights` are taken as they are, and the step is None. The experiment is the config of the run, with
+    the sampling settings that were changed.
 
     Raises:
         ConfigError: there is no such checkpoint, or there are no such weights.
@@ -129,12 +127,8 @@ def rollout_header(experiment: Experiment, step: int | None, saved: int | None, 
         record,
         experiment.rollout.max_frames,
     )
-    made_by = {"checkpoint_step": step, "checkpoint_saved": saved, "config": CONVERTER.unstructure(_drop_speed(experiment))}
-    return header | made_by
-
-
-def _drop_speed(experiment: Experiment) -> Experiment:
-    return replace(experiment, rollout=replace(experiment.rollout, batch=0))
+    config = CONVERTER.unstructure(replace(experiment, rollout=replace(experiment.rollout, batch=0)))
+    return header | {"checkpoint_step": step, "checkpoint_saved": saved, "config": config}
 
 
 def common_header(model: str, condition: str, record: Record, max_frames: int = 0) -> dict[str, Any]:

@@ -11,9 +11,9 @@ from lab.codec.pictures import gather_pictures
 from lab.codec.sampling import Batch
 from lab.codec.settings import load_codec_experiment
 from lab.codec.step import init_codec_state, make_codec_step
+from lab.codec.unpaired import unpaired_training_episodes
 from tests import synthetic
 from xew.dataset import read_dataset
-from xew.model.episodes.unpaired import unpaired_training_episodes
 
 CONFIG = """
 clip: {frames: 5, height: 32, width: 32}

@@ -19,6 +19,7 @@ from lab.codec.report import choose_robots
 from lab.codec.sampling import Batches, Schedule
 from lab.codec.settings import CodecTrainSettings, load_codec_experiment
 from lab.codec.step import augment, codec_losses, unpack_regions
+from lab.codec.unpaired import select_unpaired, unpaired_training_episodes
 from tests import synthetic
 from xew.config import ConfigError
 from xew.dataset import find_accepted, read_dataset
@@ -29,7 +30,6 @@ from xew.model.codecs.autoencoders import ConvAutoencoderCodec
 from xew.model.codecs.ceiling import reconstruct
 from xew.model.codecs.contract import CodecSettings
 from xew.model.episodes.choice import training_episodes
-from xew.model.episodes.unpaired import select_unpaired, unpaired_training_episodes
 from xew.model.experiment import load_experiment
 from xew.model.training.loop import STOPPED
 from xew.model.video.frames import to_model_size

@@ -3,4 +3,4 @@
 What is stale is never found, and what is missing is an error that says how to make it.
 """
 
-__all__ = ["clips", "codecs", "encode", "keys", "scales", "store"]
+__all__ = ["clips", "encode", "keys", "scales", "store"]

@@ -43,12 +43,7 @@ def read_streams(
 ) -> dict[str, np.ndarray]:
     """Read the named streams of a whole episode: [t h w 3] uint8 at the model's size, or [t n] float32.
 
-    Args:
-        conditions: those of the experiment, by stream.
-        clip: its size is the model's.
-        folder, record: the episode.
-        streams: rgb, and keys of `conditions`.
-        pixels: the episode's own, where they are at hand (`needed_pixels`); else its videos are read.
+    Streams are rgb and keys of `conditions`. Where the episode's pixels are not at hand (`needed_pixels`), its videos are read.
     """
     if pixels is None:
         pixels = stored_pixels(folder, record, needed_pixels(conditions, streams))

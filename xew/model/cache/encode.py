@@ -44,11 +44,8 @@ def encode_episodes(
 ) -> int:
     """Encode what is missing of some episodes, and return the number of bytes written.
 
-    Args:
-        source: where their pixels come from; they are read or rendered, and conditions drawn, ahead in threads.
-        batch: clips that the codec encodes at once.
-        processes: number of processes that share the work, each with threads and, on a GPU, a codec of its own; they have the
-            GPUs in turn.
+    Pixels are read or rendered, and conditions drawn, ahead in threads; `batch` clips are encoded at once. Processes share the
+    work, each with threads and, on a GPU, a codec of its own; they have the GPUs in turn.
     """
     pending = [episode for episode in episodes if cache.missing(episode[1])]
     if processes > 1:

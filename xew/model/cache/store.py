@@ -11,8 +11,8 @@ from xew.config import ConfigError
 from xew.episode import Record
 from xew.files import demand_regular, replacing
 from xew.model.cache.clips import clip_starts
-from xew.model.cache.codecs import load_codec
 from xew.model.cache.keys import stream_path
+from xew.model.codecs.codec import RUN_CODEC, RUN_REMEDY, load_kept_codec
 from xew.model.codecs.contract import Codec
 from xew.model.conditions import Condition
 from xew.model.settings.parts import Encoding
@@ -87,3 +87,10 @@ class LatentCache:
 def open_cache(encoding: Encoding) -> LatentCache:
     """Open the cache with its codec. Raises ConfigError if the codec's weights are missing or damaged."""
     return LatentCache(encoding, load_codec(encoding))
+
+
+def load_codec(encoding: Encoding) -> Codec:
+    """The codec that the latents are made with. Raises ConfigError if its weights are missing, damaged or of another kind."""
+    if encoding.start_from is None:
+        return encoding.kind.open(encoding.codec)
+    return load_kept_codec(encoding.kind, encoding.start_from / RUN_CODEC, RUN_REMEDY)

@@ -3,7 +3,7 @@
 import functools
 import hashlib
 import json
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from xew.config import ConfigError, parse, pick
 from xew.files import read_json, write_text
-from xew.model.codecs.contract import BatchCodec, CodecSettings, FrameBatch, LatentBatch, LatentSize, to_pictures, to_signed
+from xew.model.codecs.contract import Codec, CodecSettings, FrameBatch, LatentBatch, LatentSize, to_pictures, to_signed
 from xew.model.codecs.conv_autoencoder import (
     AutoencoderSize,
     ConvAutoencoder,
@@ -32,7 +32,7 @@ PACKAGED_WEIGHTS = Path(__file__).with_name("conv_autoencoder.safetensors")
 """Weights of conv_autoencoder that come with the package."""
 
 
-class AutoencoderCodec(BatchCodec, ABC):
+class AutoencoderCodec(Codec):
     """What the codecs of autoencoders share: the network, and that its weights are written once."""
 
     file: ClassVar[str]
@@ -42,16 +42,13 @@ class AutoencoderCodec(BatchCodec, ABC):
     graph: nnx.GraphDef
     size: Any
     dtype: str
-    hash: str
 
     @property
-    def spatial_factor(self) -> int:  # type: ignore[override]
-        """Number of pixels a side of a latent."""
+    def spatial_factor(self) -> int:
         return self.size.spatial_factor
 
     @property
     def channels(self) -> int:
-        """Number of channels of the latents."""
         return self.size.channels
 
     @property

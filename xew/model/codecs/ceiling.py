@@ -48,10 +48,7 @@ def measure_ceiling(
 ) -> Ceiling:
     """Grade what is left of the first `frames` frames of each video after encoding and decoding.
 
-    Args:
-        codec: the codec.
-        videos: true video, uint8 [t 240 320 3] each; a shorter one is continued by its last frame, which is not graded.
-        frames, height, width: of the model's clip.
+    Each is true video, uint8 [t 240 320 3]; what a shorter one is continued by is not graded.
     """
     from xew.metrics import lpips, psnr
 
@@ -69,10 +66,7 @@ def reconstruct(
 ) -> UInt8[np.ndarray, "t 240 320 3"]:
     """What the codec leaves of a video, at the camera's size: [t 240 320 3] uint8.
 
-    Args:
-        codec: the codec.
-        truth: [t 240 320 3] uint8, at most `frames` of them; fewer are continued by their last frame, which is not returned.
-        frames, height, width: of the model's clip.
+    The video has at most `frames` frames; fewer are continued by their last one, which is not returned.
     """
     clip = truth[np.minimum(np.arange(frames), len(truth) - 1)]
     return to_camera_size(codec.decode(codec.encode(to_model_size(clip, height, width))))[: len(truth)]

@@ -4,7 +4,6 @@ To add one: a class with the methods of `Codec`, and one line in CODECS.
 """
 
 from pathlib import Path
-from typing import Any
 
 from xew.config import ConfigError, pick
 from xew.model.codecs.autoencoders import ConvAutoencoderCodec, WanVaeCodec
@@ -21,8 +20,8 @@ RUN_REMEDY = "copy the whole run again, or train again"
 """Sentence on what to do where a run's codec is damaged or lost."""
 
 
-def codec_class(settings: CodecSettings) -> type[Any]:
-    """The class of codec that a config names, with what `Codec` asks. Raises ConfigError if there is none of that name."""
+def codec_class(settings: CodecSettings) -> type[Codec]:
+    """The class of codec that a config names. Raises ConfigError if there is none of that name."""
     return pick(CODECS, settings.name, "codec")
 
 
@@ -31,7 +30,7 @@ def latent_size(settings: CodecSettings) -> LatentSize:
     return codec_class(settings).latent_size(settings)
 
 
-def load_kept_codec(kind: type[Any], folder: Path, remedy: str) -> Codec:
+def load_kept_codec(kind: type[Codec], folder: Path, remedy: str) -> Codec:
     """The codec of this class that is kept in a folder.
 
     Raises:

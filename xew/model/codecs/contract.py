@@ -2,15 +2,15 @@
 
 Reads  uint8 [t h w 3], or on the device float [b t h w 3] in [-1, 1]; t = 4 k + 1
 Writes float32 latents [k + 1, h / factor, w / factor, channels] of about unit size
-To add a codec: a class with the methods of `Codec` (most come with `BatchCodec`), and one line in CODECS (codec.py).
+To add a codec: a class with the methods of `Codec`, and one line in CODECS (codec.py).
 
 A codec is a JAX pytree of its arrays, so that it is passed to compiled functions and is no constant in them.
 """
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,51 +51,62 @@ class LatentSize(NamedTuple):
     channels: int
 
 
-@runtime_checkable
-class Codec(Protocol):
+class Codec(ABC):
     """What the rest of the package asks of a codec."""
 
-    groups_independent: ClassVar[bool]
+    groups_independent: ClassVar[bool] = False
     """Whether the first frame and each later group of four are coded independently, so a video may be coded in pieces."""
+    hash: str
+    """Text that changes whenever latents would."""
 
     @property
+    @abstractmethod
     def spatial_factor(self) -> int:
         """Number of pixels a side of a latent."""
 
     @property
+    @abstractmethod
     def channels(self) -> int:
         """Number of channels of the latents."""
 
-    @property
-    def hash(self) -> str:
-        """Text that changes whenever latents would."""
-
     def encode(self, video: Pictures) -> Latents:
-        """Video uint8 [t h w 3] -> latents float32 [t' h' w' c]. Later frames never change earlier latents."""
+        """Video uint8 [t h w 3] -> latents float32 [t' h' w' c]; t must be 4 k + 1 and the sides multiples of the factor.
+
+        Later frames never change earlier latents.
+        """
+        check_clip_shape(video.shape, self.spatial_factor)
+        return np.asarray(encode_pictures(self, video[None]))[0]
 
     def decode(self, latents: Latents) -> Pictures:
         """Latents float32 [t' h' w' c] -> video uint8 [t h w 3]."""
+        return np.asarray(decode_to_pictures(self, latents[None]))[0]
 
+    @abstractmethod
     def encode_batch(self, frames: FrameBatch) -> LatentBatch:
         """Frames [b t h w 3] in [-1, 1] -> latents [b t' h' w' c] float32; may be traced."""
 
+    @abstractmethod
     def decode_batch(self, latents: LatentBatch) -> FrameBatch:
         """Latents [b t' h' w' c] -> frames [b t h w 3] float32, about in [-1, 1]; may be traced."""
 
+    @abstractmethod
     def next_reference(self, latents: LatentBatch) -> Float[Array, "b 1 y x c"]:
         """The last frame of a decoded clip, encoded alone: [b t' h' w' c] -> [b 1 h' w' c]; may be traced.
 
         It is rounded as if it had been a picture in between, so it is what a rollout begins its next chunk with.
         """
 
+    @abstractmethod
     def save(self, folder: Path) -> None:
         """Write all that `load` needs into a folder, under names of its own."""
 
     @classmethod
+    @abstractmethod
     def load(cls, folder: Path) -> "Codec":
         """The codec that was saved in a folder."""
 
     @classmethod
+    @abstractmethod
     def latent_size(cls, settings: CodecSettings) -> LatentSize:
         """Spatial factor and channels of a config's codec; at most the header of its weights is read.
 
@@ -104,30 +115,9 @@ class Codec(Protocol):
         """
 
     @classmethod
+    @abstractmethod
     def open(cls, settings: CodecSettings) -> "Codec":
         """The codec of a config. Raises ConfigError if its weights are missing, broken or of another kind."""
-
-
-class BatchCodec:
-    """A codec's functions on pictures and on single clips, from its `encode_batch` and `decode_batch`."""
-
-    groups_independent: ClassVar[bool] = False
-    spatial_factor: int
-    encode_batch: Callable[[Array], Array]
-    decode_batch: Callable[[Array], Array]
-
-    def encode(self, video: np.ndarray) -> np.ndarray:
-        """Video uint8 [t h w 3] -> latents float32 [t' h' w' c]; t must be 4 k + 1 and the sides multiples of the factor."""
-        check_clip_shape(video.shape, self.spatial_factor)
-        return np.asarray(encode_pictures(self, video[None]))[0]
-
-    def decode(self, latents: Latents) -> Pictures:
-        """Latents float32 [t' h' w' c] -> video uint8 [t h w 3]."""
-        return np.asarray(decode_to_pictures(self, latents[None]))[0]
-
-    def next_reference(self, latents: LatentBatch) -> Float[Array, "b 1 y x c"]:
-        """The last decoded frame as a picture, encoded alone: [b t' h' w' c] -> [b 1 h' w' c]."""
-        return self.encode_batch(to_signed(to_pictures(self.decode_batch(latents)[:, -1:])))
 
 
 @jax.jit

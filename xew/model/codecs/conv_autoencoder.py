@@ -16,7 +16,6 @@ import itertools
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +34,7 @@ from xew.model.codecs.vae import LatentStatistic
 from xew.model.codecs.vae_layers import Conv, Layers, RmsNorm, as_row, patchify, unpatchify
 from xew.model.video.frames import TEMPORAL_FACTOR
 from xew.model.weights.filling import fill
-from xew.model.weights.layout import Source
+from xew.model.weights.layout import Source, module_leaves
 from xew.model.weights.reading import read_tensors
 
 Groups = Float[Array, "n 4 h w 3"]
@@ -221,18 +220,6 @@ def abstract_autoencoder(size: AutoencoderSize, dtype: DTypeLike = jnp.float32) 
     return nnx.eval_shape(lambda: ConvAutoencoder(size, dtype=dtype, rngs=nnx.Rngs(0)))
 
 
-class NamedLeaf(NamedTuple):
-    """A leaf of an autoencoder under its name in a file of weights."""
-
-    name: str
-    variable: nnx.Variable
-
-
-def list_leaves(autoencoder: ConvAutoencoder) -> list[NamedLeaf]:
-    """All leaves of an autoencoder, the statistics of its latents included, by name."""
-    return [NamedLeaf(".".join(map(str, path)), leaf) for path, leaf in nnx.to_flat_state(nnx.state(autoencoder))]
-
-
 def save_autoencoder(autoencoder: ConvAutoencoder, path: Path) -> None:
     """Write an autoencoder as .safetensors that says its own size: kernels rounded to bfloat16, the rest in float32.
 
@@ -240,7 +227,7 @@ def save_autoencoder(autoencoder: ConvAutoencoder, path: Path) -> None:
         ConfigError: the file cannot be written.
     """
     tensors = {}
-    for name, variable in list_leaves(autoencoder):
+    for name, variable in module_leaves(autoencoder, {}).items():
         value = np.asarray(jax.device_get(variable.get_value()))
         tensors[name] = value.astype(ml_dtypes.bfloat16) if name.endswith(".kernel") else value
     try:
@@ -258,7 +245,7 @@ def load_autoencoder(path: Path, dtype: DTypeLike = jnp.float32) -> ConvAutoenco
         ConfigError: there is no such file, it is broken, or it is of another kind.
     """
     autoencoder = abstract_autoencoder(read_size(path), dtype)
-    fill(autoencoder, read_tensors(find_weights(path)), {name: Source((name,)) for name, _ in list_leaves(autoencoder)})
+    fill(autoencoder, read_tensors(find_weights(path)), {name: Source((name,)) for name in module_leaves(autoencoder, {})})
     return autoencoder
 
 

@@ -244,8 +244,6 @@ class Decoder(nnx.Module):
 class DownStage(nnx.Module):
     """Residual blocks, then half the sides and perhaps half the frames; all of it beside an average without parameters.
 
-    [b t h w i] becomes [b t' h' w' o].
-
     Args:
         halve_time: None leaves sides and frames as they are.
     """
@@ -265,8 +263,6 @@ class DownStage(nnx.Module):
 
 class UpStage(nnx.Module):
     """Residual blocks, then double the sides and perhaps the frames, beside a repetition without parameters.
-
-    [b t h w i] becomes [b t' h' w' o].
 
     Args:
         double_time: None leaves sides and frames as they are, and there is nothing beside.

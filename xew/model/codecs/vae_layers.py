@@ -70,10 +70,7 @@ class FrameAttention(nnx.Module):
 
 
 class Downsample(nnx.Module):
-    """Half the sides by a strided convolution of each frame; half the frames, the first passed by, by one over time.
-
-    [b t h w c] becomes [b t' h/2 w/2 c].
-    """
+    """Half the sides by a strided convolution of each frame; half the frames, the first passed by, by one over time."""
 
     def __init__(self, width: int, halve_time: bool, layers: Layers) -> None:
         self.conv = Conv((3, 3, width, width), layers)
@@ -91,10 +88,7 @@ class Downsample(nnx.Module):
 
 
 class Upsample(nnx.Module):
-    """Double the frames, the first passed by, by a convolution over time; double the sides by repeating and convolving.
-
-    [b t h w c] becomes [b t' 2h 2w c].
-    """
+    """Double the frames, the first passed by, by a convolution over time; double the sides by repeating and convolving."""
 
     def __init__(self, width: int, double_time: bool, layers: Layers) -> None:
         self.conv = Conv((3, 3, width, width), layers)

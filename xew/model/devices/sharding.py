@@ -106,18 +106,14 @@ def parameter_spec(path: Sequence[Any], shape: Sequence[int], fsdp: int) -> Part
     return PartitionSpec(*("fsdp" if axis == chosen else None for axis in range(len(shape))))
 
 
-def state_shardings(state: Any, mesh: Mesh | AbstractMesh) -> Any:
-    """Sharding of each array of a tree (parameters, optimizer), in the same tree; only shapes and names are looked at."""
-
-    def place(path: tuple[Any, ...], leaf: Any) -> NamedSharding:
-        return NamedSharding(mesh, parameter_spec(path_names(path), leaf.shape, mesh.shape["fsdp"]))
-
-    return jax.tree_util.tree_map_with_path(place, state)
-
-
 def place_shapes(shapes: Any, mesh: Mesh | AbstractMesh) -> Any:
-    """Give a tree of shapes and types their places on the mesh."""
-    return _with_places(shapes, state_shardings(shapes, mesh))
+    """Give a tree of shapes and types (parameters, optimizer) their places on the mesh; only shapes and names are looked at."""
+
+    def place(path: tuple[Any, ...], leaf: Any) -> jax.ShapeDtypeStruct:
+        spec = parameter_spec(path_names(path), leaf.shape, mesh.shape["fsdp"])
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=NamedSharding(mesh, spec))
+
+    return jax.tree_util.tree_map_with_path(place, shapes)
 
 
 def place_like(shapes: Any, like: Any) -> Any:
@@ -125,11 +121,7 @@ def place_like(shapes: Any, like: Any) -> Any:
     sharding = jax.tree.leaves(like)[0].sharding
     if isinstance(sharding, NamedSharding) and isinstance(sharding.mesh, Mesh):
         return place_shapes(shapes, sharding.mesh)
-    return _with_places(shapes, jax.tree.map(lambda leaf: sharding, shapes))
-
-
-def _with_places(shapes: Any, places: Any) -> Any:
-    return jax.tree.map(lambda leaf, place: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), shapes, places)
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), shapes)
 
 
 def path_names(path: Sequence[Any]) -> tuple[str, ...]:

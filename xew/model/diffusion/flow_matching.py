@@ -56,7 +56,7 @@ def training_pair(key: Key[Array, ""], latents: Float[Array, "b t h w c"], shift
     reference = latents[:, :1] + strength * jax.random.normal(key_reference, latents[:, :1].shape, jnp.float32)
     level, latents = sigma[:, None, None, None, None], put_first(latents, reference)
     noisy = (1 - level) * latents + level * noise
-    return TrainingPair(jnp.concatenate([reference, noisy[:, 1:]], axis=1), noise - latents, sigma)
+    return TrainingPair(put_first(noisy, reference), noise - latents, sigma)
 
 
 def motion_weights(latents: Float[Array, "b t h w c"], strength: float) -> Float[Array, "b t h w"]:

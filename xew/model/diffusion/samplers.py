@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from xew.model.diffusion.flow_matching import TRAIN_LEVELS, sampling_sigmas, shift_sigma
+from xew.model.diffusion.flow_matching import TRAIN_LEVELS, put_first, sampling_sigmas, shift_sigma
 
 Velocity = Callable[[Array, Array], Array]
 """Function (latents [b t h w c], noise level that the network gets as input [b]) -> velocity [b t h w c], all float32."""
@@ -103,10 +103,10 @@ def euler(
     def step(latents: Array, levels: tuple[Array, Array]) -> tuple[Array, None]:
         input_level, difference = levels
         change = difference * velocity(latents, _repeat_for_batch(input_level, latents))
-        return _put_back(reference, latents + change), None
+        return put_first(latents + change, reference), None
 
     levels = (_to_float32(schedule.input_levels), _to_float32(np.diff(schedule.sigmas)))
-    return jax.lax.scan(step, _put_back(reference, noise), levels)[0]
+    return jax.lax.scan(step, put_first(noise, reference), levels)[0]
 
 
 def unipc(
@@ -121,14 +121,7 @@ def unipc(
     corrects the latents that it was made at, then predicts the next. All coefficients follow from the schedule alone, so a
     step is two weighted sums.
 
-    Args:
-        velocity: see `Velocity`.
-        reference: [b 1 h w c] float32, as of `euler`.
-        noise: [b t h w c] float32, as of `euler`.
-        schedule: see `SCHEDULES`.
-
-    Returns:
-        [b t h w c] float32 whose frame 0 is the reference.
+    It takes and gives the same as `euler`: latents [b t h w c] float32.
     """
 
     def step(carry: _Carry, weights: tuple[Array, ...]) -> tuple[_Carry, None]:
@@ -137,9 +130,9 @@ def unipc(
         data = latents - sigma * velocity(latents, _repeat_for_batch(input_level, latents))
         corrected = _sum_weighted(correct, (latents, before, data, data_1, data_2))
         latents = _sum_weighted(predict, (corrected, data, data_1))
-        return (_put_back(reference, latents), corrected, data, data_1), None
+        return (put_first(latents, reference), corrected, data, data_1), None
 
-    start = _put_back(reference, noise)
+    start = put_first(noise, reference)
     nothing = jnp.zeros_like(start)
     sigmas = schedule.sigmas
     weights = (schedule.input_levels, sigmas[:-1], corrector_weights(sigmas), predictor_weights(sigmas))
@@ -222,10 +215,6 @@ def _ratio(sigmas: tuple[float, ...], step: int, interval: _Interval) -> float:
 def _order(sigmas: tuple[float, ...], step: int) -> int:
     """Order of a step: 2 but for the first, which has no past, and the last."""
     return 1 if step in (0, len(sigmas) - 2) else 2
-
-
-def _put_back(reference: Array, latents: Array) -> Array:
-    return jnp.concatenate([reference, latents[:, 1:]], axis=1)
 
 
 def _repeat_for_batch(level: Array, latents: Array) -> Array:

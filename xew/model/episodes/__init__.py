@@ -3,4 +3,4 @@
 Each choice is made here once, from one index of the data set, and everything behind takes the episodes themselves.
 """
 
-__all__ = ["choice", "commands", "unpaired"]
+__all__ = ["choice", "commands"]

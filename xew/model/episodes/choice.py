@@ -87,10 +87,6 @@ def sample_episodes(dataset: Dataset, roles: Mapping[str, str], motion: str | No
     """An episode of each of these robots that the data has, by role and robot, never of a test seed.
 
     It is of a validation seed where there is one of that robot, else of a training seed, which a model of the robot has seen.
-
-    Args:
-        roles: of the robots that samples are drawn of, by robot.
-        motion: kind of motion that the episodes have to be of; left open, any.
     """
     robots = tuple(roles)
     candidates = [e for family in ("validation", "train") for e in dataset.select(robots=robots, split=family, motion=motion)]

@@ -24,7 +24,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Float, Int, Key
 
 from xew.model.devices.sharding import shard_over_batch
-from xew.model.network.mechanisms import FramedContext
+from xew.model.network.mechanisms import FramedContext, linear
 from xew.model.network.tokens import WAN_PATCH, WAVELENGTH_BASE, Patch
 
 EPSILON = 1e-6
@@ -123,14 +123,7 @@ class Block(nnx.Module):
     def keys_values(
         self, tokens: Float[Array, "b s d"], modulation: Float[Array, "b r 6 d"], levels: Levels, rotary: Rotary
     ) -> tuple[Float[Array, "b s heads k"], Float[Array, "b s heads k"]]:
-        """What others' self-attention reads of these tokens: keys and values [b s n head_dim].
-
-        Args:
-            tokens: [b s d].
-            modulation: [b r 6 d] float32, one for each noise level.
-            levels: [s], which of them each token takes.
-            rotary: rotations of the tokens' positions.
-        """
+        """What others' self-attention reads of these tokens: keys and values [b s n head_dim]; arguments as of `__call__`."""
         shift, scale = self._chunks(modulation, levels)[:2]
         return self.self_attn.keys_values(modulate(tokens, shift, scale, self.dtype, self.epsilon), rotary)
 
@@ -393,11 +386,6 @@ def attend_in_pairs(
 def gelu(values: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Gelu of values [...] by its approximation with tanh, as Wan has it."""
     return nnx.gelu(values, approximate=True)
-
-
-def linear(features: int, out: int, dtype: DTypeLike, rngs: nnx.Rngs) -> nnx.Linear:
-    """A linear layer whose product is computed in `dtype`."""
-    return nnx.Linear(features, out, dtype=dtype, kernel_init=nnx.initializers.xavier_uniform(), rngs=rngs)
 
 
 def scaled_normal(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "..."]:

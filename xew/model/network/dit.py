@@ -35,12 +35,11 @@ from xew.model.network.blocks import (
     Rotary,
     TwoLayer,
     gelu,
-    linear,
     scaled_normal,
     select_levels,
     stacked_blocks,
 )
-from xew.model.network.mechanisms import MECHANISMS, FramedContext, create_mechanism, ray_maps
+from xew.model.network.mechanisms import MECHANISMS, FramedContext, create_mechanism, linear, ray_maps
 from xew.model.network.spec import Network
 from xew.model.network.tokens import (
     TIME_FREQUENCIES,
@@ -174,14 +173,7 @@ class WorldModel(nnx.Module):
         return velocity_of_residual(predicted, latents, sigma, guess)
 
     def condition_cache(self, conditions: Conditions, text: Text) -> ConditionCache:
-        """Keys and values of the condition tokens in every layer; they hold for all steps of sampling a clip.
-
-        Args:
-            conditions: as of `__call__`.
-            text: as of `__call__`.
-
-        Returns:
-            Two of [layers b s n head_dim].
+        """Keys and values [layers b s n head_dim] of the condition tokens; they hold for all steps of sampling a clip.
 
         Raises:
             ValueError: the model is not `one_way`, so that condition tokens depend on the RGB tokens of each step.
@@ -203,15 +195,9 @@ class WorldModel(nnx.Module):
     def embed_streams(
         self, latents: Latents, conditions: Conditions, cached: bool = False
     ) -> tuple[Float[Array, "b s d"], Levels, Rotary]:
-        """Tokens of all streams, their noise levels and their rotations.
+        """Tokens [b s d] of all streams, or of RGB's latents alone where the others are cached.
 
-        Args:
-            latents: [b t h w c] of RGB.
-            conditions: as of `__call__`.
-            cached: leave the condition streams out.
-
-        Returns:
-            Tokens [b s d], the index of each one's noise level [s], cosine and sine of its angles [s head_dim/2].
+        With them come the index of each one's noise level [s], and cosine and sine of its angles [s head_dim/2].
         """
         streams = {name: conditions[name] for name in self.condition_streams if not cached}
         tokens, levels, rotary = self._join({"rgb": latents} | streams)
@@ -338,19 +324,9 @@ class WorldModel(nnx.Module):
         rgb: int | None = None,
         cache: ConditionCache | None = None,
     ) -> Float[Array, "b s d"]:
-        """Apply the block stack, as a scan over the leading axis of the stacked parameters.
+        """Apply the block stack to tokens [b s d], as a scan over the leading axis of the stacked parameters.
 
-        Args:
-            tokens: [b s d] of all streams.
-            modulation: [b r 6 d] float32, one for each noise level.
-            levels: [s], which of them each token takes.
-            rotary: rotations of the tokens' positions.
-            text: [b k d], what cross-attention reads.
-            rgb: number of RGB's tokens, which come first.
-            cache: from `condition_cache`.
-
-        Returns:
-            Tokens [b s d].
+        Args as of `Block.__call__`, but `rgb`: number of RGB's tokens, which come first; and `cache`: from `condition_cache`.
         """
         graph, layers = nnx.split(self.blocks)
         start = rgb if self.one_way and rgb != tokens.shape[1] else None

@@ -5,7 +5,6 @@ The paper's few-shot protocol changes all weights on the target's episodes alone
 forgetting that it leaves open (the other is replay, in training/data.py).
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -25,18 +24,12 @@ Lora = dict[str, dict[str, dict[str, Float[Array, "layers i o"]]]]
 def init_lora(params: Any, rank: int, key: Key[Array, ""]) -> Lora:
     """Corrections that change nothing yet: A is normal over the root of its inputs, B is zero.
 
-    Args:
-        params: of the network, whose matrices in the blocks are [layers in out].
-        rank: columns of A.
-        key: of the random numbers.
-
-    Returns:
-        See `Lora`.
+    In the blocks of `params` matrices are [layers in out]; A has `rank` columns.
     """
     learned = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         names = path_names(path)
-        if is_lora_layer(names):
+        if names[0] == LAYERS and names[-1] == "kernel" and names[-2] in LORA_LAYERS:
             key, own = jax.random.split(key)
             layers, inputs, outputs = leaf.shape
             a = jax.random.normal(own, (layers, inputs, rank), jnp.float32) / np.sqrt(inputs).astype(np.float32)
@@ -45,12 +38,7 @@ def init_lora(params: Any, rank: int, key: Key[Array, ""]) -> Lora:
 
 
 def apply_lora(base: Any, learned: Any) -> Any:
-    """The network's parameters: `base` plus its corrections, or without a base what was learned itself.
-
-    Args:
-        base: parameters of the run that the adaptation started from; None without LoRA.
-        learned: see `Lora`; without a base, parameters.
-    """
+    """The network's parameters: `base` plus its corrections (see `Lora`), or without a base what was learned itself."""
     if base is None:
         return learned
 
@@ -59,8 +47,3 @@ def apply_lora(base: Any, learned: Any) -> Any:
         return leaf if matrices is None else leaf + matrices["a"] @ matrices["b"]
 
     return jax.tree_util.tree_map_with_path(add, base)
-
-
-def is_lora_layer(names: Sequence[str]) -> bool:
-    """Whether the parameter of this path is a matrix that LoRA corrects."""
-    return names[0] == LAYERS and names[-1] == "kernel" and names[-2] in LORA_LAYERS

@@ -53,7 +53,7 @@ class FrameVector(nnx.Module):
 
     def __init__(self, dim: int, numbers: int, activation: Activation, null: bool, rngs: nnx.Rngs) -> None:
         self.activation = activation
-        self.first = _linear(numbers, HIDDEN * dim, jnp.float32, rngs)
+        self.first = linear(numbers, HIDDEN * dim, jnp.float32, rngs)
         self.second = nnx.Linear(HIDDEN * dim, dim, kernel_init=nnx.initializers.zeros_init(), rngs=rngs)
         self.null = nnx.Param(0.02 * jax.random.normal(rngs.params(), (dim,), jnp.float32)) if null else None
 
@@ -70,7 +70,7 @@ class FrameTokens(nnx.Module):
     """Three layers from the tool poses of a latent frame to one context token of that frame (Ctrl-World)."""
 
     def __init__(self, dim: int, numbers: int, dtype: DTypeLike, rngs: nnx.Rngs) -> None:
-        self.layers = nnx.List([_linear(width, dim, dtype, rngs) for width in (numbers, dim, dim)])
+        self.layers = nnx.List([linear(width, dim, dtype, rngs) for width in (numbers, dim, dim)])
 
     def __call__(self, numbers: Float[Array, "b f n"]) -> Float[Array, "b f 1 d"]:
         """Numbers [b f n] -> tokens [b f 1 d]."""
@@ -82,7 +82,7 @@ class ClipTokens(nnx.Module):
     """Two layers from the tool pose of each frame of video to a context token of all (BWM)."""
 
     def __init__(self, dim: int, numbers: int, dtype: DTypeLike, rngs: nnx.Rngs) -> None:
-        self.first, self.second = _linear(numbers // TEMPORAL_FACTOR, dim, dtype, rngs), _linear(dim, dim, dtype, rngs)
+        self.first, self.second = linear(numbers // TEMPORAL_FACTOR, dim, dtype, rngs), linear(dim, dim, dtype, rngs)
 
     def __call__(self, numbers: Float[Array, "b t n"]) -> Float[Array, "b k d"]:
         """Numbers [b t 4*n] -> tokens [b k d], k the frames of video."""
@@ -93,7 +93,7 @@ class PooledTokens(nnx.Module):
     """A fixed number of learned queries that attend to the actions of all frames of video (EnerVerse-AC's resampler)."""
 
     def __init__(self, dim: int, heads: int, numbers: int, dtype: DTypeLike, rngs: nnx.Rngs) -> None:
-        self.first = _linear(numbers // TEMPORAL_FACTOR, dim, dtype, rngs)
+        self.first = linear(numbers // TEMPORAL_FACTOR, dim, dtype, rngs)
         self.queries = nnx.Param(0.02 * jax.random.normal(rngs.params(), (POOLED_TOKENS, dim), jnp.float32))
         self.layers = nnx.List([PoolingLayer(dim, heads, dtype, rngs) for _ in range(POOLING_LAYERS)])
 
@@ -113,7 +113,7 @@ class PoolingLayer(nnx.Module):
     def __init__(self, dim: int, heads: int, dtype: DTypeLike, rngs: nnx.Rngs) -> None:
         self.norm_tokens, self.norm_actions, self.norm = (nnx.LayerNorm(dim, dtype=jnp.float32, rngs=rngs) for _ in range(3))
         self.attention = nnx.MultiHeadAttention(heads, dim, dtype=dtype, decode=False, rngs=rngs)
-        self.first, self.second = _linear(dim, HIDDEN * dim, dtype, rngs), _linear(HIDDEN * dim, dim, dtype, rngs)
+        self.first, self.second = linear(dim, HIDDEN * dim, dtype, rngs), linear(HIDDEN * dim, dim, dtype, rngs)
 
     def __call__(self, tokens: Float[Array, "b 16 d"], actions: Float[Array, "b k d"]) -> Float[Array, "b 16 d"]:
         """Tokens [b 16 d] and actions [b k d] -> tokens [b 16 d], all float32."""
@@ -240,5 +240,6 @@ def positions(count: int, dim: int) -> Float[np.ndarray, "count dim"]:
     return np.concatenate([np.sin(angles), np.cos(angles)], axis=-1)[:, :dim].astype(np.float32)
 
 
-def _linear(features: int, out: int, dtype: DTypeLike, rngs: nnx.Rngs) -> nnx.Linear:
+def linear(features: int, out: int, dtype: DTypeLike, rngs: nnx.Rngs) -> nnx.Linear:
+    """A linear layer whose product is computed in `dtype`."""
     return nnx.Linear(features, out, dtype=dtype, kernel_init=nnx.initializers.xavier_uniform(), rngs=rngs)

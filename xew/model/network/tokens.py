@@ -65,13 +65,8 @@ def rotary_angles(
     """Rotation angles [s head_dim/2, rad] float64 of the tokens of a grid; every stream counts from (0, 0, 0).
 
     The head is split among time, height and width as in Wan (44, 42, 42 of 128; 24, 20, 20 of 64), and each part has
-    its own geometric series of frequencies.
-
-    Args:
-        grid: tokens in time, height and width.
-        head_dim: width of a head.
-        base: ratio of the fastest to the slowest rotation.
-        times: of the frames, in latent frames; 0, 1, … if left out.
+    its own geometric series of frequencies, whose fastest is `base` times the slowest. Times of the frames are in latent
+    frames; 0, 1, … if left out.
     """
     part = 2 * (head_dim // 6)
     parts = (head_dim - 2 * part, part, part)

@@ -106,20 +106,13 @@ def check_one_of(resume: bool, overwrite: bool) -> None:
 
 
 def claim_run(out: Path, settings: T, read: Callable[[Path], T], *, resume: bool, overwrite: bool) -> None:
-    """Make a folder ready for a run with these settings, new, continued or replaced, and write them there as config.yaml.
-
-    Args:
-        read: reads settings of this kind.
-
-    Raises:
-        ConfigError: it holds a run and neither was asked, or it would be continued with another config.
-    """
+    """Make a folder ready for a run with these settings, new, continued or replaced, and write them there as config.yaml."""
     check_claim(out, settings, read, resume=resume, overwrite=overwrite)
     write_claim(out, settings, overwrite=overwrite)
 
 
 def check_claim(out: Path, settings: T, read: Callable[[Path], T], *, resume: bool, overwrite: bool) -> None:
-    """Raise what `claim_run` would for what the folder holds."""
+    """Raise ConfigError where a folder holds a run and neither was asked, or one to be continued with another config."""
     saved = out / "config.yaml"
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out} is a file; choose another --out.")

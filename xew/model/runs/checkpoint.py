@@ -26,6 +26,7 @@ from xew.model.network.dit import network_shapes
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.network.spec import Network
 from xew.model.runs.folder import KeptStep, trace_run
+from xew.model.runs.layout import list_steps
 
 SUMMING = ThreadPoolExecutor(1, "sums")
 """Thread in which checksums of earlier checkpoints are computed, during training."""
@@ -123,11 +124,7 @@ def load_params(
 ) -> tuple[Any, int]:
     """The parameters of a run's network, as `restore_params`, in the types of training; and their step.
 
-    Args:
-        run: folder of the run.
-        network: that of its config.
-        step: of the checkpoint; the latest where left out.
-        sharding: where they are to lie; on the first device where left out.
+    They lie where `sharding` says, or on the first device.
     """
     place = sharding or jax.sharding.SingleDeviceSharding(jax.devices()[0])
     like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), network_shapes(network))
@@ -154,15 +151,7 @@ def restore_sum(kept: Sequence[KeptStep], like: Any) -> tuple[Any, int]:
 
 
 def _restore_kept(out: Path, like: Any, step: int | None) -> tuple[Any, int]:
-    """Restore what a run's checkpoint holds for inference, `ema` or else `params`, and its step.
-
-    Args:
-        like: shapes, types and shardings of what is restored.
-        step: of the checkpoint; the latest where left out.
-
-    Raises:
-        ConfigError: the run has no such checkpoint.
-    """
+    """Restore what a run's checkpoint holds for inference, `ema` or else `params`, and its step; raises as `restore_sum`."""
     with open_checkpoints(out) as checkpoints:
         steps = checkpoints.all_steps()
         if not steps:
@@ -209,28 +198,27 @@ def _abstract(tree: Any) -> Any:
 
 def note_sums(out: Path) -> None:
     """Write the sums of all complete checkpoints of a run that have none yet, and remove those of checkpoints that are gone."""
-    steps = {folder.name: folder for folder in (out / "checkpoints").glob("*") if folder.name.isdecimal()}
-    for name, folder in steps.items():
-        path = _sums(out, int(name))
+    steps = list_steps(out)
+    for step in steps:
+        path, folder = _sums(out, step), out / "checkpoints" / str(step)
         if path.exists():
             continue
         try:
-            sums = {file.relative_to(folder).as_posix(): file_digest(file) for file in _files(folder)}
+            sums = {
+                file.relative_to(folder).as_posix(): file_digest(file) for file in sorted(folder.rglob("*")) if file.is_file()
+            }
             write_text(path, json.dumps(sums, indent=1, sort_keys=True) + "\n")
         except OSError:  # it is being replaced by a later one, or the disk is full: then it is read without sums
             continue
     for path in (out / "sums").glob("*.json"):
-        if path.stem not in steps:
+        if path.stem not in map(str, steps):
             path.unlink(missing_ok=True)
 
 
 def find_damage(out: Path, step: int, items: Collection[str]) -> str:
     """What is wrong with the files of a checkpoint by its sums; '' where nothing is, or where there are no sums.
 
-    Args:
-        out: folder of the run.
-        step: of the checkpoint.
-        items: those of its parts that are read; other files directly in its folder count too.
+    Only the items that are read count, and other files directly in its folder.
     """
     folder, path = out / "checkpoints" / str(step), _sums(out, step)
     if not path.exists():
@@ -255,18 +243,17 @@ def find_damage(out: Path, step: int, items: Collection[str]) -> str:
 
 def damaged(out: Path, step: int, items: Collection[str], what: object) -> ConfigError:
     """The error for a damaged checkpoint, in one line: what is wrong with which, and the last one that is whole."""
-    steps = sorted((int(path.name) for path in (out / "checkpoints").glob("*") if path.name.isdecimal()), reverse=True)
-    whole = [other for other in steps if other != step and _sums(out, other).exists() and not find_damage(out, other, items)]
+    whole = [
+        other
+        for other in list_steps(out)
+        if other != step and _sums(out, other).exists() and not find_damage(out, other, items)
+    ]
     offer = "no other is known to be whole: copy the run again, or train it again with --overwrite"
     if whole:
-        offer = f"step {whole[0]} is whole: move that folder away to go on from it, or read it by --checkpoint {whole[0]}"
+        offer = f"step {whole[-1]} is whole: move that folder away to go on from it, or read it by --checkpoint {whole[-1]}"
     reason = " ".join(str(what).split())[:200] or type(what).__name__
     return ConfigError(f"{out / 'checkpoints' / str(step)}: the checkpoint of step {step} is damaged ({reason}); {offer}.")
 
 
 def _sums(out: Path, step: int) -> Path:
     return out / "sums" / f"{step}.json"
-
-
-def _files(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.rglob("*") if file.is_file())

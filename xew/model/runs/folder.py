@@ -66,11 +66,7 @@ def trace_run(out: Path, step: int | None = None) -> list[KeptStep]:
 
 
 def trace_start(out: Path, run: Path | None) -> list[KeptStep]:
-    """The checkpoints that make the network which an adapted run started from, as noted when it began.
-
-    Args:
-        out: the adapted run.
-        run: the run that it started from.
+    """The checkpoints that make the network of `run` which the adapted run `out` started from, as noted when it began.
 
     Raises:
         ConfigError: they have gone or were trained again since, or a note is lost.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from xew.model.cache.codecs import load_codec
+from xew.model.cache.store import load_codec
 from xew.model.codecs.contract import Codec
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.folder import load_run
@@ -50,10 +50,7 @@ class RunRoundtrip:
 
 
 def open_roundtrip(run: Path) -> RunRoundtrip:
-    """The codec of a run as a function of video to video.
-
-    Args:
-        run: folder of the run; or the config of one that has not been trained.
+    """The codec of a run, or of the config of one that has not been trained, as a function of video to video.
 
     Raises:
         ConfigError: there is no such run, or it has lost its codec; of a config, see `load_codec`.

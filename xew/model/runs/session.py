@@ -30,12 +30,7 @@ class Session:
 
 @contextlib.contextmanager
 def open_session(out: Path, keep: int) -> Iterator[Session]:
-    """Open the checkpoints and the log of a run; what is being written is finished when the block ends.
-
-    Args:
-        out: folder of the run.
-        keep: number of checkpoints to keep.
-    """
+    """Open the log and the checkpoints of a run, so many of which are kept; all is written when the block ends."""
     with write_checkpoints(out, keep) as checkpoints:
         log = RunLog(out, checkpoints.latest_step() or 0) if jax.process_index() == 0 else None
         try:

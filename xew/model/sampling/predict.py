@@ -118,6 +118,7 @@ class Predictor:
         text, negative = self._encode_text(whole)
         given = self._place(np.stack([stream["rgb"] for stream in streams]))
         unaligned = self._encode_unaligned(streams)
+        sampling = ChunkSampling(self.settings.sampler, self.schedule, self.settings.guidance, self.inputs.latent_shape)
         chunks: list[Array] = []
         for number, start in enumerate(range(0, max(frame_count - 1, 1), self.inputs.clip.frames - 1)):
             conditions = unaligned | self._encode_history(given, chunks, start) | self._encode_conditions(streams, start)
@@ -125,12 +126,8 @@ class Predictor:
             reference = chunks[-1][:, -1:] if chunks else given
             inputs = ChunkInputs(reference, conditions, text, negative, keys)
             with jax.set_mesh(self._mesh) if self._mesh is not None else nullcontext():
-                chunks.append(predict_chunk(self.graph, self.params, self.codec, inputs, self._sampling))
+                chunks.append(predict_chunk(self.graph, self.params, self.codec, inputs, sampling))
         return Prediction(chunks, len(episodes), frame_count)
-
-    @property
-    def _sampling(self) -> ChunkSampling:
-        return ChunkSampling(self.settings.sampler, self.schedule, self.settings.guidance, self.inputs.latent_shape)
 
     def _read(self, episode: Episode) -> Streams:
         """The first frame of an episode, and all of its conditions."""
@@ -206,13 +203,7 @@ class Predictor:
 
 
 def make_predictor(experiment: Experiment, codec: Codec, params: Any, scales: Mapping[str, Scale]) -> Predictor:
-    """The model of an experiment with these parameters, sampled as its config says.
-
-    Args:
-        codec: that of the run.
-        params: of its network, on one device or on the devices of a mesh.
-        scales: normalization of conditions that are numbers, as in training.
-    """
+    """The model of an experiment with these parameters, sampled as its config says; the rest as of `Predictor`."""
     graph, settings = network_graph(experiment.network.for_sampling), experiment.rollout
     return Predictor(experiment.inputs, experiment.instructions, settings, experiment.schedule, codec, graph, params, scales)
 

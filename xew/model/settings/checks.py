@@ -2,26 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
-from typing import Any, Protocol
+from typing import Any
 
 from xew.config import ConfigError, pick
 from xew.model.codecs.codec import latent_size
-from xew.model.codecs.contract import CodecSettings
 from xew.model.conditions import Condition
 from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES
-from xew.model.network.dit import STREAMS, ModelSize
+from xew.model.network.dit import STREAMS
 from xew.model.network.mechanisms import MECHANISMS
 from xew.model.settings.parts import pick_conditions
-from xew.model.settings.settings import (
-    AdaptSettings,
-    Clip,
-    ModelSettings,
-    RolloutSettings,
-    TrainSettings,
-    count_replayed,
-)
+from xew.model.settings.settings import AdaptSettings, ModelSettings, count_replayed
 from xew.model.video.frames import TEMPORAL_FACTOR
-from xew.protocol import Split
 
 LEAST_OF_STEPS: dict[str, float] = {
     "train.batch": 1,
@@ -56,28 +47,7 @@ LONGEST_AVERAGE = 0.25
 """Largest `train.ema`: an average of a longer reach would still hold the random start (2 % of it at this one)."""
 
 
-class Settings(Protocol):
-    """The sections of an experiment that are checked."""
-
-    @property
-    def clip(self) -> Clip: ...
-    @property
-    def model(self) -> ModelSettings: ...
-    @property
-    def train(self) -> TrainSettings: ...
-    @property
-    def codec(self) -> CodecSettings: ...
-    @property
-    def adapt(self) -> AdaptSettings: ...
-    @property
-    def rollout(self) -> RolloutSettings: ...
-    @property
-    def size(self) -> ModelSize: ...
-    @property
-    def robots(self) -> Split: ...
-
-
-def check_experiment(experiment: Settings, source: str) -> None:
+def check_experiment(experiment: Any, source: str) -> None:
     """Raise ConfigError, naming the source, with a choice of an experiment that does not exist or does not fit."""
     try:
         _check_choices(experiment, source)
@@ -87,7 +57,7 @@ def check_experiment(experiment: Settings, source: str) -> None:
         raise type(error)(f"{source}: {error}") from error
 
 
-def _check_choices(experiment: Settings, source: str) -> None:
+def _check_choices(experiment: Any, source: str) -> None:
     check_least(LEAST, experiment, source)
     pick(SAMPLERS, experiment.rollout.sampler, "sampler")
     pick(SCHEDULES, experiment.rollout.noise_schedule, "noise schedule")
@@ -130,7 +100,7 @@ def _check_conditions(conditions: Sequence[Condition], source: str) -> None:
         feeders[condition.stream] = condition.name
 
 
-def _check_sizes(experiment: Settings, source: str) -> None:
+def _check_sizes(experiment: Any, source: str) -> None:
     clip, factor = experiment.clip, latent_size(experiment.codec).spatial_factor * experiment.size.patch[1]
     if clip.frames < 5 or clip.frames % TEMPORAL_FACTOR != 1:
         near = max(5, clip.frames // TEMPORAL_FACTOR * TEMPORAL_FACTOR + 1)
@@ -140,7 +110,7 @@ def _check_sizes(experiment: Settings, source: str) -> None:
         raise ConfigError(f"{source}: {found}; both sides must be multiples of {factor} (codec factor x patch).")
 
 
-def _check_training(experiment: Settings, source: str) -> None:
+def _check_training(experiment: Any, source: str) -> None:
     train, adapt = experiment.train, experiment.adapt
     check_steps(train.steps, train.epochs, "epochs", source)
     if train.ema > LONGEST_AVERAGE:

@@ -3,12 +3,11 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import optax
 
 from xew.config import pick
-from xew.model.codecs.contract import CodecSettings
+from xew.model.codecs.contract import Codec, CodecSettings
 from xew.model.codecs.vae import VaeSize
 from xew.model.conditions import ACTIONS, CONDITIONS, HISTORY, Condition, list_conditions
 from xew.model.network.dit import STREAMS, token_grid
@@ -54,8 +53,8 @@ class Encoding:
 
     inputs: ClipInputs
     codec: CodecSettings
-    kind: type[Any]
-    """Class of codec that the settings name, with what `Codec` asks."""
+    kind: type[Codec]
+    """Class of codec that the settings name."""
     folder: Path
     data: Path
     start_from: Path | None
@@ -115,12 +114,7 @@ def pick_conditions(settings: ModelSettings) -> list[Condition]:
 
 
 def sample_roles(split: Split, targets: Iterable[str] = ()) -> dict[str, str]:
-    """Roles of the robots that samples are drawn of: those by which choices are made (`validation_split`), and their targets.
-
-    Args:
-        split: of the training; of an adapted run's, that of the run that it started from.
-        targets: robots that are adapted to.
-    """
+    """Roles of the robots that samples are drawn of: those that choices are made by (`validation_split`), and targets."""
     chosen = validation_split(split)
     roles = dict.fromkeys(chosen.train_robots, "seen") | dict.fromkeys(chosen.held_out_robots, "unseen")
     return roles | dict.fromkeys(targets, "target")

@@ -43,12 +43,8 @@ class Batch:
 class ClipSource:
     """Random access to the training samples of the cache, for Grain: index -> Batch without its leading axis.
 
-    Args:
-        cache: the latents.
-        text: instructions as the network takes them, [l e] float32 or [l] int32.
-        scales: of conditions that are numbers.
-        episodes: those to learn from.
-        replay: episodes that every batch has a part of besides them.
+    Instructions are as the network takes them, [l e] float32 or [l] int32. Every batch has a part of `replay` besides the
+    episodes to learn from.
     """
 
     def __init__(

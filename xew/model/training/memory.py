@@ -53,12 +53,7 @@ class Memory:
 
 
 def estimate_memory(trainer: Trainer, encoding: Encoding) -> Memory:
-    """Estimate what each device of the trainer's mesh needs to train.
-
-    Args:
-        trainer: its devices need not be there.
-        encoding: the codec, which works between two chunks.
-    """
+    """Estimate what each device of the trainer's mesh needs to train, and the codec between two chunks; none need be there."""
     spec, state, params = trainer.spec, trainer.shapes, trainer.network_shapes
     settings, network = spec.settings, spec.network
     devices, fsdp = trainer.mesh.size, trainer.mesh.shape["fsdp"]
@@ -94,7 +89,8 @@ def activation_bytes(network: Network, inputs: ClipInputs) -> float:
     tokens = sum(math.prod(grid) for grid in inputs.grids)
     compute, logits = jnp.dtype(settings.dtype).itemsize, logits_bytes(network, tokens)
     kept = tokens * kept_bytes(size, settings.remat, compute) + (logits if settings.remat == "none" else 0.0)
-    return size.depth * kept + 2 * (tokens * work_bytes(size, compute) + logits)
+    work = compute * (19 * size.dim + 2 * size.ffn_dim)  # of a token: 14 widths, two of the hidden width, and the norms
+    return size.depth * kept + 2 * (tokens * work + logits)
 
 
 def codec_bytes(encoding: Encoding, samples: float) -> float:
@@ -117,11 +113,6 @@ def kept_bytes(size: ModelSize, remat: RematName, compute: int) -> float:
         # Nothing is fused away: every step of the norms, modulations and rotations keeps its float32 result.
         "none": (104 + 7 * compute) * size.dim + 6 * compute * size.ffn_dim,
     }[remat]
-
-
-def work_bytes(size: ModelSize, compute: int) -> float:
-    """Bytes a token of what one block needs at a time: 14 widths and two of the hidden width, and the norms."""
-    return compute * (19 * size.dim + 2 * size.ffn_dim)
 
 
 def logits_bytes(network: Network, tokens: int) -> float:

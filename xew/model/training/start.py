@@ -15,11 +15,6 @@ def begin_state(trainer: Trainer, start_from: Path | None, weights: Path | None,
     """Make the state of step 0, or restore that of the latest checkpoint with the position of the data.
 
     The network starts from the run to adapt, published weights or random numbers; with LoRA it is needed in a resumed run too.
-
-    Args:
-        start_from: the run that is adapted, if any.
-        weights: published weights to start from, if any.
-        batches: the iterator of batches, which goes on where it was left.
     """
     resumed = _resume(session, trainer.shapes, batches) if session.step > 0 else None
     if resumed is not None and not trainer.spec.lora_rank:

@@ -25,11 +25,7 @@ def fill(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Coll
     Leaves that the layout does not name keep their values. An abstract module (of `nnx.eval_shape`) becomes a real one
     but for such leaves.
 
-    Args:
-        module: whose leaves are filled.
-        tensors: of the checkpoint, from `read_tensors`.
-        layout: where each leaf comes from.
-        optional: patterns (as "flow_stream.*") of leaves that the checkpoint may lack, and of its keys that may be left.
+    The patterns in `optional`, as "flow_stream.*", are of leaves that the checkpoint may lack and of its keys that may be left.
 
     Raises:
         ConfigError: tensors are missing, left over or misshapen; the first few are named. Nothing has been filled then.

@@ -9,14 +9,14 @@ Nothing is ever unpickled freely.
 
 import pickle
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import ml_dtypes
 import numpy as np
-from jaxtyping import Shaped
 from safetensors import SafetensorError, safe_open
 
 from xew.config import ConfigError
@@ -29,16 +29,13 @@ STATE_DICTS = ("state_dict", "model_state_dict", "model")
 """Names under which a .pth may hold its tensors one level down."""
 
 
-@runtime_checkable
-class Entry(Protocol):
+@dataclass(frozen=True)
+class Entry:
     """One tensor of a checkpoint, not yet read."""
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the tensor."""
-
-    def read(self) -> Shaped[np.ndarray, "..."]:
-        """The tensor [...], of `shape`."""
+    shape: tuple[int, ...]
+    read: Callable[[], np.ndarray]
+    """Function that gives the tensor [...], of `shape`."""
 
 
 class Tensors(Mapping):
@@ -103,34 +100,14 @@ def read_tensors(path: Path) -> Tensors:
         raise ConfigError(f"cannot read the weights {path}: {error.strerror or error}.") from error
 
 
-@dataclass(frozen=True)
-class _SafetensorsEntry:
-    file: Any
-    key: str
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return tuple(self.file.get_slice(self.key).get_shape())
-
-    def read(self) -> np.ndarray:
-        return self.file.get_tensor(self.key)
-
-
-@dataclass(frozen=True)
-class _TorchEntry:
-    tensor: Any
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return tuple(self.tensor.shape)
-
-    def read(self) -> np.ndarray:
-        tensor = self.tensor.detach()
-        if str(tensor.dtype) == "torch.bfloat16":  # NumPy has no such type: the same bits by another name
-            import torch
-
-            return tensor.contiguous().view(torch.uint16).numpy().view(ml_dtypes.bfloat16)
+def _read_torch(tensor: Any) -> np.ndarray:
+    """A tensor [...] of PyTorch as NumPy's."""
+    tensor = tensor.detach()
+    if str(tensor.dtype) != "torch.bfloat16":
         return tensor.numpy()
+    import torch
+
+    return tensor.contiguous().view(torch.uint16).numpy().view(ml_dtypes.bfloat16)  # NumPy has no such type: the same bits
 
 
 def _open(path: Path) -> dict[str, Entry]:
@@ -191,7 +168,8 @@ def _open_safetensors(path: Path) -> dict[str, Entry]:
         file = safe_open(path, framework="numpy")
     except SafetensorError as error:
         raise ConfigError(f"{path} is no whole safetensors file ({error}); download it again.") from error
-    return {key: _SafetensorsEntry(file, key) for key in file.keys()}  # noqa: SIM118 (no mapping)
+    shapes = {key: tuple(file.get_slice(key).get_shape()) for key in file.keys()}  # noqa: SIM118 (no mapping)
+    return {key: Entry(shape, partial(file.get_tensor, key)) for key, shape in shapes.items()}
 
 
 def _open_torch(path: Path) -> dict[str, Entry]:
@@ -208,10 +186,14 @@ def _open_torch(path: Path) -> dict[str, Entry]:
     except (RuntimeError, EOFError, ValueError) as error:
         raise ConfigError(f"{path} is no whole PyTorch file ({str(error).splitlines()[0]}); download it again.") from error
     state = _state_dict(content)
-    tensors = {str(key): _TorchEntry(value) for key, value in state.items() if isinstance(value, torch.Tensor)}
+    tensors = {
+        str(key): Entry(tuple(value.shape), partial(_read_torch, value))
+        for key, value in state.items()
+        if isinstance(value, torch.Tensor)
+    }
     if not tensors:
         raise ConfigError(f"{path} holds no tensors by name; expected a state dict.")
-    return dict(tensors)
+    return tensors
 
 
 def _state_dict(content: Any) -> Mapping[str, Any]:

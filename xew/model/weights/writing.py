@@ -25,13 +25,10 @@ SHARD_BYTES = 5_000_000_000
 
 
 def save_weights(module: nnx.Module, path: Path, layout: Layout) -> None:
-    """Write a module's leaves under another project's names.
+    """Write a module's leaves, each in its own type, under another project's names: the inverse of loading.
 
-    Args:
-        module: whose leaves are written, each in its own type.
-        path: a file that ends in .safetensors, or a folder, which then gets shards of at most 5 GB and their index under
-            the names that diffusers looks for.
-        layout: where each leaf goes; the inverse of loading.
+    A path that does not end in .safetensors is a folder, which gets shards of at most 5 GB and their index under the names
+    that diffusers looks for.
 
     Raises:
         ConfigError: the file cannot be written.
