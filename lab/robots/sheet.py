@@ -25,16 +25,16 @@ from xew.protocol import expand_robots
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
 from xew.sim_warp.rendering.bodies import robot_bodies, robot_pose
-from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.rendering.render import Renderer, default_renderer
 from xew.sim_warp.rendering.streams import (
     VIEW_COUNT,
     articulation_action,
     articulation_clip,
+    fit_cameras,
     home_action,
     nine_views,
     ray_map,
     reference_image,
-    side_view,
 )
 from xew.sim_warp.robots import ROBOTS, RobotSpec, get_robot
 from xew.sim_warp.robots.adopt import view_sheet
@@ -72,6 +72,12 @@ def grid(robots: Sequence[RobotSpec]) -> np.ndarray:
         tiles.append(image)
     tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % GRID_COLUMNS)
     return np.vstack([np.hstack(tiles[row : row + GRID_COLUMNS]) for row in range(0, len(tiles), GRID_COLUMNS)])
+
+
+def side_view(robot: RobotSpec, azimuth: float) -> np.ndarray:
+    """The robot at home from one azimuth [deg], as in `nine_views` but as near as this view allows: [h w 3] uint8."""
+    bodies, pose = robot_bodies(robot), robot_pose(robot, home_action(robot)[None])
+    return default_renderer().render(bodies, pose, fit_cameras(bodies, pose, [azimuth])[0], ground=False).rgb[0]
 
 
 def head_view(robot: RobotSpec, renderer: Renderer) -> np.ndarray:

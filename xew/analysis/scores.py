@@ -162,16 +162,11 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
     metrics = _read_metric_infos(path, rows.attrs["metrics"])
     names = rows["robot"].unique()
     known = {*ROBOT_NAMES, *rows.attrs.get("robots", ()), *own_robots}
-    known |= {robot for robot in names if _is_named_by_form(str(robot))}
+    known |= {robot for robot in names if IMPORT_PATH.fullmatch(str(robot)) or BODY_NAME.fullmatch(str(robot))}
     wrong = _find_wrong_rows(rows, metrics, known)
     if wrong:
         raise ConfigError(f"{path} cannot be averaged over:\n{_format_wrong_rows(wrong)}\nGrade anew: {command} --overwrite")
     return Scores(rows, curves, metrics, rows.attrs)
-
-
-def _is_named_by_form(robot: str) -> bool:
-    """Does the form of a robot's name say by itself whose it is: a user's module, or a body by its number?"""
-    return bool(IMPORT_PATH.fullmatch(robot) or BODY_NAME.fullmatch(robot))
 
 
 def merge_scores(tables: Sequence[tuple[str, Path]], trainings: Sequence[int] = ()) -> Scores:

@@ -19,7 +19,7 @@ class Total:
 
     @property
     def mean(self) -> Float32[jax.Array, ""]:
-        """Mean [] of the values that count; NaN where there is none."""
+        """Mean [()] of the values that count; NaN where there is none."""
         return self.total / self.count.astype(jnp.float32)
 
     def __add__(self, other: "Total") -> "Total":

@@ -28,6 +28,7 @@ from tests.analysis.inline import InlineMachines
 from tests.metrics.quick import QUICK, QUICK_TRACKS
 from tests.sim_warp.small import TASK, work_inline
 from xew.analysis import study, study_analyse
+from xew.config import read_yaml
 from xew.protocol import BASELINES, PAPER_PARTS, PARTS, VARIANTS
 
 ROOT = Path(__file__).parents[3]
@@ -84,7 +85,7 @@ class Place:
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     """A folder without data or weights; compiled programs are those of the session, which compiles many of them too."""
     root = tmp_path_factory.mktemp("debug")
-    settings = yaml.safe_load(CONFIG.read_text())
+    settings = read_yaml(CONFIG)
     del settings["step_environment"]  # XLA's options are those of the session
     # The estimators that find masks and points are at work in tests/metrics/grading/test_evaluate.py.
     settings["evaluate"] = ["--masks", QUICK, "--tracks", QUICK_TRACKS]

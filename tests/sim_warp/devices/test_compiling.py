@@ -8,7 +8,7 @@ import warp as wp
 
 from lab import compile_kernels as compile_command
 from tests.sim_warp.small import TASK, InlineWorkers, launched_modules, produce
-from xew.sim_warp.devices.kernels import Variant, compile_for, compile_together, noted_launches, watched_launches
+from xew.sim_warp.devices.kernels import Variant, compile_together, noted_launches
 from xew.sim_warp.physics.kernels import set_targets
 from xew.sim_warp.production import warm_up
 from xew.sim_warp.production.cells import Job
@@ -95,12 +95,12 @@ def test_what_is_compiled_is_not_compiled_again(monkeypatch: pytest.MonkeyPatch)
 def test_kernels_are_compiled_for_a_gpu_that_is_not_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     values = wp.zeros(3, dtype=float, device="cpu")
-    with watched_launches() as found:
+    with compile_command.watched_launches() as found:
         wp.launch(add_one, 3, [values], device="cpu")
         wp.launch(halve, 3, [values], block_dim=64, device="cpu")
     np.testing.assert_array_equal(values.numpy(), 0.5)
     assert list(found) == [(add_one.module, 256), (halve.module, 64)]
-    assert compile_for([*found, (add_one.module, 32), (add_one.module, 32)], 90) == 3
+    assert compile_command.compile_for([*found, (add_one.module, 32), (add_one.module, 32)], 90) == 3
     names = {module.get_module_identifier(size) for module, size in (*found, (add_one.module, 32))}
     assert {path.name for path in tmp_path.glob("*/*.cubin")} == {f"{name}.sm90.cubin" for name in names}
     assert all((tmp_path / name / f"{name}.meta").exists() for name in names)

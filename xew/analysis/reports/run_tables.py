@@ -111,17 +111,15 @@ def finding(held_out: Sequence[RobotTable], seen: Sequence[RobotTable], metrics:
     compared = [(table, row) for table in held_out for row in table.rows if row.verdicts]
     sentences = []
     for table, row in compared:
-        twins = [(other, twin) for other in seen for twin in other.rows if _same_model(twin, row)]
+        twins = [
+            (other, twin) for other in seen for twin in other.rows if (twin.model, twin.condition) == (row.model, row.condition)
+        ]
         episodes = f"{table.count} episode{'s' if table.count != 1 else ''}"
         sentences.append(
             f"{table.title} ({episodes}): {row.title} {_compare(row, metrics)}.{_distance_left((table, row), twins, metrics)}"
             f"{_parting(row, metrics)}"
         )
     return sentences or ["No model has been compared with the frozen first frame yet: grade without --no-baselines."]
-
-
-def _same_model(a: Row, b: Row) -> bool:
-    return (a.model, a.condition) == (b.model, b.condition)
 
 
 def _distance_left(

@@ -62,11 +62,6 @@ def start_step(
     return process
 
 
-def format_command(command: Sequence[str]) -> str:
-    """A command as it is typed."""
-    return f"python -m {' '.join(command)}"
-
-
 def last_lines(log: Path, count: int = 3) -> str:
     """The end of a command's log, without progress bars."""
     try:
@@ -86,7 +81,7 @@ def _run(command: tuple[str, ...], log: Path, environment: dict[str, str], launc
     with log.open("a", buffering=1) as file, wait_for_lock(log.with_suffix(".lock")):
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-        print("$", " ".join([*launcher, format_command(command)]), flush=True)
+        print("$", " ".join([*launcher, "python -m", *command]), flush=True)
         try:
             code = _launch([*launcher, sys.executable, "-m", *command]) if launcher else _run_module(*command)
         finally:

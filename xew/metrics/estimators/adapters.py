@@ -77,7 +77,7 @@ class PointTracker(ABC):
             visible: [t k] bool, where a true point is seen; a point that is never seen is lost in all frames.
         """
         check_tracks(prediction, points, visible)
-        tracks = lost_tracks(visible.shape)
+        tracks = np.full((*visible.shape, 2), np.nan, np.float32)
         frames = query_frames(visible)
         asked = np.flatnonzero(frames >= 0)
         if len(asked) == 0:
@@ -112,11 +112,6 @@ def query_frames(visible: np.ndarray) -> np.ndarray:
     counts = visible.sum(axis=1)
     frames = np.where(visible, counts[:, None], 0).argmax(axis=0)
     return np.where(visible.any(axis=0), frames, -1)
-
-
-def lost_tracks(shape: tuple[int, ...]) -> np.ndarray:
-    """Tracks [t k 2] float32 of which nothing is known: NaN."""
-    return np.full((*shape, 2), np.nan, np.float32)
 
 
 def check_tracks(prediction: np.ndarray, points: np.ndarray, visible: np.ndarray) -> None:

@@ -75,13 +75,9 @@ def _mean_lines(means: pd.DataFrame) -> list[str]:
         unit = f" [{rows[0].unit}]" if rows[0].unit else ""
         arrow = "↑" if METRICS[metric].higher_is_better else "↓"
         own = [row for row in rows if row.model not in BASELINES]
-        noise = dict.fromkeys(_noise_text(row.noise) for row in own or rows)
+        noise = dict.fromkeys("not graded" if math.isnan(row.noise) else f"{row.noise:.3g}" for row in own or rows)
         lines.append(f"| {metric}{unit} {arrow} | {' | '.join(cells)} | {' or '.join(noise)} |")
     return lines
-
-
-def _noise_text(noise: float) -> str:
-    return "not graded" if math.isnan(noise) else f"{noise:.3g}"
 
 
 def _mean_text(row: Any) -> str:

@@ -1,11 +1,10 @@
-"""Kernels of Warp: whether a device has any compiled yet, compiling many at once, and compiling for a GPU that is not here.
+"""Kernels of Warp: whether a device has any compiled yet, and compiling many at once.
 
 Warp compiles a module of kernels when one of them is first launched, one module after another. What many launches need can be
 known before: `noted_launches` lets them pass by without launching anything, and `compile_together` compiles on all cores.
 """
 
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -50,22 +49,6 @@ def noted_launches() -> Iterator[dict[Variant, None]]:
         yield found
 
 
-@contextmanager
-def watched_launches() -> Iterator[dict[Variant, None]]:
-    """Note what a block launches by `wp.launch` and `wp.launch_tiled`, in its order, and launch it."""
-    found: dict[Variant, None] = {}
-
-    def watch(launch: Callable[..., Any]) -> Callable[..., Any]:
-        def note(kernel: wp.Kernel, *arguments: Any, block_dim: int = DEFAULT_BLOCK, **named: Any) -> Any:
-            found[kernel.module, block_dim] = None
-            return launch(kernel, *arguments, block_dim=block_dim, **named)
-
-        return note
-
-    with mock.patch.multiple(wp, launch=watch(wp.launch), launch_tiled=watch(wp.launch_tiled)):
-        yield found
-
-
 def compile_together(variants: Iterable[Variant], device: wp.Device) -> None:
     """Compile and load kernels, on as many threads as there are cores.
 
@@ -75,41 +58,10 @@ def compile_together(variants: Iterable[Variant], device: wp.Device) -> None:
         variants: what to compile, as `noted_launches` gives it.
         device: that they will be launched on.
     """
-    _run_in_threads(lambda variant: wp.force_load(device, [variant[0]], variant[1], 0), variants)
+    run_in_threads(lambda variant: wp.force_load(device, [variant[0]], variant[1], 0), variants)
 
 
-def compile_for(variants: Iterable[Variant], arch: int) -> int:
-    """Compile modules into Warp's cache for GPUs of an architecture, on as many threads as there are cores.
-
-    No such GPU needs to be here: the compiler comes with Warp. A module's file is found there by its name, which says what is
-    in it, so that the cache can be copied to where the GPU is.
-
-    Args:
-        variants: what to compile.
-        arch: compute capability, such as 90; one of `wp.get_cuda_supported_archs()`.
-
-    Returns:
-        Number of modules.
-    """
-    blocks: dict[wp.Module, list[int]] = defaultdict(list)
-    for module, block_dim in dict.fromkeys(variants):
-        blocks[module].append(block_dim)
-    _run_in_threads(lambda item: _compile_module(item[0], item[1], arch), blocks.items())
-    return sum(map(len, blocks.values()))
-
-
-def _compile_module(module: wp.Module, blocks: Sequence[int], arch: int) -> None:
-    """Compile a module for each number of threads in a block, which Warp takes from the module's options."""
-    before = module.options["block_dim"]
-    try:
-        for block_dim in blocks:
-            module.options["block_dim"] = block_dim
-            wp.compile_aot_module(module, arch=arch)
-    finally:
-        module.options["block_dim"] = before
-
-
-def _run_in_threads(function: Callable[[Any], object], items: Iterable[Any]) -> None:
+def run_in_threads(function: Callable[[Any], object], items: Iterable[Any]) -> None:
     """Call a function with each item, on as many threads as there are cores, and raise what one of the calls raises."""
     with ThreadPoolExecutor(usable_cores()) as pool:
         for _ in pool.map(function, items):

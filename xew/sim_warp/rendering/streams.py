@@ -177,21 +177,15 @@ def reference_image(robot: RobotSpec) -> np.ndarray:
 def nine_views(robot: RobotSpec) -> np.ndarray:
     """The robot at home from nine azimuths 40 degrees apart, [9 h w 3] uint8, the first from the front."""
     bodies, pose = robot_bodies(robot), robot_pose(robot, home_action(robot)[None])
-    cameras = _fit_cameras(bodies, pose, [index * 360 / VIEW_COUNT for index in range(VIEW_COUNT)])
+    cameras = fit_cameras(bodies, pose, [index * 360 / VIEW_COUNT for index in range(VIEW_COUNT)])
     return np.concatenate([default_renderer().render(bodies, pose, camera, ground=False).rgb for camera in cameras])
-
-
-def side_view(robot: RobotSpec, azimuth: float) -> np.ndarray:
-    """The robot at home from one azimuth [deg], as in `nine_views` but as near as this view allows: [h w 3] uint8."""
-    bodies, pose = robot_bodies(robot), robot_pose(robot, home_action(robot)[None])
-    return default_renderer().render(bodies, pose, _fit_cameras(bodies, pose, [azimuth])[0], ground=False).rgb[0]
 
 
 def articulation_clip(robot: RobotSpec) -> np.ndarray:
     """A clip of the robot, seen from the front, that sweeps every joint and both grippers (`articulation_action`): [17 h w 3]
     uint8."""
     bodies, pose = robot_bodies(robot), robot_pose(robot, articulation_action(robot))
-    camera = _fit_cameras(bodies, pose, [0.0])[0]
+    camera = fit_cameras(bodies, pose, [0.0])[0]
     return default_renderer().render(bodies, pose, camera, ground=False).rgb
 
 
@@ -220,7 +214,7 @@ def home_action(robot: RobotSpec) -> np.ndarray:
     return action
 
 
-def _fit_cameras(bodies: Sequence[Body], pose: np.ndarray, azimuths: Sequence[float]) -> list[Camera]:
+def fit_cameras(bodies: Sequence[Body], pose: np.ndarray, azimuths: Sequence[float]) -> list[Camera]:
     """Cameras round the robot, equally far from its middle, so near that poses [t b 7] just fit into every image.
 
     Azimuth 0 [deg] looks the robot in the face; from there it goes round towards the robot's left hand.

@@ -119,10 +119,6 @@ class _Seen:
         """Those of an index [k]."""
         return _Seen(self.pixels[:, points], self.visible[:, points], self.body[points])
 
-    def count_on(self, bodies: Sequence[int]) -> np.ndarray:
-        """[t] int, how many are visible on some bodies."""
-        return np.sum(self.visible[:, np.isin(self.body, bodies)], axis=1)
-
 
 def track_surfaces(
     recordings: Sequence[Recording], thing_names: Sequence[Sequence[str]], renderer: Renderer, camera: Camera = HEAD_CAMERA
@@ -236,7 +232,7 @@ def _fill(view: _View, bodies: Sequence[int], aim: int | np.ndarray, first: _See
     Returns:
         The points to add; none where the first suffice, or nothing is seen.
     """
-    missing = np.maximum(aim - first.count_on(bodies), 0)
+    missing = np.maximum(aim - np.sum(first.visible[:, np.isin(first.body, bodies)], axis=1), 0)
     lacking = np.flatnonzero(missing)
     pixels = np.stack([np.sum(view.shown.body[lacking] == body, axis=(1, 2)) for body in bodies])
     missing[lacking[pixels.sum(axis=0) < LEAST_SHOWN]] = 0

@@ -22,7 +22,7 @@ from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import Joint, Urdf, load_urdf
 from xew.sim_warp.geometry.poses import matrix_from_pose
 from xew.sim_warp.kinematics.forward import joint_motion
-from xew.sim_warp.robots.user.posed import moved_points, pose_links
+from xew.sim_warp.robots.user.posed import moved_points, nearest_axis, pose_links
 
 TIP = 0.02
 """Part of a finger from its farthest point on that counts as its tip [m]."""
@@ -147,8 +147,7 @@ def _finger_points(urdf: Urdf, linkage: Linkage, tops: list[Joint], driven: floa
 def _choose_fingers(points: Mapping[str, np.ndarray]) -> tuple[list[str], np.ndarray]:
     """The two branches that reach farthest, and the direction [3] in which they do."""
     approach = np.mean([cloud.mean(0) for cloud in points.values()], axis=0)
-    axis = np.zeros(3)
-    axis[np.argmax(np.abs(approach))] = np.sign(approach[np.argmax(np.abs(approach))])
+    axis = nearest_axis(approach)
     return sorted(points, key=lambda name: -float((points[name] @ axis).max()))[:2], axis
 
 
@@ -162,8 +161,7 @@ def _on_axis(direction: np.ndarray, approach: np.ndarray) -> np.ndarray:
     """The unit vector across the approach that is nearest to a direction; an axis of the base's where that is near."""
     across = direction - approach * (direction @ approach)
     across /= max(float(np.linalg.norm(across)), 1e-12)
-    axis = np.zeros(3)
-    axis[np.argmax(np.abs(across))] = np.sign(across[np.argmax(np.abs(across))])
+    axis = nearest_axis(across)
     return axis if axis @ across > ON_AXIS else across
 
 

@@ -18,7 +18,7 @@ from xew.sim_warp.embodiment.spec import Arm
 from xew.sim_warp.embodiment.urdf import Joint, Urdf
 from xew.sim_warp.geometry.poses import Pose
 from xew.sim_warp.robots.user.draft import ArmDraft, RobotDraft
-from xew.sim_warp.robots.user.posed import moved_points, pose_links
+from xew.sim_warp.robots.user.posed import moved_points, nearest_axis, pose_links
 
 ARM_JOINTS = (6, 7)
 TIP_MARGIN = 0.015
@@ -256,8 +256,7 @@ def tool_at_tips(urdf: Urdf, link: str, rotation: np.ndarray, fingers: tuple[str
 
 def _snap_to_axis(direction: np.ndarray, opening: np.ndarray) -> np.ndarray:
     """The nearest axis of the hand that is square to `opening`, if it is near, else the direction itself."""
-    axis = np.zeros(3)
-    axis[np.argmax(np.abs(direction))] = np.sign(direction[np.argmax(np.abs(direction))])
+    axis = nearest_axis(direction)
     return axis if axis @ direction > SNAP and abs(axis @ opening) < 1e-6 else direction
 
 

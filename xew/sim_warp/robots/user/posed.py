@@ -32,3 +32,10 @@ def moved_points(urdf: Urdf, joint: str, poses: Mapping[str, np.ndarray], frame:
         shapes = [shape.points for shape in link.collisions] or ([link.visual.vertices] if link.visual else [])
         clouds += [shape @ pose[:3, :3].T + pose[:3, 3] for shape in shapes]
     return np.concatenate(clouds) if clouds else (to_frame @ poses[urdf.joints[joint].child])[None, :3, 3]
+
+
+def nearest_axis(direction: np.ndarray) -> np.ndarray:
+    """The unit vector [3] along the coordinate axis that is nearest to a direction [3]."""
+    axis = np.zeros(3)
+    axis[np.argmax(np.abs(direction))] = np.sign(direction[np.argmax(np.abs(direction))])
+    return axis
