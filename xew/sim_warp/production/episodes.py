@@ -81,6 +81,7 @@ def _versions() -> dict[str, str]:
 
 
 def _states(cell: Cell, view: Observation) -> States:
+    assert cell.tool_pose is not None, "a cell that is rendered has been simulated"
     return States(
         action=cell.commands.action,
         joint_pos=cell.known_motion.joint_pos,
