@@ -25,11 +25,12 @@ from xew.protocol import expand_robots
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
 from xew.sim_warp.rendering.bodies import robot_bodies, robot_pose
-from xew.sim_warp.rendering.render import Renderer, default_renderer
+from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import (
     VIEW_COUNT,
     articulation_action,
     articulation_clip,
+    default_renderer,
     fit_cameras,
     home_action,
     nine_views,
