@@ -9,8 +9,6 @@ After RoboTwin 2.0's place_a2b_left, whose expert puts A 13 cm beside B; here up
     hand would touch otherwise.
 """
 
-from functools import partial
-
 import numpy as np
 
 from xew.sim_warp.assets import household
@@ -39,7 +37,7 @@ NEAREST, FARTHEST = 0.08, 0.2
 """Distances between the two that count [m]."""
 
 
-def sample_beside(rng: np.random.Generator, seed: int, task: str, side: float) -> Scene:
+def sample_beside(rng: np.random.Generator, task: str, seed: int, side: float) -> Scene:
     """A scene of things A and B in which A is to be put on the `side` of B: `LEFT_OF` or `RIGHT_OF`."""
     kinds = rng.permutation(KINDS)
     first, second = (household.THINGS[str(kind)](rng) for kind in kinds[:2])
@@ -98,10 +96,16 @@ def is_beside(scene: Scene, now: Moment, side: float) -> bool:
     return bool(there and now.both_open)
 
 
-def task_beside(name: str, says: str, side: float) -> Task:
-    """The task of putting A on the `side` of B."""
-    parts = partial(sample_beside, task=name, side=side), partial(plan_beside, side=side), partial(is_beside, side=side)
-    return Task(name, says, *parts)
+def sample(rng: np.random.Generator, seed: int) -> Scene:
+    return sample_beside(rng, "place_a2b_left", seed, LEFT_OF)
 
 
-TASK = task_beside("place_a2b_left", "place the {a} to the left of the {b}", LEFT_OF)
+def plan(scene: Scene) -> Timeline:
+    return plan_beside(scene, LEFT_OF)
+
+
+def success(scene: Scene, now: Moment) -> bool:
+    return is_beside(scene, now, LEFT_OF)
+
+
+TASK = Task("place_a2b_left", "place the {a} to the left of the {b}", sample, plan, success)

@@ -5,6 +5,24 @@ Success: A right of B, between .08 and .20 away, within 50 mm of it in y, both g
 After RoboTwin 2.0's place_a2b_right, with the departures of place_a2b_left.
 """
 
-from xew.sim_warp.tasks.place_a2b_left import RIGHT_OF, task_beside
+import numpy as np
 
-TASK = task_beside("place_a2b_right", "place the {a} to the right of the {b}", RIGHT_OF)
+from xew.sim_warp.plan import Timeline
+from xew.sim_warp.scene import Scene
+from xew.sim_warp.tasks.place_a2b_left import RIGHT_OF, is_beside, plan_beside, sample_beside
+from xew.sim_warp.tasks.task import Moment, Task
+
+
+def sample(rng: np.random.Generator, seed: int) -> Scene:
+    return sample_beside(rng, "place_a2b_right", seed, RIGHT_OF)
+
+
+def plan(scene: Scene) -> Timeline:
+    return plan_beside(scene, RIGHT_OF)
+
+
+def success(scene: Scene, now: Moment) -> bool:
+    return is_beside(scene, now, RIGHT_OF)
+
+
+TASK = Task("place_a2b_right", "place the {a} to the right of the {b}", sample, plan, success)
