@@ -1,6 +1,6 @@
 """The summary that `evaluate` prints and writes next to its scores, as Markdown.
 
-The ground truth that noise floors are of is graded softened, as any prediction is (`jobs.SOFTNESS`).
+The ground truth that noise floors are of is graded softened, as any prediction is (`list_jobs.SOFTNESS`).
 """
 
 import math
