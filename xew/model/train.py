@@ -31,7 +31,7 @@ from xew.model.devices.sharding import (
 from xew.model.episodes.choice import choose_episodes
 from xew.model.experiment import Experiment, parse_experiment
 from xew.model.runs.checkpoint import TrainState
-from xew.model.runs.folder import begin_run, check_one_of
+from xew.model.runs.folder import begin_run, check_one_of, check_start
 from xew.model.runs.session import open_session
 from xew.model.settings.optimizer import learning_rate
 from xew.model.training.data import ClipSource
@@ -103,6 +103,7 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     mesh = make_mesh(experiment.mesh)
     check_batch(experiment.train.batch, experiment.train.accumulate, mesh.size)
     own = process_samples(mesh, experiment.train.batch)
+    check_start(experiment)
     episodes = choose_episodes(read_dataset(experiment.data), experiment.choice)
     source = ClipSource.open(experiment.encoding, experiment.instructions, episodes.fresh, episodes.replay)
     source.check()

@@ -66,12 +66,7 @@ FREE_TO_CHANGE = (
 def begin_run(
     experiment: Experiment, codec: Codec, scales: Mapping[str, Scale], *, resume: bool, overwrite: bool
 ) -> dict[str, Scale]:
-    """Make the run folder ready, by the first process, as `prepare_run`; the others wait for it. Returns the run's scales.
-
-    Raises:
-        ConfigError: the run to adapt, or the published weights to start from, do not fit; or as `prepare_run`.
-    """
-    check_start(experiment)
+    """Make the run folder ready, by the first process, as `prepare_run`; the others wait for it. Returns the run's scales."""
     if jax.process_index() == 0:
         prepare_run(experiment, codec, scales, resume=resume, overwrite=overwrite)
     if jax.process_count() > 1:
