@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/models.md: the network with its streams and mechanisms, and where a step's time goes.
+"""Draws the pictures of docs/model.md and docs/performance.md: the network with its streams and mechanisms, and where a step's time goes.
 
 `python docs/img/models.py` writes network.png and step_time.png beside this file. The times are those of docs/performance.md.
 """
