@@ -1,9 +1,9 @@
-"""Writes the section on the metrics' power on each task into docs/tasks.md.
+"""Writes the section on the metrics' power on each task into docs/reference/tasks.md.
 
 Reads  a score table with the baselines, such as of `xew.metrics.evaluate --data data --baselines-of validation`
 Writes one section of a Markdown page; the rest of the page stays
 
-    python -m lab.power scores.parquet --page docs/tasks.md
+    python -m lab.power scores.parquet --page docs/reference/tasks.md
 """
 
 import re
@@ -26,7 +26,7 @@ MOST_SHOWN = 10_000
 """Power from which on no number is written; it is infinite where the true video has a metric's best score."""
 
 
-COMMAND = "python -m lab.power scores.parquet --page docs/tasks.md"
+COMMAND = "python -m lab.power scores.parquet --page docs/reference/tasks.md"
 """Command that the page names."""
 
 
@@ -36,7 +36,7 @@ class Args:
 
     scores: Annotated[Path, tyro.conf.Positional]
     """Score table with the baselines of some episodes."""
-    page: Path = Path("docs/tasks.md")
+    page: Path = Path("docs/reference/tasks.md")
     """Markdown page whose section is written again."""
 
 

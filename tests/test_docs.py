@@ -35,8 +35,11 @@ ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 WALKED = ("add_a_robot", "add_a_task")
 """Pages that are run as a whole, in a folder of their own."""
-WITH_DATA = {"add_a_condition": (), "add_a_metric": (), "add_a_model": ("python -m xew.model.outside",)}
+OUTSIDE = ("python -m xew.model.outside",)
+WITH_DATA = {"add_a_condition": (), "add_a_metric": (), "add_a_model": OUTSIDE, "score_a_pytorch_model": OUTSIDE}
 """Pages whose Python is run in a folder with made-up data, each with the beginnings of the commands that are run too."""
+NEEDS = {"score_a_pytorch_model": "torch"}
+"""Packages without which a page is not run."""
 WITH_ARRAYS = ("metrics",)
 """Pages whose snippets are run in order, and held against their comments, in tests/metrics/test_page.py."""
 KEPT = ("XEW_TRUST", "XEW_ROBOTS")
@@ -111,8 +114,10 @@ def with_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
 
 @pytest.mark.parametrize("page", WITH_DATA)
 def test_a_page_runs_on_data(page: str, with_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if page in NEEDS:
+        pytest.importorskip(NEEDS[page])
     found, ran = blocks(ROOT / "docs" / f"{page}.md"), 0
-    for language, text in found:
+    for language, text in sorted(found, key=lambda block: block[0] == "bash"):  # a page shows its commands first
         wanted = [line for line in text.splitlines() if line.startswith(WITH_DATA[page])] if WITH_DATA[page] else []
         if language != "bash":
             assert text.startswith(("# file: ", "# run\n"))
@@ -283,3 +288,23 @@ def is_importable(name: str) -> bool:
     named = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
     named |= {alias.asname or alias.name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names}
     return attribute in named | {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+
+
+def test_the_page_on_errors_quotes_the_source() -> None:
+    """Messages in the first column of its tables, whose … stands for any text; those of JAX are not ours."""
+    nodes = [node for path in sorted((ROOT / "xew").rglob("*.py")) for node in ast.walk(ast.parse(path.read_text()))]
+    messages = "\n".join(text for node in nodes if (text := message_text(node)))
+    rows = [line for line in (ROOT / "docs" / "troubleshooting.md").read_text().splitlines() if line.startswith("| ")]
+    cells = [line.split(" | ")[0] for line in rows]
+    quoted = [match[1] for cell in cells if "(from JAX)" not in cell for match in INLINE.finditer(cell) if " " in match[1]]
+    assert len(quoted) > 25
+    patterns = {message: ".*".join(re.escape(part.strip()) for part in message.split("…")) for message in quoted}
+    assert not [message for message, pattern in patterns.items() if not re.search(pattern, messages)]
+
+
+def message_text(node: ast.AST) -> str:
+    """The text of a string or an f-string of the source, with its values as {}; '' for other nodes."""
+    if isinstance(node, ast.Constant):
+        return node.value if isinstance(node.value, str) else ""
+    parts = node.values if isinstance(node, ast.JoinedStr) else []
+    return "".join(message_text(part) if isinstance(part, ast.Constant) else "{}" for part in parts)

@@ -1,6 +1,6 @@
-"""Draws the pictures of docs/models.md: the network with its streams and mechanisms, and where a step's time goes.
+"""Draws the pictures of docs/model.md (the network, its streams and mechanisms) and docs/performance.md (time of a step).
 
-`python docs/img/models.py` writes network.png and step_time.png beside this file. The times are those of docs/performance.md.
+`python docs/img/models.py` writes network.png and step_time.png next to this file. The times are those of docs/performance.md.
 """
 
 from pathlib import Path
@@ -16,13 +16,13 @@ STREAMS = (
     ("history", "earlier frames", CONDITION),
     ("action", "motion as\npictures", CONDITION),
     ("joints", "16 numbers\na latent frame", CONDITION),
-    ("embodiment", "looks as\npictures", CONDITION),
+    ("embodiment", "appearance as\npictures", CONDITION),
 )
 """Name, content and color of each stream, in the order of the tokens."""
 MECHANISMS = (
     ("time", "a vector for each\nlatent frame", 5.38),
     ("context", "tokens that\nall tokens read", 4.22),
-    ("frame", "tokens for those of\ntheir own frame", 3.06),
+    ("frame", "tokens for their\nframe alone", 3.06),
 )
 """Place, content and height of each mechanism but `channels`."""
 TIMES = {
@@ -86,7 +86,7 @@ def draw_network(path: Path) -> None:
     for (name, content, y), target in zip(MECHANISMS, (5.85, 4.7, 4.3), strict=True):
         box(axes, 12.0, y, 2.0, 0.95, f"$\\bf{{{name}}}$\n{content}", MECHANISM)
         arrow(axes, (12.0, y + 0.47), (11.5, target))
-    box(axes, 0.1, 1.1, 1.5, 1.0, "$\\bf{channels}$\npictures beside\nRGB's latents", MECHANISM)
+    box(axes, 0.1, 1.1, 1.5, 1.0, "$\\bf{channels}$\npictures with\nRGB's latents", MECHANISM)
     arrow(axes, (1.6, 1.6), (1.9, 1.6))
     for label, color in {"RGB": RGB, "condition streams": CONDITION, "mechanisms": MECHANISM, "every model": TEXT}.items():
         axes.scatter([], [], marker="s", s=90, color=color, edgecolor="#444444", label=label)

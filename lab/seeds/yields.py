@@ -1,11 +1,11 @@
 """The command that counts how often the experts succeed, on some seeds of every task and robot, in physics, without pictures.
 
 Reads  the registries of tasks and robots
-Writes a Markdown table to the terminal and, with --page, docs/tasks.md: the tasks in words and the table
+Writes a Markdown table to the terminal and, with --page, docs/reference/tasks.md: the tasks in words and the table
 
 Unlike generate this tries every seed on every robot and stores no episode.
 
-Command: python -m lab.seeds.yields [--tasks … --robots … --seeds 20 --first-seed 0 --page docs/tasks.md]
+Command: python -m lab.seeds.yields [--tasks … --robots … --seeds 20 --first-seed 0 --page docs/reference/tasks.md]
 """
 
 import contextlib
@@ -163,15 +163,15 @@ def task_section(task: Task) -> str:
 
 
 def page(records: Sequence[Record], args: Args) -> str:
-    """The text of docs/tasks.md."""
+    """The text of docs/reference/tasks.md."""
     tasks = "\n\n".join(task_section(get_task(name)) for name in sorted(args.tasks))
     seeds = f"{args.seeds} seeds from {args.first_seed}"
     first = f" --first-seed {args.first_seed}" if args.first_seed else ""
     first += f" --motion {args.motion}" if args.motion != SHARED_MOTION else ""
     device = next(record.device for record in records)
-    return f"""# The tasks
+    return f"""# Reference: tasks
 
-This page is written by `{COMMAND} --seeds {args.seeds}{first} --page docs/tasks.md`;
+This page is written by `{COMMAND} --seeds {args.seeds}{first} --page docs/reference/tasks.md`;
 the descriptions are the docstrings of `xew/sim_warp/tasks/`. Lengths are in meters,
 x to the right, y away from the robot, the origin under the table's center; the table's top is at z = 0.74.
 Words in braces are replaced by what the scene has: objects, their kinds and their colors.

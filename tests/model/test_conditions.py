@@ -123,7 +123,7 @@ def test_registries_name_what_feeds_each_stream() -> None:
 
 
 def test_what_a_user_gives_in_the_place_of_an_entry_is_taken() -> None:
-    """A condition, a tuple of them as in docs/models.md, or a system."""
+    """A condition, a tuple of them as in docs/conditioning.md, or a system."""
     joints = ACTIONS["joints"]
     assert list_conditions(joints) == list_conditions((joints,)) == list_conditions(System((joints,), "", "")) == (joints,)
 

@@ -12,7 +12,7 @@ from xew.sim_warp.production.cells import Job
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.tasks import TASKS
 
-PAGE = Path(__file__).parents[3] / "docs" / "tasks.md"
+PAGE = Path(__file__).parents[3] / "docs" / "reference" / "tasks.md"
 
 
 # --- The page and the table of yields.
@@ -22,7 +22,7 @@ PAGE = Path(__file__).parents[3] / "docs" / "tasks.md"
 def test_the_page_tells_what_the_docstrings_tell(name: str) -> None:
     assert all(describe_task(TASKS[name]).get(part) for part in PARAGRAPHS)
     assert task_section(TASKS[name]) in PAGE.read_text(), (
-        "write docs/tasks.md anew: python -m lab.seeds.yields --seeds 50 --page docs/tasks.md"
+        "write docs/reference/tasks.md anew: python -m lab.seeds.yields --seeds 50 --page docs/reference/tasks.md"
     )
 
 
@@ -60,7 +60,7 @@ def test_yields_try_every_robot_and_write_nothing(tmp_path: Path, monkeypatch: p
     assert (
         f"| `{TASK}` | 2/2 (100 %) | 1/2 (50 %) | 1/2 (50 %) |" in text
         and "2 seeds from 0 of each task, in physics, on CPU:" in text
-        and "python -m lab.seeds.yields --seeds 2 --page docs/tasks.md`" in text
+        and "python -m lab.seeds.yields --seeds 2 --page docs/reference/tasks.md`" in text
     )
     assert not list(tmp_path.iterdir())
 

@@ -95,7 +95,7 @@ def test_failures_are_listed_by_task_robot_and_seed() -> None:
 def test_the_page_says_by_which_command_it_is_made() -> None:
     args = Args(tasks=(TASK,), robots=("piper",), seeds=7, first_seed=30)
     text = page([record(30, "piper", task=TASK)], args)
-    assert "`python -m lab.seeds.yields --seeds 7 --first-seed 30 --page docs/tasks.md`" in text
+    assert "`python -m lab.seeds.yields --seeds 7 --first-seed 30 --page docs/reference/tasks.md`" in text
     assert "7 seeds from 30 of each task, in physics, on CPU:" in text
     assert text.index("### `close`") < text.index("## How often the experts succeed") < text.index("| **all tasks**")
 
@@ -106,7 +106,7 @@ def test_a_page_is_written_with_its_folder_or_the_option_is_named(tmp_path: Path
     measured = "\n## How much is seen\nof surfaces\n\n## What the metrics can tell\nof metrics\n"
     write_page(tmp_path / "tasks.md", f"# Tasks\nold\n\n{YIELDS}\nold, too\n" + measured)
     assert find_kept(tmp_path / "tasks.md") == measured and find_kept(tmp_path / "new" / "tasks.md") == ""
-    kept = find_kept(Path(__file__).parents[3] / "docs" / "tasks.md")
+    kept = find_kept(Path(__file__).parents[3] / "docs" / "reference" / "tasks.md")
     assert [line for line in kept.splitlines() if line.startswith("## ")] == [SEEN, POWER], "the page keeps what others write"
     assert find_kept(tmp_path / "none.md") == ""
     with pytest.raises(EpisodeError, match="Choose another file with --page"):

@@ -11,7 +11,7 @@ from xew.model.codecs.autoencoders import PACKAGED_WEIGHTS, ConvAutoencoderCodec
 from xew.model.codecs.ceiling import reconstruct
 from xew.model.codecs.contract import CodecSettings
 
-DOCS = Path(__file__).parents[3] / "docs" / "models.md"
+DOCS = Path(__file__).parents[3] / "docs" / "codec.md"
 MOST_BYTES = 20e6
 
 

@@ -353,20 +353,21 @@ def test_conditions_of_a_system_are_all_of_one_kind() -> None:
             )
 
 
-PAGE = (ROOT / "docs" / "models.md").read_text()
+TOPICS = ("model", "conditioning", "codec", "training", "rollout", "pretrained_weights")
+PAGES = "\n".join((ROOT / "docs" / f"{topic}.md").read_text() for topic in TOPICS)
 
 
-def test_the_page_names_all_that_can_be_chosen() -> None:
+def test_the_pages_name_all_that_can_be_chosen() -> None:
     registries = (MODELS, STREAMS, ACTIONS, CONDITIONS, MECHANISMS, CODECS, VAES, SAMPLERS, SCHEDULES)
-    absent = [name for registry in registries for name in registry if f"`{name}`" not in PAGE]
+    absent = [name for registry in registries for name in registry if f"`{name}`" not in PAGES]
     assert not absent
-    assert all((ROOT / path).is_file() for path in re.findall(r"configs/[\w/]+\.yaml", PAGE))
-    modules = set(re.findall(r"python -m (xew[\w.]+)", PAGE))
+    assert all((ROOT / path).is_file() for path in re.findall(r"configs/[\w/]+\.yaml", PAGES))
+    modules = set(re.findall(r"python -m (xew[\w.]+)", PAGES))
     assert len(modules) > 5 and all((ROOT / f"{module.replace('.', '/')}.py").is_file() for module in modules)
 
 
 def test_the_page_s_condition_from_outside_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (code,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    (code,) = re.findall(r"^```python\n(.*?)^```$", PAGES, re.MULTILINE | re.DOTALL)
     (tmp_path / "my_conditions.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
     chosen = ["--model.embodiment", "my_conditions:STILL"]

@@ -18,7 +18,7 @@ from xew.sim_warp.scene import Scene, scene_rng
 from xew.sim_warp.tasks import TASKS, get_task
 from xew.sim_warp.tasks.task import Moment
 
-PAGE = Path(__file__).parents[3] / "docs" / "tasks.md"
+PAGE = Path(__file__).parents[3] / "docs" / "reference" / "tasks.md"
 SOLVERS = dict(zip(sorted(TASKS), cycle(ROBOTS), strict=False))
 """One robot a task, all five among them."""
 SEED = 2
