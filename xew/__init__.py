@@ -8,4 +8,4 @@ Rooms, in the order in which the data flows (docs/architecture.md):
 The contracts between them: `xew.episode` (what an episode holds) and `xew.protocol` (who is held out).
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -40,8 +40,8 @@ from xew.model.codecs.autoencoders import ConvAutoencoderCodec
 from xew.model.codecs.ceiling import check_lpips
 from xew.model.codecs.contract import to_pictures, to_signed
 from xew.model.codecs.conv_autoencoder import ConvAutoencoder, save_autoencoder
-from xew.model.runs.begin import check_one_of, claim_run
 from xew.model.runs.checkpoint import TrainState, restore_state
+from xew.model.runs.folder import check_one_of, claim_run
 from xew.model.runs.log import RunLog
 from xew.model.runs.session import open_session
 from xew.model.training.loop import STOPPED, Meter, Timetable, run_steps

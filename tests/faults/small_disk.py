@@ -30,7 +30,7 @@ from xew.exchange import lerobot
 from xew.files import write_bytes, write_text
 from xew.model import outside
 from xew.model.experiment import load_experiment
-from xew.model.runs.begin import claim_run
+from xew.model.runs.folder import claim_run
 from xew.model.runs.log import RunLog
 from xew.rollout import write_rollout
 

@@ -30,8 +30,7 @@ from xew.exchange import robotwin
 from xew.exchange.hdf5 import read_robotwin
 from xew.model import outside, rollout
 from xew.model.experiment import load_experiment
-from xew.model.runs.begin import claim_run
-from xew.model.runs.folder import load_run_config
+from xew.model.runs.folder import claim_run, load_run_config
 from xew.names import check_name, path_below
 from xew.rollout import RolloutError, find_rollouts, read_rollout, write_rollout
 from xew.sim_warp.inspect import read_headers

@@ -21,7 +21,7 @@ from xew.files import write_text
 from xew.model import outside
 from xew.model.episodes.choice import select_episodes
 from xew.model.experiment import load_experiment
-from xew.model.runs.begin import claim_run
+from xew.model.runs.folder import claim_run
 from xew.sim_warp import generate
 
 REPOSITORY = Path(__file__).parents[2]

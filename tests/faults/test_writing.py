@@ -22,7 +22,7 @@ MAY_WRITE_IN_PLACE = {
     "xew/files.py": ("write_text", "write_bytes", "_lock"),
     "xew/episode.py": ("write_video",),  # into a folder that takes its name when it is complete
     "xew/exchange/lerobot.py": ("add", "_open", "_write_meta"),  # the same
-    "xew/model/runs/begin.py": ("write_claim",),  # an empty mark
+    "xew/model/runs/folder.py": ("write_claim",),  # an empty mark
     "xew/model/runs/log.py": ("__init__",),  # lines are appended; a cut one is left out when it is read
     "xew/sim_warp/embodiment/prepared.py": ("write_prepared",),  # into such a folder
     "xew/sim_warp/generate.py": ("_prepare_folder",),  # whether anything can be written

@@ -17,8 +17,8 @@ from xew.model.devices.sharding import make_mesh
 from xew.model.experiment import load_experiment
 from xew.model.network.dit import WorldModel
 from xew.model.network.dit_layouts import check_dit, load_dit, load_dit_params
-from xew.model.runs.begin import check_start
 from xew.model.runs.checkpoint import TrainState, open_checkpoints, save_state
+from xew.model.runs.folder import check_start
 from xew.model.training.step import make_trainer
 from xew.model.weights.reading import read_tensors
 

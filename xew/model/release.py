@@ -25,9 +25,8 @@ from xew.model.cache.scales import load_run_scales
 from xew.model.codecs.codec import RUN_CODEC
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment
-from xew.model.runs.begin import prepare_run
 from xew.model.runs.checkpoint import load_params, save_params, write_checkpoints
-from xew.model.runs.folder import load_run
+from xew.model.runs.folder import load_run, prepare_run
 from xew.model.settings.settings import AdaptSettings
 
 CARD = "README.md"

@@ -25,16 +25,14 @@ from xew.model.devices.sharding import (
     check_batch,
     make_mesh,
     mesh_shape,
-    place_batch,
     process_samples,
     start_processes,
 )
 from xew.model.episodes.choice import choose_episodes
 from xew.model.experiment import Experiment, parse_experiment
-from xew.model.runs.begin import begin_run, check_one_of, check_start
 from xew.model.runs.checkpoint import TrainState
+from xew.model.runs.folder import begin_run, check_one_of
 from xew.model.runs.session import open_session
-from xew.model.sampling.predict import make_predictor
 from xew.model.settings.optimizer import learning_rate
 from xew.model.training.data import ClipSource
 from xew.model.training.flops import flops_of_step
@@ -105,7 +103,6 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     mesh = make_mesh(experiment.mesh)
     check_batch(experiment.train.batch, experiment.train.accumulate, mesh.size)
     own = process_samples(mesh, experiment.train.batch)
-    check_start(experiment)
     episodes = choose_episodes(read_dataset(experiment.data), experiment.choice)
     source = ClipSource.open(experiment.encoding, experiment.instructions, episodes.fresh, episodes.replay)
     source.check()
@@ -125,12 +122,10 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
 
         def draw_samples(state: TrainState, step: int) -> None:
             params = trainer.average_params(state)
-            log_samples(session.log, make_predictor(experiment, codec, params, source.scales), episodes.samples, step)
+            log_samples(session.log, experiment, codec, params, source.scales, episodes.samples, step)
 
         meter = Meter(summarize, settings.batch, flops_of_step(spec))
-        state = run_steps(
-            timetable, session, meter, trainer.step, state, batches, draw_samples, lambda batch: place_batch(batch, mesh)
-        )
+        state = run_steps(timetable, session, meter, trainer.step, state, batches, draw_samples, trainer.place)
     return int(state.step) >= settings.steps
 
 

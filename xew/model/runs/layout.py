@@ -5,7 +5,7 @@ It loads without JAX, for `xew.analysis.study`. folder.py says what each file ho
 
 from pathlib import Path
 
-from xew.files import read_json, remove_written
+from xew.files import read_json
 
 RUN_MARK = ".xew-run"
 """Name of the file that marks the folder of a run."""
@@ -30,11 +30,6 @@ RUN_FILES = (
 def is_run(folder: Path) -> bool:
     """Whether a training run has made a folder, by its mark."""
     return (folder / RUN_MARK).is_file()
-
-
-def remove_run(folder: Path) -> list[Path]:
-    """Remove the files of a run, and return what else lies there, which stays. Raises OSError as `files.remove_written`."""
-    return remove_written(folder, RUN_FILES)
 
 
 def list_steps(run: Path) -> list[int]:

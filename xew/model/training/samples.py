@@ -1,24 +1,36 @@
 """Sample videos in training: one clip of each sample episode, predicted and compared with the ground truth."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from xew.dataset import Episode
 from xew.episode import read_video
+from xew.model.cache.scales import Scale
+from xew.model.codecs.contract import Codec
+from xew.model.experiment import Experiment
 from xew.model.runs.log import RunLog
-from xew.model.sampling.predict import Predictor
+from xew.model.sampling.predict import make_predictor
 from xew.model.video.comparison import psnr, strip
 from xew.model.video.frames import to_model_size
 
 
-def log_samples(log: RunLog | None, predictor: Predictor, episodes: Mapping[str, Episode], step: int) -> None:
+def log_samples(
+    log: RunLog | None,
+    experiment: Experiment,
+    codec: Codec,
+    params: Any,
+    scales: Mapping[str, Scale],
+    episodes: Mapping[str, Episode],
+    step: int,
+) -> None:
     """Predict one clip of each sample episode, by name; log PSNR, a strip (ground truth above prediction) and a video.
 
-    Every process predicts, for each has a part of the parameters; the one with a log writes.
+    Every process predicts, because each has a part of the parameters; the one with a log writes.
     """
-    clip = predictor.inputs.clip
-    predicted = predictor.predict(list(episodes.values()), clip.frames)
+    clip = experiment.clip
+    predicted = make_predictor(experiment, codec, params, scales).predict(list(episodes.values()), clip.frames)
     if log is None:
         return
     pairs = {}

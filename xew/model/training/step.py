@@ -23,7 +23,7 @@ from jax import Array
 from jax.sharding import AbstractMesh, Mesh
 
 from xew.model.codecs.contract import Codec
-from xew.model.devices.sharding import gather_parameters, place_shapes
+from xew.model.devices.sharding import gather_parameters, place_batch, place_shapes
 from xew.model.diffusion.flow_matching import (
     TrainingPair,
     motion_weights,
@@ -107,6 +107,10 @@ class Trainer:
         """The network's parameters for inference: the moving average where one is kept."""
         with jax.set_mesh(self.mesh):
             return jax.jit(apply_lora)(state.base, state.params if state.ema is None else state.ema)
+
+    def place(self, batch: Batch) -> Batch:
+        """Put this process's samples on the mesh as its shard of the whole batch."""
+        return place_batch(batch, self.mesh)
 
     def step(self, state: TrainState, batch: Batch) -> tuple[TrainState, StepResult]:
         """Take a step with a batch on the mesh. The given state is used up."""

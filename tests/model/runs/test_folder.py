@@ -10,7 +10,7 @@ from tests.networks import TINY_CODEC
 from xew.config import ConfigError
 from xew.model.codecs.autoencoders import ConvAutoencoderCodec
 from xew.model.experiment import Experiment, load_experiment
-from xew.model.runs.begin import prepare_run
+from xew.model.runs.folder import prepare_run
 from xew.model.runs.layout import RUN_MARK, is_run
 from xew.model.settings.settings import AdaptSettings
 
