@@ -135,9 +135,9 @@ def _failure_lines(records: Sequence[Record]) -> list[str]:
     if not failed:
         return ["Nothing failed."]
     return [
-        "What failed:",
-        "",
-        *(f"- `{r.task}`, `{r.robot}`, seed {r.seed}: {r.failure} ({r.failure_detail})" for r in failed),
+        "| task | robot | seed | failure | detail |",
+        "|---|---|---|---|---|",
+        *(f"| `{r.task}` | `{r.robot}` | {r.seed} | {r.failure} | {r.failure_detail} |" for r in failed),
     ]
 
 
@@ -158,8 +158,10 @@ def describe_task(task: Task) -> dict[str, str]:
 def task_section(task: Task) -> str:
     """A task as a section of the page."""
     parts = describe_task(task)
-    lines = [f"- **{part}**: {parts[part]}" for part in ("Task", "Randomization", "Success") if part in parts]
-    return "\n".join([f"### `{task.name}`", f"*{task.instruction}*", "", *lines, "", parts.get("After", "")]).strip()
+    rows = {"Instruction": task.instruction} | {part: text for part, text in parts.items() if part != "After"}
+    rows |= {"Source": parts["After"]} if "After" in parts else {}
+    lines = [f"| {name} | {text.replace('|', chr(92) + '|')} |" for name, text in rows.items()]
+    return "\n".join([f"### `{task.name}`", "", lines[0], "|---|---|", *lines[1:]])
 
 
 def page(records: Sequence[Record], args: Args) -> str:
@@ -174,7 +176,7 @@ def page(records: Sequence[Record], args: Args) -> str:
 This page is written by `{COMMAND} --seeds {args.seeds}{first} --page docs/reference/tasks.md`;
 the descriptions are the docstrings of `xew/sim_warp/tasks/`. Lengths are in meters,
 x to the right, y away from the robot, the origin under the table's center; the table's top is at z = 0.74.
-Words in braces are replaced by what the scene has: objects, their kinds and their colors.
+Words in braces stand for the scene's objects, their kinds and their colors.
 
 {tasks}
 

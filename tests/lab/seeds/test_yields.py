@@ -53,14 +53,14 @@ def test_paragraphs_are_found_by_their_first_word(documented: Task) -> None:
 
 def test_a_task_without_paragraphs_has_a_section_without_them() -> None:
     assert describe_task(CLOSE) == {}
-    assert task_section(CLOSE) == "### `close`\n*close both hands*"
+    assert task_section(CLOSE) == "### `close`\n\n| Instruction | close both hands |\n|---|---|"
 
 
 def test_a_section_lists_what_the_docstring_has(documented: Task) -> None:
     lines = task_section(documented).splitlines()
-    assert lines[:2] == ["### `documented`", "*put the {color} cube on the plate*"]
-    assert lines[3:5] == ["- **Task**: put the cube on the plate.", "- **Success**: it lies there, and the hand is open."]
-    assert lines[-1].startswith("After the plate"), "where a task comes from stands last, without a word before it"
+    assert lines[:3] == ["### `documented`", "", "| Instruction | put the {color} cube on the plate |"]
+    assert lines[4:6] == ["| Task | put the cube on the plate. |", "| Success | it lies there, and the hand is open. |"]
+    assert lines[-1].startswith("| Source | After the plate"), "the source comes last"
 
 
 def test_tasks_are_lines_and_robots_columns_in_the_order_of_the_registry() -> None:
@@ -84,11 +84,12 @@ def test_a_seed_counts_for_all_only_if_every_robot_succeeds_on_it() -> None:
 def test_failures_are_listed_by_task_robot_and_seed() -> None:
     failed = [record(4, "piper", "slip"), record(2, "piper", "grasp"), record(9, "arx_x5", "plan")]
     lines = markdown([record(0, "piper"), *failed]).splitlines()
-    assert lines[-5:-3] == ["What failed:", ""]
-    assert lines[-3:] == [
-        "- `grab_roller`, `arx_x5`, seed 9: plan (because)",
-        "- `grab_roller`, `piper`, seed 2: grasp (because)",
-        "- `grab_roller`, `piper`, seed 4: slip (because)",
+    assert lines[-5:] == [
+        "| task | robot | seed | failure | detail |",
+        "|---|---|---|---|---|",
+        "| `grab_roller` | `arx_x5` | 9 | plan | because |",
+        "| `grab_roller` | `piper` | 2 | grasp | because |",
+        "| `grab_roller` | `piper` | 4 | slip | because |",
     ]
 
 
