@@ -66,8 +66,9 @@ def power_section(power: pd.DataFrame, rows: pd.DataFrame) -> str:
     robots = ", ".join(f"`{robot}`" for robot in sorted(rows["robot"].unique()))
     episodes = len(rows[["task", "seed", "robot"]].drop_duplicates())
     introduction = (
-        "Power is the distance of the frozen first frame from a metric's best score, divided by the distance of the true video, "
-        f"which `evaluate` shows softened to its estimators. It is of {episodes} episodes of {robots}, seed {seeds} of each task.\n"
+        "Power is the distance of the frozen first frame from a metric's best score, divided by the distance of the true "
+        f"video, which `evaluate` shows softened to its estimators. It is of {episodes} episodes of {robots}, "
+        f"seed {seeds} of each task.\n"
         f"A task leaves a metric's mean where that is not above {LEAST_POWER:g}. "
         f"{describe_power(power, {}) or 'None of these does.'} The least power is {_times(least['power'])}, of "
         f"`{least['task']}` for `{least['metric']}`."

@@ -46,7 +46,7 @@ def test_the_table_of_yields_counts_right() -> None:
     lines = markdown(records).splitlines()
     assert lines[0] == "| task | `arx_x5` | `piper` | all robots on the same seed |"
     assert lines[2] == "| `grab_roller` | 2/3 (67 %) | 1/2 (50 %) | 1/3 (33 %) |"
-    assert lines[-1] == "- `grab_roller`, `piper`, seed 1: slip (because)"
+    assert lines[-1] == "| `grab_roller` | `piper` | 1 | slip | because |"
 
 
 def test_yields_try_every_robot_and_write_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
