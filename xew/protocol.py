@@ -261,14 +261,7 @@ def expected_counts(
     test_seeds: int = TEST_SEEDS_PER_TASK,
     robots: tuple[str, ...] = ROBOT_NAMES,
 ) -> dict[str, int]:
-    """Number of scored episodes of each robot in a complete table: 500 in the paper, fewer in a smaller study.
-
-    Args:
-        variant: the model.
-        tasks: number of the study's tasks.
-        test_seeds: number of its test seeds of each task.
-        robots: its robots.
-    """
+    """Number of scored episodes of each robot in a complete table: 500 in the paper, fewer in a smaller study."""
     return {robot: tasks * test_seeds for robot in variant.graded_robots if robot in robots}
 
 
@@ -282,16 +275,6 @@ def training_counts(
     if variant.target is not None:
         return {variant.target: tasks * variant.shots} if variant.target in robots else {}
     return {robot: tasks * train_seeds for robot in SPLITS[variant.split].train_robots if robot in robots}
-
-
-def split_counts(
-    split: Split,
-    tasks: int = TASK_COUNT,
-    train_seeds: int = TRAIN_SEEDS_PER_TASK,
-    test_seeds: int = TEST_SEEDS_PER_TASK,
-) -> tuple[int, int]:
-    """Numbers of training episodes of a split and of test episodes of its held-out robots: 1,250 and 500 a robot."""
-    return len(split.train_robots) * tasks * train_seeds, len(split.held_out_robots) * tasks * test_seeds
 
 
 def seed_split(seed: int) -> str:

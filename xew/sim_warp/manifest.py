@@ -9,10 +9,8 @@ to seeds that have not been tried.
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-import cattrs
-
+from xew.config import ConfigError, parse
 from xew.episode import EpisodeError
 from xew.files import read_json
 from xew.names import check_name
@@ -55,31 +53,12 @@ def read_manifest(path: Path = PACKAGED) -> Manifest:
         EpisodeError: it is not there or not of this form; the message says where.
     """
     try:
-        return _check(_converter().structure(_demand_object(read_json(Path(path))), Manifest))
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, cattrs.BaseValidationError) as error:
+        return _check(parse(Manifest, read_json(Path(path)), "its content"))
+    except (OSError, ValueError, ConfigError) as error:
+        reason = "; ".join(str(error).splitlines())
         raise EpisodeError(
-            f"{path} is no manifest of seeds ({error}); name another file by --manifest, or leave it out"
+            f"{path} is no manifest of seeds ({reason}); pass another file with --manifest, or omit it."
         ) from error
-    except cattrs.ForbiddenExtraKeysError as error:
-        raise EpisodeError(f"{path} is no manifest of seeds: unknown keys {sorted(error.extra_fields)}") from error
-
-
-def _converter() -> cattrs.Converter:
-    converter = cattrs.Converter(forbid_extra_keys=True, detailed_validation=False)
-    converter.register_structure_hook(int, lambda value, _: _demand_whole(value))
-    return converter
-
-
-def _demand_whole(value: Any) -> int:
-    if type(value) is not int:
-        raise ValueError(f"found {value!r}, expected a whole number")
-    return value
-
-
-def _demand_object(value: Any) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ValueError(f"found {type(value).__name__}, expected an object with tasks")
-    return value
 
 
 def _check(manifest: Manifest) -> Manifest:

@@ -35,6 +35,11 @@ class Tool:
     """[3] m, world frame."""
     rotation: Rotation
 
+    @property
+    def pose(self) -> np.ndarray:
+        """[7] position x y z [m] and quaternion x y z w."""
+        return np.concatenate([self.position, self.rotation.as_quat()])
+
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Tool":
         """The tool shifted along world axes [m]."""
         return Tool(self.position + np.array([x, y, z]), self.rotation)
@@ -213,7 +218,7 @@ def minimum_jerk(share: np.ndarray) -> np.ndarray:
 
 def _sample(home: Tool, segments: list[Segment], times: np.ndarray) -> np.ndarray:
     """[t 7] pose of one tool; it stands still between segments."""
-    pose = np.tile(np.concatenate([home.position, home.rotation.as_quat()]), (len(times), 1))
+    pose = np.tile(home.pose, (len(times), 1))
     for segment in segments:
         now = times >= segment.start_time
         progress = minimum_jerk((times[now] - segment.start_time) / (segment.end_time - segment.start_time))

@@ -289,7 +289,7 @@ def test_what_looks_wrong_is_told(tmp_path: Path) -> None:
     write_text(folder, text.replace("@", '<origin xyz="4 0 0"/><axis xyz="0 0 0"/>'))
     told = "\n".join(warning_lines(load_robot(folder)))
     for words in (
-        "it has no collision shapes: the convex hulls of what is seen collide in their place",
+        "it has no collision shapes: the convex hulls of its visuals collide instead",
         "all joints have a speed limit of 1 rad/s, which looks like a placeholder",
         "the left hand opens 20 mm; tasks hold things of up to 70 mm",
         "link lamp is 4.0 m away from the root",

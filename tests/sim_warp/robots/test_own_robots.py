@@ -179,7 +179,7 @@ def test_files_of_another_machine_are_found_by_their_end(start: str, tmp_path: P
     path = write_urdf(tmp_path / "arm", {"meshes/skin.obj": f"{start}meshes/skin.obj"})
     urdf, found = load_urdf(path), path.parent / "meshes" / "skin.obj"
     assert urdf.meshes[f"{start}meshes/skin.obj"] == found
-    assert urdf.notes == (f"{start}meshes/skin.obj is not on this machine: {found} is taken for it",)
+    assert urdf.notes == (f"{start}meshes/skin.obj is not on this machine: {found} is used instead",)
 
 
 def test_textures_of_materials_color_the_triangles(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_without_collision_shapes_what_is_seen_collides(tmp_path: Path) -> None:
     path.write_text(re.sub(r"<collision>.*?</collision>", "", path.read_text(), flags=re.DOTALL))
     urdf = load_urdf(path)
     assert all(len(link.collisions) == 1 and len(link.collisions[0].points) == 8 for link in urdf.links.values())
-    assert urdf.notes == ("it has no collision shapes: the convex hulls of what is seen collide in their place",)
+    assert urdf.notes == ("it has no collision shapes: the convex hulls of its visuals collide instead",)
 
 
 # --- Kept beside the data.

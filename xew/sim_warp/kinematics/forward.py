@@ -1,7 +1,7 @@
 """Where a robot's links and tools are: forward kinematics, a pure function of joint positions.
 
-Poses are x y z [m] and quaternion x y z w. `forward_kinematics` is the kernel of batched_kinematics.py, which also takes and
-gives device arrays; all else here is NumPy, so that what the renderer is given is the same bits on every device.
+Poses are x y z [m] and quaternion x y z w. `forward_kinematics` runs the kernel of batched.py. All other functions are NumPy:
+the renderer gets the same bits on every device.
 """
 
 import numpy as np
@@ -26,17 +26,16 @@ def forward_kinematics(robot: RobotSpec | Urdf, joint_pos: np.ndarray) -> dict[s
     Raises:
         ValueError: `joint_pos` does not have one column per moving joint.
     """
-    # Only here, so that the rooms that need a robot's geometry and no simulation do without Warp.
+    # Imported here: packages that need a robot's geometry without simulation work without Warp.
     import warp as wp
 
     from xew.sim_warp.kinematics.batched import BatchedKinematics
 
     urdf = robot if isinstance(robot, Urdf) else load_urdf(robot.urdf)
     rows = _check_rows(urdf, joint_pos)
-    batched = BatchedKinematics.of_urdf(urdf, dtype=wp.float64)
+    batched = BatchedKinematics(urdf, dtype=wp.float64)
     poses = batched.poses(wp.array(rows, dtype=wp.float64, device=batched.device)).numpy()
-    found = {link: poses[:, number] for number, (_, link) in enumerate(batched.links[0])}
-    return {name: np.ascontiguousarray(found[name]) for name in urdf.links}
+    return {name: np.ascontiguousarray(poses[:, batched.links.index(name)]) for name in urdf.links}
 
 
 def _check_rows(urdf: Urdf, joint_pos: np.ndarray) -> np.ndarray:

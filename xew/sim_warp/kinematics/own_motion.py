@@ -92,8 +92,7 @@ def _follow(robot: RobotSpec, timeline: Timeline, joint_pos: np.ndarray) -> tupl
 
 def _lines(steps: Sequence[Step], rows: int) -> np.ndarray:
     """[rows 2 7] poses of both tools along the straight lines of all moves, `SAMPLES` rows each; then they stand."""
-    at = np.stack([np.concatenate([home.position, home.rotation.as_quat()]) for home in HOME])
-    poses = np.tile(at, (rows, 1, 1))
+    poses = np.tile([home.pose for home in HOME], (rows, 1, 1))
     progress = np.linspace(0, 1, SAMPLES + 1)
     for number, step in enumerate(steps):
         for arm, segment in step.items():

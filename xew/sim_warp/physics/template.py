@@ -121,18 +121,27 @@ def _mass_properties(
     mass = sum((inertial.mass for inertial, _ in known), 0.0)
     if mass <= 0:
         return 0.05, np.zeros(3), np.eye(3) * 5e-5
-    centers = [pose[:3, :3] @ inertial.center + pose[:3, 3] for inertial, pose in known]
-    center = sum(inertial.mass * c for (inertial, _), c in zip(known, centers, strict=True)) / mass
-    inertia = np.zeros((3, 3))
-    for (inertial, pose), c in zip(known, centers, strict=True):
-        arm = c - center
-        inertia += pose[:3, :3] @ inertial.inertia @ pose[:3, :3].T + inertial.mass * (
-            arm @ arm * np.eye(3) - np.outer(arm, arm)
-        )
+    center, inertia = _combine(
+        [inertial.mass for inertial, _ in known],
+        [pose[:3, :3] @ inertial.center + pose[:3, 3] for inertial, pose in known],
+        [pose[:3, :3] @ inertial.inertia @ pose[:3, :3].T for inertial, pose in known],
+    )
     is_placeholder = np.sqrt(np.trace(inertia) / mass) > FARTHEST_MASS or np.linalg.eigvalsh(inertia).min() <= 0
     if is_placeholder and hulls:
         return solid(mass, [points for _, points in hulls])
     return mass, center, inertia
+
+
+def _combine(
+    masses: Sequence[float], centers: Sequence[np.ndarray], inertias: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Center [3] and inertia about it [3 3] of bodies together, from their own centers and inertias (parallel axes)."""
+    center = np.asarray(sum(mass * middle for mass, middle in zip(masses, centers, strict=True)) / sum(masses))
+    inertia = np.zeros((3, 3))
+    for mass, middle, own in zip(masses, centers, inertias, strict=True):
+        arm = middle - center
+        inertia += own + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return center, inertia
 
 
 def solid(mass: float, hulls: Sequence[np.ndarray]) -> tuple[float, np.ndarray, np.ndarray]:
@@ -144,13 +153,9 @@ def solid(mass: float, hulls: Sequence[np.ndarray]) -> tuple[float, np.ndarray, 
 def _solid(mass: float, hulls: tuple[bytes, ...]) -> tuple[float, np.ndarray, np.ndarray]:
     """`solid` of float32 points: all robots of a seed meet the same objects."""
     pieces = [_convex(points) for points in hulls]
-    volume = sum(piece.volume for piece in pieces)
-    center = sum(piece.volume * piece.center_mass for piece in pieces) / volume
-    inertia = np.zeros((3, 3))
-    for piece in pieces:
-        arm = piece.center_mass - center
-        inertia += piece.moment_inertia + piece.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    return mass, center, inertia * mass / volume
+    volumes = [piece.volume for piece in pieces]
+    center, inertia = _combine(volumes, [p.center_mass for p in pieces], [p.moment_inertia for p in pieces])
+    return mass, center, inertia * mass / sum(volumes)
 
 
 def new_builder() -> "newton.ModelBuilder":

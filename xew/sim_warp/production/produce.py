@@ -8,6 +8,7 @@ the last of them is done the scene is written, ahead of all that has not begun. 
 a share is one robot of one scene there. A GPU steps many worlds together, so a share is a batch of whole scenes there.
 """
 
+import operator
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -71,10 +72,6 @@ class _Scene:
     seconds: float = 0.0
 
     @property
-    def is_simulated(self) -> bool:
-        return len(self.cells) == len(self.job.robots)
-
-    @property
     def ordered_cells(self) -> list[Cell]:
         """The cells in the order of the job's robots."""
         by_robot = {cell.robot_name: cell for cell in self.cells}
@@ -95,22 +92,18 @@ def make_scenes(workers: Workers, jobs: Sequence[Job], production: Production) -
     """
     scenes = {(job.task, job.seed): _Scene(job) for job in jobs}
     work: deque[Callable[[], Outcome]] = deque(partial(_simulate, share, production) for share in production.shares(jobs))
-    for made, seconds in workers.run(_call, work):
-        if made and isinstance(made[0], Record):
-            records = [record for record in made if isinstance(record, Record)]
+    for results, seconds in workers.run(operator.call, work):
+        if results and isinstance(results[0], Record):
+            records = [record for record in results if isinstance(record, Record)]
             yield records, scenes[records[0].task, records[0].seed].seconds + seconds
             continue
-        cells = [cell for group in made if isinstance(group, list) for cell in group]
+        cells = [cell for group in results if isinstance(group, list) for cell in group]
         for cell in cells:
             scene = scenes[cell.task_name, cell.scene.seed]
             scene.cells.append(cell)
             scene.seconds += seconds / len(cells)
-            if scene.is_simulated:
+            if len(scene.cells) == len(scene.job.robots):
                 work.appendleft(partial(_write, scene.ordered_cells, scene.job.rejected, production))
-
-
-def _call(unit: Callable[[], Outcome]) -> Outcome:
-    return unit()
 
 
 def _simulate(share: Sequence[Job], production: Production) -> Outcome:

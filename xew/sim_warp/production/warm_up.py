@@ -15,7 +15,6 @@ import numpy as np
 import warp as wp
 from tqdm import tqdm
 
-from xew.protocol import ACTION_DIM, ARMS
 from xew.sim_warp.devices.kernels import has_kernels
 from xew.sim_warp.devices.workers import Workers
 from xew.sim_warp.embodiment.spec import RobotSpec
@@ -24,6 +23,7 @@ from xew.sim_warp.kinematics.inverse import arm_solver
 from xew.sim_warp.physics import World, simulate
 from xew.sim_warp.rendering.observe import Recording, observe
 from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.rendering.streams import home_action
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.scene import scene_rng
 from xew.sim_warp.tasks import TASKS
@@ -98,8 +98,4 @@ def _render(robot: RobotSpec, device: wp.Device, batch: int) -> None:
 
 def stand_at_home(robot: RobotSpec, frames: int) -> np.ndarray:
     """[t 16] float32 commands to stand at home with open grippers."""
-    action = np.zeros((frames, ACTION_DIM), np.float32)
-    for arm, (joints, gripper) in zip(robot.arms, ARMS, strict=True):
-        action[:, joints.start : joints.start + robot.arm_joint_count] = arm.home
-        action[:, gripper] = 1.0
-    return action
+    return np.tile(home_action(robot).astype(np.float32), (frames, 1))

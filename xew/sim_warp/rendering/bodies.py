@@ -19,7 +19,7 @@ def robot_bodies(spec: RobotSpec) -> list[Body]:
     """The robot's visible links, as many and in the order of `robot_pose`. The meshes are shared between calls."""
     links = load_urdf(spec.urdf).links
     meshes = {name: link.visual for name, link in links.items() if link.visual is not None}
-    return [Body(meshes[name], is_robot=True) for _, name in _visible_links(spec)]
+    return [Body(meshes[name], is_robot=True) for _, name in body_names(spec)]
 
 
 def robot_pose(spec: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
@@ -32,7 +32,7 @@ def robot_pose(spec: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
         [t b 7] float32, xyz [m] and quaternion xyzw.
     """
     poses = link_poses(spec, joint_pos)
-    return np.stack([poses[copy][link] for copy, link in _visible_links(spec)], 1).astype(np.float32)
+    return np.stack([poses[copy][link] for copy, link in body_names(spec)], 1).astype(np.float32)
 
 
 def keypoint_links(spec: RobotSpec) -> list[tuple[int, str, str]]:
@@ -42,21 +42,17 @@ def keypoint_links(spec: RobotSpec) -> list[tuple[int, str, str]]:
     keypoints, such as left/link3, say whose they are.
     """
     urdf = load_urdf(spec.urdf)
-    found = []
+    keypoints = []
     for index, (side, arm) in enumerate(zip(SIDES, spec.arms, strict=True)):
         copy = 0 if spec.one_urdf_holds_both_arms else index
         links = [urdf.joints[joint].child for joint in (*arm.joints, *arm.fingers)]
-        found += [(copy, link, f"{side}/{link}") for link in links]
-    return found
-
-
-def body_names(spec: RobotSpec) -> list[tuple[int, str]]:
-    """(copy of the URDF, link) of each body of `robot_bodies`."""
-    return list(_visible_links(spec))
+        keypoints += [(copy, link, f"{side}/{link}") for link in links]
+    return keypoints
 
 
 @lru_cache(maxsize=256)
-def _visible_links(spec: RobotSpec) -> tuple[tuple[int, str], ...]:
+def body_names(spec: RobotSpec) -> tuple[tuple[int, str], ...]:
+    """(copy of the URDF, link) of each body of `robot_bodies`."""
     urdf = load_urdf(spec.urdf)
     copies = 1 if spec.one_urdf_holds_both_arms else 2
     return tuple((copy, name) for copy in range(copies) for name, link in urdf.links.items() if link.visual is not None)

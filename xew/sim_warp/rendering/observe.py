@@ -53,7 +53,7 @@ class Observation:
 def observe(renderer: Renderer, recordings: Sequence[Recording], camera: Camera = HEAD_CAMERA) -> list[Observation]:
     """Look at many episodes at once; the result of each does not depend on the others."""
     points = [keypoint_positions(recording.robot, recording.joint_pos) for recording in recordings]
-    worlds = [_world(recording, at) for recording, at in zip(recordings, points, strict=True)]
+    worlds = [recording_world(recording, at) for recording, at in zip(recordings, points, strict=True)]
     frames = renderer.render_batch(worlds, camera)
     return [_observation(*seen, camera) for seen in zip(recordings, points, frames, strict=True)]
 
@@ -141,7 +141,8 @@ def _own_table(robot: RobotSpec) -> np.ndarray:
     return table
 
 
-def _world(recording: Recording, points: np.ndarray) -> World:
+def recording_world(recording: Recording, points: np.ndarray | None = None) -> World:
+    """A recording as the renderer takes it, the robot's bodies first; `points` [t k 3] m, world, are looked up."""
     bodies = [*robot_bodies(recording.robot), *recording.things]
     pose = robot_pose(recording.robot, recording.joint_pos)
     if recording.thing_pose is not None:

@@ -10,7 +10,7 @@ too few in some frames, as on a lid seen edge-on or a tool in a hand, far more a
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -20,9 +20,9 @@ from xew.sim_warp.embodiment.urdf import load_urdf
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera, project
 from xew.sim_warp.geometry.poses import matrix_from_pose
 from xew.sim_warp.geometry.surface_points import sample_surface
-from xew.sim_warp.rendering.bodies import SIDES, body_names, robot_bodies, robot_pose
-from xew.sim_warp.rendering.observe import Recording
-from xew.sim_warp.rendering.render import Frames, Renderer, World, nearest_pixel
+from xew.sim_warp.rendering.bodies import SIDES, body_names, robot_bodies
+from xew.sim_warp.rendering.observe import Recording, recording_world
+from xew.sim_warp.rendering.render import Frames, Renderer, nearest_pixel
 
 LINK_CANDIDATES, THING_CANDIDATES = 64, 256
 """Numbers of points that are sampled on each link that an arm or a gripper moves, and on each object and hinged lid: of what a
@@ -131,23 +131,14 @@ def track_surfaces(
         renderer: whose buffer says what is seen.
         camera: the camera.
     """
-    poses = [_body_pose(recording) for recording in recordings]
-    placed = [_place(_candidates(recording), pose) for recording, pose in zip(recordings, poses, strict=True)]
-    worlds = [
-        World([*robot_bodies(recording.robot), *recording.things], pose, points.xyz)
-        for recording, pose, points in zip(recordings, poses, placed, strict=True)
-    ]
+    worlds = [recording_world(recording) for recording in recordings]
+    placed = [_place(_candidates(recording), world.pose) for recording, world in zip(recordings, worlds, strict=True)]
+    worlds = [replace(world, points=points.xyz) for world, points in zip(worlds, placed, strict=True)]
     seen = renderer.probe_batch(worlds, camera)
     return [
-        _tracks(_View(recording, pose, shown, camera), names, points)
-        for recording, names, pose, points, shown in zip(recordings, thing_names, poses, placed, seen, strict=True)
+        _tracks(_View(recording, world.pose, shown, camera), names, points)
+        for recording, names, world, points, shown in zip(recordings, thing_names, worlds, placed, seen, strict=True)
     ]
-
-
-def _body_pose(recording: Recording) -> np.ndarray:
-    """Poses [t b 7] of all bodies of a recording, the robot's first."""
-    pose = robot_pose(recording.robot, recording.joint_pos)
-    return pose if recording.thing_pose is None else np.concatenate([pose, recording.thing_pose], 1)
 
 
 def _candidates(recording: Recording) -> dict[int, _Points]:
@@ -170,11 +161,11 @@ def robot_points(robot: RobotSpec, count: int = LINK_CANDIDATES) -> tuple[_Point
     """Points of each of the robot's visible links, in the order of `robot_bodies`; none on links that nothing moves."""
     urdf = load_urdf(robot.urdf)
     moving = {name for arm in robot.arms for name in (*arm.joints, *arm.fingers)}
-    found = []
+    points = []
     for body, (_, link) in zip(robot_bodies(robot), body_names(robot), strict=True):
         moves = any(joint.name in moving for joint in urdf.chain(link))
-        found.append(_Points(*sample_surface(body.mesh, count if moves else 0)))
-    return tuple(found)
+        points.append(_Points(*sample_surface(body.mesh, count if moves else 0)))
+    return tuple(points)
 
 
 def _tracks(view: _View, thing_names: Sequence[str], placed: _Placed) -> SurfaceTracks:
@@ -236,10 +227,10 @@ def _fill(view: _View, bodies: Sequence[int], aim: int | np.ndarray, first: _See
     lacking = np.flatnonzero(missing)
     pixels = np.stack([np.sum(view.shown.body[lacking] == body, axis=(1, 2)) for body in bodies])
     missing[lacking[pixels.sum(axis=0) < LEAST_SHOWN]] = 0
-    found = [_look(view, body) for body, of_body in zip(bodies, pixels, strict=True) if of_body[missing[lacking] > 0].any()]
-    if not found:
+    sets = [_look(view, body) for body, of_body in zip(bodies, pixels, strict=True) if of_body[missing[lacking] > 0].any()]
+    if not sets:
         return first.select(np.zeros(0, int))
-    dense = _join(found)
+    dense = _join(sets)
     return dense.select(choose_points(dense.visible, missing))
 
 

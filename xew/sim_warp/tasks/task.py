@@ -235,23 +235,6 @@ def vessel_pose(position: Point) -> Pose:
     return upright(position[:2], TABLE_TOP, radial_yaw(arm_for(position[0]), position))
 
 
-def rim_grasp(vessel: SceneObject, wall: float, depth: float) -> tuple[int, Tool]:
-    """The arm on whose side a vessel stands, and its grasp from above of the wall on that side.
-
-    Args:
-        vessel: round, standing at `vessel_pose`, so that the hand meets the flat of a wall segment.
-        wall: thickness [m].
-        depth: of the grasp below the rim [m].
-    """
-    position = np.array(vessel.pose[:3])
-    arm = arm_for(position[0])
-    vertices = vessel.shape.mesh.vertices
-    radius = float(np.hypot(*vertices[:, :2].T).max()) - wall / 2
-    yaw = radial_yaw(arm, position)
-    radial = side_sign(arm) * np.array([np.cos(yaw), np.sin(yaw), 0.0])
-    return arm, tool(position + radius * radial + [0, 0, vertices[:, 2].max() - depth], yaw, GRASP_TILT)
-
-
 def carry_by_rim(
     timeline: Timeline,
     vessel: SceneObject,
@@ -263,12 +246,23 @@ def carry_by_rim(
     above: float = 0.05,
     retreat: float = 0.08,
 ) -> None:
-    """Take a vessel by its rim (`rim_grasp`), set it down with its origin at `goal` [3] m, and draw back by `retreat` [m].
+    """Take a vessel by its rim with the arm on its side and set it down with its origin at `goal` [3] m.
 
-    `lift` and `above` are its heights over its old and its new place [m].
+    Args:
+        timeline: is extended.
+        vessel: round, standing at `vessel_pose`: the hand meets the flat of a wall segment.
+        goal: of its origin, world.
+        wall: thickness [m].
+        depth: of the grasp below the rim [m].
+        lift, above: heights of the vessel over its old and its new place [m].
+        retreat: height by which the hand draws back [m].
     """
-    arm, grasp = rim_grasp(vessel, wall, depth)
-    start = vessel.pose[:3]
+    start = np.array(vessel.pose[:3])
+    arm, vertices = arm_for(start[0]), vessel.shape.mesh.vertices
+    radius = float(np.hypot(*vertices[:, :2].T).max()) - wall / 2
+    yaw = radial_yaw(arm, start)
+    radial = side_sign(arm) * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    grasp = tool(start + radius * radial + [0, 0, vertices[:, 2].max() - depth], yaw, GRASP_TILT)
     pick(timeline, {arm: grasp}, lift, opening=0.5)
     end = grasp.carried(start, goal, radial_turn(arm, start, goal))
     place(timeline, arm, vessel.name, end, above=above, retreat=retreat, release=0.4)

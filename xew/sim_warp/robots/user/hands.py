@@ -76,7 +76,8 @@ def find_linkages(urdf: Urdf) -> list[Linkage]:
         name, factor, offset = joint.name, 1.0, 0.0
         while (mimic := urdf.joints[name].mimic) is not None and mimic[0] in urdf.joints and mimic[0] != joint.name:
             name, factor, offset = mimic[0], factor * mimic[1], factor * mimic[2] + offset
-        if joint.kind != "fixed" and (name != joint.name or _is_driver(joint, urdf)):
+        drives = any(other.mimic is not None and other.mimic[0] == joint.name for other in urdf.joints.values())
+        if joint.kind != "fixed" and (name != joint.name or drives):
             factors.setdefault(name, {})[joint.name] = (factor, offset)
     linkages = []
     for name, driven in factors.items():
@@ -84,10 +85,6 @@ def find_linkages(urdf: Urdf) -> list[Linkage]:
         if not (len(joints) == 2 and {j.kind for j in joints} == {"prismatic"} and len({j.parent for j in joints}) == 1):
             linkages.append(Linkage(_common_link(urdf, joints), urdf.joints[name], joints, driven))
     return linkages
-
-
-def _is_driver(joint: Joint, urdf: Urdf) -> bool:
-    return any(other.mimic is not None and other.mimic[0] == joint.name for other in urdf.joints.values())
 
 
 def _common_link(urdf: Urdf, joints: tuple[Joint, ...]) -> str:
@@ -120,7 +117,8 @@ def _slide(tree: ElementTree.Element, urdf: Urdf, linkage: Linkage, number: int)
         if joint in tops:
             side = float((ends[shut][joint.name].mean(0) - middle) @ opening)
             first = joint.name == fingers[0] or (joint.name != fingers[1] and side > 0)
-            _set_parent(tree, joint, f"{linkage.base}_slide_{number}{'ab'[not first]}")
+            parent = _element(tree, joint).find("parent")
+            parent.set("link", f"{linkage.base}_slide_{number}{'ab'[not first]}")  # type: ignore[union-attr]
             origin = np.linalg.inv(frames[linkage.base]) @ frames[joint.parent] @ origin
         _fix(tree, joint, origin @ joint_motion(joint, np.array([linkage.positions(closed)[joint.name]]))[0])
     for letter, sign in (("a", 1.0), ("b", -1.0)):
@@ -178,10 +176,6 @@ def _turn(urdf: Urdf, linkage: Linkage, finger: str) -> float:
 
 def _element(tree: ElementTree.Element, joint: Joint) -> ElementTree.Element:
     return next(entry for entry in tree.findall("joint") if entry.get("name") == joint.name)
-
-
-def _set_parent(tree: ElementTree.Element, joint: Joint, link: str) -> None:
-    _element(tree, joint).find("parent").set("link", link)  # type: ignore[union-attr]
 
 
 def _fix(tree: ElementTree.Element, joint: Joint, origin: np.ndarray) -> None:

@@ -130,7 +130,7 @@ class Trials:
         starts = [_start_postures(self.candidates[0], wanted, seeds) for wanted in near]
         pairs = np.array(list(product(range(len(self.candidates)), (0, 1))))
         rows = Postures(pairs[:, 0], pairs[:, 1], np.zeros((len(pairs), starts[0].shape[1])))
-        pose = np.stack([_tool_pose(HOME[arm]) for arm in rows.arm])[:, None].repeat(seeds, 1)
+        pose = np.stack([HOME[arm].pose for arm in rows.arm])[:, None].repeat(seeds, 1)
         joint_pos, position, rotation = self.solve(rows, pose, np.stack([starts[arm] for arm in rows.arm]))
         every = Postures(rows.candidate.repeat(seeds), rows.arm.repeat(seeds), joint_pos.reshape(-1, joint_pos.shape[-1]))
         return every, position.ravel(), rotation.ravel()
@@ -233,11 +233,6 @@ def _straight(start: Tool, end: Tool, shares: np.ndarray) -> np.ndarray:
 def _are_home(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """[e] bool for errors [e] m and rad."""
     return (position < POSITION_TOLERANCE) & (rotation < ROTATION_TOLERANCE)
-
-
-def _tool_pose(at: Tool) -> np.ndarray:
-    """[7] position and quaternion of a tool."""
-    return np.concatenate([at.position, at.rotation.as_quat()])
 
 
 def _link_points(robot: RobotSpec) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
