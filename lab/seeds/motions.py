@@ -22,7 +22,7 @@ from xew.config import user_errors
 from xew.episode import EpisodeError
 from xew.protocol import FRAME_RATE, MOTIONS, expand_robots
 from xew.sim_warp.devices.workers import quiet_warp
-from xew.sim_warp.kinematics import tool_poses
+from xew.sim_warp.kinematics.forward import tool_poses
 from xew.sim_warp.plan import Timeline, ToolPath, frame_times
 from xew.sim_warp.production.cells import Cell, Job, plan_cells
 from xew.sim_warp.robots import ROBOTS, get_robot

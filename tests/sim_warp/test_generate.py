@@ -78,9 +78,7 @@ def test_own_motion_is_on_record_and_never_mixed_with_shared_motion(tmp_path: Pa
     generate(asked)
     ((folder, record),) = find_records(out)
     assert record.motion == "own" and find_problem(folder) == "", "its holds are known again in its own time"
-    with pytest.raises(
-        EpisodeError, match="holds episodes of own motion, and shared motion is asked for; choose another --out"
-    ):
+    with pytest.raises(EpisodeError, match="holds episodes of own motion, expected shared motion; choose another --out"):
         generate(replace(asked, motion="shared"))
     assert yield_table([record]).splitlines()[-1] == "motion: own 1"
     header = folder / "episode.json"

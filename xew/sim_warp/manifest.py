@@ -1,9 +1,6 @@
-"""The manifest: seeds that are known to fail, found once in physics, so `generate` does not try them.
+"""The manifest: seeds that are known to fail, which `generate` skips.
 
-Reads  seeds.json in this folder, or a file of the same form (lab/seeds/manifest.py makes one)
-
-A seed in the manifest is not a promise: where physics differs a little (another GPU) one may fail, and generate goes on
-to seeds that have not been tried.
+lab/seeds/manifest.py makes seeds.json. On another GPU an accepted seed may fail; generate then continues with further seeds.
 """
 
 from collections.abc import Collection
@@ -21,7 +18,7 @@ PACKAGED = Path(__file__).with_name("seeds.json")
 
 @dataclass(frozen=True)
 class TaskSeeds:
-    """What is known of one task's seeds."""
+    """Known seeds of one task."""
 
     train: tuple[int, ...]
     """Training seeds on which every robot of the manifest succeeded, ascending."""
@@ -33,7 +30,7 @@ class TaskSeeds:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Seeds by task, and what they were found with."""
+    """Seeds by task, with the robots, device and versions of the search."""
 
     robots: tuple[str, ...] = ()
     device: str = ""
@@ -47,11 +44,7 @@ class Manifest:
 
 
 def read_manifest(path: Path = PACKAGED) -> Manifest:
-    """A manifest from its file.
-
-    Raises:
-        EpisodeError: it is not there or not of this form; the message says where.
-    """
+    """Read a manifest. Raises EpisodeError if the file is missing or invalid."""
     try:
         return _check(parse(Manifest, read_json(Path(path)), "its content"))
     except (OSError, ValueError, ConfigError) as error:
@@ -62,7 +55,7 @@ def read_manifest(path: Path = PACKAGED) -> Manifest:
 
 
 def _check(manifest: Manifest) -> Manifest:
-    """The same manifest. Raises ValueError for names that could lead out of a folder and for seeds that are none."""
+    """The same manifest. Raises ValueError for invalid names and seeds."""
     for task, seeds in manifest.tasks.items():
         try:
             for name, what in [(task, "task"), *((robot, "robot") for failed in seeds.rejected.values() for robot in failed)]:

@@ -10,7 +10,8 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp.kinematics import (
+from xew.sim_warp.kinematics.batched import BatchedKinematics
+from xew.sim_warp.kinematics.forward import (
     finger_positions,
     forward_kinematics,
     joint_positions,
@@ -18,7 +19,6 @@ from xew.sim_warp.kinematics import (
     link_poses,
     tool_pose,
 )
-from xew.sim_warp.kinematics.batched import BatchedKinematics
 from xew.sim_warp.kinematics.inverse import ArmSolver, arm_solver
 from xew.sim_warp.kinematics.reachability import work_reach
 from xew.sim_warp.plan import tool

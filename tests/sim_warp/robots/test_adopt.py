@@ -290,7 +290,7 @@ def test_what_looks_wrong_is_told(tmp_path: Path) -> None:
     told = "\n".join(warning_lines(load_robot(folder)))
     for words in (
         "it has no collision shapes: the convex hulls of its visuals collide instead",
-        "all joints have a speed limit of 1 rad/s, which looks like a placeholder",
+        "all joints have a speed limit of 1 rad/s, probably a placeholder",
         "the left hand opens 20 mm; tasks hold things of up to 70 mm",
         "link lamp is 4.0 m away from the root",
     ):

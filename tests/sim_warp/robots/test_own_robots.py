@@ -21,7 +21,7 @@ from xew.episode import array_hash
 from xew.sim_warp import generate as command
 from xew.sim_warp.embodiment import mesh_files
 from xew.sim_warp.generate import Args, generate
-from xew.sim_warp.kinematics import tool_pose
+from xew.sim_warp.kinematics.forward import tool_pose
 from xew.sim_warp.plan import HOME
 from xew.sim_warp.production.rerender import render_again
 from xew.sim_warp.rendering.render import Renderer
@@ -215,7 +215,7 @@ def test_data_keep_their_robot(embodiment: Path, tmp_path: Path, monkeypatch: py
     assert [family.accepted for family in generate(args)] == [1, 0], "again, with what is kept"
     shutil.rmtree(source)
     moved = data.rename(tmp_path / "moved")
-    with pytest.raises(ConfigError, match=r"unknown robot 'my-arm'.*a data set keeps its own in <data>/robots, list that in"):
+    with pytest.raises(ConfigError, match=r"unknown robot 'my-arm'.*For robots of a data set, list <data>/robots in"):
         get_robot("my-arm")
     folder, record = find_accepted(moved)[0]
     assert array_hash(render_again(folder, Renderer("cpu"))[0]) == record.hashes["rgb"]
@@ -368,8 +368,8 @@ BAD_CONFIGS: list[tuple[dict[str, Any], str]] = [
     ({"gripper_name": [{"base": "grip_a", "mimic": []}]}, "expected a base joint and one mimic of"),
     ({"gripper_name": [{"base": "grip_c", "mimic": [["grip_b", 1, 0]]}]}, "small.urdf has no joint grip_c; it has arm1"),
     ({"robot_pose": [[0, 0, 0]]}, "robot_pose is [[0, 0, 0]]; expected lists of x y z and a quaternion w x y z"),
-    ({"robot_pose": [[0, -3, 0.75, 0.707, 0, 0, 0.707]]}, "m, looking to +y, both arms reach home."),
-    ({"ee_joints": ["nowhere"]}, "has no link or joint nowhere; name the one that carries the tool"),
+    ({"robot_pose": [[0, -3, 0.75, 0.707, 0, 0, 0.707]]}, "m, facing +y, both arms reach home."),
+    ({"ee_joints": ["nowhere"]}, "has no link or joint nowhere; expected the tool's link"),
     ({"arm_joints_name": [["arm1", "arm2"]]}, "have 2 and 2 joints; expected equal arms of six or seven"),
     ({"homestate": [[0, 0]]}, "a home has 2 joints, the arm 6"),
     ({"urdf_path": "./none.urdf"}, "none.urdf does not exist; expected a URDF file"),
@@ -389,7 +389,7 @@ def test_a_bad_embodiment_ends_in_one_line(
     ("content", "told"),
     [
         ({"urdff": "small.urdf"}, "unknown key 'urdff'; did you mean 'urdf'?"),
-        ({"arms": [PLACED | {"tool_pose": [0, 0, 0, 0, 0, 0, 0]}, {}]}, "is no position and unit quaternion x y z w"),
+        ({"arms": [PLACED | {"tool_pose": [0, 0, 0, 0, 0, 0, 0]}, {}]}, "expected a position and a unit quaternion x y z w"),
         ({"arms": [PLACED | {"home": [0.0] * 5}, {}]}, "a home has 5 joints, the arm 6"),
         ({"arms": [PLACED, PLACED | {"joints": ["arm1", "arm2"]}]}, "the arms have 6 and 2 joints; expected equal arms"),
         ({"arms": [PLACED, {}], "joint_upper": [1.0]}, "need 6 numbers each"),

@@ -158,7 +158,7 @@ def _load(path: Path, modified: int) -> Urdf:
         ElementTree.parse(path)  # yourdfpy accepts truncated files
         robot = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
     except Exception as error:  # lxml and yourdfpy each have their own
-        raise UrdfError(f"{path} is not a readable URDF ({error}); fix its XML.") from error
+        raise UrdfError(f"{path} is not a URDF that can be read ({error}); fix its XML.") from error
     for kind, entries in (("link", robot.links), ("joint", robot.joints)):
         _check_names(path, kind, [entry.name for entry in entries])
     source = _Source(path, {material.name: material for material in robot.materials}, {}, read_prepared(path))

@@ -1,7 +1,4 @@
-"""A robot as the renderer sees it: one body per link that has a shape, posed by canonical joint positions.
-
-Reads a RobotSpec and its URDF; both arms come in one list, the left copy of the URDF first where there are two.
-"""
+"""A robot's bodies for the renderer: one per visible link, posed by canonical joint positions; the left copy first."""
 
 from functools import lru_cache
 
@@ -16,7 +13,7 @@ SIDES = ("left", "right")
 
 
 def robot_bodies(spec: RobotSpec) -> list[Body]:
-    """The robot's visible links, as many and in the order of `robot_pose`. The meshes are shared between calls."""
+    """The robot's visible links in the order of `robot_pose`; calls share the meshes."""
     links = load_urdf(spec.urdf).links
     meshes = {name: link.visual for name, link in links.items() if link.visual is not None}
     return [Body(meshes[name], is_robot=True) for _, name in body_names(spec)]
@@ -36,11 +33,7 @@ def robot_pose(spec: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
 
 
 def keypoint_links(spec: RobotSpec) -> list[tuple[int, str, str]]:
-    """The links whose origins are keypoints: (copy of the URDF, name of the link, name of the keypoint).
-
-    They are the links that the joints of each arm and its fingers move, from the base outwards; the names of their
-    keypoints, such as left/link3, say whose they are.
-    """
+    """Keypoints as (copy of the URDF, link, name such as left/link3): the child links of each arm's joints and fingers."""
     urdf = load_urdf(spec.urdf)
     keypoints = []
     for index, (side, arm) in enumerate(zip(SIDES, spec.arms, strict=True)):
@@ -59,6 +52,6 @@ def body_names(spec: RobotSpec) -> tuple[tuple[int, str], ...]:
 
 
 def nearby_links(urdf: Urdf, link: str) -> set[str]:
-    """A link and those that one joint joins to it."""
+    """A link and its neighbors."""
     joined = {joint.parent for joint in urdf.joints.values() if joint.child == link}
     return joined | {joint.child for joint in urdf.joints.values() if joint.parent == link} | {link}
